@@ -89,10 +89,10 @@ def test_mistakes_are_told_with_their_path(what: str, golden: Golden) -> None:
 
 
 def test_mistakes_elsewhere_are_told_beside_those_of_a_nemesis() -> None:
-    """All at once, as everywhere."""
+    """All at once, as everywhere: those of entries, and then those across tables."""
     with pytest.raises(ScenarioError) as caught:
-        right({"targets": ["router"]}, slots=0)
-    assert len(caught.value.mistakes) == 2
+        right({"every": 0.5, "targets": ["router"]}, slots=0)
+    assert [line.partition(":")[0] for line in caught.value.mistakes] == ["slots", "nemesis.every"]
     with pytest.raises(ScenarioError) as caught:
         right({"faults": ["set"], "set": {"quality": 2.0}, "targets": ["legitimate", "router"]}, record_trials=2)
     assert len(caught.value.mistakes) == 3

@@ -109,23 +109,37 @@ def test_a_wrong_event_is_named(name: str, golden: Golden) -> None:
     golden("check", mistakes)
 
 
-def test_all_wrong_events_are_named_at_once() -> None:
-    """A line for each, among mistakes of other tables."""
+def test_all_wrong_entries_are_named_at_once() -> None:
+    """A line for each, of events among other tables; what only other tables show waits until every table is valid."""
     found = mistakes_of(
         right,
         {"at": 100, "cut": "eve"},
-        {"at": 1, "kill": "nobody"},
         {"at": 1},
+        {"at": 1.5, "kill": "eve"},
         legitimate={"link": {"quality": 0.9, "delay": {"model": "constant"}, "reorder": 3.0}, "window": -1},
     )
     starts = (
-        "event.0.at",
-        "event.1.kill",
-        "event.2.event",
+        "event.1.event",
+        "event.2.at",
         "legitimate.link.delay.value",
         "legitimate.link.reorder",
         "legitimate.window",
     )
+    assert len(found) == len(starts), found
+    assert all(any(line.startswith(start) for line in found) for start in starts), found
+
+
+def test_all_mistakes_across_tables_are_named_at_once() -> None:
+    """Where every table is valid by itself, those of events among others."""
+    found = mistakes_of(
+        right,
+        {"at": 100, "cut": "eve"},
+        {"at": 1, "kill": "nobody"},
+        legitimate={"link": {"quality": 0.9, "correlation": {"with": "mallory", "strength": 0.5}}},
+        record_trials=2,
+    )
+    starts = ("event.0.at", "event.1.kill", "legitimate.link.correlation.with", "record_trials")
+    assert len(found) == len(starts), found
     assert all(any(line.startswith(start) for line in found) for start in starts), found
 
 

@@ -92,8 +92,8 @@ FAILING = {
     "no receiver": ('    names_in = "dim"\n', "", "it names no receiver; expected one, or several"),
     "mistakes raise": (
         "    def acts",
-        "    @classmethod\n    def mistakes(cls, table):\n        raise ValueError('no')\n\n    def acts",
-        "cannot be checked: Dim.mistakes raised ValueError: no, dimming.py line 15",
+        "    def mistakes(self):\n        raise ValueError('no')\n\n    def acts",
+        "cannot be checked: Dim.mistakes raised ValueError: no, dimming.py line 14",
     ),
     "compared raises": (
         "    def acts",

@@ -81,20 +81,34 @@ def test_a_mistake_of_an_expectation_is_named(expectation: dict[str, Any], said:
     assert [line for line in found if line.startswith("expect.0.") and said in line], found
 
 
-def test_all_mistakes_of_expectations_are_named_at_once() -> None:
-    """Mistakes of several tables, and of one table with wrong entries and wrong combinations, are reported together."""
-    found = mistakes_of(
-        expecting,
-        {"metric": "smart.mean_eror", "near": 1, "slots": [3, 99], "quantile": 2.0},
-        {"secrecy": "relative", "against": "nobody", "by": 3},
-        {"link": "nobody"},
-        {"in_step": "nobody", "by": 99, "since": 100},
-    )
-    for path in (
-        "0.metric", "0.within", "0.slots", "0.quantile", "1.by", "1.against", "2.link", "3.in_step", "3.by", "3.since",
-    ):  # fmt: skip
-        assert [line for line in found if line.startswith(f"expect.{path}: ")], path
-    assert len(found) == 11  # by of the last is both beyond the run and before since
+AT_ONCE: dict[str, tuple[list[dict[str, Any]], set[str]]] = {
+    "of tables": (
+        [
+            {"metric": "smart.mean_eror", "near": 1, "slots": [3, 99]},
+            {"metric": ERROR, "below": "1", "quantile": 2.0},
+            {"secrecy": "relative", "by": 3},
+            {"in_step": "nobody", "by": 99, "since": 100},
+        ],
+        {"0.within", "1.below", "1.quantile", "2.by", "2.against", "3.by"},
+    ),
+    "across tables": (
+        [
+            {"metric": "smart.mean_eror", "below": 1, "slots": [3, 99]},
+            {"secrecy": "relative", "against": "nobody"},
+            {"link": "nobody"},
+            {"in_step": "nobody", "by": 99, "since": 98},
+        ],
+        {"0.metric", "0.slots", "1.against", "2.link", "3.in_step", "3.by", "3.since"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", AT_ONCE)
+def test_all_mistakes_of_expectations_are_named_at_once(name: str) -> None:
+    """Wrong entries of several tables, and wrong combinations of valid entries; then all that other tables show."""
+    expectations, paths = AT_ONCE[name]
+    found = mistakes_of(expecting, *expectations)
+    assert sorted(line.partition(": ")[0] for line in found) == sorted(f"expect.{path}" for path in paths)
 
 
 def test_without_eavesdroppers_there_is_nobody_to_be_secret_from() -> None:

@@ -105,38 +105,48 @@ def test_an_uncontrollable_pair_is_named() -> None:
     assert any("not controllable: the noise reaches 1 of 2 directions" in line for line in found)
 
 
-def test_all_mistakes_are_named_at_once() -> None:
-    """No mistake hides another: neither a missing entry those between entries, nor a bad table its neighbours."""
-    changes = {
-        "slots": "many",
-        "titel": "x",
-        "process.Q.0.1": 1e-4,
-        "encoding.scheme": "plain",
-        "encoding.extra": 1,
-        "legitimate.link.quality": 2.0,
-        "eavesdroppers.smart.use_state": 0.5,
-        "eavesdroppers.smart.link": 3,
-        "expect": [{"metric": "nobody.used_fraction"}, {"below": 1.0}],
-        "record_trials": 9,
-    }
-    found = mistakes_in_good(changes, "process.initial_covariance")
-    for path in (
-        "slots: ",
-        "titel: ",
-        "process.Q: ",
-        "process.initial_covariance: ",
-        "encoding.extra: ",
-        "encoding.state_probability: ",
-        "legitimate.link.quality: ",
-        "eavesdroppers.smart.link: ",
-        "eavesdroppers.smart.use_state: ",
-        "expect.0.below: ",
-        "expect.0.metric: ",
-        "expect.1.metric: ",
-        "record_trials: ",
-    ):
-        assert len([line for line in found if line.startswith(path)]) == 1, path
-    assert len(found) == 13
+WRONG_ENTRIES = {
+    "slots": "many",
+    "titel": "x",
+    "encoding.scheme": "plain",
+    "encoding.extra": 1,
+    "legitimate.link.quality": 2.0,
+    "eavesdroppers.smart.link": 3,
+    "expect": [{"metric": "nobody.used_fraction"}, {"below": 1.0}],
+    "record_trials": 9,
+}
+WRONG_TOGETHER = {
+    "process.Q.0.1": 1e-4,
+    "eavesdroppers.smart.use_state": 0.5,
+    "legitimate.link.reorder": 0.5,
+    "expect": [{"metric": "nobody.used_fraction"}],
+    "record_trials": 9,
+}
+WRONG_ACROSS = {
+    "legitimate.knows_input": True,
+    "expect": [{"metric": "nobody.used_fraction", "below": 1.0}],
+    "record_trials": 9,
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "without", "paths"),
+    [
+        (
+            WRONG_ENTRIES,
+            "process.initial_covariance",
+            "slots titel process.initial_covariance encoding.extra encoding.state_probability legitimate.link.quality "
+            "eavesdroppers.smart.link expect.0.below expect.1.metric",
+        ),
+        (WRONG_TOGETHER, "", "process.Q eavesdroppers.smart.use_state legitimate.link.reorder expect.0.below"),
+        (WRONG_ACROSS, "", "legitimate.knows_input expect.0.metric record_trials"),
+    ],
+    ids=["entries", "tables", "across tables"],
+)
+def test_all_mistakes_are_named_at_once(changes: dict[str, Any], without: str, paths: str) -> None:
+    """No wrong table hides another; what only shows when tables are compared waits until all of them are valid."""
+    found = mistakes_in_good(changes, without)
+    assert sorted(line.partition(": ")[0] for line in found) == sorted(paths.split())
 
 
 def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from evedrop.wire.file import wire_of
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.tables import WireExpectTable, expectation_mistakes
+from evedrop.wire.tables import WireExpectTable
 from tests.builders import mistakes_of
 
 
@@ -78,5 +78,9 @@ def test_a_metric_is_that_of_a_link() -> None:
 
 
 def test_malformed_names_of_links_are_the_tables_matter() -> None:
-    """Here they are passed over: the table itself refuses them."""
-    assert list(expectation_mistakes([{"metric": 3, "link": 4}, {"metric": ".heard"}, {"link": ""}], ["scan"])) == []
+    """The table itself refuses a value that is not a text; a text that names no link is an unknown link."""
+    assert mistakes_of(expecting, metric=3)[0].startswith("expect.0.metric: is 3; expected a string")
+    assert mistakes_of(expecting, metric=".heard", below=1)[0].startswith(
+        'expect.0.metric: is ".heard", but there is no link '
+    )
+    assert mistakes_of(expecting, link="")[0].startswith('expect.0.link: is "", but there is no link ')

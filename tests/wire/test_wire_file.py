@@ -210,8 +210,8 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
         load_wire(tmp_path / "wire.toml")
 
 
-def test_all_mistakes_at_once() -> None:
-    """Those of single tables and those across tables are in one message."""
+def test_all_mistakes_of_tables_at_once() -> None:
+    """They are in one message; those that only show across tables wait until every table is valid."""
     found = mistakes_of(
         of,
         """
@@ -241,9 +241,33 @@ def test_all_mistakes_at_once() -> None:
         'largest: is "64 Mb"; expected bytes, or a text such as "256 kB"; the units are B, kB, MB, GB, KiB, MiB, GiB, such as '
         '"64 MB"',
         "lossles: is not an entry of this table; did you mean lossless?",
+    ]
+
+
+def test_all_mistakes_across_tables_at_once() -> None:
+    """Where every table is valid by itself, they are in one message."""
+    found = mistakes_of(
+        of,
+        """
+    [side.robot]
+    listen = "tcp/127.0.0.1:7448"
+    [side.base]
+    listen = ["tcp/0.0.0.0:7448"]
+    [[link]]
+    from = "robto"
+    to = "base"
+    [[event]]
+    at = "12 s"
+    partition = ["robot", "bsae"]
+    [[expect]]
+    link = "scan"
+    """,
+    )
+    assert found == [
         'side.base.listen.0: is "tcp/0.0.0.0:7448", the same place as tcp/127.0.0.1:7448 at which side robot listens; '
         "expected another port",
         'link.0.from: is "robto"; expected robot or base; did you mean robot?',
+        'expect.0.link: is "scan", but there is no link scan; expected a metric or the name of robto-base',
         'event.0.partition.1: is "bsae"; expected robot or base; did you mean base?',
     ]
 

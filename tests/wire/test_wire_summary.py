@@ -397,7 +397,6 @@ below = 0.5
     said = "\n".join(caught.value.mistakes)
     for line in (
         "expect.0.below: is missing, and so is above; add one of them, or both",
-        'expect.0.metric: is "scam.delivery", but there is no link scam; expected a metric or the name of scan',
         'expect.1.metric: is "scan.latencies"; expected LINK.heard, LINK.delivery, LINK.latency, LINK.gap_messages or LINK.ga',
         'expect.1.below: is "3 apples"; expected a number, or a length of time such as "20 ms"',
         "expect.2.quantile: is set, but only a latency has quantiles",
@@ -406,6 +405,12 @@ below = 0.5
         "expect.5.metric: is missing",
     ):
         assert line in said, said
+    with pytest.raises(ScenarioError) as caught:
+        expecting('[[expect]]\nmetric = "scam.delivery"\nabove = 0.5\n')
+    (line,) = caught.value.mistakes
+    assert line.startswith(
+        'expect.0.metric: is "scam.delivery", but there is no link scam; expected a metric or the name of scan'
+    )
 
 
 @pytest.mark.parametrize(("bound", "found", "holds"), [

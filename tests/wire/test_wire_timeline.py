@@ -105,7 +105,7 @@ def test_an_operator_ends_partitions() -> None:
 
 
 def test_what_an_operator_cannot_do() -> None:
-    """The messages are those of a file, all at once, and say what to do."""
+    """The messages are those of a file, in the same two steps, and say what to do."""
     plan = plan_of({"at": 1, "partition": ["robot", "base"]})
     assert mistakes_of(with_change, plan, {"link": "scan", "set": {"qualty": 1, "corrupt": 2}}, 2.0) == [
         "set.qualty: is not a link setting that can be changed; expected quality, loss, delay, reorder, duplicate, corrupt, rate "
@@ -113,8 +113,13 @@ def test_what_an_operator_cannot_do() -> None:
         "set.corrupt: is 2; expected a number from 0 to 1, such as 0.01",
     ]
     assert mistakes_of(with_change, plan, {"cut": "scna", "partition": ["robot", "bas"]}, 2.0) == [
-        'event: has partition or cut at once; expected one of partition, cut, set or note, such as partition = ["robot", "base"]',
+        'event: has partition or cut at once; expected one of partition, cut, set or note, such as partition = ["robot", "base"]'
+    ]
+    assert mistakes_of(with_change, plan, {"partition": ["rbot", "bas"]}, 2.0) == [
+        'partition.0: is "rbot"; expected robot, base or listener; did you mean robot?',
         'partition.1: is "bas"; expected robot, base or listener; did you mean base?',
+    ]
+    assert mistakes_of(with_change, plan, {"cut": "scna"}, 2.0) == [
         'cut: is "scna"; expected scan, robot-base, base-robot or robot-listener; did you mean scan?',
     ]
     assert mistakes_of(with_cut_ended, plan, "scan", 2.0) == [

@@ -59,10 +59,14 @@ def place_of(error: BaseException, file: str | None = None) -> str:
 
 def asked(model: Any, given: Mapping[str, Any]) -> list[tuple[str, str]]:
     """A class's own mistakes in the given parameters, as (entry, sentence); the class may be custom."""
-    entry = next(iter(given), "parameters")
+    return answered(model, next(iter(given), "parameters"), lambda: model.mistakes(given))
+
+
+def answered(model: Any, entry: str, ask: Callable[[], Any]) -> list[tuple[str, str]]:
+    """The mistakes that a class finds itself when asked; entry: where it is reported that a custom class cannot answer."""
     wanted = "expected it to return a list of (entry, what is wrong)"
     try:
-        answer = model.mistakes(given)
+        answer = ask()
     except Exception as error:
         file = getattr(sys.modules.get(model.__module__), "__file__", None)
         return [(entry, f"cannot be checked: {model.__name__}.mistakes raised {place_of(error, file)}; {wanted}")]

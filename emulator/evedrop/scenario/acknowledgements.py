@@ -5,8 +5,8 @@ Source: docs/scenario.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from collections.abc import Iterator
+from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
@@ -30,28 +30,22 @@ class AcknowledgementsTable(Table):
     flip: Annotated[Probability | None, Field(examples=[0.1])] = None
     false_alarms: Annotated[float, Field(strict=True, ge=10.0, le=1e9, examples=[1e4])] = 1e4
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Mistakes in the entries of attacks: two need a jammer with a link of its own, `flip` a probability."""
-        attack, jammer, flip = table.get("attack", "none"), table.get("jammer"), table.get("flip")
-        if attack == "flip" and flip is None:
-            return [
-                (
-                    "flip",
-                    "is missing; the attack flip needs the probability of flipping an acknowledgement, such as flip = 0.1",
-                )
-            ]
-        if attack != "flip" and flip is not None:
-            return [("flip", f"is set, but the attack {as_toml(attack)} flips nothing; remove the line")]
-        if attack in [*OVERHEARING] and jammer is None:
-            return [
-                ("jammer", f"is missing; the attack {attack} needs the eavesdropper that it serves, by what that hears")
-            ]
-        if attack not in [*OVERHEARING] and jammer is not None:
-            return [
-                (
-                    "jammer",
-                    f"is set, but the attack {as_toml(attack)} does not depend on what it hears; remove the line",
-                )
-            ]
-        return []
+        if self.attack == "flip" and self.flip is None:
+            yield (
+                "flip",
+                "is missing; the attack flip needs the probability of flipping an acknowledgement, such as flip = 0.1",
+            )
+        elif self.attack != "flip" and self.flip is not None:
+            yield "flip", f"is set, but the attack {as_toml(self.attack)} flips nothing; remove the line"
+        elif self.attack in OVERHEARING and self.jammer is None:
+            yield (
+                "jammer",
+                f"is missing; the attack {self.attack} needs the eavesdropper that it serves, by what that hears",
+            )
+        elif self.attack not in OVERHEARING and self.jammer is not None:
+            yield (
+                "jammer",
+                f"is set, but the attack {as_toml(self.attack)} does not depend on what it hears; remove the line",
+            )

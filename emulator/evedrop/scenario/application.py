@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from evedrop.errors import NotRegistered
 from evedrop.model.controllers import Assignment, Controller
 from evedrop.model.integrity.monitor import MonitoredSlots, MonitorPlan
 from evedrop.model.metrics import error_column
@@ -308,15 +307,3 @@ def applications_in(tables: Iterable[str], besides: Container[str] = ()) -> dict
     besides: names that cannot be applications.
     """
     return {name: APPLICATIONS[name] for name in tables if name not in besides and name in APPLICATIONS}
-
-
-def unloadable_in(tables: Iterable[str], besides: Container[str] = ()) -> dict[str, str]:
-    """Name → why it cannot be loaded, in words that follow the name, for applications among these names. besides: as above."""
-    reasons = {}
-    for name in tables:
-        if name not in besides and name in APPLICATIONS.names:
-            try:
-                _ = APPLICATIONS[name]
-            except NotRegistered as error:
-                reasons[name] = error.why
-    return reasons

@@ -12,58 +12,61 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, limit_mistakes, noise_mistakes, plant_of
 from evedrop.scenario.process import ProcessTable
-from evedrop.scenario.valid import ValidTables
+from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
 
 
-def loop_mistakes(tables: ValidTables) -> Iterator[str]:
+def loop_mistakes(scenario: Scenario) -> Iterator[str]:
     """Mistakes in the plant, the controller and `legitimate.knows_input`."""
-    plant, given = tables.plant, tables.given
-    if "controller" in given and ("plant" not in given or (plant is not None and not plant.inputs)):
+    plant, controller = scenario.plant, scenario.controller
+    if controller is not None and (plant is None or not plant.inputs):
         yield (
             "plant: has no inputs, but there is a controller; expected a table [plant] with inputs and input_matrix, or no "
             "[controller]"
         )
-    if plant is not None and plant.inputs and "controller" not in given:
+    if plant is not None and plant.inputs and controller is None:
         inputs = listed(plant.inputs)
         yield f"controller: is missing; expected a table [controller] that decides {inputs}, or a plant without inputs"
-    if tables.legitimate is not None and tables.legitimate.knows_input and "controller" not in given:
+    if scenario.legitimate.knows_input and controller is None:
         yield f"{LEGITIMATE}.knows_input: is true, but there are no inputs; add a [plant] and a [controller], or remove the line"
-    if tables.process is not None and plant is not None:
-        yield from _plant_and_process(plant, tables.process)
-        yield from _rows(plant, tables.slots)
-        if tables.controller is not None:
-            yield from _controller_and_plant(plant, tables.controller, tables.process, tables.slot_seconds or 1.0)
-    if tables.controller is not None:
-        yield from _outages(tables, tables.controller)
+    if plant is not None:
+        yield from _plant_and_process(plant, scenario.process)
+        rows = plant.disturbance_values
+        if plant.disturbances and rows and len(rows) < scenario.slots:
+            yield f"plant.disturbance_values: has {len(rows)} rows; expected slots, which is {scenario.slots}, or more"
+        if controller is not None:
+            yield from _controller_and_plant(plant, controller, scenario.process, scenario.slot_seconds or 1.0)
+    if controller is not None:
+        yield from _outages(scenario, controller)
 
 
-def given_state_mistakes(tables: ValidTables) -> Iterator[str]:
+def given_state_mistakes(scenario: Scenario) -> Iterator[str]:
     """Mistakes together with states that come from a recording or a program."""
-    process = tables.process
-    if process is None or not process.given:
+    process = scenario.process
+    if not process.given:
         return
     where = f"process.source: is {process.source}"
-    for name in ("plant", "controller", *tables.applications):
-        if name in tables.given:
+    loop = {"plant": scenario.plant, "controller": scenario.controller, **scenario.applications}
+    for name, table in loop.items():
+        if table is not None:
             yield (
                 f"{where}, but there is a [{name}], and nothing here moves such states; expected no [{name}], or no source, "
                 "so that states are simulated"
             )
-    if tables.encoding is not None and tables.scheme is not None and tables.scheme.decides_initial_state():
+    if scenario.scheme.decides_initial_state():
         able = listed(sorted(name for name in SCHEMES if not SCHEMES[name].decides_initial_state()))
         yield (
-            f"encoding.scheme: is {tables.encoding.scheme}, whose secret decides the first state, and states come from a "
+            f"encoding.scheme: is {scenario.encoding.scheme}, whose secret decides the first state, and states come from a "
             f"{process.source}; expected {able}"
         )
-    if process.source == "zenoh" and tables.shards is not None and tables.shards > 1:
+    if process.source == "zenoh" and scenario.shards > 1:
         yield (
-            f"shards: is {tables.shards}; expected 1: each set of processes has a sensor of its own, and these would take "
+            f"shards: is {scenario.shards}; expected 1: each set of processes has a sensor of its own, and these would take "
             "different states from the program"
         )
     rows = process.state_values
-    if process.source == "file" and rows and tables.slots is not None and len(rows) < tables.slots:
-        yield f"process.state_values: has {len(rows)} rows; expected slots, which is {tables.slots}, or more"
+    if process.source == "file" and rows and len(rows) < scenario.slots:
+        yield f"process.state_values: has {len(rows)} rows; expected slots, which is {scenario.slots}, or more"
 
 
 def _plant_and_process(plant: PlantTable, process: ProcessTable) -> Iterator[str]:
@@ -81,15 +84,9 @@ def _plant_and_process(plant: PlantTable, process: ProcessTable) -> Iterator[str
         yield f"plant.start: has {len(plant.start)} entries; expected {n}, one for each state"
     elif plant.start is not None:
         inside["start"] = plant.start
-    limits = {"state_lower": plant.state_lower, "state_upper": plant.state_upper}
-    for name, sentence in limit_mistakes(limits, "state", n, "one for each state", inside):
+    limits = limit_mistakes("state", plant.state_lower, plant.state_upper, n, "one for each state", inside)
+    for name, sentence in limits:
         yield f"{name}: {sentence}" if name.startswith("process.") else f"plant.{name}: {sentence}"
-
-
-def _rows(plant: PlantTable, slots: int | None) -> Iterator[str]:
-    rows = plant.disturbance_values
-    if plant.disturbances and rows and slots is not None and len(rows) < slots:
-        yield f"plant.disturbance_values: has {len(rows)} rows; expected slots, which is {slots}, or more"
 
 
 def _controller_and_plant(
@@ -119,15 +116,15 @@ def _controller_and_plant(
         yield f"controller.{entry}: {sentence}"
 
 
-def _outages(tables: ValidTables, controller: ControllerTable) -> Iterator[str]:
+def _outages(scenario: Scenario, controller: ControllerTable) -> Iterator[str]:
     """Outages of a legitimate estimator that the loop waits for: the controller acts on its estimate, or it gets the inputs."""
     if controller.acts_on == "estimate":
         why = "the controller acts on its estimate"
-    elif tables.legitimate is not None and tables.legitimate.knows_input:
+    elif scenario.legitimate.knows_input:
         why = "it waits for the inputs"
     else:
         return
-    for i, event in tables.event:
+    for i, event in enumerate(scenario.event):
         for act in event.acts():
             if act.effect.present is False and LEGITIMATE in act.names:
                 yield (

@@ -28,6 +28,7 @@ from evedrop.scenario.nemesis import NEMESIS, NemesisTable
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.timeline import acts_of
+from evedrop.scenario.words import as_toml, listed
 
 MOST_EVENTS = 10_000
 """The largest number of events in a scenario: those of the file and the drawn ones together."""
@@ -58,7 +59,14 @@ def with_faults(tables: Mapping[str, Any], scenario: Scenario) -> tuple[dict[str
 
 
 def _mistakes(table: NemesisTable, scenario: Scenario) -> Iterator[str]:
-    """Mistakes that the nemesis's `set` would cause on the link of any target."""
+    """Slots outside the run, targets that are not receivers, and a `set` that does not fit the link of a target."""
+    if table.start >= scenario.slots:
+        yield f"{NEMESIS}.from: is {table.start}, but the last slot is {scenario.slots - 1}; expected a slot of the run"
+    if table.to is not None and table.to > scenario.slots:
+        yield f"{NEMESIS}.to: is {table.to}; expected at most {scenario.slots}, the end of the run"
+    for i, name in enumerate(table.targets or ()):
+        if name not in scenario.receivers:
+            yield f"{NEMESIS}.targets.{i}: is {as_toml(name)}; expected {listed(scenario.receivers)}"
     told = set[str]()
     for name in _targets(table, scenario) if table.set is not None else ():
         link = scenario.link(name)

@@ -9,6 +9,8 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
+from pydantic import ValidationError
+
 from evedrop.errors import NoAnswer
 from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
@@ -23,10 +25,10 @@ from evedrop.scenario.conformance.links import DelayChecks, LossChecks
 from evedrop.scenario.conformance.problems import Problem
 from evedrop.scenario.conformance.rules import how_broken
 from evedrop.scenario.conformance.schemes import SchemeChecks
+from evedrop.scenario.link_table import LinkTable, changed_link
 from evedrop.scenario.plugins import names_in
 from evedrop.scenario.receivers import EavesdropperTable
-from evedrop.scenario.table import model_mistakes
-from evedrop.scenario.tables import Scenario
+from evedrop.scenario.tables import NUMBERS, Scenario
 from evedrop.scenario.words import as_toml
 
 _SLOTS = 4
@@ -39,15 +41,17 @@ def foreign(tables: Any) -> bool:
     return any(name not in built_in for name in names_in(tables))
 
 
+def has_foreign(scenario: Scenario) -> bool:
+    """Whether a scenario names any class that is not built in."""
+    return foreign(scenario.model_dump(exclude_unset=True, exclude=NUMBERS))
+
+
 def dry_run(scenario: Scenario) -> list[str]:
     """Try the classes that are not built in; returns a mistake for each that breaks a rule on shapes, types or keys, or raises.
 
     Does not affect the digests of the run.
     """
-    # The numbers of a day are hundreds of thousands, and name no class.
-    if not foreign(
-        scenario.model_dump(exclude_unset=True, exclude={"plant": {"disturbance_values"}, "process": {"state_values"}})
-    ):
+    if not has_foreign(scenario):
         return []
     batch = Batch(min(scenario.slots, _SLOTS), _TRIALS, scenario.first_trial)
     problem = Problem(scenario.process.process, batch)
@@ -113,20 +117,18 @@ def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
         # An event's models are checked when tables are compared: mistakes are reported there, not here.
         for act in event.acts():
             settings = act.effect.entries
-            if settings is not None and not _model_mistakes(settings):
+            if settings is not None and _describes_models(settings):
                 yield from _settings_mistakes(f"event.{i}.{act.entry}", settings, problem)
 
 
-def _model_mistakes(settings: Mapping[str, Any]) -> bool:
-    """Whether a loss or delay model cannot be constructed from its description."""
-    for name, models in (("loss", LOSS_MODELS), ("delay", DELAY_MODELS)):
-        model = settings.get(name)
-        if model is not None and not isinstance(model, Mapping):
-            return True
-        given = {entry: value for entry, value in (model or {}).items() if entry != "unit"}
-        if model is not None and model_mistakes(name, given, models):
-            return True
-    return False
+def _describes_models(settings: Mapping[str, Any]) -> bool:
+    """Whether the loss and delay models that an event changes can be constructed from their descriptions."""
+    described = {name: settings[name] for name in ("loss", "delay") if name in settings}
+    try:
+        changed_link(LinkTable(quality=1.0), described)
+    except ValidationError:
+        return False
+    return True
 
 
 def _settings_mistakes(path: str, settings: Mapping[str, Any], problem: Problem) -> Iterator[str]:

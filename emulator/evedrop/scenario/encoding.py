@@ -5,16 +5,15 @@ Source: docs/scenario.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, ConfigDict, Field
 
-from evedrop.model.registry import asked, is_own
+from evedrop.model.registry import asked
 from evedrop.model.schedule import StateProbability, mean_of
 from evedrop.model.schemes import SCHEMES
-from evedrop.scenario.table import Found, Table, registered
-from evedrop.scenario.words import as_toml, listed
+from evedrop.scenario.table import Found, Table, parameter_mistakes, registered
 
 
 class EncodingTable(Table):
@@ -24,27 +23,11 @@ class EncodingTable(Table):
 
     scheme: Annotated[str, Field(strict=True, examples=["innovation"]), AfterValidator(registered(SCHEMES))]
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Missing, unknown and wrong parameters of the scheme."""
-        scheme = SCHEMES.get(str(table.get("scheme")))
-        given = {name: value for name, value in table.items() if name != "scheme"}
-        if scheme is None and is_own(table.get("scheme")):
-            return []
-        if scheme is None:
-            anywhere = {name for scheme_class in SCHEMES.values() for name in scheme_class.parameters}
-            return [
-                (name, "is not a parameter of any scheme; remove the line") for name in given if name not in anywhere
-            ]
-        mistakes = [
-            (name, f"is missing; the scheme {table['scheme']} needs it, such as {name} = {as_toml(example)}")
-            for name, example in scheme.parameters.items()
-            if name not in given
-        ]
-        expected_names = f"expected {listed(sorted(scheme.parameters))}" if scheme.parameters else "remove the line"
-        sentence = f"is set, but the scheme {table['scheme']} has no such parameter; {expected_names}"
-        mistakes += [(name, sentence) for name in given if name not in scheme.parameters]
-        return mistakes + asked(scheme, {name: value for name, value in given.items() if name in scheme.parameters})
+        scheme, given = SCHEMES[self.scheme], self.parameters
+        yield from parameter_mistakes("scheme", self.scheme, scheme, given)
+        yield from asked(scheme, {name: value for name, value in given.items() if name in scheme.parameters})
 
     @property
     def parameters(self) -> dict[str, Any]:

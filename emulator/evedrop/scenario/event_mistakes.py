@@ -13,42 +13,41 @@ from pydantic import ValidationError
 
 from evedrop.model.links.loss_model import Fate
 from evedrop.model.registry import place_of
+from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.events.event import Act, EventKind, Surroundings
 from evedrop.scenario.link_table import CHANGEABLE, OTHER_MODEL, LinkTable, changed_link, unchangeable
 from evedrop.scenario.sentences import sentences
-from evedrop.scenario.valid import ValidTables
+from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import as_toml, listed
 
 Numbered = tuple[int, Act]
 """An act with the number of its event."""
 
 
-def event_mistakes(tables: ValidTables) -> Iterator[str]:
+def event_mistakes(scenario: Scenario) -> Iterator[str]:
     """Mistakes across tables in events that are valid by themselves, each with the number of its event."""
-    attack = None if tables.acknowledgements is None else tables.acknowledgements.attack
     surroundings = Surroundings(
-        tables.scheme,
-        "" if tables.encoding is None else tables.encoding.scheme,
-        attack if "acknowledgements" in tables.given else "none",
-        any(application.has_monitor for application in tables.applications.values()),
+        scenario.scheme,
+        scenario.encoding.scheme,
+        "none" if scenario.acknowledgements is None else scenario.acknowledgements.attack,
+        any(APPLICATIONS[name].has_monitor for name in scenario.applications),
     )
-    for i, event in tables.event:
+    for i, event in enumerate(scenario.event):
         path = f"event.{i}"
-        if tables.slots is not None:
-            yield from _when_mistakes(path, event, tables.slots)
+        yield from _when_mistakes(path, event, scenario.slots)
         for name in event.names:
-            if name not in tables.receivers:
+            if name not in scenario.receivers:
                 hint = ": it is not a receiver" if name in ("sensor", "router", "recorder") else ""
-                yield f"{path}.{event.names_in}: names {as_toml(name)}{hint}; expected {listed(tables.receivers)}"
+                yield f"{path}.{event.names_in}: names {as_toml(name)}{hint}; expected {listed(scenario.receivers)}"
         yield from _own(path, type(event), partial(_compared, path, event, surroundings))
         for act in event.acts():
             if act.effect.changes_settings and act.effect.entries is not None:
                 for name in act.names:
-                    yield from _change_mistakes(f"{path}.{act.entry}", name, act.effect.entries, tables)
-    yield from _order_mistakes(tables)
-    kinds = dict.fromkeys(type(event) for _, event in tables.event)
+                    yield from _change_mistakes(f"{path}.{act.entry}", name, act.effect.entries, scenario)
+    yield from _order_mistakes(scenario)
+    kinds = dict.fromkeys(type(event) for event in scenario.event)
     for kind in kinds:
-        events = [(i, event) for i, event in tables.event if type(event) is kind]
+        events = [(i, event) for i, event in enumerate(scenario.event) if type(event) is kind]
         yield from _own(f"event.{events[0][0]}", kind, partial(kind.in_turn, events))
 
 
@@ -64,15 +63,16 @@ def _own(path: str, kind: type[EventKind], ask: Callable[[], Iterator[str]]) -> 
         return [f"{path}.{kind.kind}: cannot be checked: {kind.__name__} raised {place_of(error)}"]
 
 
-def _acts(tables: ValidTables) -> list[Numbered]:
+def _acts(scenario: Scenario) -> list[Numbered]:
     """All acts, each with the number of its event, in order of slots."""
-    return sorted(((i, act) for i, event in tables.event for act in event.acts()), key=lambda numbered: numbered[1].at)
+    acts = ((i, act) for i, event in enumerate(scenario.event) for act in event.acts())
+    return sorted(acts, key=lambda numbered: numbered[1].at)
 
 
-def away_in(tables: ValidTables, name: str, slot: int) -> str | None:
+def away_in(scenario: Scenario, name: str, slot: int) -> str | None:
     """Say that a receiver is down or paused in a slot, and by which event; None if it is present."""
     away = None
-    for i, act in _acts(tables):
+    for i, act in _acts(scenario):
         if act.at <= slot and name in act.names and act.effect.present is not None:
             away = None if act.effect.present else (i, act.at, act.effect.reason)
     return None if away is None else f"{name} is {_said(away[2])} (event.{away[0]}, from slot {away[1]} on)"
@@ -90,11 +90,11 @@ def _when_mistakes(path: str, event: EventKind, slots: int) -> Iterator[str]:
         yield f"{path}.to: is {event.to}; expected at most {slots}, the end of the run"
 
 
-def _change_mistakes(path: str, name: str, changes: Mapping[str, Any], tables: ValidTables) -> Iterator[str]:
+def _change_mistakes(path: str, name: str, changes: Mapping[str, Any], scenario: Scenario) -> Iterator[str]:
     """Mistakes in the changed entries of a receiver's link. One link with a new quality or loss model replaces pooled links."""
-    link = tables.links.get(name)
+    link = scenario.links.get(name)
     if link is None:
-        if name not in tables.eavesdroppers or tables.eavesdroppers[name].links is None:
+        if name not in scenario.eavesdroppers or scenario.eavesdroppers[name].links is None:
             return
         if not {"quality", "loss"} & set(changes):
             yield f"{path}: {name} has several links; expected a quality or a loss, for the one link that replaces them"
@@ -106,16 +106,16 @@ def _change_mistakes(path: str, name: str, changes: Mapping[str, Any], tables: V
     except ValidationError as error:
         yield from (f"{path}.{line}" for line in sentences(error, LinkTable))
         return
-    if changed.in_seconds and "slot_seconds" not in tables.given:
+    if changed.in_seconds and scenario.slot_seconds is None:
         yield f"{path}.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
     if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
         yield f"{path}.{OTHER_MODEL}"
 
 
-def _order_mistakes(tables: ValidTables) -> Iterator[str]:
+def _order_mistakes(scenario: Scenario) -> Iterator[str]:
     """Events that end a cut or an outage that has not begun, or that begin one while another of its kind lasts."""
-    acts = _acts(tables)
-    for name in tables.receivers:
+    acts = _acts(scenario)
+    for name in scenario.receivers:
         yield from _order_mistakes_of(name, [(i, act) for i, act in acts if name in act.names])
 
 

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from evedrop.model.checks import is_number
 from evedrop.model.metrics import expectable_metrics, metrics_of, unloadable_metrics
 from evedrop.model.metrics.built_in import LINK_METRICS
 from evedrop.scenario.application import APPLICATIONS, Application
@@ -79,10 +78,9 @@ class ExpectTable(Table):
     by: Annotated[Slot | None, Field(examples=[40])] = None
     since: Annotated[Slot | None, Field(examples=[0])] = None
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterable[Found]:
         """Mistakes unless the table has exactly one subject, all the entries that this subject needs, and no others."""
-        given = [name for name, value in table.items() if value is not None]
+        given = [name for name, value in self if value is not None]
         kinds = [kind for kind in _ENTRIES if kind in given]
         if not kinds:
             meant = [kind for kind, entries in _ENTRIES.items() if any(name in given for name in entries)]
@@ -99,8 +97,48 @@ class ExpectTable(Table):
             for name in entries
             if other != kind and name in given
         ]
-        check = {"metric": _metric_mistakes, "link": _nothing, "secrecy": _secrecy_mistakes, "in_step": _step_mistakes}
-        return mistakes + check[kind](table)
+        if self.metric is not None:
+            mistakes += self._bound_mistakes()
+            mistakes += self._metric_mistakes(self.metric)
+        if kind == "secrecy" and self.against is None:
+            mistakes.append(("against", "is missing; expected the name of an eavesdropper"))
+        if kind == "in_step" and self.by is None:
+            mistakes.append(("by", "is missing; expected the last slot by which it must be in step, such as by = 40"))
+        elif kind == "in_step" and self.by is not None and self.since is not None and self.by < self.since:
+            mistakes.append(("by", f"is {self.by}, before since, which is {self.since}; expected since ≤ by"))
+        return mistakes
+
+    def _bound_mistakes(self) -> Iterator[Found]:
+        """Mistakes unless there is a bound to compare with."""
+        distances = [name for name in ("within", "within_relative") if getattr(self, name) is not None]
+        if self.near is None and distances:
+            yield distances[0], "is set without near; expected near = 0.01 as well"
+        elif self.near is None and self.below is None and self.above is None:
+            yield "below", "is missing, and so is above; add below, above or near, such as below = 0.01"
+        elif self.near is not None and not distances:
+            yield "within", "is missing; expected within = 0.002, or within_relative = 0.1, with near"
+        elif len(distances) > 1:
+            yield "within_relative", "is given together with within; expected one of them"
+        elif self.near == 0 and distances == ["within_relative"]:
+            yield "within_relative", "is set, but any fraction of near = 0 is 0; expected within"
+        if self.below is not None and self.above is not None and not self.above < self.below:
+            yield "above", f"is {as_toml(self.above)}, and below is {as_toml(self.below)}; expected above < below"
+
+    def _metric_mistakes(self, metric: str) -> Iterator[Found]:
+        """Slots or a quantile for a metric that does not allow them."""
+        link = link_metric(metric)
+        for name in ("slots", "quantile"):
+            if direction_metric(metric) is not None and getattr(self, name) is not None:
+                yield name, "is set, but the error in a direction is the mean of the whole run; remove the line"
+            if link is not None and getattr(self, name) is not None:
+                instead = f"expected none, or the metric {link[0]}.received_fraction"
+                yield name, f"is set, but a link's account is of the whole run; {instead}"
+        metrics = expectable_metrics()
+        of_receiver = metrics.get(metric.rpartition(".")[2])
+        if link is None and self.quantile is not None and of_receiver is not None and not of_receiver.by_trial:
+            all_trials = listed([name for name, kind in metrics.items() if kind.by_trial])
+            instead = f"expected a metric that every trial has: {all_trials}"
+            yield "quantile", f"is set, but {metric} is not known trial by trial; {instead}"
 
     @property
     def kind(self) -> str:
@@ -162,80 +200,20 @@ def direction_metric(metric: str) -> tuple[str, str] | None:
     return (parts[1], parts[2]) if parts[0] == DIRECTIONS and len(parts) == 3 else None
 
 
-def _nothing(table: Mapping[str, Any]) -> list[Found]:
-    del table
-    return []
-
-
-def _metric_mistakes(table: Mapping[str, Any]) -> list[Found]:
-    """Mistakes unless there is a bound to compare with, and slots or a quantile only for a metric that allows them."""
-    below, above, middle = (table.get(name) for name in ("below", "above", "near"))
-    distances = [name for name in ("within", "within_relative") if table.get(name) is not None]
-    mistakes: list[Found] = []
-    if middle is None and distances:
-        mistakes.append((distances[0], "is set without near; expected near = 0.01 as well"))
-    elif middle is None and below is None and above is None:
-        sentence = "is missing, and so is above; add below, above or near, such as below = 0.01"
-        mistakes.append(("below", sentence))
-    elif middle is not None and not distances:
-        mistakes.append(("within", "is missing; expected within = 0.002, or within_relative = 0.1, with near"))
-    elif len(distances) > 1:
-        mistakes.append(("within_relative", "is given together with within; expected one of them"))
-    elif middle == 0 and distances == ["within_relative"]:
-        mistakes.append(("within_relative", "is set, but any fraction of near = 0 is 0; expected within"))
-    if below is not None and above is not None and is_number(below) and is_number(above) and not above < below:
-        mistakes.append(("above", f"is {as_toml(above)}, and below is {as_toml(below)}; expected above < below"))
-    metric = table["metric"]
-    if not isinstance(metric, str):
-        return mistakes
-    link = link_metric(metric)
-    for name in ("slots", "quantile"):
-        if direction_metric(metric) is not None and table.get(name) is not None:
-            mistakes.append(
-                (name, "is set, but the error in a direction is the mean of the whole run; remove the line")
-            )
-        if link is not None and table.get(name) is not None:
-            instead = f"expected none, or the metric {link[0]}.received_fraction"
-            mistakes.append((name, f"is set, but a link's account is of the whole run; {instead}"))
-    names = expectable_metrics()
-    of_receiver = names.get(metric.rpartition(".")[2])
-    if link is None and table.get("quantile") is not None and of_receiver is not None and not of_receiver.by_trial:
-        instead = f"expected a metric that every trial has: {listed([name for name, name_ in names.items() if name_.by_trial])}"
-        mistakes.append(("quantile", f"is set, but {metric} is not known trial by trial; {instead}"))
-    return mistakes
-
-
-def _secrecy_mistakes(table: Mapping[str, Any]) -> list[Found]:
-    """A mistake if the eavesdropper is missing."""
-    if table.get("against") is None:
-        return [("against", "is missing; expected the name of an eavesdropper")]
-    return []
-
-
-def _step_mistakes(table: Mapping[str, Any]) -> list[Found]:
-    """Mistakes in `by` and `since`."""
-    by, since = table.get("by"), table.get("since")
-    if by is None:
-        return [("by", "is missing; expected the last slot by which it must be in step, such as by = 40")]
-    if type(by) is int and type(since) is int and by < since:
-        return [("by", f"is {by}, before since, which is {since}; expected since ≤ by")]
-    return []
-
-
 @dataclass(frozen=True)
 class Around:
-    """The parts of a scenario that expectations refer to; None where the file has a mistake there."""
+    """The parts of a scenario that expectations refer to."""
 
     receivers: Sequence[str]
     """The legitimate estimator first."""
-    slots: int | None
-    trials: int | None
+    slots: int
+    trials: int
     no_theory: Callable[[str], str | None]
     """Why no theory covers a receiver; None if one does."""
     applications: Mapping[str, type[Application]] = field(default_factory=dict)
     """Those whose tables the scenario has."""
-    directions: Sequence[str] | None = ()
-    """Names of the process's directions; None if its table has a mistake."""
+    directions: Sequence[str] = ()
+    """Names of the process's directions."""
 
     def mistakes(self, expectation: ExpectTable) -> list[Found]:
         """Unknown receivers and metrics, slots beyond the run, and quantiles of too few trials."""
@@ -259,8 +237,8 @@ class Around:
         return mistakes + self._slot_mistakes(expectation) + self._quantile_mistakes(expectation.quantile)
 
     def _unknown_direction(self, name: str) -> str | None:
-        """What to do if the process has no such direction; None if it has, or has mistakes."""
-        if self.directions is None or name in self.directions:
+        """What to do if the process has no such direction; None if it has."""
+        if name in self.directions:
             return None
         if not self.directions:
             return f"there are no directions; expected process.directions = {{ {name} = [1.0, 0.0] }}, a number for each state"
@@ -316,8 +294,6 @@ class Around:
         return [("metric", f"is {as_toml(metric)}; expected {' or '.join(choice)}{near(metric, metrics)}")]
 
     def _slot_mistakes(self, expectation: ExpectTable) -> list[Found]:
-        if self.slots is None:
-            return []
         mistakes: list[Found] = []
         span = expectation.slots
         if span is not None and span[1] > self.slots:
@@ -328,7 +304,7 @@ class Around:
         return mistakes
 
     def _quantile_mistakes(self, quantile: float | None) -> list[Found]:
-        if self.trials is None or quantile is None:
+        if quantile is None:
             return []
         # At least one trial is expected beyond the quantile. The tolerance is for rounding: 1/q is seldom exact in binary.
         least = math.ceil(1.0 / min(quantile, 1.0 - quantile) - 1e-9)

@@ -18,7 +18,7 @@ from evedrop.model.plant import Plant
 from evedrop.model.process import MARGINAL, Floats, Process
 from evedrop.scenario.plant import PlantTable, noise_mistakes, plant_of
 from evedrop.scenario.process import ProcessTable
-from evedrop.scenario.valid import ValidTables
+from evedrop.scenario.tables import Scenario
 
 FILTER = "filter"
 _CERTAINLY, _NEARLY = (
@@ -129,11 +129,9 @@ def measured_mistakes(plant: PlantTable, n: int) -> list[str]:
     return mistakes
 
 
-def filter_mistakes(tables: ValidTables) -> Iterator[str]:
+def filter_mistakes(scenario: Scenario) -> Iterator[str]:
     """Mistakes in the sensor's filter together with process, scheme and eavesdroppers."""
-    process, plant, encoding, scheme = tables.process, tables.plant, tables.encoding, tables.scheme
-    if process is None:
-        return
+    process, plant = scenario.process, scenario.plant
     if plant is not None and plant.output_matrix is not None:
         wrong = measured_mistakes(plant, len(process.A))
         yield from wrong
@@ -142,8 +140,8 @@ def filter_mistakes(tables: ValidTables) -> Iterator[str]:
         except ValueError:
             if not wrong and not noise_mistakes(plant, len(process.A)):
                 yield from _why_unsettled(process, plant)
-        if encoding is not None and scheme is not None and scheme.decides_initial_state():
-            decides = f"the scheme {encoding.scheme} decides x_0 itself"
+        if scenario.scheme.decides_initial_state():
+            decides = f"the scheme {scenario.encoding.scheme} decides x_0 itself"
             yield f"plant.output_matrix: is given, but {decides}; expected another scheme"
 
 

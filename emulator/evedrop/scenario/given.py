@@ -6,15 +6,18 @@ Source: docs/scenario.md, process; docs/programs.md.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
 
 from evedrop.model.slot.cores import LARGEST
-from evedrop.scenario.table import Found, Table, expected, numbers
+from evedrop.scenario.table import Found, Table, expected
 from evedrop.scenario.words import as_toml
+
+if TYPE_CHECKING:
+    from evedrop.scenario.process import ProcessTable
 
 Source = Literal["model", "file", "zenoh"]
 """Where the true states come from: `model`, the process itself."""
@@ -50,59 +53,46 @@ class ProgramTable(Table):
         list[Annotated[int, Field(strict=True, ge=0, le=_MOST_BYTES)]] | None, Field(examples=[[4, 12]])
     ] = None
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Neither or both of `connect` and `listen`."""
-        if (table.get("connect") is None) == (table.get("listen") is None):
-            which = "is missing" if table.get("connect") is None else "is given together with listen"
-            return [
-                (
-                    "connect",
-                    f"{which}; expected the endpoint of a router that the program uses, such as connect = "
-                    '"tcp/127.0.0.1:7447", or listen, the endpoint that the program itself connects to',
-                )
-            ]
-        return []
+        if (self.connect is None) == (self.listen is None):
+            which = "is missing" if self.connect is None else "is given together with listen"
+            yield (
+                "connect",
+                f"{which}; expected the endpoint of a router that the program uses, such as connect = "
+                '"tcp/127.0.0.1:7447", or listen, the endpoint that the program itself connects to',
+            )
 
 
-def source_mistakes(table: Mapping[str, Any], n: int) -> Iterator[Found]:
-    """Mistakes in the entries of `[process]` that say where states come from; n: the number of states.
-
-    The table is unchecked: any entry may be missing or malformed.
-    """
-    source, names = table.get("source"), table.get("states")
-    given = source in ("file", "zenoh")  # the source may be a list, which a set does not take
-    held = {"state_file": table.get("state_file"), "state_values": table.get("state_values")}
+def source_mistakes(table: ProcessTable, n: int) -> Iterator[Found]:
+    """Mistakes in the entries of `[process]` that say where states come from; n: the number of states."""
+    source = table.source
     if source is None:
-        entries = {**held, "zenoh": table.get("zenoh")}
+        entries = {"state_file": table.state_file, "state_values": table.state_values, "zenoh": table.zenoh}
         kinds = [("zenoh" if name == "zenoh" else "file", name) for name, value in entries.items() if value is not None]
         yield from (("source", f'is missing, but {name} is given; expected source = "{kind}"') for kind, name in kinds)
-    if source == "file" and all(value is None for value in held.values()):
+    if source == "file" and table.state_file is None and table.state_values is None:
         yield "state_file", 'is missing; expected state_file = "pose.csv", or state_values'
-    if source == "zenoh" and table.get("zenoh") is None:
+    if source == "zenoh" and table.zenoh is None:
         yield "zenoh", f"is missing; expected {_EXAMPLE}"
-    if given and names is None:
+    if table.given and table.states is None:
         yield "states", 'is missing; expected the names of the states in file or message, such as states = ["x", "y"]'
-    for entry in ("states", "units") if given else ():
-        found = table.get(entry)
-        words = found if isinstance(found, list) and all(isinstance(word, str) for word in found) else []
+    for entry, words in (("states", table.states or []), ("units", table.units or [])) if table.given else ():
         wrong = next((word for word in words if not _WORD.fullmatch(word)), None)
         if wrong is not None:
             yield entry, f'has {as_toml(wrong)}; expected words for the first line of a CSV file, without [ ] , " and #'
         elif entry == "states" and len({*words}) < len(words):
             yield entry, "has a name twice; expected different names"
-    if not given and table.get("theory") is not None:
+    if not table.given and table.theory is not None:
         yield "theory", "is given, but the states are simulated, and theory describes them; remove the line"
-    program = table.get("zenoh")
-    offsets = program.get("offsets") if isinstance(program, Mapping) else None
-    if isinstance(offsets, list) and len(offsets) != n:
+    offsets = None if table.zenoh is None else table.zenoh.offsets
+    if offsets is not None and len(offsets) != n:
         yield "zenoh.offsets", f"has {len(offsets)} entries; expected {n}, one for each state"
-    yield from _row_mistakes(held["state_values"], n)
+    if table.state_values is not None:
+        yield from _row_mistakes(table.state_values, n)
 
 
-def _row_mistakes(rows: Any, n: int) -> Iterator[Found]:
-    if not numbers(rows):
-        return
+def _row_mistakes(rows: list[list[float]], n: int) -> Iterator[Found]:
     wrong = next((i for i, row in enumerate(rows) if len(row) != n), None)
     if wrong is not None:
         yield "state_values", f"row {wrong} has {len(rows[wrong])} numbers; expected {n}, one for each state"

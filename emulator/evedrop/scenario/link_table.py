@@ -6,14 +6,14 @@ Source: docs/scenario.md, links.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS, loss_of, pooled_spec
 from evedrop.model.links.loss_model import LossModel
-from evedrop.scenario.table import Found, Probability, Table, model_mistakes
+from evedrop.scenario.table import Found, Probability, Table, model_mistakes, refuse
 from evedrop.scenario.words import as_toml, listed
 from evedrop.system.hints import near
 
@@ -27,40 +27,50 @@ class CorrelationTable(Table):
     strength: Annotated[Probability, Field(examples=[0.5])]
 
 
+def _loss(loss: dict[str, Any]) -> dict[str, Any]:
+    refuse(model_mistakes(loss, LOSS_MODELS))
+    return loss
+
+
+def _delay(delay: dict[str, Any]) -> dict[str, Any]:
+    mistakes = model_mistakes({name: value for name, value in delay.items() if name != "unit"}, DELAY_MODELS)
+    if delay.get("unit", "slots") not in ("slots", "seconds"):
+        mistakes.append(("unit", f'is {as_toml(delay["unit"])}; expected "slots" or "seconds"'))
+    refuse(mistakes)
+    return delay
+
+
 class LinkTable(Table):
     """`link = {…}`: how packets travel from the router to one receiver."""
 
+    may_be_perfect: ClassVar[bool] = False
+    """Whether a link without losses needs neither a quality nor a loss model."""
+
     quality: Annotated[Probability | None, Field(examples=[0.9])] = None
-    loss: Annotated[dict[str, Any] | None, Field(examples=[{"model": "gilbert-elliott", "p": 0.05, "r": 0.5}])] = None
+    loss: Annotated[
+        Annotated[dict[str, Any], AfterValidator(_loss)] | None,
+        Field(examples=[{"model": "gilbert-elliott", "p": 0.05, "r": 0.5}]),
+    ] = None
     correlation: Annotated[CorrelationTable | None, Field(examples=[{"with": "legitimate", "strength": 0.5}])] = None
-    delay: Annotated[dict[str, Any] | None, Field(examples=[{"model": "constant", "value": 2.0}])] = None
+    delay: Annotated[
+        Annotated[dict[str, Any], AfterValidator(_delay)] | None, Field(examples=[{"model": "constant", "value": 2.0}])
+    ] = None
     reorder: Annotated[Probability, Field(examples=[0.1])] = 0.0
     duplicate: Annotated[Probability, Field(examples=[0.05])] = 0.0
     corrupt: Annotated[Probability, Field(examples=[0.01])] = 0.0
     rate: Annotated[float | None, Field(strict=True, gt=0.0, le=1e6, examples=[0.9])] = None
     queue: Annotated[int | None, Field(strict=True, ge=0, le=1_000_000, examples=[100])] = None
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes unless there is one of quality and loss, each model has exactly its parameters, and no entry is pointless."""
-        mistakes: list[Found] = []
-        if table.get("quality") is None and table.get("loss") is None:
-            mistakes.append(("quality", "is missing; expected quality = 0.9, or a loss model"))
-        elif table.get("quality") is not None and table.get("loss") is not None:
-            mistakes.append(("quality", "is given together with loss, whose short form it is; expected one of them"))
-        mistakes += model_mistakes("loss", table.get("loss"), LOSS_MODELS)
-        delay = table.get("delay")
-        if isinstance(delay, Mapping):
-            mistakes += model_mistakes("delay", {name: delay[name] for name in delay if name != "unit"}, DELAY_MODELS)
-            if delay.get("unit", "slots") not in ("slots", "seconds"):
-                mistakes.append(("delay.unit", f'is {as_toml(delay["unit"])}; expected "slots" or "seconds"'))
-        elif table.get("reorder"):
-            mistakes.append(
-                ("reorder", "is given without a delay, so that nothing can overtake; expected a delay as well")
-            )
-        if table.get("queue") is not None and table.get("rate") is None:
-            mistakes.append(("queue", "is given without a rate, so that nothing queues; expected a rate as well"))
-        return mistakes
+    def mistakes(self) -> Iterator[Found]:
+        """Mistakes unless there is one of quality and loss, and no entry is pointless."""
+        if self.quality is None and self.loss is None and not self.may_be_perfect:
+            yield "quality", "is missing; expected quality = 0.9, or a loss model"
+        elif self.quality is not None and self.loss is not None:
+            yield "quality", "is given together with loss, whose short form it is; expected one of them"
+        if self.reorder and self.delay is None:
+            yield "reorder", "is given without a delay, so that nothing can overtake; expected a delay as well"
+        if self.queue is not None and self.rate is None:
+            yield "queue", "is given without a rate, so that nothing queues; expected a rate as well"
 
     @classmethod
     def pooled(cls, links: list[LinkTable]) -> LinkTable:

@@ -5,8 +5,9 @@ Source: docs/scenario.md, plant and controller.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -16,8 +17,8 @@ from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.plant import Plant
 from evedrop.model.process import MOST_STATES, Floats, Process
-from evedrop.scenario.table import Found, Matrix, Number, Table, numbers, one_of
-from evedrop.scenario.words import as_toml, listed
+from evedrop.scenario.table import Found, Matrix, Number, Table, one_of, parameter_mistakes
+from evedrop.scenario.words import as_toml
 
 Numbers = list[Number]
 Names = list[Annotated[str, Field(strict=True, min_length=1)]]
@@ -43,86 +44,73 @@ class PlantTable(Table):
     state_lower: Annotated[Numbers | None, Field(examples=[[20.0, 10.0]])] = None
     state_upper: Annotated[Numbers | None, Field(examples=[[90.0, 90.0]])] = None
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Entries that do not fit each other; whether they fit the process is checked later."""
-        mistakes: list[Found] = []
-        for kind in ("input", "disturbance"):
-            names, matrix, units = table.get(f"{kind}s") or [], table.get(f"{kind}_matrix"), table.get(f"{kind}_units")
-            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-                continue
-            if len(names) > MOST_STATES:
-                mistakes.append((f"{kind}s", f"has {len(names)} names; expected at most {MOST_STATES}"))
-                continue
-            twice = sorted(name for name, count in Counter(names).items() if count > 1)
-            mistakes += [(f"{kind}s", f"has {as_toml(name)} twice") for name in twice]
-            if names and matrix is None:
-                mistakes.append(
-                    (f"{kind}_matrix", f"is missing; expected a row for each state, a number for each of {kind}s")
-                )
-            if matrix is not None and numbers(matrix) and any(len(row) != len(names) for row in matrix):
-                wrong = next(row for row in matrix if len(row) != len(names))
-                mistakes.append(
-                    (
-                        f"{kind}_matrix",
-                        f"has a row of {len(wrong)} numbers; expected {len(names)}, one for each of {kind}s",
-                    )
-                )
-            if isinstance(units, list) and len(units) != len(names):
-                mistakes.append(
-                    (f"{kind}_units", f"has {len(units)} entries; expected {len(names)}, one for each of {kind}s")
-                )
-        inputs = table.get("inputs") or []
-        if isinstance(inputs, list):
-            mistakes += limit_mistakes(table, "input", len(inputs), "one for each of inputs", {})
-        for number, other in (("output_matrix", "measurement_noise"), ("measurement_noise", "output_matrix")):
-            if table.get(number) is not None and table.get(other) is None:
-                example = as_toml((cls.model_fields[other].examples or [0])[0])
-                mistakes.append((other, f"is missing, but {number} is given; expected {other} = {example}, or neither"))
-        rows, disturbances = table.get("disturbance_values"), table.get("disturbances") or []
-        if isinstance(disturbances, list):
-            if disturbances and rows is None:
-                mistakes.append(
-                    ("disturbance_file", 'is missing; expected disturbance_file = "day.csv", or disturbance_values')
-                )
-            # A day has 86 400 rows: their numbers are checked elsewhere, in a faster way.
-            whole = isinstance(rows, list) and {type(row) for row in rows} == {list}
-            if whole and rows is not None and {*map(len, rows)} != {len(disturbances)}:
-                i = next(i for i, row in enumerate(rows) if len(row) != len(disturbances))
-                few = f"row {i} has {len(rows[i])} numbers; expected {len(disturbances)}, one for each of disturbances"
-                mistakes.append(("disturbance_values", few))
-        return mistakes
+        yield from _named_mistakes("input", self.inputs, self.input_matrix, self.input_units)
+        yield from _named_mistakes("disturbance", self.disturbances, self.disturbance_matrix, self.disturbance_units)
+        count = len(self.inputs)
+        yield from limit_mistakes("input", self.input_lower, self.input_upper, count, "one for each of inputs", {})
+        for entry, other in (("output_matrix", "measurement_noise"), ("measurement_noise", "output_matrix")):
+            if getattr(self, entry) is not None and getattr(self, other) is None:
+                example = as_toml((type(self).model_fields[other].examples or [0])[0])
+                yield other, f"is missing, but {entry} is given; expected {other} = {example}, or neither"
+        rows, disturbances = self.disturbance_values, len(self.disturbances)
+        if disturbances and rows is None:
+            yield "disturbance_file", 'is missing; expected disturbance_file = "day.csv", or disturbance_values'
+        wrong = next((i for i, row in enumerate(rows or ()) if len(row) != disturbances), None)
+        if rows is not None and wrong is not None:
+            few = f"row {wrong} has {len(rows[wrong])} numbers; expected {disturbances}, one for each of disturbances"
+            yield "disturbance_values", few
+
+
+def _named_mistakes(
+    kind: str, names: list[str], matrix: list[list[float]] | None, units: list[str] | None
+) -> Iterator[Found]:
+    """Mistakes in the inputs, or in the disturbances; kind: the first word of their entries."""
+    if len(names) > MOST_STATES:
+        yield f"{kind}s", f"has {len(names)} names; expected at most {MOST_STATES}"
+        return
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
+    yield from ((f"{kind}s", f"has {as_toml(name)} twice") for name in twice)
+    if names and matrix is None:
+        yield f"{kind}_matrix", f"is missing; expected a row for each state, a number for each of {kind}s"
+    wrong = next((row for row in matrix or () if len(row) != len(names)), None)
+    if wrong is not None:
+        few = f"has a row of {len(wrong)} numbers; expected {len(names)}, one for each of {kind}s"
+        yield f"{kind}_matrix", few
+    if units is not None and len(units) != len(names):
+        yield f"{kind}_units", f"has {len(units)} entries; expected {len(names)}, one for each of {kind}s"
 
 
 def limit_mistakes(
-    table: Mapping[str, Any], kind: str, count: int, why: str, within: Mapping[str, Sequence[float]]
-) -> list[Found]:
+    kind: str,
+    lower: Numbers | None,
+    upper: Numbers | None,
+    count: int,
+    why: str,
+    within: Mapping[str, Sequence[float]],
+) -> Iterator[Found]:
     """Mistakes in the lower and upper limits of `kind`, and in values outside them.
 
     count: how many limits there must be; why: the reason for that number; within: name → values that must lie between them.
     """
-    mistakes: list[Found] = []
-    limits: dict[str, list[float]] = {}
-    for name in (f"{kind}_lower", f"{kind}_upper"):
-        values = table.get(name)
-        if values is None or not numbers([values]):
-            continue
-        if len(values) != count:
-            mistakes.append((name, f"has {len(values)} entries; expected {count}, {why}"))
-        else:
-            limits[name] = values
-    lower, upper = limits.get(f"{kind}_lower"), limits.get(f"{kind}_upper")
-    for i, (least, most) in enumerate(zip(lower or [], upper or [], strict=False)):
-        if least > most:
-            mistakes.append(
-                (f"{kind}_lower", f"entry {i} is {least}, above that of {kind}_upper, which is {most}; swap them")
-            )
+    for name, limits in ((f"{kind}_lower", lower), (f"{kind}_upper", upper)):
+        if limits is not None and len(limits) != count:
+            yield name, f"has {len(limits)} entries; expected {count}, {why}"
+    least = [-math.inf] * count if lower is None or len(lower) != count else lower
+    most = [math.inf] * count if upper is None or len(upper) != count else upper
+    for i in range(count):
+        if least[i] > most[i]:
+            above = f"entry {i} is {least[i]}, above that of {kind}_upper, which is {most[i]}; swap them"
+            yield f"{kind}_lower", above
     for name, values in within.items():
         for i, value in enumerate(values):
-            if (lower is not None and value < lower[i]) or (upper is not None and value > upper[i]):
-                span = f"{lower[i] if lower is not None else '−∞'} to {upper[i] if upper is not None else '∞'}"
-                mistakes.append((name, f"entry {i} is {value}, outside its limits, {span}; change one of them"))
-    return mistakes
+            if not least[i] <= value <= most[i]:
+                span = " to ".join(
+                    str(limit).replace("-", "−").replace("inf", "∞") if math.isinf(limit) else str(limit)
+                    for limit in (least[i], most[i])
+                )
+                yield name, f"entry {i} is {value}, outside its limits, {span}; change one of them"
 
 
 class ControllerTable(Table):
@@ -138,29 +126,15 @@ class ControllerTable(Table):
     rate_weights: Annotated[Numbers | None, Field(examples=[[1.0, 0.02]])] = None
     rate_limits: Annotated[Numbers | None, Field(examples=[[0.05, 3.0]])] = None
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Weights and limits below 0, and missing, unknown or wrong parameters of the strategy."""
-        mistakes: list[Found] = []
         for name in ("state_weights", "input_weights", "rate_weights", "rate_limits"):
-            values = table.get(name)
-            if values is not None and numbers([values]) and any(value < 0.0 for value in values):
-                mistakes.append((name, f"has {min(values)}; expected numbers of 0 or more"))
-        strategy = CONTROLLERS.get(str(table.get("strategy")))
-        given = {name: value for name, value in table.items() if name not in cls.model_fields}
-        if strategy is None:
-            return mistakes
-        mistakes += [
-            (name, f"is missing; the strategy {table['strategy']} needs it, such as {name} = {as_toml(example)}")
-            for name, example in strategy.parameters.items()
-            if name not in given and name not in strategy.optional
-        ]
-        expected_names = f"expected {listed(sorted(strategy.parameters))}" if strategy.parameters else "remove the line"
-        sentence = f"is set, but the strategy {table['strategy']} has no such parameter; {expected_names}"
-        mistakes += [(name, sentence) for name in given if name not in strategy.parameters]
-        return mistakes + strategy.mistakes(
-            {name: value for name, value in given.items() if name in strategy.parameters}
-        )
+            values = getattr(self, name)
+            if values and min(values) < 0.0:
+                yield name, f"has {min(values)}; expected numbers of 0 or more"
+        strategy, given = CONTROLLERS[self.strategy], self.model_extra or {}
+        yield from parameter_mistakes("strategy", self.strategy, strategy, given)
+        yield from strategy.mistakes({name: value for name, value in given.items() if name in strategy.parameters})
 
     @property
     def parameters(self) -> dict[str, Any]:

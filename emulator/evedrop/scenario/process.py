@@ -5,17 +5,16 @@ Source: docs/scenario.md, process.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from collections.abc import Iterator
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evedrop.model.checks import is_number
 from evedrop.model.process import Process, mistakes_of
 from evedrop.scenario.given import ProgramTable, Source, source_mistakes
-from evedrop.scenario.table import Found, Matrix, Number, ProcessName, Table, numbers
+from evedrop.scenario.table import Found, Matrix, Number, ProcessName, Table
 from evedrop.scenario.words import as_toml, listed
 
 _MATRICES = ("A", "Q", "initial_covariance")
@@ -43,43 +42,40 @@ class ProcessTable(Table):
     )
     theory: Annotated[bool | None, Field(strict=True, examples=[True])] = None
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Matrices that are not square or do not fit each other, and lists without an entry for each state.
 
-        A matrix that is missing or malformed is not compared with the others.
+        A matrix that is not square is not compared with the others.
         """
-        mistakes: list[Found] = []
-        matrices: dict[str, NDArray[np.float64]] = {}
-        for name in _MATRICES:
-            field = cls.model_fields[name]
-            rows = table.get(name)
-            if not numbers(rows) or rows is None:
-                continue
-            lengths = {len(row) for row in rows}
-            if lengths == {len(rows)} and rows:
-                matrices[name] = np.array(rows, np.float64)
-            else:
-                count = "1 row" if len(rows) == 1 else f"{len(rows)} rows"
-                shape = f"{count} of {listed([str(n) for n in sorted(lengths)])} numbers" if rows else "no rows"
-                mistakes.append(
-                    (name, f"has {shape}; expected a square matrix, such as {as_toml((field.examples or [0])[0])}")
-                )
-        if matrices:
-            square = matrices.get("A", next(iter(matrices.values())))
-            placeholder = np.eye(len(square))
-            A, Q, initial = (matrices.get(name, placeholder) for name in _MATRICES)
-            singular = table.get("singular_noise") is True
-            mistakes += [
-                (name, sentence) for name, sentence in mistakes_of(A, Q, initial, singular) if name in matrices
-            ]
-            mistakes += _direction_mistakes(table.get("directions"), len(square))
-            mistakes += source_mistakes(table, len(square))
-            for name in ("reference", "states", "units"):
-                values = table.get(name)
-                if isinstance(values, list) and len(values) != len(square):
-                    mistakes.append((name, f"has {len(values)} entries; expected {len(square)}, one for each state"))
-        return mistakes
+        shapes = {name: sentence for name in _MATRICES if (sentence := self._shape_mistake(name)) is not None}
+        yield from shapes.items()
+        square = {name: np.array(getattr(self, name), np.float64) for name in _MATRICES if name not in shapes}
+        if not square:
+            return
+        n = len(next(iter(square.values())))
+        A, Q, initial = (square.get(name, np.eye(n)) for name in _MATRICES)
+        yield from (mistake for mistake in mistakes_of(A, Q, initial, self.singular_noise) if mistake[0] in square)
+        for name, weights in (self.directions or {}).items():
+            if len(weights) != n:
+                yield f"directions.{name}", f"has {len(weights)} entries; expected {n}, one for each state"
+            elif not any(weights):
+                yield f"directions.{name}", "is zero; expected a direction, such as [1.0, 0.0]"
+        yield from source_mistakes(self, n)
+        for name in ("reference", "states", "units"):
+            values = getattr(self, name)
+            if values is not None and len(values) != n:
+                yield name, f"has {len(values)} entries; expected {n}, one for each state"
+
+    def _shape_mistake(self, name: str) -> str | None:
+        """What is wrong with the shape of a matrix; None if it is square."""
+        rows = getattr(self, name)
+        lengths = {len(row) for row in rows}
+        if lengths == {len(rows)}:
+            return None
+        count = "1 row" if len(rows) == 1 else f"{len(rows)} rows"
+        shape = f"{count} of {listed([str(n) for n in sorted(lengths)])} numbers" if rows else "no rows"
+        example = (type(self).model_fields[name].examples or [0])[0]
+        return f"has {shape}; expected a square matrix, such as {as_toml(example)}"
 
     @property
     def around(self) -> list[float]:
@@ -100,18 +96,3 @@ class ProcessTable(Table):
     def process(self) -> Process:
         """The process it describes."""
         return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance), self.singular_noise)
-
-
-def _direction_mistakes(directions: object, n: int) -> list[Found]:
-    """Directions that have not n numbers, or only zeros; entries that are malformed are not looked at."""
-    if not isinstance(directions, Mapping):
-        return []
-    mistakes: list[Found] = []
-    for name, weights in directions.items():
-        if not isinstance(weights, list) or not all(is_number(weight) for weight in weights):
-            continue
-        if len(weights) != n:
-            mistakes.append((f"directions.{name}", f"has {len(weights)} entries; expected {n}, one for each state"))
-        elif not any(weights):
-            mistakes.append((f"directions.{name}", "is zero; expected a direction, such as [1.0, 0.0]"))
-    return mistakes

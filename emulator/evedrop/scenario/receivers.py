@@ -5,13 +5,13 @@ Source: docs/scenario.md, legitimate and eavesdroppers.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, ConfigDict, Field
 
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
-from evedrop.model.registry import asked, is_own
+from evedrop.model.registry import asked
 from evedrop.scenario.link_table import LinkField, LinkTable, WindowField
 from evedrop.scenario.table import Found, Probability, Table, registered
 from evedrop.scenario.words import as_toml, listed, no_entry
@@ -43,53 +43,33 @@ class EavesdropperTable(Table):
     use_state: Annotated[Probability | None, Field(examples=[0.8])] = None
     use_innovation: Annotated[Probability | None, Field(examples=[0.2])] = None
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Missing, unknown and wrong parameters of the strategy, and a missing link."""
-        strategy = STRATEGIES.get(str(table.get("strategy")))
-        example = as_toml((cls.model_fields["link"].examples or [0])[0])
-        strange = [name for name in table if name not in cls.model_fields]
-        if strategy is None:
-            lost = table.get("link") is None and table.get("links") is None
-            mistakes = [("link", f"is missing; expected link = {example}")] if lost else []
-            # Nobody knows which entries a class that cannot be loaded has.
-            expected_names = strange if is_own(table.get("strategy")) else []
-            return mistakes + [
-                (name, no_entry(name, [*cls.model_fields])) for name in strange if name not in expected_names
-            ]
-        reader = READERS.get(str(table.get("reads_as"))) if "reads_as" in strategy.parameters else None
+        strategy, fields = STRATEGIES[self.strategy], type(self).model_fields
+        reader = None if self.reads_as is None or "reads_as" not in strategy.parameters else READERS[self.reads_as]
         parameters = {**strategy.parameters, **(reader.parameters if reader is not None else {})}
         wanted = {"links" if strategy.pools_links else "link", *parameters}
-        mistakes = [
-            (name, no_entry(name, [*{**cls.model_fields, **parameters}])) for name in strange if name not in wanted
-        ]
-        mistakes += [
-            (name, f"is missing; the strategy {table['strategy']} needs it; expected {name} = {as_toml(parameter)}")
-            for name, parameter in parameters.items()
-            if name not in cls.model_fields and table.get(name) is None
-        ]
-        for name, field in cls.model_fields.items():
-            given = table.get(name) is not None
-            if name in wanted and not given:
-                of = "" if name == "link" else f"the strategy {table['strategy']} needs it; "
-                mistakes.append((name, f"is missing; {of}expected {name} = {as_toml((field.examples or [0])[0])}"))
-            if given and name not in {"strategy", "window", *wanted}:
+        given = {name: value for name, value in self if value is not None}
+        for name in given:
+            if name not in fields and name not in wanted:
+                yield name, no_entry(name, [*{**fields, **parameters}])
+        for name, example in parameters.items():
+            if name not in fields and name not in given:
+                yield name, f"is missing; the strategy {self.strategy} needs it; expected {name} = {as_toml(example)}"
+        for name, field in fields.items():
+            if name in wanted and name not in given:
+                of = "" if name == "link" else f"the strategy {self.strategy} needs it; "
+                yield name, f"is missing; {of}expected {name} = {as_toml((field.examples or [0])[0])}"
+            if name in given and name not in {"strategy", "window", *wanted}:
                 instead = "; its entry is links" if name == "link" else ""
-                sentence = (
-                    f"is set, but the strategy {table['strategy']} has no such parameter{instead}; remove the line"
-                )
-                mistakes.append((name, sentence))
+                yield name, f"is set, but the strategy {self.strategy} has no such parameter{instead}; remove the line"
         for kind in (strategy, reader):
             if kind is not None:
-                mistakes += asked(kind, {name: table[name] for name in kind.parameters if table.get(name) is not None})
-        for i, link in enumerate(table.get("links") or []) if isinstance(table.get("links"), list) else ():
-            entries = {name for name, value in link.items() if value} if isinstance(link, Mapping) else set()
-            more = sorted(entries - {"quality", "loss"})
-            if more:
-                mistakes.append(
-                    (f"links.{i}", f"has {listed(more)}; links that are pooled have only a quality or a loss")
-                )
-        return mistakes
+                yield from asked(kind, {name: given[name] for name in kind.parameters if name in given})
+        for i, link in enumerate(self.links or []):
+            entries = {name for name, value in link.model_dump(exclude_unset=True).items() if value}
+            if more := sorted(entries - {"quality", "loss"}):
+                yield f"links.{i}", f"has {listed(more)}; links that are pooled have only a quality or a loss"
 
     @property
     def parameters(self) -> dict[str, Any]:

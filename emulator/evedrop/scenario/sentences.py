@@ -31,7 +31,7 @@ def sentences(error: ValidationError, root: type[Table]) -> list[str]:
         path = ".".join(str(part) for part in detail["loc"] if part != "[key]")
         if detail["type"] == "mistakes":
             inner: list[Found] = detail["ctx"]["mistakes"]
-            lines += [f"{path}.{name}: {sentence}" if path else f"{name}: {sentence}" for name, sentence in inner]
+            lines += [f"{'.'.join(filter(None, (path, name)))}: {sentence}" for name, sentence in inner]
         else:
             lines.append(f"{path}: {_sentence(detail, root)}")
     return lines

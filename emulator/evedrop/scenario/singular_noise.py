@@ -20,7 +20,7 @@ from evedrop.model.theory.leak import Leaks
 from evedrop.scenario.filter_noise import FILTER, measured_mistakes
 from evedrop.scenario.plant import PlantTable, plant_of
 from evedrop.scenario.process import ProcessTable
-from evedrop.scenario.valid import ValidTables
+from evedrop.scenario.tables import Scenario
 
 _WAYS_ON = (
     "another strategy, such as smart, or noise in every direction: add a small variance to the diagonal of Q and leave out "
@@ -36,28 +36,26 @@ class Unsuited(NamedTuple):
     expected: str
 
 
-def singular_mistakes(tables: ValidTables) -> Iterator[str]:
+def singular_mistakes(scenario: Scenario) -> Iterator[str]:
     """Mistakes of eavesdroppers together with a Q that may be singular."""
-    table = tables.process
-    if table is None or not table.singular_noise:
+    table = scenario.process
+    if not table.singular_noise:
         return
     tested = False
-    for name, one in tables.eavesdroppers.items():
-        for entry, strategy in (("strategy", one.strategy), ("reads_as", one.reads_as)):
+    for name, eavesdropper in scenario.eavesdroppers.items():
+        for entry, strategy in (("strategy", eavesdropper.strategy), ("reads_as", eavesdropper.reads_as)):
             if strategy is None:
                 continue
-            for reason in unsuited(table, tables.plant, strategy):
+            for reason in unsuited(table, scenario.plant, strategy):
                 place = f"eavesdroppers.{name}.{entry}: is {strategy}"
                 yield f"{place}, which {reason.why}; expected {reason.expected}"
             kind = STRATEGIES.get(strategy)
             tested = tested or (kind is not None and kind.tests_range)
-    if tested and tables.slots is not None:
+    if tested:
         with suppress(ValueError):  # A is singular, or there is a mistake in a scheme's noise: reported elsewhere
             process = table.process
-            distribution = (
-                None if tables.encoding is None else scheme_of(process, tables.encoding.spec).noise_distribution
-            )
-            yield from _blurred(Leaks(process, distribution), horizon(process, tables.slots), tables.slots)
+            distribution = scheme_of(process, scenario.encoding.spec).noise_distribution
+            yield from _blurred(Leaks(process, distribution), horizon(process, scenario.slots), scenario.slots)
 
 
 def unsuited(table: ProcessTable, plant: PlantTable | None, strategy: str) -> Iterator[Unsuited]:

@@ -1,9 +1,9 @@
-"""The base class of all tables of a scenario file: it checks each entry and all together, and reports the mistakes together."""
+"""The base class of all tables of a scenario file: each entry is checked by itself, then the table as a whole."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Self, get_args
 
 from pydantic import (
@@ -11,26 +11,21 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    ModelWrapValidatorHandler,
-    ValidationError,
     model_validator,
 )
-from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+from pydantic_core import PydanticCustomError
 
 from evedrop.errors import NotRegistered
-from evedrop.model.checks import is_number
 from evedrop.model.registry import Registry, asked
 from evedrop.names import RESERVED
 from evedrop.scenario.words import as_toml, listed
 from evedrop.system.hints import near
 
-MOST = 2**1023
-"""The largest whole number that is sure to fit a float."""
 NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 
 
 def expected(words: str, hint: str = "") -> PydanticCustomError:
-    """The error about one value, to be raised in a check. what: the expected value; hint: what to add, such as a similar name.
+    """The error about one value, to be raised in a check. words: the expected value; hint: what to add, such as a similar name.
 
     The message also says what was found.
     """
@@ -109,29 +104,14 @@ class Table(BaseModel):
         field = cls.model_fields.get(entry)
         return None if field is None else _table_in(field.annotation)
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes that only show in several entries together. The table is unchecked: any entry may be missing or malformed."""
-        del table
-        return []
+    def mistakes(self) -> Iterable[Found]:
+        """Mistakes that only show in several entries together; each entry is valid by itself."""
+        return ()
 
-    @model_validator(mode="wrap")
-    @classmethod
-    def _all_at_once(cls, entries: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
-        """Check each entry and all entries together, so that one mistake does not hide another."""
-        together = cls.mistakes(entries) if isinstance(entries, Mapping) else []
-        mistakes = PydanticCustomError("mistakes", "several", {"mistakes": together})
-        try:
-            table = check(entries)
-        except ValidationError as error:
-            if not together:
-                raise
-            lines = [again(detail) for detail in error.errors(include_url=False)]
-            lines.append(InitErrorDetails(type=mistakes, input=entries))
-            raise ValidationError.from_exception_data(cls.__name__, lines) from None
-        if together:
-            raise mistakes
-        return table
+    @model_validator(mode="after")
+    def _as_a_whole(self) -> Self:
+        refuse(self.mistakes())
+        return self
 
 
 def _table_in(annotation: Any) -> type[Table] | None:
@@ -141,46 +121,45 @@ def _table_in(annotation: Any) -> type[Table] | None:
     return next((table for argument in get_args(annotation) if (table := _table_in(argument)) is not None), None)
 
 
-def again(detail: ErrorDetails, *above: str) -> InitErrorDetails:
-    """An error of one check in the form in which it can be reported with others; above: the entries that contain its table."""
-    kind, context = detail["type"], detail.get("ctx", {})
-    own = PydanticCustomError(kind, detail["msg"], context) if kind in {"expected", "mistakes"} else kind
-    return InitErrorDetails(type=own, loc=(*above, *detail["loc"]), input=detail["input"], ctx=context)
+def refuse(mistakes: Iterable[Found]) -> None:
+    """Raise the error of a check that finds these mistakes below the checked value, if there are any."""
+    if given := list(mistakes):
+        raise PydanticCustomError("mistakes", "several", {"mistakes": given})
 
 
-def numbers(rows: Any) -> bool:
-    """Whether these are rows of numbers, of any lengths; they may be infinite, or NaN."""
-    return isinstance(rows, list) and all(
-        isinstance(row, list) and all(isinstance(element, float) or is_number(element, -MOST, MOST) for element in row)
-        for row in rows
-    )
+def parameter_mistakes(kind: str, name: str, model: Any, given: Mapping[str, Any]) -> Iterator[Found]:
+    """Missing and unknown parameters of a class; kind, name: the class in messages, such as scheme innovation."""
+    for entry, example in model.parameters.items():
+        if entry not in given and entry not in getattr(model, "optional", ()):
+            yield entry, f"is missing; the {kind} {name} needs it, such as {entry} = {as_toml(example)}"
+    choice = f"expected {listed(sorted(model.parameters))}" if model.parameters else "remove the line"
+    for entry in given:
+        if entry not in model.parameters:
+            yield entry, f"is set, but the {kind} {name} has no such parameter; {choice}"
 
 
-def model_mistakes(entry: str, found: Any, models: Registry[Any]) -> list[Found]:
+def model_mistakes(table: Mapping[str, Any], models: Registry[Any]) -> list[Found]:
     """Mistakes in `{model = "…", …}`: a missing or unknown model; missing, unknown or wrong parameters.
 
     models: a registry of classes with `parameters`, `optional` and `mistakes`.
     """
-    if not isinstance(found, Mapping):
-        return []
-    model = models.get(str(found.get("model")))
+    model = models.get(str(table.get("model")))
     if model is None:
-        if "model" not in found:
-            return [(f"{entry}.model", f"is missing; expected model = {as_toml(models.names[0])}, or another")]
-        name = found["model"]
+        if "model" not in table:
+            return [("model", f"is missing; expected model = {as_toml(models.names[0])}, or another")]
+        name = table["model"]
         problem = _no_class(name, models) or f"; expected {listed(models.names)}{near(name, models.names)}"
-        return [(f"{entry}.model", f"is {as_toml(name)}{problem}")]
-    given = {name: value for name, value in found.items() if name != "model"}
+        return [("model", f"is {as_toml(name)}{problem}")]
+    given = {name: value for name, value in table.items() if name != "model"}
     mistakes = [
-        (f"{entry}.{name}", f"is missing; expected {name} = {as_toml(example)}")
+        (name, f"is missing; expected {name} = {as_toml(example)}")
         for name, example in model.parameters.items()
         if name not in given and name not in model.optional
     ]
     names = {*model.parameters, *(("file",) if getattr(model, "recorded", None) is not None else ())}
     mistakes += [
-        (f"{entry}.{name}", f"is not a parameter of {found['model']}; expected {listed(sorted(names))}")
+        (name, f"is not a parameter of {table['model']}; expected {listed(sorted(names))}")
         for name in given
         if name not in model.parameters
     ]
-    known = {name: value for name, value in given.items() if name in model.parameters}
-    return mistakes + [(f"{entry}.{name}", sentence) for name, sentence in asked(model, known)]
+    return mistakes + asked(model, {name: value for name, value in given.items() if name in model.parameters})

@@ -5,34 +5,27 @@ Source: docs/scenario.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, Unpack
 
-from pydantic import (
-    Field,
-    ModelWrapValidatorHandler,
-    PrivateAttr,
-    SerializationInfo,
-    SerializerFunctionWrapHandler,
-    ValidationError,
-    model_serializer,
-    model_validator,
-)
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import AfterValidator, ConfigDict, Field, PlainValidator, SerializeAsAny, model_validator
+from pydantic_core import PydanticCustomError, PydanticKnownError
 
-from evedrop.errors import UsageError
+from evedrop.errors import NotRegistered, UsageError
 from evedrop.model.controllers import Assignment
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.energy import EnergyModel
 from evedrop.model.plant import Plant
+from evedrop.model.schemes import SCHEMES
+from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.streams import MOST_SLOTS
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.acknowledgements import AcknowledgementsTable
-from evedrop.scenario.application import APPLICATIONS, applications_in, unloadable_in
+from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.arguments import CHANGES, table_argument
 from evedrop.scenario.encoding import EncodingTable
 from evedrop.scenario.entries import ScenarioEntries
@@ -44,13 +37,15 @@ from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, p
 from evedrop.scenario.plugins import elsewhere, look_in, trusted_in
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.receivers import EavesdropperTable, LegitimateTable
-from evedrop.scenario.table import Found, ProcessName, Table, again
+from evedrop.scenario.table import Found, ProcessName, Table, refuse
 from evedrop.scenario.timeline import Timeline
 from evedrop.scenario.values import MOST_EAVESDROPPERS
 from evedrop.scenario.wire_table import WireTable
 from evedrop.scenario.words import as_toml, dotted
 
 _LOADS = 'Scenario.load("vehicle") reads a built-in scenario, a file or a results folder'
+NUMBERS = {"plant": {"disturbance_values"}, "process": {"state_values"}}
+"""Entries that may be hundreds of thousands of numbers, and name no class."""
 _Energy = Annotated[float, Field(strict=True, ge=0.0, le=1e12)]
 
 
@@ -66,6 +61,25 @@ class NetworkTable(Table):
     """`[network]`: how the processes of a live run are connected; it does not change the trials."""
 
     routers: Annotated[int, Field(ge=1, le=2, strict=True, examples=[2])] = 1
+
+
+def _folder(path: str) -> str:
+    if not Path(path).is_dir():
+        ending = ", which is not a folder; expected the folder that contains the modules"
+        raise PydanticCustomError("expected", "one value", {"said": ending})
+    return path
+
+
+def _application_table(named: tuple[str, Any]) -> Table:
+    """The table of an application; named: its name and its entries."""
+    name, entries = named
+    try:
+        application = APPLICATIONS[name]
+    except NotRegistered as error:
+        if name in APPLICATIONS.names:
+            refuse([("", f"is a table{error.why}")])
+        raise PydanticKnownError("extra_forbidden") from error
+    return application.table.model_validate(entries)
 
 
 @dataclass(frozen=True)
@@ -112,7 +126,7 @@ class Scenario(Table):
     longest_outage: Annotated[float, Field(ge=0.0, le=86400.0, strict=True, examples=[30.0])] = 30.0
     slot_seconds: Annotated[float | None, Field(gt=0.0, le=1e6, strict=True, examples=[0.02])] = None
     secret_file: Annotated[str | None, Field(examples=["secret.bin"])] = None
-    modules: Annotated[str | None, Field(strict=True, examples=["."])] = None
+    modules: Annotated[Annotated[str, AfterValidator(_folder)] | None, Field(strict=True, examples=["."])] = None
     process: Annotated[ProcessTable, Field(examples=[{"A": [[1.0]], "Q": [[0.001]], "initial_covariance": [[1.0]]}])]
     encoding: Annotated[EncodingTable, Field(examples=[{"scheme": "innovation", "state_probability": 0.6}])]
     legitimate: Annotated[LegitimateTable, Field(examples=[{"link": {"quality": 0.9}}])]
@@ -138,7 +152,9 @@ class Scenario(Table):
         list[ExpectTable], Field(examples=[[{"metric": "legitimate.mean_squared_error", "below": 0.01}]])
     ] = Field(default_factory=list)
     made_with: Annotated[dict[str, str], Field(exclude=True)] = Field(default_factory=dict)
-    _applications: dict[str, Table] = PrivateAttr(default_factory=dict)
+    __pydantic_extra__: dict[str, Annotated[SerializeAsAny[Table], PlainValidator(_application_table)]]
+
+    model_config = ConfigDict(extra="allow")
 
     def __init__(self, entries: Mapping[str, Any] | None = None, /, **others: Unpack[ScenarioEntries]) -> None:
         """Check the entries as those of a file are checked; entries: further ones, such as the table of an application.
@@ -212,60 +228,35 @@ class Scenario(Table):
             return APPLICATIONS[entry].table
         return super().inner(entry)
 
+    def mistakes(self) -> Iterator[Found]:
+        """Modules that this process would find elsewhere: each process looks, as it may be on another host."""
+        if self.modules is not None:
+            tables = self.model_dump(exclude_unset=True, exclude=NUMBERS)
+            yield from (("modules", sentence) for sentence in elsewhere(str(Path(self.modules).absolute()), tables))
+
     @property
     def applications(self) -> Mapping[str, Table]:
         """Application → its table, for those that the scenario uses."""
-        return self._applications
+        return self.model_extra or {}
 
-    @model_validator(mode="wrap")
+    @model_validator(mode="before")
     @classmethod
-    def _with_applications(cls, entries: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
-        """Check the tables of applications together with the fields, so that a mistake in one does not hide one in the other."""
+    def _with_names(cls, entries: Any) -> Any:
+        """Give each table that is not a field its name, which says whose it is."""
         if not isinstance(entries, Mapping):
-            return check(entries)
-        applications, broken = applications_in(entries, cls.model_fields), unloadable_in(entries, cls.model_fields)
-        made: dict[str, Table] = {}
-        mistakes = [
-            InitErrorDetails(
-                type=PydanticCustomError("mistakes", "one", {"mistakes": [(name, f"is a table{why}")]}), input=None
-            )
-            for name, why in broken.items()
-        ]
-        for name, application in applications.items():
-            try:
-                made[name] = application.table.model_validate(entries[name])
-            except ValidationError as error:
-                mistakes += [again(detail, name) for detail in error.errors(include_url=False)]
-        scenario = None
-        try:
-            scenario = check({name: value for name, value in entries.items() if name not in {*applications, *broken}})
-        except ValidationError as error:
-            mistakes = [again(detail) for detail in error.errors(include_url=False)] + mistakes
-        if scenario is None or mistakes:
-            raise ValidationError.from_exception_data(cls.__name__, mistakes)
-        scenario._applications = made
-        return scenario
+            return entries
+        return {name: value if name in cls.model_fields else (name, value) for name, value in entries.items()}
 
-    @model_serializer(mode="wrap")
-    def _with_application_tables(
-        self, handler: SerializerFunctionWrapHandler, info: SerializationInfo
-    ) -> dict[str, Any]:
-        tables: dict[str, Any] = handler(self)
-        for name, table in self._applications.items():
-            tables[name] = table.model_dump(
-                mode=info.mode, exclude_none=info.exclude_none, exclude_unset=info.exclude_unset
-            )
-        return tables
+    @property
+    def scheme(self) -> type[Scheme]:
+        """The scheme's class."""
+        return SCHEMES[self.encoding.scheme]
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes in the folder of modules."""
-        folder = table.get("modules")
-        if not isinstance(folder, str):
-            return []
-        if not Path(folder).is_dir():
-            return [("modules", f'is "{folder}", which is not a folder; expected the folder that contains the modules')]
-        return [("modules", sentence) for sentence in elsewhere(str(Path(folder).absolute()), table)]
+    @property
+    def links(self) -> dict[str, LinkTable]:
+        """Receiver → its link, without receivers whose links are pooled."""
+        tables: dict[str, LegitimateTable | EavesdropperTable] = {LEGITIMATE: self.legitimate, **self.eavesdroppers}
+        return {name: table.link for name, table in tables.items() if table.link is not None}
 
     @property
     def relayed(self) -> bool:

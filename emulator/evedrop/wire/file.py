@@ -1,7 +1,7 @@
 """Wire files: read, checked, explained, and written again.
 
-Mistakes are reported together. Some only show when tables are compared: names, endpoints, events. Any of these tables may be
-malformed. An explanation has the links in order, which of them each key takes, and entries that are probably mistakes.
+Mistakes of tables are reported together; without any, those that only show when tables are compared: names, endpoints, events.
+An explanation has the links in order, which of them each key takes, and entries that are probably mistakes.
 
 Source: docs/wire.md, the file, and which link a key takes.
 """
@@ -9,8 +9,7 @@ Source: docs/wire.md, the file, and which link a key takes.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import resources
 from itertools import permutations
 from pathlib import Path
@@ -90,8 +89,8 @@ def wire_of(
     try:
         file = WireFile.model_validate(made)
     except ValidationError as error:
-        raise ScenarioError(source, [*sentences(error, WireFile), *recordings, *mistakes_across(made)]) from None
-    if mistakes := [*recordings, *mistakes_across(made)]:
+        raise ScenarioError(source, [*sentences(error, WireFile), *recordings]) from None
+    if mistakes := recordings or list(mistakes_across(file, made["side"])):
         raise ScenarioError(source, mistakes)
     return _plan(file)
 
@@ -121,7 +120,8 @@ def _by_number(key: str, tables: Mapping[str, Any]) -> str:
     links = tables.get("link")
     if table != "link" or not name or name.isdecimal() or not isinstance(links, list):
         return key
-    names = link_names([link if isinstance(link, Mapping) else {} for link in links])
+    named = [link if isinstance(link, Mapping) else {} for link in links]
+    names = link_names((link.get("name"), link.get("from"), link.get("to")) for link in named)
     if name not in names:
         raise UsageError(f"{key}: {unknown(name, names, 'link')}, or a number from 0")
     return f"link.{names.index(name)}{dot}{entry}"
@@ -139,7 +139,7 @@ def _locate_files(tables: dict[str, Any], folder: Path) -> None:
 
 
 def _plan(file: WireFile) -> WirePlan:
-    names = link_names([table.model_dump(include={"name", "source", "target"}) for table in file.link])
+    names = link_names((table.name, table.source, table.target) for table in file.link)
     links = tuple(_link(number, name, table) for number, (name, table) in enumerate(zip(names, file.link, strict=True)))
     settings = {link.name: link.settings for link in links}
     return WirePlan(
@@ -217,36 +217,37 @@ def _event_table(event: WireEvent) -> dict[str, Any]:
     return table | {name: value for name, value in given.items() if value is not None}
 
 
-Tables = Sequence[Mapping[str, Any]]
 LinkNow = tuple[Mapping[str, Any], bool]
 """A link's settings, and whether its losses are tied to another link's."""
 
 
-def mistakes_across(tables: Mapping[str, Any]) -> Iterator[str]:
-    """Mistakes across the tables of a wire file."""
-    side = tables.get("side")
-    sides: Mapping[str, Any] = side if isinstance(side, Mapping) else {}
-    links, events = _tables(tables.get("link")), _tables(tables.get("event"))
+def mistakes_across(file: WireFile, sides: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """Mistakes across the tables of a wire file. sides: the tables as they are written, for the places of endpoints."""
+    names = link_names((link.name, link.source, link.target) for link in file.link)
     yield from _endpoint_mistakes(sides)
-    if sides:
-        yield from _side_mistakes(sides, links)
-    yield from _name_mistakes(links)
-    yield from _correlation_mistakes(links)
-    names = link_names(links)
-    yield from expectation_mistakes(_tables(tables.get("expect")), names)
-    for i, event in enumerate(events):
-        settings_of = partial(_settings_of, dict(zip(names, links, strict=True)))
-        yield from (f"event.{i}.{line}" for line in event_mistakes(event, [*sides], names, settings_of))
+    yield from _side_mistakes([*file.side], file.link)
+    yield from _name_mistakes(file.link)
+    yield from _correlation_mistakes(names, file.link)
+    yield from expectation_mistakes(file.expect, names)
+    links = {
+        name: (link.wire_settings(), link.correlation is not None) for name, link in zip(names, file.link, strict=True)
+    }
+    for i, event in enumerate(file.event):
+        yield from (f"event.{i}.{line}" for line in event_mistakes(event, [*file.side], links))
 
 
-def link_names(links: Tables) -> list[str]:
-    """The name of each link: that in its table, or FROM-TO, or FROM-TO-2 and so on where that is taken."""
-    taken = {str(link["name"]) for link in links if link.get("name") is not None}
+def link_names(links: Iterable[tuple[Any, Any, Any]]) -> list[str]:
+    """The name of each link: that in its table, or FROM-TO, or FROM-TO-2 and so on where that is taken.
+
+    links: the name or None, where it begins and where it ends, for each.
+    """
+    links = list(links)
+    taken = {str(name) for name, _, _ in links if name is not None}
     names = []
-    for link in links:
-        name = link.get("name")
+    for own, source, target in links:
+        name = own
         if name is None:
-            plain = f"{link.get('from')}-{link.get('to')}"
+            plain = f"{source}-{target}"
             numbered = (f"{plain}-{number}" for number in range(2, 2 * len(links) + 2))
             name = next(name_ for name_ in (plain, *numbered) if name_ not in taken)
             taken.add(name)
@@ -266,20 +267,7 @@ def change_mistakes(settings: Mapping[str, Any], correlated: bool, changes: Mapp
         yield OTHER_MODEL
 
 
-def _settings_of(links: Mapping[str, Mapping[str, Any]], name: str) -> LinkNow | None:
-    """The settings of a link of the file at the start; None if the link's table has mistakes, which are reported elsewhere."""
-    try:
-        return WireLinkTable.model_validate(links[name]).wire_settings(), links[name].get("correlation") is not None
-    except ValidationError:
-        return None
-
-
-def _tables(tables: Any) -> Tables:
-    """The entries of a list of tables; a malformed one is empty."""
-    return [table if isinstance(table, Mapping) else {} for table in tables] if isinstance(tables, list) else []
-
-
-def _endpoint_mistakes(sides: Mapping[str, Any]) -> Iterator[str]:
+def _endpoint_mistakes(sides: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     """Two sides, or one side twice, at one place."""
     listens, connects = _places(sides, "listen"), _places(sides, "connect")
     round_and_round = "so that messages would go round"
@@ -297,7 +285,7 @@ def _endpoint_mistakes(sides: Mapping[str, Any]) -> Iterator[str]:
 
 
 class _Placed(NamedTuple):
-    """A well-formed endpoint of a side."""
+    """An endpoint of a side."""
 
     path: str
     side: str
@@ -314,86 +302,69 @@ def _overlapping(endpoint: _Placed, others: Sequence[_Placed]) -> _Placed | None
     return next((other for other in others if endpoint.place.overlaps(other.place)), None)
 
 
-def _places(sides: Mapping[str, Any], entry: str) -> list[_Placed]:
+def _places(sides: Mapping[str, Mapping[str, Any]], entry: str) -> list[_Placed]:
     places = []
     for name, side in sides.items():
-        given = side.get(entry) if isinstance(side, Mapping) else None
-        several = {f".{i}": endpoint_ for i, endpoint_ in enumerate(given)} if isinstance(given, list) else {"": given}
+        given = side.get(entry) or []
+        several = {"": given} if isinstance(given, str) else {f".{i}": endpoint for i, endpoint in enumerate(given)}
         for number, endpoint in several.items():
-            if isinstance(endpoint, str) and (place := place_of(endpoint)) is not None:
+            if (place := place_of(endpoint)) is not None:
                 places.append(_Placed(f"side.{name}.{entry}{number}", name, endpoint, place))
     return places
 
 
 def unknown(name: object, names: Sequence[str], kind: str) -> str:
-    """The end of a message about a name that nothing has. what: `side` or `link`."""
+    """The end of a message about a name that nothing has. kind: `side` or `link`."""
     choice = f"expected {listed(names)}" if names else f"the file has no {kind}"
     return f"is {as_toml(name)}; {choice}{near(name, names)}"
 
 
-def _side_mistakes(sides: Mapping[str, Any], links: Tables) -> Iterator[str]:
+def _side_mistakes(sides: Sequence[str], links: Sequence[WireLinkTable]) -> Iterator[str]:
     for i, link in enumerate(links):
-        for entry in ("from", "to"):
-            if isinstance(link.get(entry), str) and link[entry] not in sides:
-                yield f"link.{i}.{entry}: {unknown(link[entry], [*sides], 'side')}"
-        if isinstance(link.get("to"), str) and link["to"] == link.get("from") and link["to"] in sides:
-            yield f"link.{i}.to: is {as_toml(link['to'])}, where the link begins; expected another side"
+        for entry, name in (("from", link.source), ("to", link.target)):
+            if name not in sides:
+                yield f"link.{i}.{entry}: {unknown(name, sides, 'side')}"
+        if link.target == link.source and link.target in sides:
+            yield f"link.{i}.to: is {as_toml(link.target)}, where the link begins; expected another side"
 
 
-def _name_mistakes(links: Tables) -> Iterator[str]:
+def _name_mistakes(links: Sequence[WireLinkTable]) -> Iterator[str]:
     first: dict[str, int] = {}
     for i, link in enumerate(links):
-        if isinstance(name := link.get("name"), str) and first.setdefault(name, i) != i:
-            yield f"link.{i}.name: is {as_toml(name)}, the name of link.{first[name]}; expected a name of its own"
+        if link.name is not None and first.setdefault(link.name, i) != i:
+            same = f"the name of link.{first[link.name]}"
+            yield f"link.{i}.name: is {as_toml(link.name)}, {same}; expected a name of its own"
 
 
-def _correlation_mistakes(links: Tables) -> Iterator[str]:
-    names = link_names(links)
+def _correlation_mistakes(names: Sequence[str], links: Sequence[WireLinkTable]) -> Iterator[str]:
     for i, (name, link) in enumerate(zip(names, links, strict=True)):
-        tie = link.get("correlation")
-        other = tie.get("with") if isinstance(tie, Mapping) else None
-        if not isinstance(other, str):
+        if link.correlation is None:
             continue
-        path = f"link.{i}.correlation.with"
-        others = [link_ for link_ in names if link_ != name]
+        path, other = f"link.{i}.correlation.with", link.correlation.to
+        others = [name_ for name_ in names if name_ != name]
         if other not in others:
             yield f"{path}: {unknown(other, others, 'other link')}"
             continue
         theirs = links[names.index(other)]
-        if theirs.get("correlation") is not None:
+        there, here = theirs.loss_spec["model"], link.loss_spec["model"]
+        if theirs.correlation is not None:
             yield f"{path}: is {other}, whose own losses are tied to another link's; expected a link without correlation"
-        elif (there := _model(theirs)) != (here := _model(link)):
+        elif there != here:
             yield f"{path}: is {other}, but the loss models differ ({there} there and {here} here); expected the same model"
 
 
-def _model(link: Mapping[str, Any]) -> object:
-    loss = link.get("loss")
-    return loss.get("model") if isinstance(loss, Mapping) else "bernoulli"
-
-
-def event_mistakes(
-    event: Mapping[str, Any], sides: Sequence[str], links: Sequence[str], settings_of: Callable[[str], LinkNow | None]
-) -> Iterator[str]:
-    """Mistakes in an event that only show with the sides and links of the wire, given by their names.
-
-    settings_of: the settings of a link, and whether its losses are tied to another link's; None for a link with mistakes.
-    """
-    partition = event.get("partition")
-    if isinstance(partition, list) and sides:
-        for i, name in enumerate(partition):
-            if isinstance(name, str) and name not in sides:
-                yield f"partition.{i}: {unknown(name, sides, 'side')}"
-        if len(partition) == 2 and partition[0] == partition[1]:
-            yield f"partition: is {as_toml(partition)}; expected two different sides"
-    for entry in ("cut", "link"):
-        if isinstance(event.get(entry), str) and event[entry] not in links:
-            yield f"{entry}: {unknown(event[entry], links, 'link')}"
-    if (
-        isinstance(event.get("set"), Mapping)
-        and event.get("link") in links
-        and (now := settings_of(event["link"])) is not None
-    ):
-        yield from (f"set.{line}" for line in change_mistakes(*now, event["set"]))
+def event_mistakes(event: WireEventTable, sides: Sequence[str], links: Mapping[str, LinkNow]) -> Iterator[str]:
+    """Mistakes in an event that only show with the sides and links of the wire, given by their names."""
+    for i, name in enumerate(event.partition or ()):
+        if name not in sides:
+            yield f"partition.{i}: {unknown(name, sides, 'side')}"
+    if event.partition is not None and event.partition[0] == event.partition[1]:
+        yield f"partition: is {as_toml(event.partition)}; expected two different sides"
+    for entry, link in (("cut", event.cut), ("link", event.link)):
+        if link is not None and link not in links:
+            yield f"{entry}: {unknown(link, [*links], 'link')}"
+    if event.link is not None and event.set is not None and event.link in links:
+        yield from (f"set.{line}" for line in change_mistakes(*links[event.link], event.set))
 
 
 def wire_lines(plan: WirePlan) -> Iterator[str]:

@@ -131,9 +131,10 @@ class WireHistory:
         """Raise UsageError unless each link had settings from which fates, and their distribution, can be computed."""
         for link, known in self._settings.items():
             for one in known:
-                mistakes = model_mistakes("loss", one.settings["loss"], LOSS_MODELS)
+                mistakes = [(f"loss.{name}", what) for name, what in model_mistakes(one.settings["loss"], LOSS_MODELS)]
                 if "delay" in one.settings:
-                    mistakes += model_mistakes("delay", one.settings["delay"], DELAY_MODELS)
+                    wrong = model_mistakes(one.settings["delay"], DELAY_MODELS)
+                    mistakes += [(f"delay.{name}", what) for name, what in wrong]
                 corrupt = one.settings.get("corrupt", 0.0)
                 if not isinstance(corrupt, float | int) or not 0.0 <= corrupt <= 1.0:
                     mistakes.append(("corrupt", f"is {as_toml(corrupt)}; expected a probability"))

@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
 
 import zenoh
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, ModelWrapValidatorHandler, model_validator
 from pydantic_core import PydanticCustomError
 
 from evedrop.model.checks import as_toml
 from evedrop.model.delays import DELAY_MODELS
+from evedrop.model.links import LOSS_MODELS
 from evedrop.scenario.link_table import CorrelationTable, LinkTable
-from evedrop.scenario.table import NAME, Found, Table, expected
+from evedrop.scenario.table import NAME, Found, Table, expected, model_mistakes, refuse
 from evedrop.scenario.words import listed
 from evedrop.system.hints import near
 from evedrop.wire.tallies import WIRE_METRICS
@@ -164,41 +165,32 @@ Bound = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False), Before
 class WireExpectTable(Table):
     """`[[expect]]` of a wire file: a metric of a link with its bounds, or a link whose losses must agree with its model."""
 
-    metric: Annotated[
-        str | None, AfterValidator(lambda text: text and _metric(text)), Field(examples=["scan.delivery"])
-    ] = None
+    metric: Annotated[Annotated[str, AfterValidator(_metric)] | None, Field(examples=["scan.delivery"])] = None
     below: Annotated[Bound | None, Field(examples=[0.9])] = None
     above: Annotated[Bound | None, Field(examples=[0.5])] = None
     quantile: Annotated[float | None, Field(strict=True, gt=0.0, lt=1.0, examples=[0.99])] = None
     link: Annotated[str | None, Field(strict=True, examples=["scan"])] = None
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Mistakes unless there is a metric with a bound, or a link alone."""
-        given = [name for name, value in table.items() if value is not None]
-        if "link" in given:
-            others = [name for name in given if name in {"metric", "quantile", *_BOUNDS}]
-            return [
-                (name, 'is set, but a table with link has no other entries; expected link = "scan" alone')
-                for name in others
-            ]
-        if "metric" not in given:
-            return [("metric", 'is missing; expected metric = "scan.delivery" with below or above, or link = "scan"')]
-        mistakes = []
-        if not set(given) & set(_BOUNDS):
-            mistakes.append(("below", "is missing, and so is above; add one of them, or both"))
-        metric = WIRE_METRICS.get(str(table["metric"]).rpartition(".")[2])
-        if (metric is not None and metric.has_quantile) == ("quantile" not in given):
+        if self.link is not None:
+            others = [name for name, value in self if name != "link" and value is not None]
+            alone = 'is set, but a table with link has no other entries; expected link = "scan" alone'
+            yield from ((name, alone) for name in others)
+            return
+        if self.metric is None:
+            yield "metric", 'is missing; expected metric = "scan.delivery" with below or above, or link = "scan"'
+            return
+        if self.below is None and self.above is None:
+            yield "below", "is missing, and so is above; add one of them, or both"
+        if WIRE_METRICS[self.metric.rpartition(".")[2]].has_quantile == (self.quantile is None):
             names = [kind.name for kind in WIRE_METRICS.values() if kind.has_quantile]
             sentence = (
                 f"is missing; a {listed(names)} needs one"
-                if "quantile" not in given
+                if self.quantile is None
                 else f"is set, but only a {listed(names)} has quantiles"
             )
-            mistakes.append(
-                ("quantile", f"{sentence}; expected quantile = 0.99 with {listed([f'LINK.{kind}' for kind in names])}")
-            )
-        return mistakes
+            yield "quantile", f"{sentence}; expected quantile = 0.99 with {listed([f'LINK.{kind}' for kind in names])}"
 
     @property
     def subject(self) -> str:
@@ -226,15 +218,14 @@ class WireExpectTable(Table):
         return (self.below is None or value < self.below) and (self.above is None or value > self.above)
 
 
-def expectation_mistakes(expectations: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Iterator[str]:
-    """Mistakes in the names of links, of tables that may be malformed."""
+def expectation_mistakes(expectations: Sequence[WireExpectTable], names: Sequence[str]) -> Iterator[str]:
+    """Mistakes in the names of links."""
     for i, table in enumerate(expectations):
-        for entry in ("metric", "link"):
-            text = table.get(entry)
-            link = text.rpartition(".")[0] if isinstance(text, str) and entry == "metric" else text
-            if isinstance(link, str) and link and link not in names:
-                choice = f"expected a metric or the name of {listed(names)}" if names else "the file has no link"
-                yield f"expect.{i}.{entry}: is {as_toml(text)}, but there is no link {link}; {choice}{near(link, names)}"
+        link = table.subject
+        if link not in names:
+            entry, text = ("link", table.link) if table.metric is None else ("metric", table.metric)
+            choice = f"expected a metric or the name of {listed(names)}" if names else "the file has no link"
+            yield f"expect.{i}.{entry}: is {as_toml(text)}, but there is no link {link}; {choice}{near(link, names)}"
 
 
 DEFAULT_QUEUE = 256_000
@@ -292,25 +283,29 @@ Endpoints = Annotated[list[Annotated[str, AfterValidator(checked_endpoint)]], Be
 File = Annotated[str, Field(strict=True, min_length=1)]
 
 
-def delay_in_seconds(delay: Any) -> tuple[Any, list[Found]]:
-    """A delay's table with its lengths of time as numbers of seconds, and the mistakes in them."""
-    if not isinstance(delay, Mapping):
-        return delay, []
-    made, mistakes = dict(delay), []
+def _delay(delay: dict[str, Any]) -> dict[str, Any]:
+    """A delay's table with its lengths of time as numbers of seconds."""
+    made, mistakes = dict(delay), dict[str, str]()
     model = DELAY_MODELS.get(str(delay.get("model")))
     for name in () if model is None else model.lengths:
         text = made.get(name)
-        seconds = in_seconds(text) if isinstance(text, str) else None
-        if seconds is not None:
+        if isinstance(text, str) and (seconds := in_seconds(text)) is not None:
             made[name] = seconds
         elif isinstance(text, str):
-            made.pop(name)
-            mistakes.append((f"delay.{name}", f'is {as_toml(text)}; expected seconds, or a text such as "20 ms"'))
+            mistakes[name] = f'is {as_toml(made.pop(name))}; expected seconds, or a text such as "20 ms"'
     if made.pop("unit", "seconds") != "seconds":
-        mistakes.append(
-            ("delay.unit", f"is {as_toml(delay['unit'])}; expected no unit: delays on a wire are in seconds")
-        )
-    return made, mistakes
+        mistakes["unit"] = f"is {as_toml(delay['unit'])}; expected no unit: delays on a wire are in seconds"
+    of_model = [mistake for mistake in model_mistakes(made, DELAY_MODELS) if mistake[0] not in mistakes]
+    refuse([*mistakes.items(), *of_model])
+    return made
+
+
+def _loss(loss: dict[str, Any]) -> dict[str, Any]:
+    mistakes = model_mistakes(loss, LOSS_MODELS)
+    if loss.get("once") is True:
+        mistakes.append(("once", "is true, but a wire has no last message; expected false: the recording repeats"))
+    refuse(mistakes)
+    return loss
 
 
 class WireCorrelationTable(CorrelationTable):
@@ -322,31 +317,20 @@ class WireCorrelationTable(CorrelationTable):
 class WireSettingsTable(LinkTable):
     """The settings of a link: those of a scenario's link, with a message as a packet and seconds and bytes as units."""
 
+    may_be_perfect = True
     correlation: Annotated[WireCorrelationTable | None, Field(examples=[{"with": "robot-base", "strength": 0.5}])] = (
         None
     )
+    loss: Annotated[
+        Annotated[dict[str, Any], AfterValidator(_loss)] | None,
+        Field(examples=[{"model": "gilbert-elliott", "p": 0.05, "r": 0.5}]),
+    ] = None
     delay: Annotated[
-        dict[str, Any] | None,
-        BeforeValidator(lambda found: delay_in_seconds(found)[0]),
+        Annotated[dict[str, Any], AfterValidator(_delay)] | None,
         Field(examples=[{"model": "constant", "value": "20 ms"}]),
     ] = None
     rate: Annotated[Rate | None, Field(examples=["2 MB/s"])] = None
     queue: Annotated[Size | None, Field(examples=["256 kB"])] = None
-
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Those of a scenario's link; but a link without losses needs no loss model."""
-        delay, mistakes = delay_in_seconds(table.get("delay"))
-        complained = {entry for entry, _ in mistakes}
-        perfect = {"loss": NOTHING_LOST} if table.get("quality") is None and table.get("loss") is None else {}
-        of_link = super().mistakes({**table, **perfect, "delay": delay})
-        mistakes += [mistake for mistake in of_link if mistake[0] not in complained]
-        loss = table.get("loss")
-        if isinstance(loss, Mapping) and loss.get("once") is True:
-            mistakes.append(
-                ("loss.once", "is true, but a wire has no last message; expected false: the recording repeats")
-            )
-        return mistakes
 
     @property
     def loss_spec(self) -> dict[str, Any]:
@@ -371,13 +355,11 @@ class WireLinkTable(WireSettingsTable):
     tap: Annotated[bool, Field(strict=True)] = False
     ordered: Annotated[bool, Field(strict=True)] = False
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Those of the settings, and messages that are to overtake others, on a link on which none does."""
-        mistakes = super().mistakes(table)
-        if table.get("ordered") is True and table.get("reorder"):
-            mistakes.append(("reorder", "is given together with ordered = true; expected one of them"))
-        return mistakes
+        yield from super().mistakes()
+        if self.ordered and self.reorder:
+            yield "reorder", "is given together with ordered = true; expected one of them"
 
 
 class TlsTable(Table):
@@ -401,23 +383,14 @@ class SideTable(Table):
     keys: Annotated[KeyExpressions, Field(default_factory=lambda: ["**"])]
     peers: Annotated[bool, Field(strict=True)] = False
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Certificates without an endpoint that uses them, and encrypted endpoints without certificates."""
-        given = (
-            endpoint
-            for name in ("listen", "connect")
-            if isinstance(entry := _listed(table.get(name)), list)
-            for endpoint in entry
-        )
-        secure = [
-            endpoint for endpoint in given if isinstance(endpoint, str) and endpoint.partition("/")[0] in ENCRYPTED
-        ]
-        if table.get("tls") is None and secure:
-            return [("tls", f"is missing; expected a certificate and its key for {secure[0]}")]
-        if table.get("tls") is not None and not secure:
-            return [("tls", f"is given, but no endpoint of the side begins with {listed(sorted(ENCRYPTED))}")]
-        return []
+        endpoints = [*(self.listen or ()), *self.connect]
+        secure = [endpoint for endpoint in endpoints if endpoint.partition("/")[0] in ENCRYPTED]
+        if self.tls is None and secure:
+            yield "tls", f"is missing; expected a certificate and its key for {secure[0]}"
+        if self.tls is not None and not secure:
+            yield "tls", f"is given, but no endpoint of the side begins with {listed(sorted(ENCRYPTED))}"
 
     @property
     def endpoints(self) -> tuple[str, ...]:
@@ -441,40 +414,34 @@ class WireEventTable(Table):
         str | None, Field(strict=True, min_length=1, max_length=200, examples=["the robot enters the lift"])
     ] = None
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Mistakes unless one thing happens, and its time is stated in one way."""
         kinds = ("partition", "cut", "set", "note")
-        given = [name for name in kinds if table.get(name) is not None]
-        mistakes: list[Found] = []
+        given = [name for name in kinds if getattr(self, name) is not None]
         if len(given) != 1:
             sentence = f"has {listed(given)} at once" if given else "does not say what happens"
-            mistakes.append(
-                ("event", f'{sentence}; expected one of {listed(kinds)}, such as partition = ["robot", "base"]')
-            )
-        if (table.get("link") is None) == ("set" in given):
-            missing, there = ("link", "set") if "set" in given else ("set", "link")
-            if table.get(there) is not None:
-                mistakes.append(
-                    (missing, f'is missing, but {there} is given; expected link = "robot-base" and what to set')
-                )
-        if table.get("set") == {}:
-            mistakes.append(("set", "is empty; expected what changes, such as set = { quality = 0.2 }"))
-        return mistakes + cls._time_mistakes(table)
+            yield "event", f'{sentence}; expected one of {listed(kinds)}, such as partition = ["robot", "base"]'
+        if (self.link is None) != (self.set is None):
+            missing, there = ("link", "set") if self.link is None else ("set", "link")
+            yield missing, f'is missing, but {there} is given; expected link = "robot-base" and what to set'
+        if self.set == {}:
+            yield "set", "is empty; expected what changes, such as set = { quality = 0.2 }"
+        if self.at is None and self.start is None:
+            yield "at", 'is missing; expected at = "12 s"'
+        elif self.at is not None and self.start is not None:
+            yield "at", "and from are both there; expected one of them"
+        elif self.start is None and self.to is not None:
+            yield "to", "is given without from; expected from and to, or only at"
 
+    @model_validator(mode="wrap")
     @classmethod
-    def _time_mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        at, start, to = (table.get(name) for name in ("at", "from", "to"))
-        if at is None and start is None:
-            return [("at", 'is missing; expected at = "12 s"')]
-        if at is not None and start is not None:
-            return [("at", "and from are both there; expected one of them")]
-        if start is None and to is not None:
-            return [("to", "is given without from; expected from and to, or only at")]
-        first, last = (in_seconds(value) if isinstance(value, str) else value for value in (start, to))
-        if isinstance(first, (int, float)) and isinstance(last, (int, float)) and last <= first:
-            return [("to", f"is {as_toml(to)}, not after from, which is {as_toml(start)}; expected a later time")]
-        return []
+    def _ends_after_its_start(cls, entries: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
+        """Refuse an end that is not after the start, with both times as they are written."""
+        event = check(entries)
+        if event.start is not None and event.to is not None and event.to <= event.start:
+            start, to = as_toml(entries["from"]), as_toml(entries["to"])
+            refuse([("to", f"is {to}, not after from, which is {start}; expected a later time")])
+        return event
 
 
 class WireFile(Table):

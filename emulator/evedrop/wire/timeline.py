@@ -69,13 +69,12 @@ def with_change(plan: WirePlan, table: Mapping[str, Any], time: float) -> tuple[
     """
     now = moment_at(plan, time).settings
     tied = {link.name for link in plan.links if link.correlation is not None}
-    entries = {"at": time, **table}
-    mistakes = list(event_mistakes(entries, [*plan.sides], [*now], lambda name: (now[name], name in tied)))
     try:
-        checked = WireEventTable.model_validate(entries)
+        checked = WireEventTable.model_validate({"at": time, **table})
     except ValidationError as error:
-        raise ScenarioError("event", [*sentences(error, WireEventTable), *mistakes]) from None
-    if mistakes:
+        raise ScenarioError("event", sentences(error, WireEventTable)) from None
+    links = {name: (settings, name in tied) for name, settings in now.items()}
+    if mistakes := list(event_mistakes(checked, [*plan.sides], links)):
         raise ScenarioError("event", mistakes)
     event = wire_event(checked, now, {link.name: link.settings for link in plan.links})
     return replace(plan, events=(*plan.events, event)), _begun(event)

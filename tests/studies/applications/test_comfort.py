@@ -110,10 +110,10 @@ def test_a_table_without_a_plant_is_refused() -> None:
     """It describes a plant with a controller; and both mistakes of a file are reported at once."""
     comfort = {"temperature": "x", "heater": "u", "lowest": 1.0, "highest": 2.0}
     with pytest.raises(ScenarioError) as caught:
-        load("eavesdroppers", {"comfort": comfort, "slots": -1})
+        load("eavesdroppers", {"comfort": comfort, "record_trials": 9})
     lines = caught.value.mistakes
     assert any(line.startswith("comfort: is given without a [plant] and a [controller]") for line in lines), lines
-    assert any(line.startswith("slots: is -1") for line in lines), lines
+    assert any(line.startswith("record_trials: is 9") for line in lines), lines
 
 
 SCENARIO = """

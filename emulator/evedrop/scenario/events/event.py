@@ -12,14 +12,13 @@ from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from evedrop.errors import NoAnswer
-from evedrop.model.registry import place_of
+from evedrop.model.registry import answered, place_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.streams import MOST_SLOTS
 from evedrop.scenario.events.effects import Effect
-from evedrop.scenario.table import Found, Table
+from evedrop.scenario.table import Found, Table, refuse
 
 Names = str | list[str]
 Slot = Annotated[int, Field(strict=True, ge=0, le=MOST_SLOTS, examples=[400])]
@@ -60,11 +59,11 @@ class Fault:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The parts of a scenario that a single event is compared with; None where there is a mistake."""
+    """The parts of a scenario that a single event is compared with."""
 
-    scheme: type[Scheme] | None
+    scheme: type[Scheme]
     scheme_name: str
-    attack: str | None
+    attack: str
     """The attack on acknowledgements; `none` if there is none."""
     monitored: bool = False
     """Whether the scenario has an application that can attack measurements, and detect it."""
@@ -101,14 +100,19 @@ class EventKind(When):
         """The beginning of the event, and its end if it lasts."""
 
     @model_validator(mode="after")
+    def _as_a_whole(self) -> Self:
+        """Refuse an event with mistakes, or one that cannot be checked: its class may come from a package."""
+        refuse(answered(type(self), self.kind, lambda: list(self.mistakes())))
+        return self
+
+    @model_validator(mode="after")
     def _acts_are_usable(self) -> Self:
         """Refuse an event whose acts cannot be carried out: its class may come from a package."""
         try:
             _expect_acts(list(self.acts()))
         except Exception as error:
             reason = str(error) if isinstance(error, NoAnswer) else f"acts() raised {place_of(error)}"
-            wrong = [(self.kind, f"is an event that cannot be carried out: {reason}")]
-            raise PydanticCustomError("mistakes", "one", {"mistakes": wrong}) from error
+            refuse([(self.kind, f"is an event that cannot be carried out: {reason}")])
         return self
 
     def compared(self, surroundings: Surroundings) -> Iterator[Found]:

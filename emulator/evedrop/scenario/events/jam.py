@@ -24,7 +24,7 @@ class Jam(Attack):
     def undescribed(self, surroundings: Surroundings) -> Iterator[str]:
         """Mistakes unless there are acknowledgements and an attack on them."""
         scheme = surroundings.scheme
-        if scheme is not None and not scheme.needs_acknowledgements:
+        if not scheme.needs_acknowledgements:
             name = surroundings.scheme_name
             yield f"the scheme {name} has no acknowledgements that could be jammed; remove the event"
         elif surroundings.attack == "none":

@@ -5,19 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from evedrop.scenario.events.effects import LinkSettings
 from evedrop.scenario.events.event import Act, EventKind, Fault, Names, spoken
-from evedrop.scenario.table import Found
+from evedrop.scenario.table import refuse
 from evedrop.scenario.words import as_toml
+
+
+def _some(changes: dict[str, Any]) -> dict[str, Any]:
+    if not changes:
+        refuse([("", "is empty; expected what changes, such as set = { quality = 0.2 }")])
+    return changes
 
 
 class Set(EventKind):
     """`link` and `set`: entries of the links change. At the end, all changes that events have made to them are undone."""
 
-    link: Annotated[Names, Field(examples=["legitimate"])]
-    set: Annotated[dict[str, Any], Field(examples=[{"quality": 0.2}])]
+    link: Annotated[Names, Field(description="the link that is changed", examples=["legitimate"])]
+    set: Annotated[dict[str, Any], AfterValidator(_some), Field(examples=[{"quality": 0.2}])]
 
     kind = "set"
     does = LinkSettings
@@ -28,16 +34,6 @@ class Set(EventKind):
     alone: ClassVar[Mapping[str, str]] = {
         "link": "is given without set; expected what changes, such as set = { quality = 0.2 }"
     }
-
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """A missing link, and an empty set of changes."""
-        mistakes: list[Found] = []
-        if table.get("link") is None:
-            mistakes.append(("link", 'is missing; expected the link that is changed, such as link = "legitimate"'))
-        if table.get("set") == {}:
-            mistakes.append(("set", "is empty; expected what changes, such as set = { quality = 0.2 }"))
-        return mistakes
 
     def acts(self) -> Iterator[Act]:
         """The changes, and their end."""

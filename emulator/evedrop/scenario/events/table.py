@@ -5,18 +5,17 @@ So an unknown entry, a value of the wrong type, two kinds at once and a wrong ti
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, PlainValidator, SerializeAsAny, create_model
 
 from evedrop.errors import NotRegistered
-from evedrop.model.registry import asked
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.events.event import EventKind, When
 from evedrop.scenario.table import Found
-from evedrop.scenario.words import listed
+from evedrop.scenario.words import as_toml, listed
 
 
 class EventTable(When):
@@ -26,46 +25,43 @@ class EventTable(When):
     broken: ClassVar[Mapping[str, str]]
     """Kinds of installed packages that cannot be loaded → why, in words that follow the name."""
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """Mistakes unless there is exactly one kind, with its time stated in one way."""
-        return [*cls._what_mistakes(table), *cls._when_mistakes(table)]
+        given = [kind for name, kind in self.kinds.items() if getattr(self, name) is not None]
+        yield from self._what_mistakes(given)
+        yield from self._when_mistakes(given)
 
-    @classmethod
-    def _given(cls, table: Mapping[str, Any]) -> list[type[EventKind]]:
-        return [kind for name, kind in cls.kinds.items() if table.get(name) is not None]
-
-    @classmethod
-    def _what_mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        given = cls._given(table)
-        unloadable = [name for name in cls.broken if table.get(name) is not None]
-        mistakes: list[Found] = [(name, f"is an event{cls.broken[name]}") for name in unloadable]
+    def _what_mistakes(self, given: list[type[EventKind]]) -> Iterator[Found]:
+        unloadable = [name for name in self.broken if getattr(self, name) is not None]
+        yield from ((name, f"is an event{self.broken[name]}") for name in unloadable)
         if len(given) != 1 and not unloadable:
             problem = f"has {listed([kind.kind for kind in given])} at once" if given else "does not say what happens"
-            mistakes.append(("event", f'{problem}; expected one of {listed([*cls.kinds])}, such as cut = "legitimate"'))
-        if len(given) == 1:
-            mistakes += asked(given[0], table)
+            yield "event", f'{problem}; expected one of {listed([*self.kinds])}, such as cut = "legitimate"'
         has = {entry for kind in given for entry in kind.own_entries()}
-        alone = {entry: sentence for kind in cls.kinds.values() for entry, sentence in kind.alone.items()}
-        return mistakes + [
-            (entry, sentence) for entry, sentence in alone.items() if table.get(entry) is not None and entry not in has
-        ]
+        alone = {entry: sentence for kind in self.kinds.values() for entry, sentence in kind.alone.items()}
+        for entry, sentence in alone.items():
+            if getattr(self, entry) is not None and entry not in has:
+                yield entry, sentence
+        for entry, field in given[0].model_fields.items() if len(given) == 1 else ():
+            if field.is_required() and getattr(self, entry) is None:
+                example = f"{entry} = {as_toml(field.examples[0])}" if field.examples else entry
+                words = f"{field.description}, such as {example}" if field.description else example
+                yield entry, f"is missing; expected {words}"
 
-    @classmethod
-    def _when_mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        at, start, to = (table.get(name) for name in ("at", "from", "to"))
-        given = cls._given(table)
-        if (at is None) == (start is None):
-            return [("at", "and from are both there" if at is not None else "is missing; expected at = 400")]
-        if start is None and to is not None:
-            return [("to", "is given without from; expected from and to, or only at")]
-        if start is not None and to is None:
-            return [("to", "is missing, but from is given; expected the slot in which it ends")]
-        if type(start) is int and type(to) is int and to <= start:
-            return [("to", f"is {to}, not after from, which is {start}; expected a later slot")]
-        if start is not None and len(given) == 1 and not given[0].lasts:
-            return [("from", f"is given, but {given[0].kind} happens in one slot; expected at")]
-        return []
+    def _when_mistakes(self, given: list[type[EventKind]]) -> Iterator[Found]:
+        at, start, to = self.at, self.start, self.to
+        if at is not None and start is not None:
+            yield "at", "and from are both there"
+        elif at is None and start is None:
+            yield "at", "is missing; expected at = 400"
+        elif start is None and to is not None:
+            yield "to", "is given without from; expected from and to, or only at"
+        elif start is not None and to is None:
+            yield "to", "is missing, but from is given; expected the slot in which it ends"
+        elif start is not None and to is not None and to <= start:
+            yield "to", f"is {to}, not after from, which is {start}; expected a later slot"
+        elif start is not None and len(given) == 1 and not given[0].lasts:
+            yield "from", f"is given, but {given[0].kind} happens in one slot; expected at"
 
 
 def event_table(entries: Iterable[str] | None = None) -> type[EventTable]:
@@ -107,9 +103,9 @@ def event_of(given: object) -> EventKind:
     if isinstance(given, EventKind):
         return given
     table = event_table(given if isinstance(given, Mapping) else ())
-    checked = table.model_validate(given)
-    entries = checked.model_dump(exclude_none=True, exclude_unset=True)
-    return next(kind for name, kind in table.kinds.items() if name in entries).model_validate(entries)
+    entries = table.model_validate(given).model_dump(exclude_none=True, exclude_unset=True)
+    kind = next(kind for name, kind in table.kinds.items() if name in entries)
+    return kind.model_validate(entries)
 
 
 AnyEvent = Annotated[SerializeAsAny[EventKind], PlainValidator(event_of)]

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.model.registry import place_of
 from evedrop.scenario.drawn import with_faults
-from evedrop.scenario.dry_run import dry_run, foreign
+from evedrop.scenario.dry_run import dry_run, has_foreign
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.filter_noise import replace_filter_noise
 from evedrop.scenario.input_files import (
@@ -28,10 +28,10 @@ from evedrop.scenario.input_files import (
 )
 from evedrop.scenario.loading.line_numbers import given_twice, with_line_numbers
 from evedrop.scenario.loading.mistakes import mistakes_across
-from evedrop.scenario.plugins import named_in
+from evedrop.scenario.plugins import elsewhere, named_in
 from evedrop.scenario.sentences import sentences
+from evedrop.scenario.stream_keys import secret_in
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.valid import ValidTables
 from evedrop.scenario.values import unusable
 from evedrop.scenario.words import listed
 from evedrop.scenarios import shipped
@@ -158,36 +158,41 @@ def checked(
         raise ScenarioError(source, wrong)
     if any(named_in(tables)):
         tables.setdefault("modules", str(folder))
+    mistakes = [*read_recordings(tables), *read_tables(tables), *replace_filter_noise(tables)]
+    if isinstance(tables.get("secret_file"), str):
+        try:
+            secret_in(tables["secret_file"])
+        except UsageError as error:
+            mistakes.append(str(error))
     if isinstance(tables.get("modules"), str):
         tables["modules"] = str(Path(tables["modules"]).absolute())
-    recordings = [*read_recordings(tables), *read_tables(tables), *replace_filter_noise(tables)]
+        mistakes += [f"modules: {sentence}" for sentence in elsewhere(tables["modules"], tables)]
     try:
         scenario = Scenario.read(tables)
     except ValidationError as error:
-        mistakes = [*sentences(error, Scenario), *recordings, *_across(tables, beyond_horizon, None)]
-        raise ScenarioError(source, mistakes) from None
+        raise ScenarioError(source, [*dict.fromkeys([*sentences(error, Scenario), *mistakes])]) from None
+    if mistakes:
+        raise ScenarioError(source, mistakes)
     broken = dry_run(scenario)
     # A class that breaks in a dry run breaks again when it is asked about itself: report that only once.
-    mistakes = recordings + broken + _across(tables, beyond_horizon, scenario, silent=bool(broken))
+    mistakes = broken + _across(scenario, beyond_horizon, silent=bool(broken))
     if scenario.nemesis is not None:
-        tables, more = with_faults(tables, scenario)
-        mistakes += more
+        tables, of_nemesis = with_faults(tables, scenario)
+        mistakes += of_nemesis
         if not mistakes:
             scenario = Scenario.read(tables)
-            mistakes = _across(tables, beyond_horizon, scenario)
+            mistakes = _across(scenario, beyond_horizon)
     if mistakes:
         raise ScenarioError(source, mistakes)
     return scenario
 
 
-def _across(
-    tables: Mapping[str, Any], beyond_horizon: bool, scenario: Scenario | None, silent: bool = False
-) -> list[str]:
+def _across(scenario: Scenario, beyond_horizon: bool, silent: bool = False) -> list[str]:
     """Mistakes across tables; an error that a custom class raises when asked is a mistake too, unless silent."""
     try:
-        return mistakes_across(ValidTables.of(tables, scenario), beyond_horizon)
+        return mistakes_across(scenario, beyond_horizon)
     except Exception as error:
-        if not foreign(tables):
+        if not has_foreign(scenario):
             raise
         if silent:
             return []

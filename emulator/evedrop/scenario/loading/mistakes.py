@@ -1,4 +1,4 @@
-"""The second of the two phases of a check: mistakes that only show when valid tables are compared.
+"""The second of the two phases of a check: the tables, each valid by itself, are compared.
 
 Source: docs/architecture.md, how a scenario is checked.
 """
@@ -10,7 +10,6 @@ from collections.abc import Iterator
 import numpy as np
 from pydantic import ValidationError
 
-from evedrop.errors import UsageError
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Process
 from evedrop.model.schemes import scheme_of
@@ -34,30 +33,26 @@ from evedrop.scenario.expect import Around
 from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.filter_noise import filter_mistakes
 from evedrop.scenario.link_table import LinkTable
-from evedrop.scenario.nemesis import nemesis_mistakes
 from evedrop.scenario.process import ProcessTable
-from evedrop.scenario.receivers import EavesdropperTable
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.singular_noise import singular_mistakes
-from evedrop.scenario.stream_keys import secret_in
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.valid import ValidTables
 
 _ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # the existence of a theory does not depend on the process
 
 
-def mistakes_across(tables: ValidTables, beyond_horizon: bool) -> list[str]:
-    """Mistakes across tables, as far as a faulty file can be checked."""
+def mistakes_across(scenario: Scenario, beyond_horizon: bool) -> list[str]:
+    """Mistakes that only show when the tables of a scenario are compared."""
     mistakes: list[str] = []
-    if tables.process is not None and tables.slots is not None and not beyond_horizon:
-        mistakes += horizon_mistakes(tables.process.process, tables.slots)
-    trials = tables.trials
-    if trials is not None and tables.record_trials is not None and tables.record_trials > trials:
-        mistakes.append(f"record_trials: is {tables.record_trials}; expected at most trials, which is {trials}")
-    if trials is not None and tables.shards is not None and tables.shards > trials:
+    slots, trials = scenario.slots, scenario.trials
+    if not beyond_horizon:
+        mistakes += horizon_mistakes(scenario.process.process, slots)
+    if scenario.record_trials > trials:
+        mistakes.append(f"record_trials: is {scenario.record_trials}; expected at most trials, which is {trials}")
+    if scenario.shards > trials:
         most = f"expected at most trials, which is {trials}: a shard has one trial or more"
-        mistakes.append(f"shards: is {tables.shards}; {most}")
-    for phase in (
+        mistakes.append(f"shards: is {scenario.shards}; {most}")
+    for compare in (
         scheme_mistakes,
         strategy_mistakes,
         encoding_mistakes,
@@ -70,70 +65,56 @@ def mistakes_across(tables: ValidTables, beyond_horizon: bool) -> list[str]:
         link_mistakes,
         event_mistakes,
     ):
-        mistakes += phase(tables)
-    if tables.scenario is not None and not mistakes:
-        mistakes += _application_objections(tables.scenario)
-    if tables.nemesis is not None and tables.all_receivers:
-        mistakes += nemesis_mistakes(tables.nemesis, tables.slots, tables.receivers)
-    if tables.scenario is not None and not mistakes:
+        mistakes += compare(scenario)
+    if not mistakes:
+        mistakes += _application_objections(scenario)
+    if not mistakes:
         try:
-            _ = tables.scenario.timeline
+            _ = scenario.timeline
         except ValidationError as error:
             together = "event: several of them together result in an invalid link"
             mistakes += [f"{together}: {line}" for line in sentences(error, LinkTable)]
-    if tables.secret_file is not None:
-        try:
-            secret_in(tables.secret_file)
-        except UsageError as error:
-            mistakes.append(str(error))
-    return [*mistakes, *_expectation_mistakes(tables, sound=not mistakes)]
+    return [*mistakes, *_expectation_mistakes(scenario, sound=not mistakes)]
 
 
-def _expectation_mistakes(tables: ValidTables, sound: bool) -> Iterator[str]:
+def _expectation_mistakes(scenario: Scenario, sound: bool) -> Iterator[str]:
     """sound: whether there are no other mistakes across tables."""
     around = Around(
-        tables.receivers,
-        tables.slots,
-        tables.trials,
-        lambda name: _assumed(tables.process) or _no_theory(name, tables, sound),
-        tables.applications,
-        None if tables.process is None else list(tables.process.directions or {}),
+        scenario.receivers,
+        scenario.slots,
+        scenario.trials,
+        lambda name: _assumed(scenario.process) or _no_theory(name, scenario, sound),
+        {name: APPLICATIONS[name] for name in scenario.applications},
+        list(scenario.process.directions or {}),
     )
-    for i, expectation in tables.expect if tables.all_receivers else ():
+    for i, expectation in enumerate(scenario.expect):
         yield from (f"expect.{i}.{entry}: {sentence}" for entry, sentence in around.mistakes(expectation))
 
 
-def _assumed(process: ProcessTable | None) -> str | None:
+def _assumed(process: ProcessTable) -> str | None:
     """The reason why theory expects nothing of given states; None if it may."""
-    if process is None or not process.given or process.theory:
+    if not process.given or process.theory:
         return None
     return f"A and Q need not describe states that come from a {process.source}; theory = true says that they do"
 
 
-def _no_theory(name: str, tables: ValidTables, sound: bool) -> str | None:
-    """The reason why no theory covers a receiver; None if a theory does, or if its table or the scheme's has mistakes.
+def _no_theory(name: str, scenario: Scenario, sound: bool) -> str | None:
+    """The reason why no theory covers a receiver; None if a theory does.
 
-    sound: whether there are no other mistakes: a valid scenario's events are then considered too.
+    sound: whether there are no other mistakes: the events are then considered too.
     """
-    receiver = tables.legitimate if name == LEGITIMATE else tables.eavesdroppers.get(name)
-    if tables.encoding is None or receiver is None:
-        return None
-    scheme = scheme_of(_ANY_PROCESS, tables.encoding.spec)
-    if isinstance(receiver, EavesdropperTable):
-        link = receiver.pool
+    scheme = scheme_of(_ANY_PROCESS, scenario.encoding.spec)
+    if name in scenario.eavesdroppers:
+        receiver = scenario.eavesdroppers[name]
         closed = receiver.strategy in scheme.closed_forms
         if not closed and eavesdropper_outcomes(scheme, receiver.strategy, receiver.parameters) is None:
             return f"no closed form is known for the strategy {receiver.strategy} of {name}"
-    else:
-        link = receiver.link
-        if LEGITIMATE not in scheme.closed_forms and legitimate_outcomes(scheme) is None:
-            return f"no closed form is known for the scheme {tables.encoding.scheme}"
-    if distribution_of(LinkSchedule(link.settings(1.0), receiver.window)) is None:
+    elif LEGITIMATE not in scheme.closed_forms and legitimate_outcomes(scheme) is None:
+        return f"no closed form is known for the scheme {scenario.encoding.scheme}"
+    if distribution_of(LinkSchedule(scenario.link(name).settings(1.0), scenario.window(name))) is None:
         return f"no theory covers {name}'s link"
-    if tables.scenario is None or not sound:
-        return None
-    has_theory = expectations_of(tables.scenario)[name].known
-    return None if has_theory else f"no theory covers {name} with these links, attacks and events together"
+    covered = not sound or expectations_of(scenario)[name].known
+    return None if covered else f"no theory covers {name} with these links, attacks and events together"
 
 
 def _application_objections(scenario: Scenario) -> list[str]:

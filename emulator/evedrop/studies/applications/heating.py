@@ -5,9 +5,9 @@ Source: docs/scenario.md, comfort.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
-from typing import Annotated, Any, ClassVar, Self, final
+from typing import Annotated, ClassVar, Self, final
 
 import numpy as np
 from pydantic import Field
@@ -41,13 +41,10 @@ class ComfortTable(Table):
     lowest: Annotated[Number, Field(examples=[20.0])]
     highest: Annotated[Number, Field(examples=[23.0])]
 
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+    def mistakes(self) -> Iterator[Found]:
         """A range without temperatures."""
-        lowest, highest = table.get("lowest"), table.get("highest")
-        if isinstance(lowest, float) and isinstance(highest, float) and lowest >= highest:
-            return [("lowest", f"is {lowest}, and highest is {highest}; expected lowest < highest")]
-        return []
+        if self.lowest >= self.highest:
+            yield "lowest", f"is {self.lowest}, and highest is {self.highest}; expected lowest < highest"
 
 
 @final
