@@ -21,10 +21,10 @@ from evedrop.model.receiver import Reception
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link import Link
 from evedrop.model.streams import Batch
-from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import expectations_of
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.workers import usable_cores
 

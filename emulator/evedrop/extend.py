@@ -40,7 +40,9 @@ if TYPE_CHECKING:
         PanelFeed,
         PowerFeed,
     )
-    from evedrop.scenario.events.effects import (
+    from evedrop.scenario.events.event import (
+        Act,
+        EventKind,
         Jamming,
         Leave,
         LinkCut,
@@ -50,7 +52,6 @@ if TYPE_CHECKING:
         Return,
         Spoofing,
     )
-    from evedrop.scenario.events.event import Act, EventKind
     from evedrop.scenario.table import Table
     from evedrop.show.view.column import Column, scalars
     from evedrop.show.view.palette import colour

@@ -20,8 +20,8 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter
 from evedrop.scenario.loading import load
-from evedrop.scenario.loading.recorded import recorded
 from evedrop.scenario.progress_events import silent
+from evedrop.scenario.recorded import recorded
 from evedrop.score.sums import SlotSums
 from evedrop.show.view.scene_slots import replay
 from evedrop.simulate.montecarlo import simulate

@@ -15,10 +15,9 @@ from evedrop.errors import MOST_MISTAKES
 from evedrop.model.checks import as_toml
 from evedrop.model.schemes import SCHEMES
 from evedrop.names import RESERVED
-from evedrop.scenario import values
+from evedrop.scenario import loading, table
 from evedrop.scenario.expect import Quantile
-from evedrop.scenario.loading import file as scenario_file
-from evedrop.scenario.recordings import disturbance_file, message_numbers
+from evedrop.scenario.recordings import disturbance_file, message_recording
 from tests.privileged import CannotRun, skip
 
 ROOT = Path(__file__).parents[2]
@@ -45,7 +44,7 @@ def test_the_reserved_names_are_all_there() -> None:
 def test_how_many_mistakes_are_reported() -> None:
     """In all, of one kind in a file, and of values that no entry can have."""
     text = page("scenario.md")
-    told = values._MOST_TOLD
+    told = table._MOST_TOLD
     assert f"A report has up to {MOST_MISTAKES} lines, with up to {told} for values that no entry can have" in text
     most = disturbance_file.MOST_REPORTED
     assert f"the first {most} lines with each kind of mistake are reported" in text
@@ -69,11 +68,11 @@ def test_what_holds_on_every_machine_is_scoped(name: str) -> None:
 
 def test_the_limits_of_a_file() -> None:
     """Of its bytes, its values and its depth."""
-    assert scenario_file.MOST_BYTES == 256 * 2**20
-    assert scenario_file.MOST_VALUES == 1_000_000
+    assert loading.MOST_BYTES == 256 * 2**20
+    assert loading.MOST_VALUES == 1_000_000
     assert (
         "a file has at most 256 MiB and a million values in lists, tables and lists are at most "
-        f"{values._DEEPEST} deep, whole numbers have at most {values._LARGEST_BITS} bits"
+        f"{table._DEEPEST} deep, whole numbers have at most {table._LARGEST_BITS} bits"
     ) in page("scenario.md")
 
 
@@ -87,7 +86,7 @@ def test_a_quantile_is_strictly_between_0_and_1() -> None:
 
 def test_a_leap_of_a_counter() -> None:
     """The shortest leap that may mean that the counter was set."""
-    assert f"**A leap ahead** of more than {message_numbers._JUMP} numbers" in page("links.md")
+    assert f"**A leap ahead** of more than {message_recording._JUMP} numbers" in page("links.md")
 
 
 def test_the_parameters_of_compared_schemes() -> None:
@@ -99,8 +98,8 @@ def test_the_parameters_of_compared_schemes() -> None:
             if entries:
                 yield f"| `{name}` | {', '.join(entries)} |"
 
-    table = "\n".join(["| scheme | entries |", "|---|---|", *rows()])
-    assert table in (ROOT / "docs" / "compare.md").read_text(encoding="utf-8")
+    written = "\n".join(["| scheme | entries |", "|---|---|", *rows()])
+    assert written in (ROOT / "docs" / "compare.md").read_text(encoding="utf-8")
 
 
 def test_every_commit_that_a_page_names_is_here() -> None:

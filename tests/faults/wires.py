@@ -24,7 +24,7 @@ import pyarrow as pa
 from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER, Link, LinkSchedule, streams_of
 from evedrop.model.streams import Batch, root_of_seed
-from evedrop.scenario.wire_table import wire_stream_key
+from evedrop.scenario.receivers import wire_stream_key
 from evedrop.wire.journal import journal_tables
 from tests.faults import ours
 from tests.faults.looks import failed_looks

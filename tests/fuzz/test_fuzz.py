@@ -17,7 +17,7 @@ from hypothesis import example, given, seed, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
-from evedrop.scenario.expected.estimates import warnings_of
+from evedrop.scenario.estimates import warnings_of
 from evedrop.scenario.loading import parse, shipped
 from tests.examples import examples
 from tests.fuzz.fuzzing import CORPUS, broken_by, campaign

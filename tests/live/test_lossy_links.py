@@ -14,7 +14,7 @@ from evedrop.cli.api import design, montecarlo, run
 from evedrop.errors import UsageError
 from evedrop.model.links import LOSS_MODELS
 from evedrop.results.reading import Results
-from evedrop.scenario.expected.estimates import warnings_of
+from evedrop.scenario.estimates import warnings_of
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
 from tests.builders import MARGINAL, digests_of, tables_of

@@ -16,8 +16,8 @@ from evedrop.cli.api import design, design_schedule
 from evedrop.errors import BriefError, ScenarioError, UsageError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.protocol.brief import read_brief
-from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked
+from evedrop.scenario.theory import expectations_of
 from evedrop.score.verdict import Verdict
 from tests.builders import UNSTABLE, digests_of, process_table
 

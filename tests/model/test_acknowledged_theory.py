@@ -13,8 +13,8 @@ from evedrop.model.reference_form import reference_floor
 from evedrop.model.schemes.acknowledged import Acknowledged, OpenLoop
 from evedrop.model.theory.closed_forms import reference_covariances
 from evedrop.model.theory.covariances import expected_covariances
-from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked
+from evedrop.scenario.theory import expectations_of
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.acknowledged_runs import MIXED, all_events, exact_sigmas, played_over
 from tests.model.slot_loop import STABLE

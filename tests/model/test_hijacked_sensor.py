@@ -14,8 +14,8 @@ from evedrop.model.acknowledgements import AckChannel, HeedRule, heed_rule_of, r
 from evedrop.model.process import Process
 from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory.closed_forms import Hears, hijacked_schedule, scheduled
-from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked
+from evedrop.scenario.theory import expectations_of
 from evedrop.score.links import chart_of
 from evedrop.simulate.simulation import Simulation
 from tests.builders import UNSTABLE, listener, tables_of

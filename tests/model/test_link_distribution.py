@@ -17,7 +17,7 @@ from evedrop.model.process import Process
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
 from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.theory.covariances import Outcomes
-from evedrop.scenario.expected.expectations import Expectation
+from evedrop.scenario.theory import Expectation
 from evedrop.scenario.timeline import Away
 
 WALK = Process(np.eye(1), np.array([[0.3]]), np.array([[2.0]]))

@@ -12,7 +12,7 @@ from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.closed_forms import growth_by_coin, growth_by_phases, most_coded
-from evedrop.scenario.expected.estimates import warnings_of
+from evedrop.scenario.estimates import warnings_of
 from evedrop.scenario.loading import checked
 from tests.builders import DRIFTING, UNSTABLE, tables_of
 from tests.model.acknowledged_runs import MIXED

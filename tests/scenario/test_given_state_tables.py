@@ -12,9 +12,9 @@ from evedrop.cli.api import compare, montecarlo
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.results.diff import difference
 from evedrop.results.resolved_scenario import write_resolved
-from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.input_files import states_of
 from evedrop.scenario.loading import checked, load
+from evedrop.scenario.theory import expectations_of
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.studies.matchups import matchups_of

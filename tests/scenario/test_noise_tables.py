@@ -12,9 +12,9 @@ from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.protocol.brief import EavesdropperPart
 from evedrop.model.local_filter import settled
 from evedrop.model.schedule import PACKETS, NoiseDistribution
-from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import expectations_of
 from tests.builders import mistakes_of, part_of
 
 _TASK = RecorderTask(Path("nowhere"), False)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.results.resolved_scenario import write_resolved
-from evedrop.scenario.expected.estimates import warnings_of
+from evedrop.scenario.estimates import warnings_of
 from evedrop.scenario.loading import load, parse, shipped, value_of
 from evedrop.scenario.tables import Scenario
 from evedrop.scenarios import write_new

@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from evedrop.scenario.toml_text import toml_text
+from evedrop.scenario.words import toml_text
 
 ROWS = """\
 title = "[ 1,"

@@ -17,9 +17,9 @@ import pytest
 
 from evedrop.model.process import Floats
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.expected.expectations import Expectation, expectations_of
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import Expectation, expectations_of
 from evedrop.score.rare_events import z_of_error
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import verdicts

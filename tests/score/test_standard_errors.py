@@ -25,9 +25,9 @@ from evedrop.model.metrics.standard_error import ratio_error, standard_error, z_
 from evedrop.model.metrics.text import estimate
 from evedrop.model.process import Floats
 from evedrop.results.reading import Results
-from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import expectations_of
 from evedrop.score.scorekeeper import RunOutcome
 from evedrop.score.summary import RARE_FRACTION, Summary
 from evedrop.score.sums import Tally

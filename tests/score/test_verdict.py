@@ -12,7 +12,7 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.theory.covariances import Outcomes
-from evedrop.scenario.expected.expectations import Expectation
+from evedrop.scenario.theory import Expectation
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
 from evedrop.score.verdict import Secrecy, Verdict, rejected, secrecy
 

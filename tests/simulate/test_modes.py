@@ -20,8 +20,8 @@ from evedrop.model import streams
 from evedrop.model.process import Process
 from evedrop.model.theory.covariances import Outcomes, expected_traces
 from evedrop.results.reading import Results
-from evedrop.scenario.link_table import LinkTable
 from evedrop.scenario.loading import checked, load
+from evedrop.scenario.receivers import LinkTable
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.montecarlo import Plan

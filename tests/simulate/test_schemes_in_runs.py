@@ -15,9 +15,9 @@ from evedrop.live.protocol.brief import RouterPart, SensorPart
 from evedrop.model.acknowledgements import OVERHEARING
 from evedrop.model.detection import Chart
 from evedrop.model.schemes import scheme_of
-from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import expectations_of
 from evedrop.score.links import Detection, chart_of
 from evedrop.score.summary import DetectionSummary
 from evedrop.simulate.montecarlo import check_mode

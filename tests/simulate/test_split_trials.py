@@ -19,9 +19,9 @@ from evedrop.errors import Interrupted
 from evedrop.model.process import Process
 from evedrop.model.streams import OWN, Lineage
 from evedrop.results.reading import Results
-from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import expectations_of
 from evedrop.score.summary import Summary
 from evedrop.simulate import montecarlo as studies
 from evedrop.simulate.montecarlo import Plan

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from evedrop.errors import TraceError, UsageError
-from evedrop.scenario.fitting.message_fit import fit_messages
+from evedrop.scenario.recordings.link_fit import fit_messages
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.link_state import KeyFates

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from evedrop.model.theory.policies import Front, PolicyMetrics
     from evedrop.model.theory.ratio import Choice, LargestRatio
     from evedrop.model.theory.schedules import MeanSchedule, ScheduleDesign
-    from evedrop.scenario.expected.energy_budget import BudgetDesign
-    from evedrop.scenario.expected.policies import PolicyDesign
+    from evedrop.scenario.designs import BudgetDesign, PolicyDesign
 
 
 def print_design(design: Design) -> None:

@@ -168,7 +168,7 @@ def _of_wire(options: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
 
 def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenario:
     """Load the scenario of a command, with its changes; prints warnings."""
-    from evedrop.scenario.expected.estimates import warnings_of
+    from evedrop.scenario.estimates import warnings_of
     from evedrop.scenario.loading import checked, load
 
     scenario = load(options.scenario, changes_of(options), beyond_horizon=beyond_horizon)

@@ -15,7 +15,7 @@ from evedrop.cli.console import StyledConsole
 from evedrop.cli.tables import TAKEN
 from evedrop.errors import UsageError
 from evedrop.results.reading import Results
-from evedrop.scenario.loading.recorded import recorded
+from evedrop.scenario.recorded import recorded
 from evedrop.score.summary import Summary
 from evedrop.show.report import closing
 from evedrop.show.report.closing import sweep_table

@@ -20,8 +20,8 @@ import pyarrow.parquet as pq
 from evedrop.errors import UsageError
 from evedrop.results.growing_tables import batches_of
 from evedrop.results.reading import Results
-from evedrop.scenario.loading.recorded import recorded
 from evedrop.scenario.progress_events import RunEvent
+from evedrop.scenario.recorded import recorded
 from evedrop.system.files import Unreadable, opened, whole_file
 
 SUFFIX = ".mcap"

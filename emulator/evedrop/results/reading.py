@@ -303,7 +303,7 @@ def as_of(moment: str, more: bool = True) -> str:
 def _no_metrics(folder: Path) -> dict[str, Any]:
     """The summary of a run that was killed before it wrote one. Raises UsageError if its scenario cannot be read."""
     # Only this case needs theory and the scenario to read results.
-    from evedrop.scenario.loading.recorded import recorded  # noqa: PLC0415
+    from evedrop.scenario.recorded import recorded  # noqa: PLC0415
     from evedrop.score.run_tally import RunTally  # noqa: PLC0415
     from evedrop.score.scorekeeper import RunOutcome, summary_of  # noqa: PLC0415
 

@@ -19,7 +19,7 @@ from evedrop.scenario.plugins import sources_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.recordings.disturbance_file import number_lines, table_head, table_text
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.toml_text import toml_text
+from evedrop.scenario.words import toml_text
 
 STATES = "states.csv"
 """The file in a results folder if its states were given."""

@@ -28,7 +28,7 @@ from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream,
 from evedrop.results.resolved_scenario import TakenStates
 from evedrop.results.summary_file import plain, summary_text, write_summary
 from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, input_columns, inputs_schema, trials_schema
-from evedrop.scenario.controlled import monitor_of
+from evedrop.scenario.closed_loop import monitor_of
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.tables import Scenario

@@ -1,23 +1,171 @@
-"""Mistakes in links, acknowledgements, strategies and applications that only show when tables are compared.
+"""The second of the two phases of a check: mistakes that only show when typed tables are compared.
 
-Source: docs/scenario.md, links and acknowledgements.
+They are in events (names, slots, changes of links, and their order), links, acknowledgements, strategies, applications, and
+expectations. `mistakes_across` lists them all, with those of the closed loop and of the process noise.
+
+Source: docs/architecture.md, how a scenario is checked; docs/scenario.md, events, links and acknowledgements.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
 
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
+from evedrop.model.links.loss_model import Fate
+from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
+from evedrop.model.process import Process
+from evedrop.model.registry import place_of
+from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.slot.link import LinkSchedule
+from evedrop.model.slot.link_distribution import distribution_of
+from evedrop.model.theory.horizon import horizon
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.application import APPLICATIONS, Application, Kind
-from evedrop.scenario.event_mistakes import away_in
-from evedrop.scenario.link_table import LinkTable
+from evedrop.scenario.closed_loop import controlled_plant, given_state_mistakes, loop_mistakes
+from evedrop.scenario.events.event import Act, EventKind, Surroundings
+from evedrop.scenario.expect import Around
 from evedrop.scenario.plant import PlantTable
 from evedrop.scenario.process import ProcessTable
-from evedrop.scenario.table import Table
+from evedrop.scenario.process_noise import filter_mistakes, singular_mistakes
+from evedrop.scenario.receivers import CHANGEABLE, OTHER_MODEL, LinkTable, changed_link, unchangeable
+from evedrop.scenario.table import Table, sentences
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import expectations_of
 from evedrop.scenario.words import as_toml, listed
+
+Numbered = tuple[int, Act]
+"""An act with the number of its event."""
+
+
+def event_mistakes(scenario: Scenario) -> Iterator[str]:
+    """Mistakes across tables in events that are valid by themselves, each with the number of its event."""
+    surroundings = Surroundings(
+        scenario.scheme,
+        scenario.encoding.scheme,
+        "none" if scenario.acknowledgements is None else scenario.acknowledgements.attack,
+        any(APPLICATIONS[name].has_monitor for name in scenario.applications),
+    )
+    for i, event in enumerate(scenario.event):
+        path = f"event.{i}"
+        yield from _when_mistakes(path, event, scenario.slots)
+        for name in event.names:
+            if name not in scenario.receivers:
+                hint = ": it is not a receiver" if name in ("sensor", "router", "recorder") else ""
+                yield f"{path}.{event.names_in}: names {as_toml(name)}{hint}; expected {listed(scenario.receivers)}"
+        yield from _own(path, type(event), partial(_compared, path, event, surroundings))
+        for act in event.acts():
+            if act.effect.changes_settings and act.effect.entries is not None:
+                for name in act.names:
+                    yield from _change_mistakes(f"{path}.{act.entry}", name, act.effect.entries, scenario)
+    yield from _order_mistakes(scenario)
+    kinds = dict.fromkeys(type(event) for event in scenario.event)
+    for kind in kinds:
+        events = [(i, event) for i, event in enumerate(scenario.event) if type(event) is kind]
+        yield from _own(f"event.{events[0][0]}", kind, partial(kind.in_turn, events))
+
+
+def _compared(path: str, event: EventKind, surroundings: Surroundings) -> Iterator[str]:
+    return (f"{path}.{entry}: {sentence}" for entry, sentence in event.compared(surroundings))
+
+
+def _own(path: str, kind: type[EventKind], ask: Callable[[], Iterator[str]]) -> list[str]:
+    """The mistakes that a kind finds itself, or the error that it raised: its class may come from a package."""
+    try:
+        return list(ask())
+    except Exception as error:
+        return [f"{path}.{kind.kind}: cannot be checked: {kind.__name__} raised {place_of(error)}"]
+
+
+def _acts(scenario: Scenario) -> list[Numbered]:
+    """All acts, each with the number of its event, in order of slots."""
+    acts = ((i, act) for i, event in enumerate(scenario.event) for act in event.acts())
+    return sorted(acts, key=lambda numbered: numbered[1].at)
+
+
+def away_in(scenario: Scenario, name: str, slot: int) -> str | None:
+    """Say that a receiver is down or paused in a slot, and by which event; None if it is present."""
+    away = None
+    for i, act in _acts(scenario):
+        if act.at <= slot and name in act.names and act.effect.present is not None:
+            away = None if act.effect.present else (i, act.at, act.effect.reason)
+    return None if away is None else f"{name} is {_said(away[2])} (event.{away[0]}, from slot {away[1]} on)"
+
+
+def _said(reason: Fate) -> str:
+    return reason.name.lower()
+
+
+def _when_mistakes(path: str, event: EventKind, slots: int) -> Iterator[str]:
+    if event.first >= slots:
+        entry = "at" if event.at is not None else "from"
+        yield f"{path}.{entry}: is {event.first}, but the last slot is {slots - 1}; expected a slot of the run"
+    if event.to is not None and event.to > slots:
+        yield f"{path}.to: is {event.to}; expected at most {slots}, the end of the run"
+
+
+def _change_mistakes(path: str, name: str, changes: Mapping[str, Any], scenario: Scenario) -> Iterator[str]:
+    """Mistakes in the changed entries of a receiver's link. One link with a new quality or loss model replaces pooled links."""
+    link = scenario.links.get(name)
+    if link is None:
+        if name not in scenario.eavesdroppers or scenario.eavesdroppers[name].links is None:
+            return
+        if not {"quality", "loss"} & set(changes):
+            yield f"{path}: {name} has several links; expected a quality or a loss, for the one link that replaces them"
+            return
+        link = LinkTable(quality=1.0)
+    yield from (f"{path}.{line}" for line in unchangeable(changes))
+    try:
+        changed = changed_link(link, {entry: value for entry, value in changes.items() if entry in CHANGEABLE})
+    except ValidationError as error:
+        yield from (f"{path}.{line}" for line in sentences(error, LinkTable))
+        return
+    if changed.in_seconds and scenario.slot_seconds is None:
+        yield f"{path}.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
+    if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
+        yield f"{path}.{OTHER_MODEL}"
+
+
+def _order_mistakes(scenario: Scenario) -> Iterator[str]:
+    """Events that end a cut or an outage that has not begun, or that begin one while another of its kind lasts."""
+    acts = _acts(scenario)
+    for name in scenario.receivers:
+        yield from _order_mistakes_of(name, [(i, act) for i, act in acts if name in act.names])
+
+
+def _order_mistakes_of(name: str, acts: Sequence[Numbered]) -> Iterator[str]:
+    """The same for one receiver; acts: those that concern it, in order of slots."""
+    cut: int | None = None
+    away: tuple[int, Fate] | None = None
+    ended = -1
+    for i, act in acts:
+        path = f"event.{i}.{act.entry}: {name}"
+        effect = act.effect
+        if effect.cuts is True:
+            if cut is not None:
+                yield f"{path} is cut already, from slot {cut} on; expected a heal before"
+            cut = act.at
+        if effect.cuts is False:
+            if cut is None:
+                yield f"{path} is not cut at slot {act.at}; expected a cut before"
+            cut = None
+        if effect.present is False:
+            if away is not None:
+                yield f"{path} is {_said(away[1])} already, from slot {away[0]} on; expected it to be back"
+            elif act.at == ended:
+                yield f"{path} comes back only in slot {act.at}; expected a later slot"
+            away = act.at, effect.reason
+        if effect.present is True:
+            if away is None or away[1] != effect.reason:
+                yield f"{path} is not {_said(effect.reason)} at slot {act.at}; expected a {effect.after} before"
+            elif act.at <= away[0]:
+                yield f"{path} leaves in the same slot, {act.at}; expected a later slot"
+            away, ended = None, act.at
 
 
 def link_mistakes(scenario: Scenario) -> Iterator[str]:
@@ -141,3 +289,113 @@ def _named_mistakes(
             where = f"process.{kind}" if kind == "states" else f"plant.{kind}"
             choice = f"expected one of {listed(there)}" if there else f"expected {where} = [{as_toml(given)}, …]"
             yield f"{name}.{entry}: is {as_toml(given)}, which is not among {where}; {choice}"
+
+
+_ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # the existence of a theory does not depend on the process
+
+
+def mistakes_across(scenario: Scenario, beyond_horizon: bool) -> list[str]:
+    """Mistakes that only show when the tables of a scenario are compared."""
+    mistakes: list[str] = []
+    slots, trials = scenario.slots, scenario.trials
+    if not beyond_horizon:
+        mistakes += horizon_mistakes(scenario.process.process, slots)
+    if scenario.record_trials > trials:
+        mistakes.append(f"record_trials: is {scenario.record_trials}; expected at most trials, which is {trials}")
+    if scenario.shards > trials:
+        most = f"expected at most trials, which is {trials}: a shard has one trial or more"
+        mistakes.append(f"shards: is {scenario.shards}; {most}")
+    for compare in (
+        scheme_mistakes,
+        strategy_mistakes,
+        encoding_mistakes,
+        acknowledgement_mistakes,
+        loop_mistakes,
+        given_state_mistakes,
+        application_mistakes,
+        filter_mistakes,
+        singular_mistakes,
+        link_mistakes,
+        event_mistakes,
+    ):
+        mistakes += compare(scenario)
+    if not mistakes:
+        mistakes += _application_objections(scenario)
+    if not mistakes:
+        try:
+            _ = scenario.timeline
+        except ValidationError as error:
+            together = "event: several of them together result in an invalid link"
+            mistakes += [f"{together}: {line}" for line in sentences(error, LinkTable)]
+    return [*mistakes, *_expectation_mistakes(scenario, sound=not mistakes)]
+
+
+def _expectation_mistakes(scenario: Scenario, sound: bool) -> Iterator[str]:
+    """sound: whether there are no other mistakes across tables."""
+    around = Around(
+        scenario.receivers,
+        scenario.slots,
+        scenario.trials,
+        lambda name: _assumed(scenario.process) or _no_theory(name, scenario, sound),
+        {name: APPLICATIONS[name] for name in scenario.applications},
+        list(scenario.process.directions or {}),
+    )
+    for i, expectation in enumerate(scenario.expect):
+        yield from (f"expect.{i}.{entry}: {sentence}" for entry, sentence in around.mistakes(expectation))
+
+
+def _assumed(process: ProcessTable) -> str | None:
+    """The reason why theory expects nothing of given states; None if it may."""
+    if not process.given or process.theory:
+        return None
+    return f"A and Q need not describe states that come from a {process.source}; theory = true says that they do"
+
+
+def _no_theory(name: str, scenario: Scenario, sound: bool) -> str | None:
+    """The reason why no theory covers a receiver; None if a theory does.
+
+    sound: whether there are no other mistakes: the events are then considered too.
+    """
+    scheme = scheme_of(_ANY_PROCESS, scenario.encoding.spec)
+    if name in scenario.eavesdroppers:
+        receiver = scenario.eavesdroppers[name]
+        closed = receiver.strategy in scheme.closed_forms
+        if not closed and eavesdropper_outcomes(scheme, receiver.strategy, receiver.parameters) is None:
+            return f"no closed form is known for the strategy {receiver.strategy} of {name}"
+    elif LEGITIMATE not in scheme.closed_forms and legitimate_outcomes(scheme) is None:
+        return f"no closed form is known for the scheme {scenario.encoding.scheme}"
+    if distribution_of(LinkSchedule(scenario.link(name).settings(1.0), scenario.window(name))) is None:
+        return f"no theory covers {name}'s link"
+    covered = not sound or expectations_of(scenario)[name].known
+    return None if covered else f"no theory covers {name} with these links, attacks and events together"
+
+
+def _application_objections(scenario: Scenario) -> list[str]:
+    """Mistakes that applications find in a scenario that is otherwise valid."""
+    loop = controlled_plant(scenario)
+    objecting = [(name, APPLICATIONS[name], table) for name, table in scenario.applications.items() if loop is not None]
+    return [
+        objection
+        for _, application, table in objecting
+        if loop is not None
+        for objection in application.objections(loop, table)
+    ]
+
+
+def horizon_mistakes(process: Process, slots: int) -> list[str]:
+    """A mistake if float64 cannot follow the process for that many slots (docs/mathematics.md, horizon)."""
+    last = horizon(process, slots)
+    if last is None:
+        return []
+    rounded = "float64 rounds off more than 1 % of the process noise inside a state this large"
+    change = "a smaller initial_covariance or a larger Q"
+    if last < 0:
+        return [
+            f"process: cannot be followed in any slot, because {rounded} as the initial one. Ways out: {change}; "
+            "initial variances up to 8e27 times those of Q can be followed"
+        ]
+    return [
+        f"slots: is {slots}; this process (spectral radius {process.spectral_radius:.4g}) can be followed up to slot "
+        f"{last}: beyond it {rounded}. Ways out: slots = {last + 1}{' or fewer' if last else ''}; {change}; an A with a "
+        "smaller spectral radius"
+    ]

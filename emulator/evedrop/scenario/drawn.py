@@ -23,9 +23,9 @@ from evedrop.model.streams import Stream, root_of_seed, stream_key, uniforms
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.events.event import EventKind, Fault
-from evedrop.scenario.link_table import LinkTable, changed_link
 from evedrop.scenario.nemesis import NEMESIS, NemesisTable
-from evedrop.scenario.sentences import sentences
+from evedrop.scenario.receivers import LinkTable, changed_link
+from evedrop.scenario.table import sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.timeline import acts_of
 from evedrop.scenario.words import as_toml, listed

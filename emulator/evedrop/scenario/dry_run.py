@@ -25,9 +25,8 @@ from evedrop.scenario.conformance.links import DelayChecks, LossChecks
 from evedrop.scenario.conformance.problems import Problem
 from evedrop.scenario.conformance.rules import how_broken
 from evedrop.scenario.conformance.schemes import SchemeChecks
-from evedrop.scenario.link_table import LinkTable, changed_link
 from evedrop.scenario.plugins import names_in
-from evedrop.scenario.receivers import EavesdropperTable
+from evedrop.scenario.receivers import EavesdropperTable, LinkTable, changed_link
 from evedrop.scenario.tables import NUMBERS, Scenario
 from evedrop.scenario.words import as_toml
 

@@ -1,20 +1,222 @@
-"""The tables of receivers: the legitimate estimator and the eavesdroppers.
+"""The receivers of a scenario, the legitimate estimator and the eavesdroppers, and the links over which packets reach them.
 
-Source: docs/scenario.md, legitimate and eavesdroppers.
+`link = {…}` is such a link. `[acknowledgements]` is the channel from the legitimate estimator back to the sensor, and an attack
+on it. `[wire]` names receivers whose links draw their random numbers as the links of a wire do, so that packets have the same
+fates.
+
+Source: docs/scenario.md, links, legitimate and eavesdroppers, acknowledgements, and wire; docs/wire.md, a wire as the network of
+a run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Annotated, Any
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, ConfigDict, Field
 
+from evedrop.model.acknowledgements import ATTACKS, OVERHEARING
+from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
+from evedrop.model.links import LOSS_MODELS, loss_of, pooled_spec
+from evedrop.model.links.loss_model import LossModel
 from evedrop.model.registry import asked
-from evedrop.scenario.link_table import LinkField, LinkTable, WindowField
-from evedrop.scenario.table import Found, Probability, Table, registered
+from evedrop.model.streams import root_of_seed, stream_key
+from evedrop.scenario.table import Found, Probability, Table, model_mistakes, one_of, refuse, registered
 from evedrop.scenario.words import as_toml, listed, no_entry
+from evedrop.system.hints import near
+
+_QUEUE = 100  # default for the packets that wait before a link of limited rate
+
+
+class CorrelationTable(Table):
+    """`correlation = {…}`: the link whose losses this link's are tied to, and how strongly."""
+
+    to: Annotated[str, Field(strict=True, alias="with", examples=["legitimate"])]
+    strength: Annotated[Probability, Field(examples=[0.5])]
+
+
+def _loss(loss: dict[str, Any]) -> dict[str, Any]:
+    refuse(model_mistakes(loss, LOSS_MODELS))
+    return loss
+
+
+def _delay(delay: dict[str, Any]) -> dict[str, Any]:
+    mistakes = model_mistakes({name: value for name, value in delay.items() if name != "unit"}, DELAY_MODELS)
+    if delay.get("unit", "slots") not in ("slots", "seconds"):
+        mistakes.append(("unit", f'is {as_toml(delay["unit"])}; expected "slots" or "seconds"'))
+    refuse(mistakes)
+    return delay
+
+
+class LinkTable(Table):
+    """`link = {…}`: how packets travel from the router to one receiver."""
+
+    may_be_perfect: ClassVar[bool] = False
+    """Whether a link without losses needs neither a quality nor a loss model."""
+
+    quality: Annotated[Probability | None, Field(examples=[0.9])] = None
+    loss: Annotated[
+        Annotated[dict[str, Any], AfterValidator(_loss)] | None,
+        Field(examples=[{"model": "gilbert-elliott", "p": 0.05, "r": 0.5}]),
+    ] = None
+    correlation: Annotated[CorrelationTable | None, Field(examples=[{"with": "legitimate", "strength": 0.5}])] = None
+    delay: Annotated[
+        Annotated[dict[str, Any], AfterValidator(_delay)] | None, Field(examples=[{"model": "constant", "value": 2.0}])
+    ] = None
+    reorder: Annotated[Probability, Field(examples=[0.1])] = 0.0
+    duplicate: Annotated[Probability, Field(examples=[0.05])] = 0.0
+    corrupt: Annotated[Probability, Field(examples=[0.01])] = 0.0
+    rate: Annotated[float | None, Field(strict=True, gt=0.0, le=1e6, examples=[0.9])] = None
+    queue: Annotated[int | None, Field(strict=True, ge=0, le=1_000_000, examples=[100])] = None
+
+    def mistakes(self) -> Iterator[Found]:
+        """Mistakes unless there is one of quality and loss, and no entry is pointless."""
+        if self.quality is None and self.loss is None and not self.may_be_perfect:
+            yield "quality", "is missing; expected quality = 0.9, or a loss model"
+        elif self.quality is not None and self.loss is not None:
+            yield "quality", "is given together with loss, whose short form it is; expected one of them"
+        if self.reorder and self.delay is None:
+            yield "reorder", "is given without a delay, so that nothing can overtake; expected a delay as well"
+        if self.queue is not None and self.rate is None:
+            yield "queue", "is given without a rate, so that nothing queues; expected a rate as well"
+
+    @classmethod
+    def pooled(cls, links: list[LinkTable]) -> LinkTable:
+        """Several links that end at one receiver, as one link: the receiver gets every packet that any of them delivers."""
+        return cls.model_construct(loss=pooled_spec([link.loss_spec for link in links]))
+
+    @property
+    def loss_spec(self) -> dict[str, Any]:
+        """The loss model and its parameters."""
+        return {"model": "bernoulli", "quality": self.quality} if self.loss is None else self.loss
+
+    @property
+    def model(self) -> LossModel:
+        """A new instance of the loss model."""
+        return loss_of(self.loss_spec)
+
+    @property
+    def in_seconds(self) -> bool:
+        """Whether the link's delays are in seconds."""
+        return self.delay is not None and self.delay.get("unit") == "seconds"
+
+    def settings(self, slot_seconds: float | None) -> dict[str, Any]:
+        """The settings for `LinkSchedule.settings`, with delays in slots."""
+        made: dict[str, Any] = {"loss": self.loss_spec}
+        made |= {name: value for name in ("reorder", "duplicate", "corrupt") if (value := getattr(self, name))}
+        if self.rate is not None:
+            made |= {"rate": self.rate, "queue": _QUEUE if self.queue is None else self.queue}
+        if self.delay is not None:
+            delay = {name: value for name, value in self.delay.items() if name != "unit"}
+            if self.in_seconds and slot_seconds:
+                for name in DELAY_MODELS[delay["model"]].lengths:
+                    value = delay[name]
+                    delay[name] = (
+                        [delay_ / slot_seconds for delay_ in value] if isinstance(value, list) else value / slot_seconds
+                    )
+            made["delay"] = delay
+        return made
+
+
+CHANGEABLE = tuple(entry for entry in LinkTable.model_fields if entry != "correlation")
+"""The entries of a link that an event can change."""
+OTHER_MODEL = (
+    "loss.model: differs from the first one, but the link's losses are tied to another link's; expected the same model"
+)
+"""The mistake of a change that gives a correlated link another loss model."""
+LinkField = Annotated[LinkTable, Field(examples=[{"quality": 0.9}])]
+WindowField = Annotated[int, Field(strict=True, ge=0, le=10_000, examples=[8])]
+
+
+def unchangeable(changes: Mapping[str, Any]) -> Iterator[str]:
+    """Mistakes for all entries that an event cannot change."""
+    for entry in changes:
+        if entry not in CHANGEABLE:
+            yield f"{entry}: is not a link setting that can be changed; expected {listed(CHANGEABLE)}{near(entry, CHANGEABLE)}"
+
+
+def changed_link(link: LinkTable, changes: Mapping[str, Any]) -> LinkTable:
+    """A link with some entries changed. Raises ValidationError if the result is not a valid link."""
+    entries = link.model_dump(exclude_unset=True)
+    if "quality" in changes:
+        entries.pop("loss", None)
+    if "loss" in changes:
+        entries.pop("quality", None)
+    return LinkTable.model_validate({**entries, **changes})
+
+
+class AckChannelTable(Table):
+    """`link = {…}` of the acknowledgements: each is lost independently or arrives at once."""
+
+    quality: Annotated[Probability, Field(examples=[0.9])]
+
+
+class AcknowledgementsTable(Table):
+    """`[acknowledgements]`: their channel to the sensor, for schemes that need them, and an attack on it."""
+
+    link: Annotated[AckChannelTable, Field(examples=[{"quality": 0.9}])]
+    attack: Annotated[str, Field(strict=True, examples=["critical"]), AfterValidator(one_of(ATTACKS))] = "none"
+    jammer: Annotated[str | None, Field(strict=True, examples=["smart"])] = None
+    flip: Annotated[Probability | None, Field(examples=[0.1])] = None
+    false_alarms: Annotated[float, Field(strict=True, ge=10.0, le=1e9, examples=[1e4])] = 1e4
+
+    def mistakes(self) -> Iterator[Found]:
+        """Mistakes in the entries of attacks: two need a jammer with a link of its own, `flip` a probability."""
+        if self.attack == "flip" and self.flip is None:
+            yield (
+                "flip",
+                "is missing; the attack flip needs the probability of flipping an acknowledgement, such as flip = 0.1",
+            )
+        elif self.attack != "flip" and self.flip is not None:
+            yield "flip", f"is set, but the attack {as_toml(self.attack)} flips nothing; remove the line"
+        elif self.attack in OVERHEARING and self.jammer is None:
+            yield (
+                "jammer",
+                f"is missing; the attack {self.attack} needs the eavesdropper that it serves, by what that hears",
+            )
+        elif self.attack not in OVERHEARING and self.jammer is not None:
+            yield (
+                "jammer",
+                f"is set, but the attack {as_toml(self.attack)} does not depend on what it hears; remove the line",
+            )
+
+
+PUT = "put"
+"""The kind of a published message, among the kinds that draw numbers of their own."""
+
+
+def wire_stream(stream: str, kind: str, key: str) -> str:
+    """The name of the random stream of a Zenoh key's messages on a link of a wire, under the root of the wire's seed.
+
+    stream: as in `streams_of`, with the name of the link; kind: of the messages.
+    """
+    return f"wire/{stream}/{kind}/{key}"
+
+
+def wire_stream_key(root: bytes, stream: str, kind: str, key: str) -> bytes:
+    """The key of the random numbers of `wire_stream`."""
+    return stream_key(root, wire_stream(stream, kind, key))
+
+
+class WireTable(Table):
+    """`[wire]`: the packet of slot k has the fate of the k-th message that is published on a key."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**256, strict=True, examples=[7])]
+    key: Annotated[str, Field(strict=True, min_length=1, examples=["robot/pose"])]
+    links: Annotated[
+        dict[str, Annotated[str, Field(strict=True, min_length=1)]], Field(examples=[{"legitimate": "radio"}])
+    ]
+
+    def stream_keys(self, streams: tuple[str, ...]) -> Mapping[str, bytes]:
+        """Stream → its key, for those streams of receivers' links that are a wire's."""
+        root = root_of_seed(self.seed)
+        keys_ = {}
+        for stream in streams:
+            kind, _, receiver = stream.partition("/")
+            if receiver in self.links:
+                keys_[stream] = wire_stream_key(root, f"{kind}/{self.links[receiver]}", PUT, self.key)
+        return keys_
 
 
 class LegitimateTable(Table):

@@ -12,8 +12,8 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.slot.link import LinkSchedule, streams_of
 from evedrop.model.streams import root_of_seed, stream_key
 from evedrop.names import ACKNOWLEDGEMENTS
+from evedrop.scenario.receivers import WireTable
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.wire_table import WireTable
 from evedrop.system.files import Unreadable, contents
 
 _SECRET_BYTES = 32

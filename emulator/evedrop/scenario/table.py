@@ -1,25 +1,28 @@
-"""The base class of all tables of a scenario file: each entry is checked by itself, then the table as a whole."""
+"""The base class of all tables of a scenario file: it checks each entry and all together, and reports the mistakes together.
+
+Values that no entry can have are found before any other check: too deep, too large, or with control characters. Pydantic's errors
+about a table become sentences, a line for each mistake, with path, value found, value expected and an example.
+
+Source: docs/scenario.md, the scenario file.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Self, get_args
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    model_validator,
-)
-from pydantic_core import PydanticCustomError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, PydanticCustomError
 
 from evedrop.errors import NotRegistered
 from evedrop.model.registry import Registry, asked
 from evedrop.names import RESERVED
-from evedrop.scenario.words import as_toml, listed
+from evedrop.scenario.words import as_toml, listed, no_entry
 from evedrop.system.hints import near
+from evedrop.system.output import escaped
 
 NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 
@@ -163,3 +166,143 @@ def model_mistakes(table: Mapping[str, Any], models: Registry[Any]) -> list[Foun
         if name not in model.parameters
     ]
     return mistakes + asked(model, {name: value for name, value in given.items() if name in model.parameters})
+
+
+_EXPECTED: Mapping[str, str] = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "string_type": "a string",
+    "string_too_short": "a string of at least one character",
+    "list_type": "a list",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "bool_type": "true or false",
+    "finite_number": "a finite number",
+}
+
+
+def sentences(error: ValidationError, root: type[Table]) -> list[str]:
+    """One line for each mistake: path, found, expected, example. root: the class that was checked."""
+    lines = []
+    for detail in error.errors(include_url=False):
+        path = ".".join(str(part) for part in detail["loc"] if part != "[key]")
+        if detail["type"] == "mistakes":
+            inner: list[Found] = detail["ctx"]["mistakes"]
+            lines += [f"{'.'.join(filter(None, (path, name)))}: {sentence}" for name, sentence in inner]
+        else:
+            lines.append(f"{path}: {_sentence(detail, root)}")
+    return lines
+
+
+def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
+    kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
+    table, field = _field(detail["loc"], root)
+    name = str(detail["loc"][-1]) if detail["loc"] else ""
+    example = f", such as {as_toml(field.examples[0])}" if field is not None and field.examples else ""
+    if kind == "missing":
+        return f"is missing; expected {name}" + (f" = {example.removeprefix(', such as ')}" if example else "")
+    if kind == "extra_forbidden":
+        return no_entry(name, table.entries())
+    if kind == "expected":
+        ending = context.get("said") or f"; expected {context['expected']}{context['hint'] or example}"
+        return f"is {as_toml(value)}{ending}"
+    if kind in {"greater_than_equal", "less_than_equal", "less_than"}:
+        words = {"ge": "at least", "le": "at most", "lt": "less than"}
+        bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)
+        return f"is {as_toml(value)}; expected a number {bound}{example}"
+    if kind in {"too_long", "too_short", "string_too_long"}:
+        things = "characters" if kind == "string_too_long" else "entries"
+        few = kind == "too_short"
+        limit = f"fewer than {context['min_length']}" if few else f"more than {context['max_length']}"
+        return f"has {limit} {things}; expected {'at least' if few else 'at most'} that many"
+    expected = _EXPECTED.get(kind, detail["msg"])
+    return f"is {as_toml(value)}; expected {expected}{example}"
+
+
+def _field(location: Sequence[int | str], root: type[Table]) -> tuple[type[Table], FieldInfo | None]:
+    """The table that contains an error, and the field's description if it is a field; root: the table that was checked."""
+    table, field = root, None
+    for i, part in enumerate(location):
+        last = i == len(location) - 1
+        inner = table.inner(str(part)) if not last else None
+        if inner is not None:
+            table, field = inner, None
+        elif part in table.model_fields:
+            field = table.model_fields[str(part)]
+        elif last:
+            field = None
+    return table, field
+
+
+_DEEPEST = 16  # levels of nested tables and lists; scenarios use about half as many
+_LARGEST_BITS = 4096  # of a whole number; a seed has 256
+_LONGEST_NAME = 200
+_PLAIN = {"\n", "\t"}
+_MOST_TOLD = 20
+MOST_EAVESDROPPERS = 64
+
+
+def unusable(tables: Any) -> Iterator[str]:
+    """A sentence with a path for each unusable value, up to 20 of them."""
+    for number, sentence in enumerate(_unusable(tables)):
+        if number == _MOST_TOLD:
+            yield f"and more such mistakes: {_MOST_TOLD} are listed"
+            return
+        yield sentence
+
+
+def _unusable(tables: Any) -> Iterator[str]:
+    eavesdroppers = tables.get("eavesdroppers")
+    if isinstance(eavesdroppers, dict) and len(eavesdroppers) > MOST_EAVESDROPPERS:
+        # Otherwise each of them would be checked and reported.
+        yield f"eavesdroppers: has {len(eavesdroppers)} entries; expected at most {MOST_EAVESDROPPERS}"
+        return
+    # An explicit stack: dotted keys can nest tables deeper than Python's recursion limit.
+    waiting: list[tuple[tuple[str, ...], Any]] = [((), tables)]
+    while waiting:
+        path, value = waiting.pop()
+        kind = type(value)
+        if kind is dict or kind is list:
+            if len(path) >= _DEEPEST:
+                yield f"{_dotted(path)}: is more than {_DEEPEST} tables deep; expected entries as docs/scenario.md lists them"
+                continue
+            entries = list(value.items()) if kind is dict else [(str(i), inner) for i, inner in enumerate(value)]
+            if kind is dict:
+                yield from _name_mistakes(path, entries)
+            waiting += [
+                ((*path, str(name)), inner) for name, inner in reversed(entries) if type(inner) not in (float, bool)
+            ]
+        elif kind is int:
+            if value.bit_length() > _LARGEST_BITS:
+                yield f"{_dotted(path)}: is a whole number of {value.bit_length()} bits; expected at most {_LARGEST_BITS}"
+        elif kind is str and not (value.isascii() and value.isprintable()):
+            strange = next((character for character in value if _is_strange(character)), None)
+            if strange is not None:
+                yield (
+                    f"{_dotted(path)}: is {as_toml(value)} with the character U+{ord(strange):04X} in it; expected text "
+                    "without control characters"
+                )
+
+
+def _name_mistakes(path: tuple[str, ...], entries: list[tuple[Any, Any]]) -> Iterator[str]:
+    for name, _ in entries:
+        if not isinstance(name, str) or len(name) > _LONGEST_NAME or any(map(_is_strange, name)):
+            yield (
+                f"{_dotted((*path, str(name)))}: is a name with a control character, or of more than {_LONGEST_NAME} "
+                "characters; expected an entry as docs/scenario.md lists them"
+            )
+
+
+def _is_strange(character: str) -> bool:
+    """Whether a character moves the cursor, ends a string, changes the direction of text, or is half of a surrogate pair."""
+    strange = unicodedata.category(character) in ("Cc", "Cs") or escaped(character) != character
+    return strange and character not in _PLAIN
+
+
+def _dotted(path: tuple[str, ...]) -> str:
+    """A dotted path of bounded length, with plain characters only."""
+    names = [name if len(name) <= _LONGEST_NAME else f"{name[:20]}…" for name in path[: _DEEPEST + 1]]
+    return (
+        "".join("?" if _is_strange(character) or character in _PLAIN else character for character in ".".join(names))
+        or "the scenario"
+    )

@@ -1,15 +1,18 @@
-"""The scenario as a table: its entries, checks and meaning.
+"""The scenario as a table: its entries, checks and meaning. Tables with few entries, such as `[encoding]`, are here, too.
 
-Source: docs/scenario.md.
+Editors and type checkers know only keywords that are written down, so the keywords of `Scenario(...)`, the names of its fields,
+stand here again, with the types of the values before the checks.
+
+Source: docs/scenario.md; docs/python.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self, Unpack
+from typing import Annotated, Any, ClassVar, Self, TypedDict, Unpack
 
 from pydantic import AfterValidator, ConfigDict, Field, PlainValidator, SerializeAsAny, model_validator
 from pydantic_core import PydanticCustomError, PydanticKnownError
@@ -19,29 +22,106 @@ from evedrop.model.controllers import Assignment
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.energy import EnergyModel
 from evedrop.model.plant import Plant
+from evedrop.model.registry import asked
+from evedrop.model.schedule import StateProbability, mean_of
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.streams import MOST_SLOTS
 from evedrop.names import CONTROLLER, LEGITIMATE
-from evedrop.scenario.acknowledgements import AcknowledgementsTable
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.arguments import CHANGES, table_argument
-from evedrop.scenario.encoding import EncodingTable
-from evedrop.scenario.entries import ScenarioEntries
 from evedrop.scenario.events.table import AnyEvent, event_table
 from evedrop.scenario.expect import ExpectTable
-from evedrop.scenario.link_table import LinkTable, changed_link
 from evedrop.scenario.nemesis import NemesisTable
 from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, plant_of
 from evedrop.scenario.plugins import elsewhere, look_in, trusted_in
 from evedrop.scenario.process import ProcessTable
-from evedrop.scenario.receivers import EavesdropperTable, LegitimateTable
-from evedrop.scenario.table import Found, ProcessName, Table, refuse
+from evedrop.scenario.receivers import (
+    AcknowledgementsTable,
+    EavesdropperTable,
+    LegitimateTable,
+    LinkTable,
+    WireTable,
+    changed_link,
+)
+from evedrop.scenario.table import MOST_EAVESDROPPERS, Found, ProcessName, Table, parameter_mistakes, refuse, registered
 from evedrop.scenario.timeline import Timeline
-from evedrop.scenario.values import MOST_EAVESDROPPERS
-from evedrop.scenario.wire_table import WireTable
 from evedrop.scenario.words import as_toml, dotted
+
+
+class EncodingTable(Table):
+    """`[encoding]`: the scheme and its parameters."""
+
+    model_config = ConfigDict(extra="allow")
+
+    scheme: Annotated[str, Field(strict=True, examples=["innovation"]), AfterValidator(registered(SCHEMES))]
+
+    def mistakes(self) -> Iterator[Found]:
+        """Missing, unknown and wrong parameters of the scheme."""
+        scheme, given = SCHEMES[self.scheme], self.parameters
+        yield from parameter_mistakes("scheme", self.scheme, scheme, given)
+        yield from asked(scheme, {name: value for name, value in given.items() if name in scheme.parameters})
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The scheme's parameters."""
+        return dict(self.model_extra or {})
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """The scheme's description for sensor and legitimate estimator."""
+        return {"scheme": self.scheme, **self.parameters}
+
+    @property
+    def mu_d(self) -> float:
+        """μ_d, or its mean over slots k ≥ 1; 1 for a scheme without `state_probability`."""
+        return mean_of(self._mu_d)
+
+    @property
+    def state_probabilities(self) -> tuple[float, ...] | None:
+        """μ_d(k) for every slot; None if it is the same in all slots."""
+        return self._mu_d if isinstance(self._mu_d, tuple) else None
+
+    @property
+    def _mu_d(self) -> StateProbability:
+        given = self.parameters.get("state_probability", 1.0)
+        return tuple(map(float, given)) if isinstance(given, list) else float(given)
+
+
+Entries = Mapping[str, Any]
+"""A table, as a dict."""
+
+
+class ScenarioEntries(TypedDict, total=False):
+    """The entries of a scenario as Python values, for editors and type checkers; docs/scenario.md describes each."""
+
+    title: str
+    slots: int
+    seed: int
+    trials: int
+    first_trial: int
+    record_trials: int
+    shards: int
+    pace: float
+    longest_outage: float
+    slot_seconds: float | None
+    secret_file: str | Path | None
+    modules: str | Path | None
+    process: Entries
+    encoding: Entries
+    legitimate: Entries
+    eavesdroppers: Mapping[str, Entries]
+    plant: Entries | None
+    controller: Entries | None
+    acknowledgements: Entries | None
+    energy: Entries | None
+    wire: Entries | None
+    network: Entries | None
+    event: Sequence[Entries]
+    nemesis: Entries | None
+    expect: Sequence[Entries]
+
 
 _LOADS = 'Scenario.load("vehicle") reads a built-in scenario, a file or a results folder'
 NUMBERS = {"plant": {"disturbance_values"}, "process": {"state_values"}}
@@ -184,7 +264,7 @@ class Scenario(Table):
 
     def to_toml(self) -> str:
         """The scenario as the text of a file; loading the file gives an equal scenario, which gives equal digests."""
-        from evedrop.scenario.toml_text import toml_text  # noqa: PLC0415 - a live run does not wait for it
+        from evedrop.scenario.words import toml_text  # noqa: PLC0415 - a live run does not wait for it
 
         made_with = {"made_with": self.made_with} if self.made_with else {}
         return toml_text({**self.as_tables(), **made_with})

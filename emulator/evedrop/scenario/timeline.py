@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from evedrop.model.slot.link import NEVER, Change, ReceiverOutage
-from evedrop.scenario.events.effects import Jamming, Spoofing
-from evedrop.scenario.events.event import Act, EventKind
+from evedrop.scenario.events.event import Act, EventKind, Jamming, Spoofing
 
 Changed = Callable[[str, Mapping[str, Any]], dict[str, Any]]
 """Maps a receiver and the changed entries of its link to the link's new settings."""

@@ -18,7 +18,7 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Codes
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.application import APPLICATIONS, ApplicationTally
-from evedrop.scenario.controlled import controlled_plant
+from evedrop.scenario.closed_loop import controlled_plant
 from evedrop.scenario.tables import Scenario
 from evedrop.score.slots import InputSlots
 from evedrop.score.summary import ControllerSummary, PeerSummary, StandardErrors

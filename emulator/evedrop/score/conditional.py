@@ -16,8 +16,8 @@ from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Codes
 from evedrop.model.schemes import SCHEMES
-from evedrop.scenario.expected.expectations import outcomes_of
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import outcomes_of
 
 _STATE = int(Action.STATE)
 _ANY_QUALITY = 0.5  # of a link that may lose a packet and may deliver it

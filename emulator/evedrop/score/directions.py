@@ -13,7 +13,7 @@ import numpy as np
 
 from evedrop.model.metrics.standard_error import standard_error
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.expected.expectations import Expectation
+from evedrop.scenario.theory import Expectation
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.summary import DirectionSummary, RareEvents
 from evedrop.score.sums import DirectionTally, Tally, window_means

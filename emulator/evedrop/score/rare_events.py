@@ -9,7 +9,7 @@ import numpy as np
 
 from evedrop.model.metrics.standard_error import mean_skewness, z_of
 from evedrop.model.process import Floats
-from evedrop.scenario.expected.expectations import Expectation
+from evedrop.scenario.theory import Expectation
 from evedrop.score.summary import RARE_FRACTION, RareEvents
 from evedrop.score.sums import Tally
 

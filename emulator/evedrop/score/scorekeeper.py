@@ -17,9 +17,9 @@ from evedrop.model.metrics import metrics_of
 from evedrop.model.metrics.metric import COVARIANCE_ONLY, ScoredSlots
 from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
-from evedrop.scenario.expected.expectations import Expectation, ExpectedTraceStream, expectations_of
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import Expectation, ExpectedTraceStream, expectations_of
 from evedrop.score.closed_loop_tally import Acted
 from evedrop.score.directions import directions_of
 from evedrop.score.expectations_held import Evidence

@@ -18,7 +18,7 @@ from evedrop.model.process import Floats, parts_of
 from evedrop.model.theory.covariances import NOBODY, ExpectedCovariance
 from evedrop.model.theory.rare_events import RARE
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.expected.expectations import Expectation, ExpectedTraceStream
+from evedrop.scenario.theory import Expectation, ExpectedTraceStream
 from evedrop.score.rare_events import rare_events_of
 from evedrop.score.summary import RARE_FRACTION, LeakSummary, SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_bounds, window_means, window_of

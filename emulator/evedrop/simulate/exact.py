@@ -35,7 +35,7 @@ from evedrop.model.slot.cores import (
 from evedrop.model.slot.link_core import Arrivals, LinkCore
 from evedrop.model.streams import Batch
 from evedrop.names import CONTROLLER, LEGITIMATE
-from evedrop.scenario.controlled import monitor_of
+from evedrop.scenario.closed_loop import monitor_of
 from evedrop.scenario.input_files import disturbances_of, states_of
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario

@@ -23,10 +23,10 @@ from evedrop.results.folder import HeldFolder, disk_errors
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario.arguments import number_argument, refuse_unless
-from evedrop.scenario.expected.expectations import expected_traces_of
 from evedrop.scenario.input_files import states_of
 from evedrop.scenario.progress_events import FolderMoved, OnEvent, RunProgress
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import expected_traces_of
 from evedrop.scenario.words import listed
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.run_tally import RunTally

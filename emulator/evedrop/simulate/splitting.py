@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from evedrop.model.metrics.standard_error import standard_error, z_of
 from evedrop.model.process import Floats
 from evedrop.model.streams import OWN, Batch, BlockReader, Lineage, root_of_seed, stream_key
-from evedrop.scenario.expected.expectations import Expectation, expectations_of
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import Expectation, expectations_of
 from evedrop.score.summary import RareEstimate
 from evedrop.simulate.chunk import ReceiverChunk
 from evedrop.simulate.simulation import Mode, Simulation

@@ -17,8 +17,8 @@ from evedrop.model.digest import Digests
 from evedrop.model.metrics.metric import ScoredSlots
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import Account, Accountant
-from evedrop.scenario.expected.expectations import KnownTraces, expected_traces_of
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import KnownTraces, expected_traces_of
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import Scorekeeper
 from evedrop.score.slots import Slots

@@ -31,9 +31,9 @@ from evedrop.results.folder import (
     write_private,
 )
 from evedrop.results.resolved_scenario import input_texts, resolved
-from evedrop.scenario.expected.expectations import Expectation, expectations_of
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import Expectation, expectations_of
 from evedrop.score.leak import revealed_by_packets
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.scorekeeper import verdicts

@@ -21,9 +21,9 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
 from evedrop.results.comparison import Match, receiver_name
 from evedrop.scenario.across import lacking_streams
-from evedrop.scenario.events.effects import Jamming
+from evedrop.scenario.events.event import Jamming
 from evedrop.scenario.loading import checked
-from evedrop.scenario.singular_noise import unsuited
+from evedrop.scenario.process_noise import unsuited
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
 from evedrop.system.hints import near

@@ -18,7 +18,7 @@ import numpy as np
 from evedrop.errors import UsageError
 from evedrop.model.process import Floats
 from evedrop.scenario.application import APPLICATIONS, ControlledPlant, applications_in
-from evedrop.scenario.controlled import controlled_plant
+from evedrop.scenario.closed_loop import controlled_plant
 from evedrop.scenario.loading import checked
 from evedrop.scenario.tables import Scenario
 from evedrop.score.energy import Meter, energy

@@ -21,13 +21,11 @@ from pydantic import ValidationError
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.model.checks import as_toml
 from evedrop.scenario.input_files import locate_recordings, read_recordings
-from evedrop.scenario.link_table import CHANGEABLE, OTHER_MODEL, unchangeable
+from evedrop.scenario.line_numbers import with_line_numbers
 from evedrop.scenario.loading import set_entry, tables_in
-from evedrop.scenario.loading.line_numbers import with_line_numbers
-from evedrop.scenario.sentences import sentences
-from evedrop.scenario.toml_text import toml_text
-from evedrop.scenario.values import unusable
-from evedrop.scenario.words import listed
+from evedrop.scenario.receivers import CHANGEABLE, OTHER_MODEL, unchangeable
+from evedrop.scenario.table import sentences, unusable
+from evedrop.scenario.words import listed, toml_text
 from evedrop.system.files import Unreadable, shown, text_of
 from evedrop.system.hints import near
 from evedrop.wire.plan import Side, SideTls, WireEvent, WireLink, WirePlan

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, final
 
 from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule
 from evedrop.model.streams import Batch, ShortReader, root_of_seed, stream_keys
-from evedrop.scenario.wire_table import wire_stream
+from evedrop.scenario.receivers import wire_stream
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock, wait_for_thread
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as

@@ -18,8 +18,14 @@ import zenoh
 from numpy.typing import NDArray
 
 from evedrop.errors import TraceError, UsageError
-from evedrop.scenario.recordings.message_numbers import MessageArrivals, MessageSeries, joined, series_of
-from evedrop.scenario.recordings.message_recording import MessageRecording, check_parts
+from evedrop.scenario.recordings.message_recording import (
+    MessageArrivals,
+    MessageRecording,
+    MessageSeries,
+    check_parts,
+    joined,
+    series_of,
+)
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import JOURNAL_FOLDER, journal_tables

@@ -18,7 +18,7 @@ from evedrop.errors import Interrupted, RunError
 from evedrop.live.network.control_file import remove_control
 from evedrop.results.folder import make_private, new_folder, write_private
 from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE
-from evedrop.scenario.wire_table import PUT
+from evedrop.scenario.receivers import PUT
 from evedrop.show.report.wire import wire_failures
 from evedrop.show.view.viewer import Viewer, choose
 from evedrop.system.environment import check_zenoh_runtime

@@ -19,7 +19,7 @@ from pydantic_core import PydanticCustomError
 from evedrop.model.checks import as_toml
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS
-from evedrop.scenario.link_table import CorrelationTable, LinkTable
+from evedrop.scenario.receivers import CorrelationTable, LinkTable
 from evedrop.scenario.table import NAME, Found, Table, expected, model_mistakes, refuse
 from evedrop.scenario.words import listed
 from evedrop.system.hints import near

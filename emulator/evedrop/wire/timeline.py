@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from evedrop.errors import ScenarioError
 from evedrop.model.checks import as_toml
-from evedrop.scenario.sentences import sentences
+from evedrop.scenario.table import sentences
 from evedrop.wire.file import event_mistakes, unknown, wire_event
 from evedrop.wire.plan import WireEvent, WirePlan
 from evedrop.wire.tables import WireEventTable

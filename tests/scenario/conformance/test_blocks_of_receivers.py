@@ -14,8 +14,8 @@ from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Reception
 from evedrop.model.schemes.plain import PlainEstimator
-from evedrop.scenario.conformance.blocks import divisions
 from evedrop.scenario.conformance.eavesdroppers import eavesdropper_verdicts
+from evedrop.scenario.conformance.receivers import divisions
 from tests.scenario.conformance.breaking import blocks_of_eavesdropper, blocks_of_scheme, broken, plain_with, setup_of
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from evedrop.cli.api import design_policy
 from evedrop.errors import UsageError
-from evedrop.scenario.expected.expectations import expectations_of
-from evedrop.scenario.loading.file import load
+from evedrop.scenario.loading import load
+from evedrop.scenario.theory import expectations_of
 
 MODULE = """
 from evedrop.extend import ClosedForm, Plain, ReceiverConditions

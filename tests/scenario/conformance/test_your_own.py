@@ -10,8 +10,7 @@ import pytest
 from evedrop import extend
 from evedrop.errors import ScenarioError
 from evedrop.results.reading import Results
-from evedrop.scenario.loading import load
-from evedrop.scenario.loading.file import with_event
+from evedrop.scenario.loading import load, with_event
 from tests.builders import digests_of
 from tests.conftest import Evedrop
 from tests.packages import install

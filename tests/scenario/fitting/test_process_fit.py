@@ -12,9 +12,9 @@ import pytest
 from evedrop.cli.main import main
 from evedrop.errors import DisturbanceError, UsageError
 from evedrop.model.process import Floats
-from evedrop.scenario.fitting.process_fit import ProcessFit, fit_process
 from evedrop.scenario.loading import checked
 from evedrop.scenario.recordings.disturbance_file import table_text
+from evedrop.scenario.recordings.process_fit import ProcessFit, fit_process
 
 A = np.array([[0.9, 0.1], [-0.1, 0.8]])
 Q = np.array([[0.04, 0.01], [0.01, 0.09]])

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError
+from evedrop.scenario.line_numbers import line_of, lines_of_entries
 from evedrop.scenario.loading import load, parse, shipped
-from evedrop.scenario.loading.line_numbers import line_of, lines_of_entries
 
 TEXT = '''# a comment with [brackets]
 a = 1

@@ -18,7 +18,7 @@ from mcap.writer import CompressionType
 from evedrop.errors import TraceError
 from evedrop.model.links import loss_of
 from evedrop.model.links.loss_model import Fate
-from evedrop.scenario.fitting.message_fit import fit_messages
+from evedrop.scenario.recordings.link_fit import fit_messages
 from evedrop.scenario.recordings.mcap_recording import mcap_recording
 from evedrop.wire.file import wire_of
 from evedrop.wire.link_state import KeyFates

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evedrop.scenario.recordings.message_numbers import MessageArrivals, numbers_of_times, series_of
+from evedrop.scenario.recordings.message_recording import MessageArrivals, numbers_of_times, series_of
 from tests.scenario.recordings.recorded_messages import BURSTS, heard, lossy, trimmed
 
 

@@ -8,7 +8,7 @@ import pytest
 from coloraide import Color
 
 from evedrop.scenario.application import APPLICATIONS
-from evedrop.scenario.controlled import controlled_plant
+from evedrop.scenario.closed_loop import controlled_plant
 from evedrop.scenario.loading import load
 from evedrop.show.view import lanes
 from evedrop.show.view.palette import DROPPED, LANES, PANELS, PLANT, WIRE_LANES, Colour, hexadecimal

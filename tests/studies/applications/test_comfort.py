@@ -11,7 +11,7 @@ import pytest
 from evedrop.cli.api import montecarlo
 from evedrop.errors import ScenarioError
 from evedrop.scenario.application import APPLICATIONS
-from evedrop.scenario.controlled import controlled_plant
+from evedrop.scenario.closed_loop import controlled_plant
 from evedrop.scenario.loading import load
 from evedrop.show.view.scene_slots import LoopValues, driven_scene
 from evedrop.simulate.montecarlo import Plan

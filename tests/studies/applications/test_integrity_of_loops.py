@@ -11,7 +11,7 @@ import pytest
 from evedrop.cli.api import montecarlo, run
 from evedrop.errors import ScenarioError
 from evedrop.model.integrity.monitor import MonitoredSlots
-from evedrop.scenario.controlled import controlled_plant, monitor_of
+from evedrop.scenario.closed_loop import controlled_plant, monitor_of
 from evedrop.scenario.loading import load
 from evedrop.show.view.scene_slots import LoopValues, driven_scene, replay
 from evedrop.simulate.montecarlo import Plan

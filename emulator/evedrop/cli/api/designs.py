@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from evedrop.model.theory.design import Design
     from evedrop.model.theory.ratio import Adversary
     from evedrop.model.theory.schedules import ScheduleDesign
-    from evedrop.scenario.expected.energy_budget import BudgetDesign
-    from evedrop.scenario.expected.policies import PolicyDesign
+    from evedrop.scenario.designs import BudgetDesign, PolicyDesign
 
 
 def measuring_command(given: str | Path | Scenario, changes: Mapping[str, Any], made: Scenario) -> str:
@@ -196,9 +195,9 @@ def design_policy(
     holding times are distinguished; changes: entries by dotted key.
 
     Raises ScenarioError with every mistake of the scenario, UsageError if it is not one for policies, see
-    `evedrop.scenario.expected.policies.policies_of`.
+    `evedrop.scenario.designs.policies_of`.
     """
-    from evedrop.scenario.expected.policies import policies_of  # a run does not need it
+    from evedrop.scenario.designs import policies_of  # a run does not need it
 
     for name, several in (("weights", weights), ("prices", prices)):
         refuse_unless(
@@ -218,9 +217,9 @@ def design_budget(
     budget: mean energy in a slot, in the unit of the scenario's `[energy]`; changes: entries by dotted key.
 
     Raises ScenarioError with every mistake of the scenario, UsageError if no threshold meets the budget, see
-    `evedrop.scenario.expected.energy_budget.budget_of`.
+    `evedrop.scenario.designs.budget_of`.
     """
-    from evedrop.scenario.expected.energy_budget import budget_of  # a run does not need it
+    from evedrop.scenario.designs import budget_of  # a run does not need it
 
     number_argument("budget", budget)
     return budget_of(scenario_of(scenario, changes or {}, beyond_horizon=True), budget)

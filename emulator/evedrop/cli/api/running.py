@@ -18,8 +18,7 @@ from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults
 from evedrop.errors import EvedropError, UsageError
 from evedrop.results.growing_tables import goes_on
 from evedrop.scenario.arguments import CHANGES, path_argument, refuse_unless, table_argument
-from evedrop.scenario.loading import prepared
-from evedrop.scenario.loading.python_values import plain_tables
+from evedrop.scenario.loading import plain_tables, prepared
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import dotted

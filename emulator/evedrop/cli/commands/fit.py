@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def fit(options: argparse.Namespace) -> int:
     """Fit a process to recorded states."""
-    from evedrop.scenario.fitting.process_fit import fit_process
+    from evedrop.scenario.recordings.process_fit import fit_process
 
     names = None if options.states is None else [name.strip() for name in options.states.split(",")]
     fitted = fit_process(options.file, names, _numbers(options.reference))
@@ -59,7 +59,7 @@ def fit_link(options: argparse.Namespace) -> int:
 
 def _table(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
     """The fit of a table of outcomes."""
-    from evedrop.scenario.fitting.fit import fit, lines
+    from evedrop.scenario.recordings.link_fit import fit, lines
 
     _refuse_others(options, "a table of outcomes", ("column", "lost", "delay_column"))
     fitted = fit(options.trace, options.column, options.delay_column, options.lost)
@@ -87,7 +87,7 @@ def _journal(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]
 
 def _messages(recording: MessageRecording, options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
     """The fit of messages that were recorded."""
-    from evedrop.scenario.fitting.message_fit import fit_messages, message_lines
+    from evedrop.scenario.recordings.link_fit import fit_messages, message_lines
     from evedrop.scenario.recordings.message_recording import save_outcomes
 
     if options.save is not None:

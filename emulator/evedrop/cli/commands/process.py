@@ -172,7 +172,7 @@ def _record(brief: Brief[RecorderPart], serve: str | None) -> int:
 
     from evedrop.live.protocol.brief import WRITE_AGAIN
     from evedrop.live.recorder.recorder import record
-    from evedrop.scenario.sentences import sentences
+    from evedrop.scenario.table import sentences
     from evedrop.scenario.tables import Scenario
 
     try:

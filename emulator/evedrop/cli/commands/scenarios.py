@@ -48,7 +48,7 @@ def _name(parser: argparse.ArgumentParser) -> None:
 
 def check(options: argparse.Namespace) -> int:
     """Validate scenarios, or check classes against the rules."""
-    from evedrop.scenario.expected.estimates import warnings_of
+    from evedrop.scenario.estimates import warnings_of
     from evedrop.scenario.loading import load
 
     names = {kind: name for kind in ("scheme", "eavesdropper", "link", "delay") if (name := getattr(options, kind))}

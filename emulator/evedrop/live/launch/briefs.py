@@ -45,7 +45,7 @@ from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link import COUNTED_BURSTS
 from evedrop.names import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import new_folder
-from evedrop.scenario.controlled import monitor_of
+from evedrop.scenario.closed_loop import monitor_of
 from evedrop.scenario.input_files import disturbances_of, states_of
 from evedrop.scenario.plugins import named_in
 from evedrop.scenario.process import ProcessTable
@@ -268,7 +268,7 @@ def _answers(scenario: Scenario) -> dict[str, Any]:
     names = {class_ for table in tables.values() for class_ in (table.strategy, table.reads_as) if class_ is not None}
     foreign = {name for name in names if STRATEGIES.foreign(name)}
     if foreign:
-        from evedrop.scenario.expected.expectations import expectations_of  # noqa: PLC0415 - slow to import, and seldom needed
+        from evedrop.scenario.theory import expectations_of  # noqa: PLC0415 - slow to import, and seldom needed
 
         for name, expectation in expectations_of(scenario).items():
             if name in tables and foreign & {tables[name].strategy, tables[name].reads_as}:

@@ -15,10 +15,9 @@ from pydantic import AfterValidator, Field, ValidationError
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.live.launch.ports import RouterEndpoint, RouterEndpoints, router_endpoint
 from evedrop.names import CONTROLLER, LEGITIMATE, RECORDER, RELAY, ROUTER, SENSOR
+from evedrop.scenario.line_numbers import with_line_numbers
 from evedrop.scenario.loading import tables_in
-from evedrop.scenario.loading.line_numbers import with_line_numbers
-from evedrop.scenario.sentences import sentences
-from evedrop.scenario.table import NAME, Table, expected
+from evedrop.scenario.table import NAME, Table, expected, sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
 from evedrop.system.files import Unreadable, shown, text_of

@@ -26,7 +26,7 @@ from evedrop.model.metrics.built_in import LinkAccount
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR, ProcessAction
 from evedrop.scenario.events.event import Act
-from evedrop.scenario.loading.file import with_event
+from evedrop.scenario.loading import with_event
 from evedrop.scenario.progress_events import Held, OnEvent, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.run_tally import RunTally

@@ -21,7 +21,7 @@ from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief
 from evedrop.names import ROUTER, SENSOR
-from evedrop.scenario.controlled import monitor_of
+from evedrop.scenario.closed_loop import monitor_of
 from evedrop.scenario.tables import Scenario
 from evedrop.score.slots import ReceiverSlots, Slots
 

@@ -22,14 +22,14 @@ from evedrop.model.registry import place_of
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme
 from evedrop.model.streams import Batch
-from evedrop.scenario.conformance.packets import (
+from evedrop.scenario.conformance.problems import (
+    Problem,
     expect_belief,
     expect_beliefs,
     expect_packet,
     expect_packets,
     slots_text,
 )
-from evedrop.scenario.conformance.problems import Problem
 from evedrop.scenario.conformance.rules import Broken
 
 

@@ -15,10 +15,26 @@ import numpy as np
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge, PacketTaker
 from evedrop.model.outcomes import eavesdropper_outcomes
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.scenario.conformance.blocks import expect_same_followed
-from evedrop.scenario.conformance.packets import SchemeOf, Slot, expect_belief, frozen_belief, made, played, row_of
-from evedrop.scenario.conformance.problems import Problem, large, small
-from evedrop.scenario.conformance.receivers import ReceiverChecks, Step, expect_actions, expect_expected, expect_pure
+from evedrop.scenario.conformance.problems import (
+    Problem,
+    SchemeOf,
+    Slot,
+    expect_belief,
+    frozen_belief,
+    large,
+    made,
+    played,
+    row_of,
+    small,
+)
+from evedrop.scenario.conformance.receivers import (
+    ReceiverChecks,
+    Step,
+    expect_actions,
+    expect_expected,
+    expect_pure,
+    expect_same_followed,
+)
 from evedrop.scenario.conformance.rules import (
     Broken,
     NamedKeys,

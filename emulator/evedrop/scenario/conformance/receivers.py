@@ -1,21 +1,40 @@
-"""Rules for every receiver, the legitimate estimator and eavesdroppers alike."""
+"""Rules for every receiver, the legitimate estimator and eavesdroppers alike, and the rule for many slots at once.
+
+Blocks of slots give the same bits as single slots, wherever the blocks begin; a scheme's encoder keeps this rule, too.
+
+Source: docs/your-own.md, many slots at once.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
-from typing import ClassVar
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import accumulate, cycle, pairwise, takewhile
+from typing import Any, ClassVar
 
 import numpy as np
 
 from evedrop.model import update
 from evedrop.model.kernels.elementary import sum_in_order
+from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Receiver, Reception
+from evedrop.model.receiver import Action, Belief, Beliefs, Receiver, Reception
+from evedrop.model.schemes.scheme import Encoder, PacketBlock, Scheme
 from evedrop.model.theory.covariances import ExpectedCovariance, OutcomesAt
-from evedrop.scenario.conformance.packets import expect_belief, row_of
-from evedrop.scenario.conformance.problems import QUALITY, Problem
-from evedrop.scenario.conformance.rules import Broken, Row, calling, expect_array, expect_same
+from evedrop.scenario.conformance.problems import (
+    QUALITY,
+    Problem,
+    Slot,
+    expect_belief,
+    expect_beliefs,
+    expect_packets,
+    frozen_belief,
+    row_of,
+    sent_of,
+    sides,
+    slots_text,
+)
+from evedrop.scenario.conformance.rules import Broken, Row, calling, expect_array, expect_same, frozen
 
 SIGMAS = 6.0
 """Standard deviations allowed for chance."""
@@ -105,7 +124,7 @@ def expect_actions(receiver: Receiver, steps: Sequence[Step], problem: Problem, 
         other = action != after.action
         if other.any():
             at = int(np.argmax(other))
-            contradiction = f"act() says {_name(action[at])} and step() did {_name(after.action[at])}"
+            contradiction = f"act() says {_action_name(action[at])} and step() did {_action_name(after.action[at])}"
             raise Broken(
                 f"slot {k}, trial {problem.batch.first_trial + at}: {contradiction}; make them agree, or {remedy}"
             )
@@ -114,12 +133,12 @@ def expect_actions(receiver: Receiver, steps: Sequence[Step], problem: Problem, 
         if unlike.any():
             at = int(np.argmax(unlike))
             raise Broken(
-                f"slot {k}, trial {problem.batch.first_trial + at}: Belief.P after {_name(action[at])} is not that of "
+                f"slot {k}, trial {problem.batch.first_trial + at}: Belief.P after {_action_name(action[at])} is not that of "
                 f"update.believed_covariance; use that function, or {remedy}"
             )
 
 
-def _name(action: int) -> str:
+def _action_name(action: int) -> str:
     return Action(action).name if int(action) in set(Action) else str(int(action))
 
 
@@ -143,3 +162,153 @@ def expect_expected(
             raise Broken(
                 f"slot {k}: the mean squared error is {error.mean():.4g}, and outcomes say {expected[k]:.4g}; {remedy}"
             )
+
+
+_LENGTHS = (1, 3, 2, 7, 70)
+_REMEDY = "let a slot's numbers depend neither on its block nor on what was asked for before"
+
+_Followed = tuple[range, Beliefs, Belief]
+"""Consecutive slots, the beliefs after each of them, and the belief after the last."""
+
+
+def divisions(slots: int) -> list[list[range]]:
+    """Divisions of slots 0 … slots − 1 into blocks: one block, single slots, and blocks of different lengths."""
+    edges = [0, *takewhile(lambda edge: edge < slots, accumulate(cycle(_LENGTHS))), slots]
+    return [
+        [range(slots)],
+        [range(k, k + 1) for k in range(slots)],
+        [range(start, stop) for start, stop in pairwise(edges)],
+    ]
+
+
+def expect_same_in_blocks(scheme: Scheme, slots: Sequence[Slot], problem: Problem, kind: type[Scheme]) -> None:
+    """Raise Broken unless both sides of a scheme do in blocks what they do in single slots, made together and apart."""
+    steps = [(one.before, one.heard, one.after) for one in slots]
+    for apart in (False, True):
+        for blocks in divisions(problem.slots):
+            encoder, estimator = sides(scheme, problem, kind, apart)
+            if apart and type(encoder).encode_block is Encoder.encode_block:
+                continue  # it cannot know of blocks, and the estimator alone is next
+            packets: list[tuple[range, PacketBlock]] = []
+            followed: list[_Followed] = []
+            belief = steps[0][0]
+            for block in blocks:
+                # The next packet may depend on the acknowledgements of this one.
+                for some in [range(k, k + 1) for k in block] if scheme.needs_acknowledgements else [block]:
+                    packets.append((some, _encoded(encoder, some, slots, problem, scheme, kind)))
+                if _plain(block, steps):
+                    followed.append(_followed(estimator, block, belief, steps, problem, kind))
+                    belief = frozen_belief(followed[-1][2])
+            _expect_same_packets(encoder, packets, slots, problem)
+            _expect_same_beliefs(estimator, followed, steps, problem)
+    expect_same_followed(lambda: sides(scheme, problem, kind, apart=True)[1], steps, problem, kind)
+
+
+def expect_same_followed(make: Callable[[], Receiver], steps: Sequence[Step], problem: Problem, kind: type) -> None:
+    """Raise Broken unless a receiver has the same beliefs for every division into blocks; `make` makes one for each division."""
+    whole, single, uneven = divisions(problem.slots)
+    for blocks, every in ((whole, 1), (single, 1), (uneven, 1), (uneven, 2)):
+        receiver = make()
+        if type(receiver).follow is Receiver.follow:
+            return  # which takes slot by slot
+        found = list(_in_order(receiver, blocks, every, steps, problem, kind))
+        _expect_same_beliefs(receiver, found, steps, problem)
+        _expect_same_uses(receiver, blocks, problem, kind)
+    receiver = make()
+    plain = [block for block in reversed(uneven) if _plain(block, steps)]
+    again = [_followed(receiver, block, steps[block.start][0], steps, problem, kind) for block in plain]
+    _expect_same_beliefs(receiver, again, steps, problem)
+
+
+def _plain(block: range, steps: Sequence[Step]) -> bool:
+    """Whether nothing but packets is heard in a block, as where a run takes its slots at once."""
+    return all(steps[k][1].header is None and steps[k][1].truth is None for k in block)
+
+
+def _in_order(
+    receiver: Receiver, blocks: list[range], every: int, steps: Sequence[Step], problem: Problem, kind: type
+) -> Iterator[_Followed]:
+    """The beliefs of a receiver after blocks, one after the other; only one block in `every` is taken at once."""
+    belief = steps[0][0]
+    for number, block in enumerate(blocks):
+        if number % every == 0 and _plain(block, steps):
+            yield (found := _followed(receiver, block, belief, steps, problem, kind))
+            belief = frozen_belief(found[2])
+        else:
+            for k in block:
+                with calling(f"slot {k}: {_method_name(receiver, 'step')} after a block of slots", kind):
+                    belief = frozen_belief(receiver.step(k, belief, steps[k][1]))
+
+
+def _encoded(
+    encoder: Encoder, some: range, slots: Sequence[Slot], problem: Problem, scheme: Scheme, kind: type
+) -> PacketBlock:
+    x, predicted = (frozen(np.array([getattr(slots[k], name) for k in some])) for name in ("x", "predicted"))
+    with calling(f"{slots_text(some)}: {_method_name(encoder, 'encode_block')}", kind):
+        packets = encoder.encode_block(some, x, predicted)
+    expect_packets(some, packets, scheme, problem)
+    if scheme.needs_acknowledgements:
+        for k in some:
+            with calling(f"slot {k}: {_method_name(encoder, 'acknowledged')}", kind):
+                encoder.acknowledged(k, frozen(slots[k].acknowledged))
+    return packets
+
+
+def _followed(
+    receiver: Receiver, some: range, belief: Belief, steps: Sequence[Step], problem: Problem, kind: type
+) -> _Followed:
+    gamma, z = (frozen(np.array([getattr(steps[k][1], name) for k in some])) for name in ("gamma", "z"))
+    with calling(f"{slots_text(some)}: {_method_name(receiver, 'follow')}", kind):
+        found: Any = receiver.follow(some, belief, gamma, z)
+    expect_beliefs(some, found, problem)
+    return some, *found
+
+
+def _expect_same_packets(
+    encoder: Encoder, found: Sequence[tuple[range, PacketBlock]], slots: Sequence[Slot], problem: Problem
+) -> None:
+    for some, packets in found:
+        rows = [sent_of(packets.at(row)) for row in range(len(some))]
+        once = [slots[k].sent for k in some]
+        _expect_same(once, rows, some, problem, _method_name(encoder, "encode_block"))
+
+
+def _expect_same_beliefs(
+    receiver: Receiver, found: Sequence[_Followed], steps: Sequence[Step], problem: Problem
+) -> None:
+    name = _method_name(receiver, "follow")
+    for some, beliefs, after in found:
+        rows = [row_of(Belief(*(column[row] for column in beliefs))) for row in range(len(some))]
+        _expect_same([row_of(steps[k][2]) for k in some], rows, some, problem, name)
+        last = f"the last Belief of {name}"
+        _expect_same([row_of(steps[some[-1]][2])], [row_of(after)], some[-1:], problem, last)
+
+
+def _expect_same_uses(receiver: Receiver, blocks: list[range], problem: Problem, kind: type) -> None:
+    """Raise Broken unless `uses_block` is `uses`, slot by slot, also where nothing arrives."""
+    if not isinstance(receiver, PacketUser) or type(receiver).uses_block is PacketUser.uses_block:
+        return
+    every = np.ones(problem.batch.trials, np.bool_)
+    for some in blocks:
+        name = _method_name(receiver, "uses_block")
+        with calling(f"{slots_text(some)}: {name}", kind):
+            found, single = receiver.uses_block(some), [receiver.uses(k) for k in some]
+        if found is not None:
+            shape = (len(some), problem.batch.trials)
+            expect_array(f"{slots_text(some)}: {name}", found, np.bool_, shape, "slots, R trials; or None: always")
+        rows = [{"whether a packet is used": every if found is None else found[row]} for row in range(len(some))]
+        once = [{"whether a packet is used": every if one is None else one} for one in single]
+        _expect_same(once, rows, some, problem, name)
+
+
+def _expect_same(once: Sequence[Row], rows: Sequence[Row], some: range, problem: Problem, name: str) -> None:
+    said = f"{{0!r}} in a single slot and {{1!r}} by {name} of {slots_text(some)}"
+    expect_same(once, rows, slice(None), problem.batch.first_trial, said, _REMEDY, some.start)
+
+
+def _method_name(one: object, method: str) -> str:
+    """A method of a class that takes many slots at once; if the class has only the inherited one, its method for one slot."""
+    for base, block, single in ((Encoder, "encode_block", "encode"), (Receiver, "follow", "step")):
+        if method == block and getattr(type(one), block) is getattr(base, block):
+            return f"{type(one).__name__}.{single}()"
+    return f"{type(one).__name__}.{method}()"

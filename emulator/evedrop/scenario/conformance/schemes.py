@@ -12,10 +12,15 @@ import numpy as np
 
 from evedrop.model.outcomes import legitimate_outcomes
 from evedrop.model.schemes.scheme import PacketBlock, Scheme
-from evedrop.scenario.conformance.blocks import expect_same_in_blocks
-from evedrop.scenario.conformance.packets import SchemeOf, Slot, made, played
-from evedrop.scenario.conformance.problems import Problem, large, small
-from evedrop.scenario.conformance.receivers import SIGMAS, ReceiverChecks, expect_actions, expect_expected, expect_pure
+from evedrop.scenario.conformance.problems import Problem, SchemeOf, Slot, large, made, played, small
+from evedrop.scenario.conformance.receivers import (
+    SIGMAS,
+    ReceiverChecks,
+    expect_actions,
+    expect_expected,
+    expect_pure,
+    expect_same_in_blocks,
+)
 from evedrop.scenario.conformance.rules import (
     Broken,
     NamedKeys,

@@ -1,4 +1,4 @@
-"""The kinds of event by their name in a scenario: one file each, and those of installed packages.
+"""The kinds of event by their name in a scenario: the built-in ones, and those of installed packages.
 
 Source: docs/scenario.md, events; docs/your-own.md, an event.
 """
@@ -8,15 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from evedrop.model.registry import Registry
-from evedrop.scenario.events.cut import Cut, Heal
-from evedrop.scenario.events.event import EventKind
-from evedrop.scenario.events.jam import Jam
-from evedrop.scenario.events.kill import Kill, Restart
-from evedrop.scenario.events.note import Note
-from evedrop.scenario.events.partition import Partition
-from evedrop.scenario.events.pause import Pause, Resume
-from evedrop.scenario.events.set import Set
-from evedrop.scenario.events.spoof import Spoof
+from evedrop.scenario.events.attacks import Jam, Spoof
+from evedrop.scenario.events.event import EventKind, Note
+from evedrop.scenario.events.links import Cut, Heal, Partition, Set
+from evedrop.scenario.events.processes import Kill, Pause, Restart, Resume
 
 _BUILT_IN: Mapping[str, type[EventKind]] = {
     "set": Set,

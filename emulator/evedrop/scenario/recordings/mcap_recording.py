@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 
 from evedrop.errors import TraceError
 from evedrop.model.process import Floats
-from evedrop.scenario.recordings.message_numbers import (
+from evedrop.scenario.recordings.message_recording import (
     WRAP,
     MessageArrivals,
+    MessageRecording,
     MessageSeries,
+    check_parts,
     numbers_of_times,
     series_of,
 )
-from evedrop.scenario.recordings.message_recording import MessageRecording, check_parts
 from evedrop.system.files import Unreadable, is_folder, opened, why_of
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from evedrop.model.metrics.text import number_text
 from evedrop.model.process import Floats
 from evedrop.model.receiver import NOTHING, SILENT, Codes
 from evedrop.results.reading import Results
-from evedrop.scenario.loading.recorded import recorded_noise
+from evedrop.scenario.recorded import recorded_noise
 from evedrop.score.expectations_held import repeating
 from evedrop.score.summary import Summary
 from evedrop.score.track import FACTOR, LongestSpans, LostSpan, Track, track_of

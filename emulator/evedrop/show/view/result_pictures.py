@@ -25,7 +25,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import NOTHING, SILENT
 from evedrop.results.reading import Results
 from evedrop.scenario.arguments import refuse_unless
-from evedrop.scenario.loading.recorded import recorded, recorded_noise
+from evedrop.scenario.recorded import recorded, recorded_noise
 from evedrop.score.verdict import MARKS, SecrecyKept
 from evedrop.show.view import palette
 from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words

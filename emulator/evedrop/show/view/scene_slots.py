@@ -27,8 +27,8 @@ from evedrop.model.receiver import ACTION_OF, INNOVATION, NOTHING, Flags
 from evedrop.names import LEGITIMATE
 from evedrop.results.reading import Results
 from evedrop.scenario.application import APPLICATIONS, ControlledPlant
-from evedrop.scenario.controlled import controlled_plant, labels
-from evedrop.scenario.loading.recorded import recorded
+from evedrop.scenario.closed_loop import controlled_plant, labels
+from evedrop.scenario.recorded import recorded
 from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots

@@ -11,10 +11,10 @@ from evedrop.model.local_filter import settled
 from evedrop.model.schemes import scheme_of
 from evedrop.model.theory.covariances import stability_bound
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.expected.expectations import expectations_of
-from evedrop.scenario.filter_noise import is_singular
 from evedrop.scenario.plugins import sources_of
+from evedrop.scenario.process_noise import is_singular
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import expectations_of
 
 _LARGE_BYTES = 1e9
 _SHOWN_STATES = 3  # the largest matrix that is written out

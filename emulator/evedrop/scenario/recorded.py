@@ -21,12 +21,12 @@ from evedrop.model.links import LOSS_MODELS
 from evedrop.model.registry import no_modules
 from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
+from evedrop.scenario.across import horizon_mistakes
 from evedrop.scenario.dry_run import foreign
-from evedrop.scenario.filter_noise import replace_filter_noise
 from evedrop.scenario.input_files import read_recordings, read_tables
-from evedrop.scenario.loading.file import checked, located, read, tables_in
-from evedrop.scenario.loading.mistakes import horizon_mistakes
-from evedrop.scenario.sentences import sentences
+from evedrop.scenario.loading import checked, located, read, tables_in
+from evedrop.scenario.process_noise import replace_filter_noise
+from evedrop.scenario.table import sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.system.files import shown
 

@@ -1,42 +1,63 @@
-"""Scenario files: found by name or path, read, changed by dotted keys, and checked.
+"""Scenarios are made here: from a file, found by name or path, or in Python; changed by dotted keys, and checked.
 
-Source: docs/scenario.md.
+A scenario from Python has the same checks as one from a file, and the same messages: numpy arrays, tuples, paths, tables that
+were checked before, and classes become the tables of a file. Mistakes are reported together.
+
+Source: docs/scenario.md; docs/python.md.
 """
 
 from __future__ import annotations
 
 import re
+import sys
 import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
-from pydantic import ValidationError
+import numpy as np
+from pydantic import BaseModel, ValidationError
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.model.registry import place_of
+from evedrop.model.delays import DELAY_MODELS
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.links import LOSS_MODELS
+from evedrop.model.registry import Registry, place_of
+from evedrop.model.schemes import SCHEMES
+from evedrop.scenario.across import mistakes_across
+from evedrop.scenario.arguments import path_argument
 from evedrop.scenario.drawn import with_faults
 from evedrop.scenario.dry_run import dry_run, has_foreign
 from evedrop.scenario.events import EVENTS
-from evedrop.scenario.filter_noise import replace_filter_noise
-from evedrop.scenario.input_files import (
-    locate_recordings,
-    locate_tables,
-    read_recordings,
-    read_tables,
-)
-from evedrop.scenario.loading.line_numbers import given_twice, with_line_numbers
-from evedrop.scenario.loading.mistakes import mistakes_across
+from evedrop.scenario.input_files import locate_recordings, locate_tables, read_recordings, read_tables
+from evedrop.scenario.line_numbers import given_twice, with_line_numbers
 from evedrop.scenario.plugins import elsewhere, named_in
-from evedrop.scenario.sentences import sentences
+from evedrop.scenario.process_noise import replace_filter_noise
 from evedrop.scenario.stream_keys import secret_in
-from evedrop.scenario.tables import Scenario
-from evedrop.scenario.values import unusable
+from evedrop.scenario.table import sentences, unusable
+from evedrop.scenario.tables import Builders, Scenario
 from evedrop.scenario.words import listed
 from evedrop.scenarios import shipped
 from evedrop.system.files import Unreadable, is_folder, is_there, shown, text_of
 from evedrop.system.hints import near
+
+__all__ = [
+    "Scenario",
+    "checked",
+    "load",
+    "located",
+    "parse",
+    "plain_tables",
+    "prepared",
+    "read",
+    "set_entry",
+    "shipped",
+    "tables_in",
+    "value_of",
+    "with_event",
+]
 
 MOST_BYTES = 2**28
 """The largest scenario file: room for the outcomes of millions of packets."""
@@ -272,3 +293,171 @@ def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenari
     except ScenarioError as error:
         mistakes = [line.removeprefix(f"event.{number}.") for line in error.mistakes]
         raise ScenarioError(error.source, mistakes) from None
+
+
+_PLAIN = (str, bool, int, float)
+_REGISTRIES: tuple[Registry[Any], ...] = (SCHEMES, STRATEGIES, LOSS_MODELS, DELAY_MODELS)
+_MAIN = "__main__"
+
+
+def plain_tables(values: Mapping[str, Any], source: str, modules: str | None = None) -> dict[str, Any]:
+    """The same values as tables that a file could have, with the folder of the classes in them as `modules`.
+
+    modules: the folder of modules, if it is known already. Entries whose value is None are left out.
+
+    Raises ScenarioError with every value that cannot be in a scenario.
+    """
+    reader = _Reader()
+    tables = {name: plain for name, value in values.items() if (plain := reader.plain(name, value)) is not None}
+    given = tables.get("modules", modules)
+    if reader.folders and not reader.mistakes and isinstance(given, (str, Path, type(None))):
+        folders = dict.fromkeys(reader.folders) if given is None else {str(Path(given).absolute()): None}
+        folders |= dict.fromkeys(reader.folders)
+        if len(folders) > 1:
+            both = " and ".join(folders)
+            reader.mistakes.append(
+                f"modules: the classes are in modules of several folders, {both}; put the modules into one folder"
+            )
+        tables["modules"] = next(iter(folders))
+    if reader.mistakes:
+        raise ScenarioError(source, reader.mistakes)
+    return tables
+
+
+@final
+@dataclass
+class _Reader:
+    mistakes: list[str] = field(default_factory=list)
+    folders: list[str] = field(default_factory=list)
+    """The folders of the modules in which classes are."""
+
+    def plain(self, path: str, value: Any) -> Any:
+        """One value; None leaves out its entry."""
+        made: Any
+        if value is None or type(value) in _PLAIN:
+            made = value
+        elif isinstance(value, BaseModel):
+            made = value.model_dump(mode="json", exclude_none=True, exclude_unset=True)
+        elif isinstance(value, Mapping):
+            inner = {name: self.plain(f"{path}.{name}", entry) for name, entry in value.items()}
+            made = {name: entry for name, entry in inner.items() if entry is not None}
+        elif isinstance(value, (list, tuple, range)):
+            made = [self.plain(f"{path}.{i}", entry) for i, entry in enumerate(value)]
+        elif isinstance(value, (Path, str)):  # strings of numpy, and members of an enumeration
+            made = str(value)
+        elif isinstance(value, type):
+            made = self._name(path, value)
+        elif hasattr(value, "__array__"):  # arrays and numbers of numpy, and what numpy can read, such as tensors
+            made = self._numbers(path, value)
+        else:
+            made = None
+            self._refuse(path, value)
+        return made
+
+    def _numbers(self, path: str, value: Any) -> Any:
+        array = np.asarray(value)
+        if array.dtype.kind in "biufU":
+            return array.tolist()
+        self._refuse(path, value, f" of {array.dtype}")
+        return None
+
+    def _refuse(self, path: str, value: Any, of: str = "") -> None:
+        kind = f"{type(value).__module__}.{type(value).__name__}".removeprefix("builtins.")
+        wanted = "a number, a text, a list, a dict, a numpy array of numbers, or a class"
+        self.mistakes.append(f"{path}: is a {kind}{of}; expected {wanted}")
+
+    def _name(self, path: str, kind: type) -> str | None:
+        """The name of a class in a scenario: that of a built-in one, or MODULE:CLASS."""
+        for registry in _REGISTRIES:
+            for name in registry:
+                if registry[name] is kind:
+                    return name
+        why = _not_importable(kind)
+        if why is not None:
+            self.mistakes.append(f"{path}: is the class {kind.__name__} {why}")
+            return None
+        folder = _folder_of(kind)
+        if folder is not None:
+            self.folders.append(folder)
+        return f"{kind.__module__}:{kind.__name__}"
+
+
+def _not_importable(kind: type) -> str | None:
+    """Why other processes cannot import a class, in words that follow its name; None if they can."""
+    if kind.__module__ == _MAIN:
+        return (
+            "of a notebook or of the program itself, which the processes of a run cannot import; write it to a file, such "
+            f"as mine.py (in a notebook: %%writefile mine.py at the top of its cell), then: from mine import {kind.__name__}"
+        )
+    if getattr(sys.modules.get(kind.__module__), kind.__name__, None) is not kind:
+        return (
+            f"of {kind.__module__}, which the processes of a run cannot import by its name; define it at the top level "
+            "of a module, and make the scenario with the class as it is in the module now"
+        )
+    return None
+
+
+def _folder_of(kind: type) -> str | None:
+    """The folder in which the module of a class is looked for; None if the module has no file."""
+    file = getattr(sys.modules[kind.__module__], "__file__", None)
+    if file is None:
+        return None
+    depth = kind.__module__.count(".") + (Path(file).stem == "__init__")
+    return str(Path(file).absolute().parents[depth])
+
+
+_SOURCE = "Scenario"
+
+
+def built(values: Mapping[str, Any]) -> Scenario:
+    """The scenario with these entries; files that it names are in the current folder.
+
+    Whether double precision can follow the process for that many slots is checked when the scenario is used.
+
+    Raises ScenarioError with every mistake.
+    """
+    tables = plain_tables(values, _SOURCE)
+    if mistakes := list(unusable(tables)):
+        raise ScenarioError(_SOURCE, mistakes)
+    located(tables, Path())
+    return checked(tables, _SOURCE, beyond_horizon=True)
+
+
+def loaded(source: str | Path, changes: Mapping[str, Any]) -> Scenario:
+    """A built-in scenario or a file, with changes by dotted key. Raises ScenarioError with every mistake."""
+    return prepared(source, changes, beyond_horizon=True)
+
+
+def prepared(scenario: str | Path | Scenario, changes: Mapping[str, Any], *, beyond_horizon: bool = False) -> Scenario:
+    """The scenario that a call is about, with changes by dotted key, checked as `load` does; beyond_horizon: as there.
+
+    Raises ScenarioError with every mistake, UsageError for what is neither a Scenario nor the name of one.
+    """
+    if isinstance(scenario, Scenario):
+        return changed(scenario, changes, beyond_horizon=beyond_horizon)
+    path_argument(
+        "scenario", scenario, "a built-in name, a file, or a Scenario, which Scenario(entries) makes of a dict"
+    )
+    return load(scenario, plain_tables(changes, str(scenario)), beyond_horizon=beyond_horizon)
+
+
+def changed(scenario: Scenario, changes: Mapping[str, Any], *, beyond_horizon: bool = True) -> Scenario:
+    """The scenario with changes by dotted key; None removes an entry. Raises ScenarioError with every mistake."""
+    tables = scenario.as_tables()
+    for key in [key for key, value in changes.items() if value is None]:
+        *above, last = key.split(".")
+        inner: Any = tables
+        for name in above:
+            inner = inner.get(name, {}) if isinstance(inner, dict) else {}
+        if isinstance(inner, dict):
+            inner.pop(last, None)
+    made = plain_tables(changes, scenario.title, scenario.modules)
+    return checked(tables, scenario.title, made, beyond_horizon=beyond_horizon)
+
+
+def register() -> None:
+    """Let `Scenario(...)`, `Scenario.load` and `replace` check whole scenarios."""
+    Scenario.builders = Builders(built, loaded, changed)
+
+
+register()

@@ -1,4 +1,7 @@
-"""`kill` and `restart`: a receiver's process is ended, and started again."""
+"""The events of a receiver's process: `kill` and `restart` end it and start it again; `pause` and `resume` stop and continue it.
+
+A process that continues has all it knew. One that is started again begins from the prior, or from its last belief.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,7 @@ from pydantic import Field
 
 from evedrop.model.links.loss_model import Fate
 from evedrop.names import ProcessAction
-from evedrop.scenario.events.effects import Leave, Return
-from evedrop.scenario.events.event import Act, EventKind, Fault
+from evedrop.scenario.events.event import Act, EventKind, Fault, Leave, Return
 
 State = Annotated[Literal["prior", "last"] | None, Field(examples=["last"])]
 """What the receiver knows when it is started again: nothing, or its last estimate."""
@@ -56,3 +58,40 @@ class Restart(EventKind):
     def acts(self) -> Iterator[Act]:
         """The restart."""
         yield _restart(self, self.first, self.state)
+
+
+def _resume(event: EventKind, at: int) -> Act:
+    effect = Return(Fate.PAUSED, ProcessAction.CONTINUE, Pause.kind, keeps_state=True)
+    return Act(at, Resume.kind, event.names, f"{Resume.kind} {event.names[0]}", effect)
+
+
+class Pause(EventKind):
+    """`pause`: the receiver's process is stopped."""
+
+    pause: Annotated[str, Field(examples=["legitimate"])]
+
+    kind = "pause"
+    does = Leave
+    lasts = True
+    names_in = "pause"
+    fault = Fault(1)
+
+    def acts(self) -> Iterator[Act]:
+        """The stop, and the continuation."""
+        yield self.begin(f"pause {self.pause}", Leave(Fate.PAUSED, ProcessAction.STOP, keeps_state=True))
+        if self.to is not None:
+            yield _resume(self, self.to)
+
+
+class Resume(EventKind):
+    """`resume`: the receiver's process continues."""
+
+    resume: Annotated[str, Field(examples=["legitimate"])]
+
+    kind = "resume"
+    does = Return
+    names_in = "resume"
+
+    def acts(self) -> Iterator[Act]:
+        """The continuation."""
+        yield _resume(self, self.first)
