@@ -95,11 +95,11 @@ def test_live_and_memory_are_the_same_bits(live: Results, memory: Results) -> No
 
 
 def test_where_there_is_no_theory_the_results_say_null(memory: Results) -> None:
-    """A link that follows no chain has no expected trace: null in the summary and in the table, and no verdict of theory."""
+    """A link that follows no chain has no theoretical trace: null in the summary and in the table, and no verdict of theory."""
     peers = memory.summary["peers"]
-    assert [name for name, peer in peers.items() if peer["expected_trace_covariance"] is None] == [*UNKNOWN]
+    assert [name for name, peer in peers.items() if peer["theoretical_trace_covariance"] is None] == [*UNKNOWN]
     assert json.loads((memory.folder / "summary.json").read_text())["peers"]["pattern"]["infinite_variance"] is False
-    nulls = memory.slots.filter(pc.is_null(memory.slots["expected_trace_covariance"]))
+    nulls = memory.slots.filter(pc.is_null(memory.slots["theoretical_trace_covariance"]))
     assert set(nulls["peer"].to_pylist()) == set(UNKNOWN)
     assert nulls.num_rows == 300 * len(UNKNOWN)
     verdict = memory.summary["secrecy"]["pattern"]
@@ -124,7 +124,7 @@ def test_simulated_errors_agree_with_the_theory_of_bursts(every_model: Path, tmp
     judged = 0
     for i, slot in enumerate(table["slot"]):
         if slot % 20 == 0 and table["peer"][i] not in UNKNOWN:
-            difference = table["mean_squared_error"][i] - table["expected_trace_covariance"][i]
+            difference = table["mean_squared_error"][i] - table["theoretical_trace_covariance"][i]
             assert abs(difference) < 4.5 * table["standard_error"][i] + 1e-15, (slot, table["peer"][i])
             judged += 1
     assert judged == 7 * 5
@@ -157,7 +157,7 @@ def test_bursts_that_last_too_long_are_a_warning() -> None:
 
 @pytest.mark.long
 def test_the_view_survives_where_there_is_no_theory(live: Results) -> None:
-    """A replayed recording of a run in which one receiver's expected trace is nowhere."""
+    """A replayed recording of a run in which one receiver's theoretical trace is nowhere."""
     from rerun.chunk import RrdReader
 
     from evedrop.show.view.scene_slots import replay
@@ -165,4 +165,4 @@ def test_the_view_survives_where_there_is_no_theory(live: Results) -> None:
     shown = {str(chunk.entity_path) for chunk in RrdReader(replay(live.folder)).stream().filter(is_static=False)}
     assert {"/error/pattern", "/trace/pattern", "/theory/legitimate"} <= shown
     assert "/theory/pattern" not in shown
-    assert live.slots["expected_trace_covariance"].null_count == 300 * len(UNKNOWN)
+    assert live.slots["theoretical_trace_covariance"].null_count == 300 * len(UNKNOWN)

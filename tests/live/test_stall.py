@@ -188,7 +188,7 @@ def test_a_slow_process_is_not_silent() -> None:
         run.wait(15.0)
 
 
-def test_slots_beyond_the_next_report_are_not_believed() -> None:
+def test_slots_beyond_the_next_report_are_not_assumed() -> None:
     """A process that says again and again that it goes on, but never reports, is silent all the same."""
     run = Run(20.0)
     slot = 50

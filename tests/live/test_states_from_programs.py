@@ -94,7 +94,7 @@ def test_a_run_over_a_program_can_be_repeated(tmp_path: Path) -> None:
     again = montecarlo(tmp_path / "live", trials=2, out=tmp_path / "again", plan=Plan(workers=1))
     assert digests_of(live) == digests_of(memory) == digests_of(again)
     assert difference(live, again).same
-    assert live.summary["peers"]["naive"]["expected_trace_covariance"] is None
+    assert live.summary["peers"]["naive"]["theoretical_trace_covariance"] is None
     assert (tmp_path / "live" / "states.csv").read_text() == (tmp_path / "again" / "states.csv").read_text()
 
 

@@ -35,7 +35,7 @@ def honest(k: int, sent: Flags, gamma: Mapping[str, Flags]) -> Flags:
 
 @dataclass
 class Played:
-    """All slots of a batch: what was sent and what each receiver believed."""
+    """All slots of a batch: what was sent and what each receiver estimated."""
 
     x: list[np.ndarray] = field(default_factory=list)
     packets: list[Packet] = field(default_factory=list)
@@ -47,7 +47,7 @@ class Played:
         return np.array([((x - one.x_hat) ** 2).sum(0) for x, one in zip(self.x, self.beliefs[name], strict=True)])
 
     def trace(self, name: str) -> np.ndarray:
-        """Tr P believed, (slots, R)."""
+        """Tr P reported, (slots, R)."""
         return np.array([np.trace(one.P) for one in self.beliefs[name]])
 
 

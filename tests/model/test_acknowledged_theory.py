@@ -12,7 +12,7 @@ from evedrop.model.process import Process
 from evedrop.model.reference_form import reference_floor
 from evedrop.model.schemes.acknowledged import Acknowledged, OpenLoop
 from evedrop.model.theory.closed_forms import reference_covariances
-from evedrop.model.theory.covariances import expected_covariances
+from evedrop.model.theory.covariances import theoretical_covariances
 from evedrop.scenario.loading import checked
 from evedrop.scenario.theory import expectations_of
 from tests.builders import DRIFTING, UNSTABLE
@@ -81,7 +81,7 @@ def test_the_papers_example(initial: np.ndarray, honest: float) -> None:
     process = Process(UNSTABLE.A, UNSTABLE.Q, initial)
     found = reference_covariances(process, 0.9, (0.81, 0.09), 41)
     assert np.trace(found[40]) == pytest.approx(honest, rel=2e-3)
-    user = np.trace(expected_covariances(process, Acknowledged(process).outcomes(0.9), 41)[40])
+    user = np.trace(theoretical_covariances(process, Acknowledged(process).outcomes(0.9), 41)[40])
     assert user == pytest.approx(2.284e-4, rel=2e-4)
     for acknowledged in ((0.0, 0.0), (0.81, 0.0)):
         blocked = np.trace(reference_covariances(process, 0.9, acknowledged, 41)[40])

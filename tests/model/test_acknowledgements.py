@@ -72,7 +72,7 @@ def test_what_was_not_sent_is_not_acknowledged() -> None:
 
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_attacks_on_state_secrecy_codes_cost_what_theory_says(attack: str) -> None:
-    """Mean believed trace after a few slots, user's and eavesdropper's, by the recursion, at 5 standard errors."""
+    """Mean reported trace after a few slots, user's and eavesdropper's, by the recursion, at 5 standard errors."""
     mu, mu_e, slots, trials = 0.8, 0.7, 6, 20_000
     batch = Batch(slots, trials)
     quality = 0.6 if attack == "hijack" else 0.9  # above μ_e a hijacked sensor has a memory, and theory another form

@@ -15,7 +15,7 @@ from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.slot.link import link_of
 from evedrop.model.streams import Batch, Stream, uniforms
-from evedrop.model.theory.covariances import Outcomes, expected_traces, state_covariances
+from evedrop.model.theory.covariances import Outcomes, state_covariances, theoretical_traces
 from tests.builders import MARGINAL, MICROGRID
 from tests.model.listening import EXAMPLE, Slot, followed, keys, slots
 
@@ -39,8 +39,8 @@ def test_the_constant_one_knows_what_is_public() -> None:
         assert np.allclose(beliefs["constant"].P, sigma[slot.k][:, :, None], rtol=1e-12)
     outcomes = STRATEGIES["constant"].outcomes({}, 0.3)
     assert outcomes is not None
-    assert np.allclose(expected_traces(MARGINAL, outcomes(0.9), 60), np.trace(sigma, axis1=1, axis2=2), rtol=1e-12)
-    naive = expected_traces(MARGINAL, Outcomes.eavesdropper(0.9, 0.3, 1.0, 1.0), 2000)
+    assert np.allclose(theoretical_traces(MARGINAL, outcomes(0.9), 60), np.trace(sigma, axis1=1, axis2=2), rtol=1e-12)
+    naive = theoretical_traces(MARGINAL, Outcomes.eavesdropper(0.9, 0.3, 1.0, 1.0), 2000)
     assert naive[-1] > np.trace(state_covariances(MARGINAL, 2000)[-1])
 
 
@@ -51,7 +51,7 @@ def test_the_constant_one_knows_what_is_public() -> None:
 )
 @pytest.mark.thorough
 def test_a_hard_test_locks_on_to_false_tracks(process: Process, mu_d: float, mu_e: float, count: int) -> None:
-    """Ten of 300 trials and more end with an error 100 times smart's median, and it believes in a tenth of it or less.
+    """Ten of 300 trials and more end with an error 100 times smart's median, and it reports a tenth of it or less.
 
     Over the last 30 slots; the Bayesian one, on the same packets, is never lost.
     """
@@ -61,15 +61,15 @@ def test_a_hard_test_locks_on_to_false_tracks(process: Process, mu_d: float, mu_
         for name in ("likelihood", "bayesian", "smart")
     }
     late = {name: np.zeros(300) for name in receivers}
-    believed = np.zeros(300)
+    reported = np.zeros(300)
     for slot, beliefs in followed(receivers, slots(process, mu_d, mu_e, batch)):
         if slot.k >= count - 30:
-            believed += np.trace(beliefs["likelihood"].P) / 30
+            reported += np.trace(beliefs["likelihood"].P) / 30
             for name, belief in beliefs.items():
                 late[name] += errors(slot, belief.x_hat) / 30
     lost = late["likelihood"] > 100.0 * np.median(late["smart"])
     assert lost.sum() >= 10
-    assert np.median(believed[lost] / late["likelihood"][lost]) < 0.1
+    assert np.median(reported[lost] / late["likelihood"][lost]) < 0.1
     assert np.all(late["bayesian"] < 100.0 * np.median(late["smart"]))
 
 

@@ -34,7 +34,7 @@ def test_beliefs_of_any_process_are_symmetric(seed: int, n: int, radius: float, 
 
 
 def test_numbers_near_the_smallest_double_are_symmetric() -> None:
-    """A receiver that decodes all innovations of a contracting process believes less and less, and 0 at last."""
+    """A receiver that decodes all innovations of a contracting process reports less and less, and 0 at last."""
     A, Q = np.array([[0.3, 0.2], [-0.1, 0.4]]), np.array([[1.0, 0.3], [0.3, 2.0]])
     P = reference.follow_covariance(A, Q, Q[:, :, None], np.full((500, 1), Action.INNOVATION, np.uint8))
     assert 0.0 < P[330:, 0, 0].max() < 1e-250

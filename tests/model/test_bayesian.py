@@ -15,7 +15,7 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Receiver, Reception
 from evedrop.model.streams import Batch
-from evedrop.model.theory.covariances import Outcomes, expected_traces
+from evedrop.model.theory.covariances import Outcomes, theoretical_traces
 from tests.builders import MARGINAL, MICROGRID
 from tests.examples import examples
 from tests.model.listening import EXAMPLE, followed, keys, slots
@@ -106,8 +106,8 @@ def test_it_is_the_posterior_over_all_type_words(
 
 
 @pytest.mark.thorough
-def test_it_believes_the_truth() -> None:
-    """Its believed trace is the mean of its squared error given what it heard: at every tenth slot, at 4.5 standard errors."""
+def test_it_reports_the_truth() -> None:
+    """Its reported trace is the mean of its squared error given what it heard: at every tenth slot, at 4.5 standard errors."""
     batch = Batch(101, 4000)
     receivers = {"bayesian": made("bayesian", MARGINAL, 0.3, batch)}
     for slot, beliefs in followed(receivers, slots(MARGINAL, 0.3, 0.9, batch)):
@@ -127,8 +127,8 @@ def test_it_becomes_the_genie_in_the_numerical_example(mu_d: float, genie: float
     """
     batch, count = Batch(61, 3000), 3000
     receivers = {name: made(name, EXAMPLE, mu_d, batch) for name in ("bayesian", "genie", "smart")}
-    exact = expected_traces(EXAMPLE, Outcomes.genie(0.9, mu_d), 61)
-    careless = expected_traces(EXAMPLE, Outcomes.eavesdropper(0.9, mu_d, 1.0, 0.0), 61)
+    exact = theoretical_traces(EXAMPLE, Outcomes.genie(0.9, mu_d), 61)
+    careless = theoretical_traces(EXAMPLE, Outcomes.eavesdropper(0.9, mu_d, 1.0, 0.0), 61)
     assert (exact[60], careless[60]) == pytest.approx((genie, smart), rel=5e-4)
     worse = 0.0
     for slot, beliefs in followed(receivers, slots(EXAMPLE, mu_d, 0.9, batch)):

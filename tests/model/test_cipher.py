@@ -14,7 +14,7 @@ from evedrop.model.number_codes import Mask
 from evedrop.model.process import Process
 from evedrop.model.schemes.cipher import Cipher
 from evedrop.model.streams import Batch, Stream, stream_key
-from evedrop.model.theory.covariances import expected_covariances, state_covariances
+from evedrop.model.theory.covariances import state_covariances, theoretical_covariances
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import ROOT, STABLE, coins, play
 
@@ -86,7 +86,7 @@ def test_errors_are_the_closed_form() -> None:
     """The user's mean squared error and mean P are the plain scheme's, at 5 standard errors."""
     slots, trials = 25, 20_000
     played = play(Cipher(DRIFTING), Batch(slots, trials), {"legitimate": coins(0.7, slots, trials)})
-    expected = np.trace(expected_covariances(DRIFTING, Cipher(DRIFTING).outcomes(0.7), slots), axis1=1, axis2=2)
+    expected = np.trace(theoretical_covariances(DRIFTING, Cipher(DRIFTING).outcomes(0.7), slots), axis1=1, axis2=2)
     for found in (played.squared_error("legitimate"), played.trace("legitimate")):
         assert (np.abs(found.mean(1) - expected) < 5.0 * found.std(1) / np.sqrt(trials)).all()
 

@@ -9,7 +9,7 @@ import pytest
 
 from evedrop.model.process import Process
 from evedrop.model.theory.closed_forms import ClearStatesForm
-from evedrop.model.theory.covariances import NOBODY, Outcomes, expected_covariances, growth
+from evedrop.model.theory.covariances import NOBODY, Outcomes, growth, theoretical_covariances
 
 TURNED, _ = np.linalg.qr(np.random.default_rng(3).standard_normal((4, 4)))
 MIXED = Process(TURNED @ np.diag([1.3, 1.1, 1.0, 0.6]) @ TURNED.T, np.eye(4), np.eye(4))
@@ -36,7 +36,7 @@ def test_an_error_grows_where_it_is_kept_longer_than_it_shrinks(outcomes: Outcom
     assert [found.along(v) for v in TURNED.T] == grows
     assert found.along(TURNED[:, 3] + TURNED[:, 0]) is grows[0]
     # Along the axes, where no rounding of a direction that grows gets into another.
-    late = expected_covariances(replace(MIXED, A=np.diag([1.3, 1.1, 1.0, 0.6])), outcomes, 900)[[300, 899]]
+    late = theoretical_covariances(replace(MIXED, A=np.diag([1.3, 1.1, 1.0, 0.6])), outcomes, 900)[[300, 899]]
     for i, expected in enumerate(grows):
         before, after = (float(P[i, i]) for P in late)
         assert (after > 1.5 * before) is expected

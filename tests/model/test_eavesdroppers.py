@@ -98,7 +98,7 @@ TESTED_ELSEWHERE = {"learning-em", "learning-particle", "tracker"}
 @pytest.mark.parametrize("name", TAKERS)
 @settings(deadline=None)
 @given(seed=st.integers(0, 2**31), first=st.integers(0, 10_000))
-def test_estimate_and_believed_covariance_are_the_papers(name: str, seed: int, first: int) -> None:
+def test_estimate_and_reported_covariance_are_the_papers(name: str, seed: int, first: int) -> None:
     """Used: (z, 0); lost or discarded: (A x̂, A P Aᵀ + Q); before slot 0: (0, Σ0), not predicted."""
     slots, A, Q = 12, PROCESS.A, PROCESS.Q
     gamma, z = events(slots, 2, seed)

@@ -8,10 +8,10 @@ from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import (
     Outcomes,
-    expected_covariances,
-    expected_traces,
     limit_trace,
     state_covariances,
+    theoretical_covariances,
+    theoretical_traces,
 )
 from evedrop.model.theory.design import best_difference, design, relative_secrecy
 from evedrop.model.theory.ratio import Adversary
@@ -71,7 +71,7 @@ def test_item_1_legitimate_expectation(k: int) -> None:
     """The Σ0 term needs the factor 1−μ: corrected it is the mean over events, printed it is not."""
     truth = words_mean(k, legitimate=True, mu_b1=0.0)
     assert legitimate_formula(k, 1 - MU) == pytest.approx(truth, rel=1e-12)
-    assert expected_covariances(EXAMPLE, Outcomes.legitimate(MU, MU_D), k + 1)[k] == pytest.approx(truth, rel=1e-12)
+    assert theoretical_covariances(EXAMPLE, Outcomes.legitimate(MU, MU_D), k + 1)[k] == pytest.approx(truth, rel=1e-12)
     assert legitimate_formula(k, 1.0) != pytest.approx(truth, rel=1e-3)
 
 
@@ -89,7 +89,7 @@ def test_item_2_eavesdropper_expectation(k: int, mu_b1: float) -> None:
     truth = words_mean(k, legitimate=False, mu_b1=mu_b1)
     corrected = eavesdropper_formula(k, mu_b1, (1 - MU) * p_d**k * power(k, START))
     assert corrected == pytest.approx(truth, rel=1e-10)
-    ours = expected_covariances(EXAMPLE, Outcomes.eavesdropper(MU, MU_D, 1.0, mu_b1), k + 1)[k]
+    ours = theoretical_covariances(EXAMPLE, Outcomes.eavesdropper(MU, MU_D, 1.0, mu_b1), k + 1)[k]
     assert ours == pytest.approx(truth, rel=1e-12)
     if p_d**k * np.trace(power(k, START)) > 1e-6 * np.trace(truth):  # beyond, the first term is forgotten anyway
         assert eavesdropper_formula(k, mu_b1, p_d**k * power(k - 1, START)) != pytest.approx(truth, rel=1e-7)
@@ -109,7 +109,7 @@ def test_item_2_base_case_of_the_proof() -> None:
     p_i = MU * (1 - MU_D) * mu_b1
     p_d = 1 - MU * MU_D * mu_b - p_i
     printed = p_d**2 * power(1, START) + p_i * misled_by(1)
-    truth = expected_covariances(EXAMPLE, Outcomes.eavesdropper(MU, MU_D, mu_b, mu_b1), 2)[1]
+    truth = theoretical_covariances(EXAMPLE, Outcomes.eavesdropper(MU, MU_D, mu_b, mu_b1), 2)[1]
     assert (1 - MU * mu_b) * p_d * power(1, START) + p_d * Q + p_i * misled_by(1) == pytest.approx(truth, rel=1e-12)
     assert printed != pytest.approx(truth, rel=1e-3)
 
@@ -156,7 +156,7 @@ def test_item_4_microgrid() -> None:
 def test_item_5_naive_is_beaten_by_no_estimate_at_all(mu_d: float) -> None:
     """For μ_d < 1/2 the constant estimate 0 has less error than the naive eavesdropper in the long run."""
     process = microgrid.process()
-    naive = expected_traces(process, Outcomes.eavesdropper(0.6, mu_d, 1.0, 1.0), 5000)[-1]
+    naive = theoretical_traces(process, Outcomes.eavesdropper(0.6, mu_d, 1.0, 1.0), 5000)[-1]
     zero = np.trace(state_covariances(process, 5000)[-1])
     assert naive > zero
     assert naive / zero == pytest.approx(2 * (1 - mu_d), rel=2e-3)
@@ -195,8 +195,8 @@ def test_item_6_size_of_the_leak() -> None:
             leak = Q - A @ np.linalg.solve(inner, A.T)  # Q Σ_k⁻¹ Q, without forming Σ_k, which is soon singular
             information = np.linalg.solve(Q, leak) @ np.linalg.inv(Q)
             genie = kept * (A @ genie @ A.T + Q) - MU * (1 - mu_d) * leak
-        user = expected_traces(process, Outcomes.legitimate(MU, mu_d), 61)[-1]
-        smart = expected_traces(process, Outcomes.eavesdropper(MU, mu_d, 1.0, 0.0), 61)[-1]
+        user = theoretical_traces(process, Outcomes.legitimate(MU, mu_d), 61)[-1]
+        smart = theoretical_traces(process, Outcomes.eavesdropper(MU, mu_d, 1.0, 0.0), 61)[-1]
         assert (user, np.trace(genie), smart) == pytest.approx(values, rel=5e-4)
 
 

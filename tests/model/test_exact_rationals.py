@@ -30,11 +30,11 @@ from evedrop.model.theory.closed_forms import (
 )
 from evedrop.model.theory.covariances import (
     Outcomes,
-    expected_traces,
     limit_trace,
     misled_covariances,
     noise_covariances,
     radius,
+    theoretical_traces,
 )
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 from tests.examples import examples
@@ -101,18 +101,18 @@ def test_the_process_that_a_recursion_of_inverses_got_wrong() -> None:
     outcomes = Outcomes.genie(0.9, 0.9)
     A, Q, initial = exact(process.A), exact(process.Q), exact(process.initial_covariance)
     expected = [trace(E) for E in rationals.expectations(A, Q, initial, odds_of(outcomes), 60)]
-    found = expected_traces(process, outcomes, 60)
+    found = theoretical_traces(process, outcomes, 60)
     assert all(close(one, value) for one, value in zip(found, expected, strict=True))
-    assert np.all(expected_traces(process, Outcomes.legitimate(0.9, 0.9), 60)[1:] < found[1:])
+    assert np.all(theoretical_traces(process, Outcomes.legitimate(0.9, 0.9), 60)[1:] < found[1:])
 
 
 @settings(deadline=None, max_examples=examples(40))
 @given(models(), receivers)
 def test_expectations(model: Model, outcomes: Outcomes) -> None:
     """The covariances of each receiver's error and belief, in each slot."""
-    for one in (outcomes, outcomes.believed):
+    for one in (outcomes, outcomes.reported):
         expected = rationals.expectations(model.A, model.Q, model.initial, odds_of(one), SLOTS)
-        found = expected_traces(model.process, one, SLOTS)
+        found = theoretical_traces(model.process, one, SLOTS)
         assert all(close(value, trace(E)) for value, E in zip(found, expected, strict=True))
 
 
@@ -336,5 +336,5 @@ def test_limits_near_the_bound_of_stability(excess: float) -> None:
 def test_expectations_of_many_processes(model: Model, outcomes: Outcomes) -> None:
     """As above, with more processes and states."""
     expected = rationals.expectations(model.A, model.Q, model.initial, odds_of(outcomes), SLOTS)
-    found = expected_traces(model.process, outcomes, SLOTS)
+    found = theoretical_traces(model.process, outcomes, SLOTS)
     assert all(close(value, trace(E)) for value, E in zip(found, expected, strict=True))

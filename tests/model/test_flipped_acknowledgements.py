@@ -20,7 +20,7 @@ from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.mixed_packets import forged_fraction
 from evedrop.model.streams import Batch
 from evedrop.model.theory.closed_forms import reference_covariances, reference_limit
-from evedrop.model.theory.covariances import Outcomes, expected_covariances
+from evedrop.model.theory.covariances import Outcomes, theoretical_covariances
 from evedrop.scenario.loading import checked
 from evedrop.studies.papers.luecke2022 import TransmissionPolicy, mean_traces
 from tests.builders import UNSTABLE, digests_of, listener, tables_of
@@ -181,7 +181,7 @@ def test_the_limit_of_the_upper_bound(alpha: float) -> None:
                 assert late[1] > 1.01 * late[0]
             else:
                 assert late[1] == pytest.approx(found, rel=1e-9)
-    spared = expected_covariances(UNSTABLE, Outcomes.plain(0.8), 400)[-1]
+    spared = theoretical_covariances(UNSTABLE, Outcomes.plain(0.8), 400)[-1]
     assert reference_limit(UNSTABLE, 0.8, (0.8, 0.0), alpha) == pytest.approx(np.trace(spared))
 
 

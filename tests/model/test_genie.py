@@ -19,13 +19,13 @@ from evedrop.model.slot.link_distribution import LinkDistribution
 from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import (
     Outcomes,
-    expected_covariances,
-    expected_traces,
     limit,
     limit_trace,
     radius,
     state_covariances,
     tail_index,
+    theoretical_covariances,
+    theoretical_traces,
 )
 from evedrop.model.theory.leak import Leaks, RemainingCovariances, remaining_limit
 from tests.builders import MARGINAL
@@ -128,7 +128,7 @@ def test_the_leak_where_the_state_covariance_cannot_be_inverted() -> None:
 @given(systems(), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
 def test_the_expectation_is_the_recursion(process: Process, mu_e: float, mu_d: float) -> None:
     """P_k = q(A P Aᵀ + Q) − μ_e(1−μ_d) QΣ_k⁻¹Q from P_0 = (1−μ_e)Σ0, to 1e-8, twelve slots."""
-    found = expected_covariances(process, Outcomes.genie(mu_e, mu_d), 12)
+    found = theoretical_covariances(process, Outcomes.genie(mu_e, mu_d), 12)
     q, P = 1.0 - mu_e * mu_d, (1.0 - mu_e) * process.initial_covariance
     for k in range(12):
         if k:
@@ -141,9 +141,9 @@ def test_the_expectation_is_the_recursion(process: Process, mu_e: float, mu_d: f
 def test_known_values() -> None:
     """Numerical example, μ = μ_e = 0.9, Σ0 = Q, slot 60; and slots do not depend on how many are asked for at a time."""
     for mu_d, value in ((0.9, 4.462e-4), (0.7, 1.545e-3)):
-        assert expected_traces(EXAMPLE, Outcomes.genie(0.9, mu_d), 61)[60] == pytest.approx(value, rel=5e-4)
-    whole = expected_traces(MARGINAL, Outcomes.genie(0.9, 0.3), 700)
-    assert np.array_equal(whole[:300], expected_traces(MARGINAL, Outcomes.genie(0.9, 0.3), 300))
+        assert theoretical_traces(EXAMPLE, Outcomes.genie(0.9, mu_d), 61)[60] == pytest.approx(value, rel=5e-4)
+    whole = theoretical_traces(MARGINAL, Outcomes.genie(0.9, 0.3), 700)
+    assert np.array_equal(whole[:300], theoretical_traces(MARGINAL, Outcomes.genie(0.9, 0.3), 300))
 
 
 @settings(deadline=None, max_examples=examples(150))
@@ -154,9 +154,9 @@ def test_nobody_without_the_secret_does_better(process: Process, mu: float, frac
     It is never worse than smart, and unbounded exactly when smart is.
     """
     mu_e = mu * fraction
-    ours = expected_covariances(process, Outcomes.legitimate(mu, mu_d), 40)
-    genie = expected_covariances(process, Outcomes.genie(mu_e, mu_d), 40)
-    smart = expected_covariances(process, Outcomes.eavesdropper(mu_e, mu_d, 1.0, 0.0), 40)
+    ours = theoretical_covariances(process, Outcomes.legitimate(mu, mu_d), 40)
+    genie = theoretical_covariances(process, Outcomes.genie(mu_e, mu_d), 40)
+    smart = theoretical_covariances(process, Outcomes.eavesdropper(mu_e, mu_d, 1.0, 0.0), 40)
     for k in range(40):
         scale = np.abs(smart[k]).max() + np.abs(process.Q).max()
         assert np.linalg.eigvalsh(genie[k] - ours[k])[0] >= -1e-11 * scale
@@ -177,7 +177,7 @@ def test_the_limit_is_where_it_goes(process: Process) -> None:
     leaks = np.linalg.eigvalsh(process.Q - M)
     assert (leaks[-1] > 1e-3) == (process is MIXED)
     outcomes = Outcomes.genie(0.9, 0.9)
-    found = expected_covariances(process, outcomes, 601)[600]
+    found = theoretical_covariances(process, outcomes, 601)[600]
     assert np.allclose(found, limit(process, outcomes), rtol=1e-9, atol=1e-9 * np.abs(found).max())
 
 
@@ -187,7 +187,7 @@ def test_the_limit_of_stable_processes(process: Process, mu_e: float, mu_d: floa
     """There Σ_k converges, and what remains of the noise is Q − QΣ⁻¹Q with Σ its limit."""
     assume(radius(process) < 1.0)
     outcomes = Outcomes.genie(mu_e, mu_d)
-    found = expected_covariances(process, outcomes, 400)[399]
+    found = theoretical_covariances(process, outcomes, 400)[399]
     assert np.allclose(found, limit(process, outcomes), rtol=1e-7, atol=1e-8 * np.abs(process.Q).max())
 
 
@@ -202,7 +202,7 @@ def test_bursts_and_tails() -> None:
     assert even is not None
     assert bursts is not None
     found = modulated.ModulatedCovariance(EXAMPLE, LinkDistribution.steady(even), at).next_traces(50)
-    assert np.allclose(found, expected_traces(EXAMPLE, Outcomes.genie(0.8, 0.8), 50), rtol=1e-12)
+    assert np.allclose(found, theoretical_traces(EXAMPLE, Outcomes.genie(0.8, 0.8), 50), rtol=1e-12)
     for process in (EXAMPLE, MIXED):
         late = modulated.ModulatedCovariance(process, LinkDistribution.steady(bursts), at).next_traces(800)[-1]
         assert late == pytest.approx(modulated.limit_trace(process, bursts, at), rel=1e-9)
@@ -212,11 +212,11 @@ def test_bursts_and_tails() -> None:
 
 
 def test_simulated_genies_agree_with_theory() -> None:
-    """Squared error and believed trace, every third slot of two processes, 4000 trials, at 4.5 standard errors."""
+    """Squared error and reported trace, every third slot of two processes, 4000 trials, at 4.5 standard errors."""
     for process, mu_d in ((MARGINAL, 0.3), (EXAMPLE, 0.9)):
         batch = Batch(31, 4000)
         one = READERS["genie"](Knowledge(process, mu_d, {}, keys(3)), batch)
-        expected = expected_traces(process, Outcomes.genie(0.9, mu_d), 31)
+        expected = theoretical_traces(process, Outcomes.genie(0.9, mu_d), 31)
         for slot, beliefs in followed({"genie": one}, slots(process, mu_d, 0.9, batch, 3)):
             belief = beliefs["genie"]
             if slot.k % 3 == 0 and slot.k:

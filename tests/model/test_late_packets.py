@@ -150,7 +150,7 @@ def test_an_absence_is_a_receiver_that_hears_nothing() -> None:
 
 
 def test_the_prior_of_a_slot_is_the_state_covariance() -> None:
-    """A receiver that starts before slot k believes 0 and Σ_{k−1}."""
+    """A receiver that starts before slot k reports 0 and Σ_{k−1}."""
     sigma = PROCESS.initial_covariance
     assert np.array_equal(prior(PROCESS, 1).P[:, :, 0], sigma)
     for k in range(1, 6):

@@ -160,7 +160,7 @@ def test_a_trial_has_the_same_bits_alone_and_among_others(process: Process) -> N
 )
 @pytest.mark.filterwarnings("error")
 def test_it_stays_finite(process: Process, mu_e: float) -> None:
-    """With a process that grows, and with hardly a packet, whatever it believes the process to be."""
+    """With a process that grows, and with hardly a packet, whatever it takes the process to be."""
     batch = Batch(90, 20)
     one = learner(process, batch, keeps=16)
     belief = one.prior()

@@ -1,4 +1,4 @@
-"""Expected covariances behind links that remember: against the independent recursion, enumeration, limits and tails."""
+"""Theoretical covariances behind links that remember: against the independent recursion, enumeration, limits and tails."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link_distribution import LinkDistribution, Segment
 from evedrop.model.theory.covariances import (
     Outcomes,
-    expected_traces,
     has_infinite_variance,
     misled_covariances,
     tail_index,
+    theoretical_traces,
 )
 from evedrop.model.theory.covariances import limit_trace as independent_limit
 from tests.builders import MARGINAL, UNSTABLE
@@ -66,7 +66,7 @@ def test_a_link_whose_states_are_alike_is_the_papers(
     process: Process, outcomes_at: Callable[[float], Outcomes]
 ) -> None:
     """One state, or several of one quality, give the independent recursion, to 1e-12, and its limit."""
-    expected = expected_traces(process, outcomes_at(0.7), 60)
+    expected = theoretical_traces(process, outcomes_at(0.7), 60)
     for chain in (Chain(np.ones((1, 1)), np.ones(1), np.array([0.7])), bursts(0.1, 0.3, 0.3, 0.3)):
         np.testing.assert_allclose(
             ModulatedCovariance(process, LinkDistribution.steady(chain), outcomes_at).next_traces(60),

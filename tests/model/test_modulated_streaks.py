@@ -14,7 +14,7 @@ from evedrop.model.links.loss_model import Chain
 from evedrop.model.modulated import ModulatedCovariance, modulated_streaks
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link_distribution import LinkDistribution, Segment
-from evedrop.model.theory.covariances import NOBODY, Outcomes, OutcomesAt, expected_traces
+from evedrop.model.theory.covariances import NOBODY, Outcomes, OutcomesAt, theoretical_traces
 from evedrop.model.theory.leak import RemainingCovariances
 from evedrop.model.theory.rare_events import Streaks, streaks
 from tests.model.test_rare_events import FIRST, LEGITIMATE, LOST, MISLEADING, MISLED, PLANE, SMART
@@ -98,7 +98,7 @@ def test_independent_losses_have_the_streaks_of_the_closed_form(outcomes: Outcom
         LinkDistribution.steady(STEADY),
         lambda _: outcomes,
         40,
-        float(expected_traces(PLANE, outcomes, 40).sum()),
+        float(theoretical_traces(PLANE, outcomes, 40).sum()),
     )
     closed = streaks(PLANE, outcomes, 40)
     assert found is not None

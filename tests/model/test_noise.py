@@ -23,7 +23,7 @@ from evedrop.model.schemes.noise import Noise
 from evedrop.model.schemes.plain import Plain
 from evedrop.model.streams import Batch
 from evedrop.model.theory.closed_forms import NoiseTaken, ReceiverConditions, TakesNoise
-from evedrop.model.theory.covariances import NOBODY, Outcomes, expected_covariances, limit, state_covariances
+from evedrop.model.theory.covariances import NOBODY, Outcomes, limit, state_covariances, theoretical_covariances
 from evedrop.model.theory.leak import Leaks
 from tests.builders import UNSTABLE
 from tests.examples import mostly_long
@@ -105,7 +105,7 @@ def test_errors_are_the_closed_forms(given: Any) -> None:
             taken = taken_by(scheme, name, 0.8, **(some if name == "suspicious" else {}))
             expected = taken.covariances(slots)
         else:
-            expected = expected_covariances(STABLE, outcomes, slots)
+            expected = theoretical_covariances(STABLE, outcomes, slots)
         errors = played.squared_error(name)
         apart = np.abs(errors.mean(axis=1) - np.trace(expected, axis1=1, axis2=2))
         assert (apart < 5.0 * errors.std(axis=1) / np.sqrt(trials) + 1e-15).all(), name

@@ -21,7 +21,7 @@ from evedrop.model.schemes.partial_encryption import UNENCRYPTED_INNOVATION, Par
 from evedrop.model.schemes.scheme import Packet
 from evedrop.model.streams import Batch
 from evedrop.model.theory.closed_forms import ClearStatesForm
-from evedrop.model.theory.covariances import Outcomes, expected_traces, state_covariances
+from evedrop.model.theory.covariances import Outcomes, state_covariances, theoretical_traces
 from tests.builders import DRIFTING, MARGINAL, MICROGRID, UNSTABLE, stream_keys
 from tests.examples import examples
 from tests.model import rationals
@@ -140,7 +140,7 @@ def test_the_reader_says_what_it_did() -> None:
     np.testing.assert_allclose(reader.prior(3).P[:, :, 0], state_covariances(MARGINAL, 3)[2], rtol=1e-12)
 
 
-def test_its_error_has_the_covariance_that_it_believes() -> None:
+def test_its_error_has_the_covariance_that_it_reports() -> None:
     """Over 4000 trials behind a lossy link, in the last slot: z within 4.5 for each entry of the error's square."""
     batch = Batch(12, 4000)
     one = scheme(UNSTABLE, [0], 0.6)
@@ -170,8 +170,8 @@ def test_one_encrypted_message_is_enough() -> None:
     assert np.trace(grown) > 1e6
     outcomes = one.reader_outcomes(READER, 1.0)
     assert outcomes is not None
-    assert expected_traces(UNSTABLE, outcomes, 31)[30] == pytest.approx(np.trace(grown), rel=1e-9)
-    assert expected_traces(UNSTABLE, one.outcomes(1.0), 31)[30] == 0.0
+    assert theoretical_traces(UNSTABLE, outcomes, 31)[30] == pytest.approx(np.trace(grown), rel=1e-9)
+    assert theoretical_traces(UNSTABLE, one.outcomes(1.0), 31)[30] == 0.0
     assert scheme(UNSTABLE, [0], 0.0).closed_form(READER, 1.0, 5).limit == math.inf  # type: ignore[union-attr]
 
 

@@ -11,7 +11,7 @@ import pytest
 from evedrop.model import process as parts_of_runs
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory import rare_events
-from evedrop.model.theory.covariances import NOBODY, Outcomes, expected_traces
+from evedrop.model.theory.covariances import NOBODY, Outcomes, theoretical_traces
 from evedrop.model.theory.rare_events import Streaks, streaks
 
 PLANE = Process(
@@ -94,7 +94,7 @@ def test_streaks_do_not_depend_on_the_parts_of_a_run(monkeypatch: pytest.MonkeyP
 def test_streaks_of_a_long_run_carry_the_whole_expectation(outcomes: Outcomes) -> None:
     """Over several blocks of powers, all but the fraction that is left out is carried; the numbers fall with the length."""
     found = found_in(STABLE, outcomes, 3000)
-    assert found.total == pytest.approx(float(expected_traces(STABLE, outcomes, 3000).sum()), rel=1e-12)
+    assert found.total == pytest.approx(float(theoretical_traces(STABLE, outcomes, 3000).sum()), rel=1e-12)
     assert found.carried.sum() == pytest.approx(found.total, rel=2e-9)
     assert np.all(np.diff(found.number) <= 0.0)
 

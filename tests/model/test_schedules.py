@@ -14,7 +14,7 @@ from scipy.optimize import differential_evolution
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
 from evedrop.model.theory import schedules
-from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
+from evedrop.model.theory.covariances import Outcomes, misled_covariances, theoretical_traces
 from evedrop.model.theory.ratio import Adversary
 from evedrop.model.theory.schedules import BestSchedule, ScheduleDesign, ScheduleProblem, SlotRecursion, best_schedule
 from tests.builders import DRIFTING, UNSTABLE
@@ -58,7 +58,7 @@ def test_a_constant_schedule_has_the_expectations_of_the_scheme(process: Process
     for outcomes_at in (user_at, at):
         found = SlotRecursion(process, outcomes_at, 12).traces(mu_d)
         for row, value in zip(found, (0.3, 0.9), strict=True):
-            assert np.allclose(row, expected_traces(process, outcomes_at(value), 12), rtol=1e-9)
+            assert np.allclose(row, theoretical_traces(process, outcomes_at(value), 12), rtol=1e-9)
 
 
 @pytest.mark.parametrize("eavesdropper", ["user", "smart", "naive"])

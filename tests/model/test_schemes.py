@@ -42,7 +42,7 @@ def packets(scheme: str, process: Process, batch: Batch) -> Iterator[tuple[np.nd
 
 
 def beliefs(scheme: str, process: Process, batch: Batch, gamma: np.ndarray) -> list[Belief]:
-    """What the legitimate estimator believes after every slot, given γ (slots, R)."""
+    """What the legitimate estimator reports after every slot, given γ (slots, R)."""
     estimator = made(scheme, process).estimator(KEYS, batch)
     belief, found = estimator.prior(), []
     for k, (_, z, _) in enumerate(packets(scheme, process, batch)):

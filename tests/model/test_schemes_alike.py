@@ -22,7 +22,7 @@ def made(name: str, process: Process, **changes: Any) -> Scheme:
 
 
 def bits(played: Played, part: slice) -> list[bytes]:
-    """Everything sent and believed in some trials."""
+    """Everything sent and estimated in some trials."""
     found = []
     for packet in played.packets:
         header = np.zeros(0) if packet.header is None else packet.header[:, part]
@@ -53,7 +53,7 @@ def test_a_trial_alone_is_the_same_trial(name: str, process: Process) -> None:
 
 @pytest.mark.parametrize("name", SCHEMES)
 def test_a_step_is_pure(name: str) -> None:
-    """A receiver asked for a slot again gives the same belief, and changes neither what it believed nor what it heard."""
+    """A receiver asked for a slot again gives the same belief, and changes neither its belief before nor what it heard."""
     scheme = made(name, STABLE)
     batch = Batch(12, 20)
     estimator = scheme.estimator(keys_of(scheme.estimator_streams), batch)

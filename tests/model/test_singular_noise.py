@@ -23,7 +23,7 @@ from evedrop.model.process import Process, StateFactors
 from evedrop.model.receiver import Action, Belief, Reception
 from evedrop.model.schedule import PACKETS, NoiseDistribution, Schedule
 from evedrop.model.streams import Batch
-from evedrop.model.theory.covariances import Outcomes, expected_traces, limit_trace
+from evedrop.model.theory.covariances import Outcomes, limit_trace, theoretical_traces
 from evedrop.model.theory.leak import Leaks, RemainingCovariances, remaining_limit
 from tests.examples import mostly_long
 from tests.model.rationals import Matrix, combined, congruent, exact, remaining, times, transposed
@@ -287,11 +287,11 @@ def test_expectations_of_the_genie_are_exact() -> None:
             G = combined((q, congruent(A, G)), (1 - mu_e, Q), (leaked, remaining(Q, sigma)))
             expected.append(G)
         traces = [float(sum(G[i][i] for i in range(process.n))) for G in expected]
-        assert np.allclose(expected_traces(process, outcomes, slots), traces, rtol=1e-11)
+        assert np.allclose(theoretical_traces(process, outcomes, slots), traces, rtol=1e-11)
     for case in ("a mode without noise", "two of three"):
         process = PROCESSES[case]
         if math.isfinite(limit := limit_trace(process, outcomes)):
-            assert expected_traces(process, outcomes, 800)[-1] == pytest.approx(limit, rel=1e-9)
+            assert theoretical_traces(process, outcomes, 800)[-1] == pytest.approx(limit, rel=1e-9)
         M = remaining_at(process, 400)
         assert np.allclose(M, remaining_limit(process), rtol=1e-9, atol=1e-15)
         assert np.linalg.eigvalsh(process.Q - M).max() > 1e-3

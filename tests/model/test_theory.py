@@ -12,10 +12,8 @@ from hypothesis import strategies as st
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory.covariances import (
     NOBODY,
-    ExpectedCovariance,
     Outcomes,
-    expected_covariances,
-    expected_traces,
+    TheoreticalCovariance,
     has_infinite_variance,
     limit,
     limit_trace,
@@ -25,6 +23,8 @@ from evedrop.model.theory.covariances import (
     stability_bound,
     state_covariances,
     tail_index,
+    theoretical_covariances,
+    theoretical_traces,
 )
 from tests.builders import MICROGRID, UNSTABLE
 from tests.examples import examples
@@ -100,7 +100,7 @@ def close(found: Floats, expected: Floats) -> bool:
 @settings(deadline=None, max_examples=examples(60))
 def test_legitimate_expectation_is_the_recursion(process: Process, mu: float, mu_d: float, slots: int) -> None:
     """E P_k of the legitimate estimator equals the slot-by-slot recursion over its events."""
-    found = expected_covariances(process, Outcomes.legitimate(mu, mu_d), slots)
+    found = theoretical_covariances(process, Outcomes.legitimate(mu, mu_d), slots)
     assert close(found, legitimate_recursion(process, slots, mu, mu_d))
 
 
@@ -110,7 +110,7 @@ def test_eavesdropper_expectation_is_the_recursion(
     process: Process, mu_e: float, mu_d: float, b0: float, b1: float, slots: int
 ) -> None:
     """E P_k of any strategy of the class equals the slot-by-slot recursion over its five events."""
-    found = expected_covariances(process, Outcomes.eavesdropper(mu_e, mu_d, b0, b1), slots)
+    found = theoretical_covariances(process, Outcomes.eavesdropper(mu_e, mu_d, b0, b1), slots)
     assert close(found, eavesdropper_recursion(process, slots, mu_e, mu_d, b0, b1))
 
 
@@ -119,7 +119,7 @@ def test_eavesdropper_expectation_is_the_recursion(
 def test_outcomes_are_a_distribution(process: Process, mu_e: float, mu_d: float, b0: float, b1: float) -> None:
     """The outcomes of a slot sum to one, for the truth and for the belief."""
     for outcomes in (Outcomes.eavesdropper(mu_e, mu_d, b0, b1), Outcomes.legitimate(mu_e, mu_d)):
-        for view in (outcomes, outcomes.believed):
+        for view in (outcomes, outcomes.reported):
             assert view.predicted + view.state + view.misled + view.decoded == pytest.approx(1.0, abs=1e-12)
             assert min(view.predicted, view.state, view.misled, view.decoded, view.initial) >= -1e-15
 
@@ -130,8 +130,8 @@ def test_long_runs_cross_blocks() -> None:
         (Outcomes.legitimate(0.9, 0.6), legitimate_recursion(UNSTABLE, 1050, 0.9, 0.6)),
         (Outcomes.eavesdropper(0.9, 0.6, 1, 1), eavesdropper_recursion(UNSTABLE, 1050, 0.9, 0.6, 1, 1)),
     ):
-        assert close(expected_covariances(UNSTABLE, outcomes, 1050), reference)
-    naive = expected_covariances(MICROGRID, Outcomes.eavesdropper(0.6, 0.1, 1, 1), 5000)
+        assert close(theoretical_covariances(UNSTABLE, outcomes, 1050), reference)
+    naive = theoretical_covariances(MICROGRID, Outcomes.eavesdropper(0.6, 0.1, 1, 1), 5000)
     assert close(naive, eavesdropper_recursion(MICROGRID, 5000, 0.6, 0.1, 1, 1))
 
 
@@ -140,8 +140,8 @@ def test_long_runs_cross_blocks() -> None:
 def test_chunks_are_the_whole(process: Process, mu: float, mu_d: float, chunks: list[int]) -> None:
     """Asked for in chunks of any size, the expectation is the same to the last bit."""
     outcomes = Outcomes.eavesdropper(mu, mu_d, 0.9, 0.2)
-    whole = expected_traces(process, outcomes, sum(chunks))
-    source = ExpectedCovariance(process, outcomes)
+    whole = theoretical_traces(process, outcomes, sum(chunks))
+    source = TheoreticalCovariance(process, outcomes)
     parts = np.concatenate([source.next_traces(chunk) for chunk in chunks])
     assert np.array_equal(whole, parts)
 
@@ -170,11 +170,11 @@ def test_expectation_is_the_mean_over_all_words(k: int) -> None:
     """E P_k is the probability-weighted mean over every sequence of events."""
     mu, mu_d, b0, b1 = 0.7, 0.6, 0.8, 0.3
     ours = {"L": 1 - mu, "S": mu * mu_d, "D": mu * (1 - mu_d)}
-    found = expected_covariances(UNSTABLE, Outcomes.legitimate(mu, mu_d), k + 1)[k]
+    found = theoretical_covariances(UNSTABLE, Outcomes.legitimate(mu, mu_d), k + 1)[k]
     assert found == pytest.approx(enumerated(UNSTABLE, k, ours, 1 - mu), rel=1e-12)
     theirs = {"S": mu * mu_d * b0, "M": mu * (1 - mu_d) * b1}
     theirs["L"] = 1 - sum(theirs.values())
-    found = expected_covariances(UNSTABLE, Outcomes.eavesdropper(mu, mu_d, b0, b1), k + 1)[k]
+    found = theoretical_covariances(UNSTABLE, Outcomes.eavesdropper(mu, mu_d, b0, b1), k + 1)[k]
     assert found == pytest.approx(enumerated(UNSTABLE, k, theirs, 1 - mu * b0), rel=1e-12)
 
 
@@ -189,9 +189,9 @@ def test_belief_ignores_being_misled() -> None:
             return p_d * (A @ B @ A.T + Q)
 
         reference = recursion(UNSTABLE, 60, step, 1 - 0.9 * b0)
-        assert close(expected_covariances(UNSTABLE, outcomes.believed, 60), reference)
+        assert close(theoretical_covariances(UNSTABLE, outcomes.reported, 60), reference)
     smart = Outcomes.eavesdropper(0.9, 0.6, 1.0, 0.0)
-    assert smart.believed == smart
+    assert smart.reported == smart
 
 
 def test_noise_has_the_covariance_of_the_carried_state() -> None:
@@ -210,7 +210,7 @@ def test_overflow_is_infinite_and_silent(scale: float) -> None:
     """Beyond double precision every expectation is inf, from then on, never nan and without a warning."""
     process = Process(scale * np.array([[1.0, -0.9], [0.3, -1.2]]), np.eye(2), np.eye(2))
     for outcomes in (Outcomes.legitimate(0.5, 0.1), Outcomes.eavesdropper(0.9, 0.1, 1, 1), Outcomes.plain(0.0)):
-        traces = expected_traces(process, outcomes, 40_000)
+        traces = theoretical_traces(process, outcomes, 40_000)
         assert not np.any(np.isnan(traces))
         assert math.isinf(traces[-1])
         first = int(np.argmax(np.isinf(traces)))
@@ -222,7 +222,9 @@ def test_overflow_is_infinite_and_silent(scale: float) -> None:
 def test_bounded_expectation_of_unstable_process_stays_at_its_limit() -> None:
     """After 86 400 slots, when A^k has long overflowed, the expectation still is its limit."""
     outcomes = Outcomes.legitimate(0.9, 0.6)
-    assert expected_traces(UNSTABLE, outcomes, 86_400)[-1] == pytest.approx(limit_trace(UNSTABLE, outcomes), rel=1e-12)
+    assert theoretical_traces(UNSTABLE, outcomes, 86_400)[-1] == pytest.approx(
+        limit_trace(UNSTABLE, outcomes), rel=1e-12
+    )
 
 
 @given(processes(), st.floats(0.05, 1.0), st.floats(0.05, 1.0), st.sampled_from([(1.0, 0.0), (0.7, 0.0)]))
@@ -236,7 +238,7 @@ def test_limits_are_where_long_runs_end(process: Process, mu: float, mu_d: float
         rate = outcomes.kept * process.spectral_radius**2
         if rate < 0.98:
             assert mu_d > stability_bound(process, quality)
-            assert close(expected_covariances(process, outcomes, 3000)[-1:], limit(process, outcomes)[None])
+            assert close(theoretical_covariances(process, outcomes, 3000)[-1:], limit(process, outcomes)[None])
         elif rate > 1.0 + 1e-9 and outcomes.predicted > 0.0:
             assert mu_d < stability_bound(process, quality)
             assert math.isinf(limit_trace(process, outcomes))
@@ -287,7 +289,7 @@ def test_stability_bounds_of_special_links() -> None:
 def test_lossless_link_has_no_error() -> None:
     """With μ = 1 the legitimate error is 0 in every slot and in the limit, whatever μ_d."""
     for mu_d in (0.0, 0.1, 1.0):
-        assert np.array_equal(expected_traces(UNSTABLE, Outcomes.legitimate(1.0, mu_d), 50), np.zeros(50))
+        assert np.array_equal(theoretical_traces(UNSTABLE, Outcomes.legitimate(1.0, mu_d), 50), np.zeros(50))
         assert limit_trace(UNSTABLE, Outcomes.legitimate(1.0, mu_d)) == 0.0
 
 
@@ -298,7 +300,7 @@ def test_microgrid_closed_form() -> None:
         theirs = limit_trace(MICROGRID, Outcomes.eavesdropper(0.6, mu_d, 1, 0))
         assert ours == pytest.approx(0.4 * 2e-5 / (0.6 * mu_d), rel=1e-12)
         assert theirs == pytest.approx((1 - 0.6 * mu_d) * 2e-5 / (0.6 * mu_d), rel=1e-12)
-        naive = expected_traces(MICROGRID, Outcomes.eavesdropper(0.6, mu_d, 1, 1), 86_400)[-1]
+        naive = theoretical_traces(MICROGRID, Outcomes.eavesdropper(0.6, mu_d, 1, 1), 86_400)[-1]
         sigma = np.trace(MICROGRID.initial_covariance + 86_399 * MICROGRID.Q)
         assert naive / sigma == pytest.approx(2 * (1 - mu_d), rel=1e-4)
 
@@ -336,14 +338,14 @@ def test_second_moment_diverges_where_variance_is_said_infinite(mu_d: float) -> 
 def test_misled_error_grows_in_proportion_to_the_state(b0: float, b1: float) -> None:
     """The ratio tr E P_k / tr Σ_k tends to 2 p_i / (p_i + p_r), for naive 2 (1 − μ_d)."""
     outcomes = Outcomes.eavesdropper(0.9, 0.6, b0, b1)
-    ratio = expected_traces(UNSTABLE, outcomes, 300)[-1] / np.trace(state_covariances(UNSTABLE, 300)[-1])
+    ratio = theoretical_traces(UNSTABLE, outcomes, 300)[-1] / np.trace(state_covariances(UNSTABLE, 300)[-1])
     assert ratio == pytest.approx(2 * 0.4 * b1 / (0.4 * b1 + 0.6 * b0), rel=1e-9)
 
 
 def test_misled_error_stays_within_a_factor_of_its_expectation() -> None:
     """Why a misled receiver has no heavy tail: no sequence of events gives more than a fixed multiple of E tr P_k."""
     outcomes = Outcomes.eavesdropper(0.9, 0.6, 1, 1)
-    expected = expected_traces(UNSTABLE, outcomes, 200)
+    expected = theoretical_traces(UNSTABLE, outcomes, 200)
     sigma = np.trace(state_covariances(UNSTABLE, 200), axis1=1, axis2=2)
     ratio = 2.0 * sigma[5:] / expected[5:]
     assert ratio.max() < 1.01 * ratio[:20].max()
@@ -361,7 +363,7 @@ def test_who_never_uses_a_state_has_no_heavy_tail() -> None:
                      Outcomes.legitimate(0.6, 0.0)):  # fmt: skip
         assert math.isinf(tail_index(UNSTABLE, outcomes))
         assert not has_infinite_variance(UNSTABLE, outcomes)
-        assert expected_traces(UNSTABLE, NOBODY, 200)[-1] < 10.0 * expected_traces(UNSTABLE, outcomes, 200)[-1]
+        assert theoretical_traces(UNSTABLE, NOBODY, 200)[-1] < 10.0 * theoretical_traces(UNSTABLE, outcomes, 200)[-1]
 
 
 @pytest.mark.parametrize("angle", [0.1, 0.7, 2.0])

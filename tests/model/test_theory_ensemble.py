@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action
-from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
+from evedrop.model.theory.covariances import Outcomes, misled_covariances, theoretical_traces
 from evedrop.model.update import actual_covariance
 from evedrop.studies.papers import strategies
 
@@ -44,8 +44,8 @@ def test_simulated_covariances_average_to_the_expectation(process: Process, b0: 
         P = actual_covariance(process, k, P, actions(gamma, nu), nu, misled[k])
         P_e = actual_covariance(process, k, P_e, np.where(used, np.uint8(Action.STATE), np.uint8(0)), nu, misled[k])
         ours[k], theirs[k] = np.trace(P), np.trace(P_e)
-    assert agrees(ours, expected_traces(process, Outcomes.legitimate(mu, mu_d), SLOTS))
-    assert agrees(theirs, expected_traces(process, Outcomes.eavesdropper(mu_e, mu_d, b0, b1), SLOTS))
+    assert agrees(ours, theoretical_traces(process, Outcomes.legitimate(mu, mu_d), SLOTS))
+    assert agrees(theirs, theoretical_traces(process, Outcomes.eavesdropper(mu_e, mu_d, b0, b1), SLOTS))
 
 
 def test_steps_are_the_three_cases() -> None:
@@ -64,12 +64,12 @@ def test_steps_are_the_three_cases() -> None:
 
 
 def test_real_model_has_the_expected_error() -> None:
-    """Squared error and believed trace of every receiver of the emulator agree with theory, slot by slot."""
+    """Squared error and reported trace of every receiver of the emulator agree with theory, slot by slot."""
     runs = strategies.simulate(20_000, lambda _: None)
     for name, outcomes in strategies.outcomes().items():
         for theory, (mean, error) in (
             (outcomes, runs.squared_error[name]),
-            (outcomes.believed, runs.believed[name]),
+            (outcomes.reported, runs.reported[name]),
         ):
-            expected = expected_traces(strategies.process(), theory, strategies.SLOTS)
+            expected = theoretical_traces(strategies.process(), theory, strategies.SLOTS)
             assert np.all(np.abs(mean - expected) <= 5.0 * error + 1e-15), name

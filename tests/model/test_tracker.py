@@ -54,7 +54,7 @@ def spy(process: Process, batch: Batch, learns_at: int) -> Eavesdropper:
     return STRATEGIES["replay-informed"](Knowledge(process, 1.0, parameters, {}), batch)
 
 
-def believed(process: Process, batch: Batch, gamma: np.ndarray, learns_at: int) -> list[tuple[Slot, Belief]]:
+def reported(process: Process, batch: Batch, gamma: np.ndarray, learns_at: int) -> list[tuple[Slot, Belief]]:
     """Every slot with the spy's belief after it."""
     one, found = spy(process, batch, learns_at), []
     belief = one.prior()
@@ -127,7 +127,7 @@ def test_it_is_the_exact_posterior(process: Process, learns_at: int) -> None:
     scale = float(np.sqrt(np.trace(process.initial_covariance + process.Q)))
     heard: list[dict[int, np.ndarray]] = [{} for _ in range(40)]
     states: dict[int, np.ndarray] = {}
-    for slot, belief in believed(process, Batch(6, 40), gamma, learns_at):
+    for slot, belief in reported(process, Batch(6, 40), gamma, learns_at):
         states[slot.k] = slot.x
         for r in range(40):
             if slot.gamma[r]:
@@ -174,7 +174,7 @@ def test_its_room_is_enough_for_as_many_packets_as_the_documents_say(process: Pr
 def test_before_the_leak_it_is_half_way_between_the_tracks(process: Process) -> None:
     """At least ½ tr A^k Σ0 A^kᵀ in the mean and, as soon as it has heard both tracks, no more; at five standard errors."""
     batch = Batch(15, 4000)
-    found, bound = errors(believed(process, batch, coins(0.9, 15, 4000), 14)), twin_track_bound(process, 15)
+    found, bound = errors(reported(process, batch, coins(0.9, 15, 4000), 14)), twin_track_bound(process, 15)
     mean, error = found.mean(axis=1), found.std(axis=1) / np.sqrt(4000)
     assert np.all(mean[:14] + 5.0 * error[:14] > bound[:14])
     assert np.all(mean[8:14] - 5.0 * error[8:14] < 1.01 * bound[8:14])
@@ -189,7 +189,7 @@ def test_one_betrayed_state_breaks_twin_tracks() -> None:
     """
     batch, learns_at = Batch(60, 2000), 20
     gamma = coins(0.9, 60, 2000)
-    found = errors(believed(DRIFTING, batch, gamma, learns_at))
+    found = errors(reported(DRIFTING, batch, gamma, learns_at))
     estimator = TwinTrack(DRIFTING).estimator(KEYS, batch)
     user, belief = [], estimator.prior()
     for slot in slots(DRIFTING, batch, gamma):
@@ -211,7 +211,7 @@ def test_a_leak_beside_the_twins_packet_opens_everything() -> None:
     batch, learns_at = Batch(40, 1000), 10
     gamma = coins(0.9, 40, 1000)
     gamma[learns_at] = True
-    pairs = believed(UNSTABLE, batch, gamma, learns_at)
+    pairs = reported(UNSTABLE, batch, gamma, learns_at)
     tracks, estimator = TwinTracks(UNSTABLE, KEYS, batch), TwinTrack(UNSTABLE).estimator(KEYS, batch)
     on_twin, user = tracks.on_twin(learns_at), estimator.prior()
     for slot, belief in pairs:
@@ -226,10 +226,10 @@ def test_a_leak_beside_the_twins_packet_opens_everything() -> None:
 
 
 @pytest.mark.thorough
-def test_what_it_believes_is_true() -> None:
+def test_what_it_reports_is_true() -> None:
     """Before and after the leak tr P is its squared error in the mean, at five standard errors, where nothing is plain."""
     batch = Batch(30, 3000)
-    pairs = believed(RESTLESS, batch, coins(0.8, 30, 3000), 12)
+    pairs = reported(RESTLESS, batch, coins(0.8, 30, 3000), 12)
     for slot, (one, belief) in enumerate(pairs):
         error = ((one.x - belief.x_hat) ** 2).sum(axis=0) - np.trace(belief.P)
         assert abs(error.mean()) < 5.0 * error.std() / np.sqrt(3000) + 1e-12, slot
@@ -237,7 +237,7 @@ def test_what_it_believes_is_true() -> None:
 
 def test_it_does_not_say_that_it_knows_before_it_does() -> None:
     """Up to the leak a packet is read for what it tells of both tracks; from then on it is a state."""
-    for slot, belief in believed(UNSTABLE, Batch(12, 50), coins(0.8, 12, 50), 6):
+    for slot, belief in reported(UNSTABLE, Batch(12, 50), coins(0.8, 12, 50), 6):
         read = Action.INNOVATION if slot.k <= 6 else Action.STATE
         assert np.array_equal(belief.action, np.where(slot.gamma, np.uint8(read), np.uint8(Action.LOST)))
 
@@ -253,10 +253,10 @@ def test_it_does_not_say_that_it_knows_before_it_does() -> None:
 def test_a_trial_alone_and_a_shorter_run_are_the_same(process: Process) -> None:
     """The same bits among 300 trials, among 6 and alone, and in a run that ends earlier, also where histories are merged."""
     gamma = coins(0.8, 40, 300)
-    among = believed(process, Batch(40, 300), gamma, 9)
+    among = reported(process, Batch(40, 300), gamma, 9)
     for first, count, length in ((77, 1, 40), (200, 6, 25)):
         part = slice(first, first + count)
-        some = believed(process, Batch(length, count, first), gamma[:length, part], 9)
+        some = reported(process, Batch(length, count, first), gamma[:length, part], 9)
         for (_, one), (_, other) in zip(some, among[:length], strict=True):
             assert one.x_hat.tobytes() == other.x_hat[:, part].tobytes()
             assert one.P.tobytes() == other.P[:, :, part].tobytes()

@@ -12,7 +12,7 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.schemes.twin_track import TwinTrack, TwinTracks
 from evedrop.model.streams import Batch
 from evedrop.model.theory.closed_forms import twin_track_bound
-from evedrop.model.theory.covariances import expected_covariances
+from evedrop.model.theory.covariances import theoretical_covariances
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import STABLE, coins, keys_of, play
 
@@ -59,7 +59,7 @@ def test_errors_are_the_closed_form() -> None:
     powers = [np.linalg.matrix_power(DRIFTING.A, j) for j in range(slots)]
     terms = [(1.0 - mu) ** (j + 1) * np.trace(power @ DRIFTING.Q @ power.T) for j, power in enumerate(powers)]
     expected = np.array([sum(terms[:k]) for k in range(slots)])
-    theory = expected_covariances(DRIFTING, TwinTrack(DRIFTING).outcomes(mu), slots)
+    theory = theoretical_covariances(DRIFTING, TwinTrack(DRIFTING).outcomes(mu), slots)
     assert np.allclose(np.trace(theory, axis1=1, axis2=2), expected, rtol=1e-12)
     for found in (played.squared_error("legitimate"), played.trace("legitimate")):
         assert (np.abs(found.mean(1) - expected) <= 5.0 * found.std(1) / np.sqrt(trials) + 1e-25).all()

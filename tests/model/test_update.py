@@ -26,7 +26,7 @@ def test_the_error_of_a_slot_is_the_tables() -> None:
 
 
 def test_the_actual_covariance_of_a_slot_is_the_tables() -> None:
-    """As the receiver believes, but where it was misled, f_k."""
+    """As the receiver reports, but where it was misled, f_k."""
     half = np.random.default_rng(4).normal(size=(2, 2, 5))
     P = np.einsum("ijr,kjr->ikr", half, half)
     f = np.array([[3.0, 1.0], [1.0, 2.0]])
@@ -35,8 +35,8 @@ def test_the_actual_covariance_of_a_slot_is_the_tables() -> None:
     expected = np.stack([carried[..., 0] + Q, carried[..., 1] + Q, np.zeros((2, 2)), f, carried[..., 4]], axis=-1)
     assert np.allclose(update.actual_covariance(UNSTABLE, 1, P, ACTIONS, INNOVATIONS, f), expected, rtol=1e-12)
     expected[..., 3] = 0.0
-    assert np.allclose(update.believed_covariance(UNSTABLE, 1, P, ACTIONS), expected, rtol=1e-12)
-    before = update.believed_covariance(UNSTABLE, 0, P, ACTIONS)
+    assert np.allclose(update.reported_covariance(UNSTABLE, 1, P, ACTIONS), expected, rtol=1e-12)
+    before = update.reported_covariance(UNSTABLE, 0, P, ACTIONS)
     assert np.array_equal(before, np.where(ACTIONS == Action.STATE, 0.0, P)), "slot 0 is not predicted"
 
 

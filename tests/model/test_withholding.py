@@ -10,7 +10,7 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.schemes.silent import Withholding
 from evedrop.model.streams import Batch
-from evedrop.model.theory.covariances import expected_covariances, limit, lyapunov
+from evedrop.model.theory.covariances import limit, lyapunov, theoretical_covariances
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import coins, play
 
@@ -34,7 +34,7 @@ def test_errors_are_the_closed_form() -> None:
         ("legitimate", scheme.outcomes(0.8)),
         ("naive", scheme.eavesdropper_outcomes(0.6, 1.0, 1.0)),
     ):
-        expected = np.trace(expected_covariances(DRIFTING, outcomes, slots), axis1=1, axis2=2)
+        expected = np.trace(theoretical_covariances(DRIFTING, outcomes, slots), axis1=1, axis2=2)
         for found in (played.squared_error(name), played.trace(name)):
             difference = np.abs(found.mean(1) - expected)
             assert (difference < 5.0 * found.std(1) / np.sqrt(trials) + 1e-15).all()

@@ -264,7 +264,7 @@ def test_an_expectation_that_events_leave_without_theory_is_refused(
     event: dict[str, Any], receiver: str, more: dict[str, Any]
 ) -> None:
     """Metrics that would be null are refused, even where link and strategy by themselves have a theory."""
-    metric = f"{receiver}.expected_trace_covariance"
+    metric = f"{receiver}.theoretical_trace_covariance"
     expect = [{"metric": metric, "below": 1.0}]
     (line,) = mistakes_of(right, event, expect=expect, **more)
     why = f"no theory covers {receiver} with these links, attacks and events together"

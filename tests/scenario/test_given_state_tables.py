@@ -80,7 +80,7 @@ ROWS = [[0.1, 2.0], [0.2, 2.5], [0.7, -1.0]]
         ),
         (
             {"source": "file", "state_values": ROWS},
-            {"expect": [{"metric": "eve.expected_trace_covariance", "below": 1.0}]},
+            {"expect": [{"metric": "eve.theoretical_trace_covariance", "below": 1.0}]},
             "expect.0.metric",
         ),
     ],
@@ -139,7 +139,7 @@ def test_the_results_of_given_states(tmp_path: Path) -> None:
     scenario = checked(given({"source": "file", "state_values": ROWS}), "file")
     found = montecarlo(scenario, trials=12, out=tmp_path / "one", plan=Plan(workers=1))
     peer = found.summary["peers"]["eve"]
-    assert peer["expected_trace_covariance"] is None
+    assert peer["theoretical_trace_covariance"] is None
     assert peer["z"] == {"mean_squared_error": None}
     assert found.summary["surprising"] is None
     verdict = found.summary["secrecy"]["eve"]

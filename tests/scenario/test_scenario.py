@@ -150,13 +150,13 @@ def test_all_mistakes_are_named_at_once(changes: dict[str, Any], without: str, p
 
 
 def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:
-    """Behind a queue the expected trace is unknown, so expectations of it are refused; those of other metrics are not."""
+    """Behind a queue the theoretical trace is unknown, so expectations of it are refused; those of other metrics are not."""
     queue = {"eavesdroppers.smart.link": {"quality": 0.9, "rate": 0.5}}
     expect = [
-        {"metric": f"smart.{metric}", "below": 1.0} for metric in ("received_fraction", "expected_trace_covariance")
+        {"metric": f"smart.{metric}", "below": 1.0} for metric in ("received_fraction", "theoretical_trace_covariance")
     ]
     (line,) = mistakes_in_good({**queue, "expect": expect})
-    assert line.startswith('expect.1.metric: is "smart.expected_trace_covariance", but no theory covers')
+    assert line.startswith('expect.1.metric: is "smart.theoretical_trace_covariance", but no theory covers')
     (line,) = mistakes_in_good({"eavesdroppers.smart.strategy": "bayesian", "expect": expect})
     assert line.endswith("but no closed form is known for the strategy bayesian of smart; expected another metric")
 

@@ -156,7 +156,7 @@ def test_simulated_errors_agree_with_theory(tmp_path: Path) -> None:
     judged = 0
     for i, slot in enumerate(table["slot"]):
         if slot % 20 == 0:
-            difference = table["mean_squared_error"][i] - table["expected_trace_covariance"][i]
+            difference = table["mean_squared_error"][i] - table["theoretical_trace_covariance"][i]
             assert abs(difference) < 4.5 * table["standard_error"][i] + 1e-15, (slot, table["peer"][i])
             judged += 1
     assert judged == 12 * len(receivers)
@@ -165,8 +165,8 @@ def test_simulated_errors_agree_with_theory(tmp_path: Path) -> None:
         spread = np.sqrt(quality * (1 - quality) / (600 * 221))
         assert abs(metrics["received_fraction"] - quality) < 4.5 * spread
     for name in ("legitimate", "smart"):  # they know how well they do
-        believed = receivers[name]["mean_trace_covariance"]
-        assert believed == pytest.approx(receivers[name]["expected_trace_covariance"], rel=0.05)
+        reported = receivers[name]["mean_trace_covariance"]
+        assert reported == pytest.approx(receivers[name]["theoretical_trace_covariance"], rel=0.05)
     for name in ("naive", "suspicious"):  # they do not
         assert receivers[name]["mean_trace_covariance"] < 0.01 * receivers[name]["mean_squared_error"]
 

@@ -12,7 +12,7 @@ from evedrop.cli.api import montecarlo
 from evedrop.cli.report import print_summary
 from evedrop.model.process import Process
 from evedrop.model.schemes.innovation import Innovation
-from evedrop.model.theory.covariances import expected_covariances
+from evedrop.model.theory.covariances import theoretical_covariances
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.score.summary import Summary
@@ -46,7 +46,7 @@ def test_the_error_in_a_direction_is_that_of_its_sum(found: Results) -> None:
             assert entry["mean_squared_error"] == pytest.approx(means.mean(), rel=1e-9)
             assert entry["standard_error"] == pytest.approx(means.std(ddof=1) / np.sqrt(40), rel=1e-6)
     mu = scenario.quality["legitimate"]
-    E = expected_covariances(process, Innovation(process, 1.0).outcomes(mu), 150)
+    E = theoretical_covariances(process, Innovation(process, 1.0).outcomes(mu), 150)
     for name, v in weights.items():
         entry = found.summary["directions"]["legitimate"][name]
         assert entry["expected"] == pytest.approx(np.mean([v @ P @ v for P in E]), rel=1e-12)

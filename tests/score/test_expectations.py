@@ -37,7 +37,7 @@ ON_SUSPICIOUS: list[dict[str, Any]] = [
 ]
 OTHERS: list[dict[str, Any]] = [
     {"metric": "naive.mean_trace_covariance", "slots": [FIRST, 70], "above": 0.0},
-    {"metric": "naive.expected_trace_covariance", "slots": [FIRST, 70], "above": 0.0},
+    {"metric": "naive.theoretical_trace_covariance", "slots": [FIRST, 70], "above": 0.0},
     {"metric": "links.naive.lost", "above": 0},
     {"metric": "links.naive.lost_by.nothing", "above": 0},
     {"link": "naive"},
@@ -72,7 +72,7 @@ def of_trials(results: Results, receiver: str) -> dict[str, Any]:
 
 @pytest.mark.long
 def test_live_and_memory_agree_on_every_expectation(made: Runs) -> None:
-    """To the last bit, except for sums over all slots, and for the believed trace, which a live run sums over trials."""
+    """To the last bit, except for sums over all slots, and for the reported trace, which a live run sums over trials."""
     live, memory = (made(where).summary["expectations"] for where in ("live", "memory"))
     assert len(live) == len(OPTIONS["expect"])
     for one, other in zip(live, memory, strict=True):
@@ -106,7 +106,7 @@ def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
     results = made("live")
     found = {one["text"]: one for one in results.summary["expectations"]}
     rows = [row for row in results.slots.to_pylist() if row["peer"] == "naive" and FIRST <= row["slot"] < 70]
-    for metric in ("mean_trace_covariance", "expected_trace_covariance"):
+    for metric in ("mean_trace_covariance", "theoretical_trace_covariance"):
         known = np.mean([row[metric] for row in rows])
         assert found[f"naive.{metric} over slots {FIRST} to 69 above 0"]["found"] == pytest.approx(known, rel=1e-12)
     assert found["links.naive.lost above 0"]["found"] == results.summary["links"]["naive"]["lost"]

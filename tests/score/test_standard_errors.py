@@ -85,7 +85,7 @@ def test_standard_errors_are_those_of_the_trials_means(recorded: Results, receiv
     for name, means in expected.items():
         assert peer[name] == pytest.approx(means.mean(), rel=1e-12), name
         assert peer["standard_errors"][name] == pytest.approx(textbook(means), rel=1e-9), name
-    z = textbook_z(expected["mean_squared_error"], peer["expected_trace_covariance"])
+    z = textbook_z(expected["mean_squared_error"], peer["theoretical_trace_covariance"])
     if peer["rare_events"]["fraction"] > RARE_FRACTION:
         assert peer["z"] == {"mean_squared_error": None}
     else:
@@ -107,7 +107,7 @@ def test_late_packets_count_in_the_trials_too() -> None:
 
 @pytest.mark.long
 def test_a_live_run_has_the_standard_errors_of_memory(recorded: Results, tmp_path: Path) -> None:
-    """In shards too, and to the bit for the believed covariance, whether all trials are recorded or not."""
+    """In shards too, and to the bit for the reported covariance, whether all trials are recorded or not."""
     some: dict[str, Any] = {"slots": 300, "trials": 7, "expect": [], "view": "off"}
     live = run("eavesdroppers", record_trials=7, shards=2, out=tmp_path / "live", **some)
     others = run("eavesdroppers", record_trials=1, out=tmp_path / "others", **some)
@@ -120,9 +120,9 @@ def test_a_live_run_has_the_standard_errors_of_memory(recorded: Results, tmp_pat
         assert same["rare_events"] == peer["rare_events"]
         assert unrecorded["standard_errors"] == pytest.approx(peer["standard_errors"], rel=1e-9)
         for one in (same, unrecorded):
-            believed = one["standard_errors"]["mean_trace_covariance"]
-            assert believed == peer["standard_errors"]["mean_trace_covariance"]
-            assert believed is not None
+            reported = one["standard_errors"]["mean_trace_covariance"]
+            assert reported == peer["standard_errors"]["mean_trace_covariance"]
+            assert reported is not None
 
 
 def test_workers_do_not_change_standard_errors() -> None:
@@ -151,7 +151,7 @@ def test_rounding_has_no_z() -> None:
 
 
 def test_infinite_variance_leaves_only_counts_a_standard_error() -> None:
-    """The error and the believed covariance have none, and no z."""
+    """The error and the reported covariance have none, and no z."""
     peer = summary_of_study(load("numerical", {"trials": 20, "expect": []})).peers["smart"]
     assert peer.infinite_variance
     assert {name for name, error in peer.standard_errors.items() if error is None} == {
@@ -166,7 +166,7 @@ def test_a_covariance_only_study_has_the_z_of_its_own_metric() -> None:
     scenario = load("eavesdroppers", {"slots": 50, "trials": 20, "expect": []})
     peer = summary_of_study(scenario, mode=Mode.COVARIANCE_ONLY).peers["naive"]
     error, z = peer.standard_errors["mean_actual_trace_covariance"], peer.z["mean_actual_trace_covariance"]
-    found, expected = peer.metric("mean_actual_trace_covariance"), peer.metric("expected_trace_covariance")
+    found, expected = peer.metric("mean_actual_trace_covariance"), peer.metric("theoretical_trace_covariance")
     assert None not in (error, z, found, expected)
     assert z * (found - expected) > 0.0  # type: ignore[operator]
     assert peer.standard_errors["mean_squared_error"] is peer.z["mean_squared_error"] is None

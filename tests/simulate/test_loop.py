@@ -348,7 +348,7 @@ def test_a_plant_without_inputs_needs_no_controller(tmp_path: Path) -> None:
 
 
 def test_other_modes_say_what_they_make_of_a_loop(tmp_path: Path) -> None:
-    """Error coordinates refuse it; covariances are those that everybody believes, with or without it."""
+    """Error coordinates refuse it; covariances are those that everybody reports, with or without it."""
     with pytest.raises(UsageError, match="error-coordinates follows errors, not states"):
         in_memory(tmp_path / "errors", Plan(Mode.ERROR_COORDINATES, 1))
     with_loop = in_memory(tmp_path / "loop", Plan(Mode.COVARIANCE_ONLY, 1))

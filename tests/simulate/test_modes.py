@@ -18,7 +18,7 @@ from evedrop.cli.api import montecarlo
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.model import streams
 from evedrop.model.process import Process
-from evedrop.model.theory.covariances import Outcomes, expected_traces
+from evedrop.model.theory.covariances import Outcomes, theoretical_traces
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.receivers import LinkTable
@@ -101,7 +101,7 @@ def test_error_coordinates_are_the_ordinary_errors(A: list[list[float]]) -> None
     of = studied(A, slots, **ALL)
     exact, errors = played(of, Mode.EXACT, 60), played(of, Mode.ERROR_COORDINATES, 60)
     unread = Outcomes(predicted=1.0, state=0.0, misled=0.0, decoded=0.0, initial=1.0)
-    state = np.sqrt(expected_traces(of.process.process, unread, slots))[:, None]
+    state = np.sqrt(theoretical_traces(of.process.process, unread, slots))[:, None]
     for name in of.receivers:
         assert np.array_equal(exact[name]["action"], errors[name]["action"])
         assert np.array_equal(exact[name]["trace"], errors[name]["trace"])
@@ -111,7 +111,7 @@ def test_error_coordinates_are_the_ordinary_errors(A: list[list[float]]) -> None
 
 
 def test_covariances_alone_see_the_same_events() -> None:
-    """Actions and believed covariances of the covariance-only mode are those of the ordinary one, to the bit."""
+    """Actions and reported covariances of the covariance-only mode are those of the ordinary one, to the bit."""
     of = studied(MARGINAL, 120, **ALL)
     exact, alone = played(of, Mode.EXACT, 40, 3), played(of, Mode.COVARIANCE_ONLY, 40, 3)
     for name in of.receivers:
@@ -152,8 +152,8 @@ def test_means_agree_with_theory(mode: Mode) -> None:
     of = studied(MARGINAL, 111, mu_d=0.4, **ALL)
     found = played(of, mode, 4000)
     for name, outcomes in outcomes_of(of).items():
-        for what, theory in (("error", outcomes), ("trace", outcomes.believed)):
-            expected = expected_traces(of.process.process, theory, of.slots)
+        for what, theory in (("error", outcomes), ("trace", outcomes.reported)):
+            expected = theoretical_traces(of.process.process, theory, of.slots)
             agrees(found[name][what][::10], expected[::10])
 
 
@@ -162,7 +162,7 @@ def test_error_coordinates_go_where_states_cannot_be_followed() -> None:
     of = studied([[1.2]], 400, mu_d=0.97, smart={"strategy": "smart", "link": {"quality": 0.9}})
     found = played(of, Mode.ERROR_COORDINATES, 4000)
     for name, outcomes in outcomes_of(of).items():
-        agrees(found[name]["error"][::20], expected_traces(of.process.process, outcomes, of.slots)[::20])
+        agrees(found[name]["error"][::20], theoretical_traces(of.process.process, outcomes, of.slots)[::20])
 
 
 def test_heavy_tails_agree_by_quantiles() -> None:
@@ -222,7 +222,7 @@ def test_random_scenarios_agree_with_theory(
     found = played(of, Mode.EXACT, 3000)
     for name, outcomes in outcomes_of(of).items():
         error = found[name]["error"]
-        expected = expected_traces(of.process.process, outcomes, of.slots)
+        expected = theoretical_traces(of.process.process, outcomes, of.slots)
         spread = error.std(axis=1, ddof=1) / np.sqrt(3000)
         rare = 1e-3 * expected  # of an outcome that no trial may have had, the error is not sampled
         scarce = (error > 1e-20).sum(axis=1) < 60  # too few errors for a bound on their mean
@@ -331,8 +331,8 @@ def test_results_say_what_was_simulated(covariances: Results) -> None:
     assert [row["slot"] for row in smart if row["error_quantile_0.5"] is not None] == list(range(0, 5000, 2))
 
 
-def test_misled_receivers_believe_less_than_there_is(covariances: Results) -> None:
-    """Actual and believed trace differ for naive and suspicious, and are one for smart and legitimate."""
+def test_misled_receivers_report_less_than_there_is(covariances: Results) -> None:
+    """Actual and reported trace differ for naive and suspicious, and are one for smart and legitimate."""
     for name, peer in covariances.summary["peers"].items():
         if name in {"naive", "suspicious"}:
             assert peer["mean_trace_covariance"] < 0.01 * peer["mean_actual_trace_covariance"]

@@ -124,7 +124,7 @@ def test_an_initial_covariance_that_is_never_lost(tmp_path: Path) -> None:
     plan = Plan(workers=1, rare=True)
     found = montecarlo("eavesdroppers", slots=40, trials=40, plan=plan, out=tmp_path / "it").summary
     user = found["peers"]["legitimate"]
-    assert user["mean_squared_error"] < 0.8 * user["expected_trace_covariance"]
+    assert user["mean_squared_error"] < 0.8 * user["theoretical_trace_covariance"]
     assert user["z"] == {"mean_squared_error": None}
     for name in ("legitimate", "naive", "suspicious", "smart"):
         assert abs(found["peers"][name]["rare_estimate"]["z"]) < SURE, name

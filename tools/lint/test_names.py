@@ -97,8 +97,16 @@ def test_no_two_test_files_have_the_same_name() -> None:
 
 GLOSSARY = ROOT / "docs" / "glossary.md"
 FORMER = {
+    "believed": "reported",
+    "believes": "reports",
     "Crossing": "WireFate",
     "deviation": "standard_deviation",
+    "expected_covariance": "theoretical_covariance",
+    "expected covariance": "theoretical covariance",
+    "expected_trace": "theoretical_trace",
+    "expected_traces": "theoretical_traces",
+    "ExpectedCovariance": "TheoreticalCovariance",
+    "ExpectedTrace": "TheoreticalTrace",
     "figure": "metric",
     "figures": "metrics",
     "filter_noise_read": "replace_filter_noise",
@@ -117,8 +125,8 @@ FORMER = {
     "observer": "recorder",
     "rare_share": "rare_fraction",
     "read_news": "read_event",
-    "recordings_located": "locate_recordings",
     "ReceiverTotals": "ReceiverTally",
+    "recordings_located": "locate_recordings",
     "regular matrix": "nonsingular matrix",
     "rooms": "packages",
     "set_news_apart": "keep_events_apart",
@@ -127,8 +135,8 @@ FORMER = {
     "StandIn": "RemoteClass, AbsenceReporter",
     "tables_located": "locate_tables",
     "tables_read": "read_tables",
-    "TrialTotals": "TrialTally",
     "the share": "the fraction",
+    "TrialTotals": "TrialTally",
     "whereabouts": "process status",
 }
 """Former word → the word of the glossary, or the name, in its place. Parts of names count: `open_rooms`, `openRooms`."""

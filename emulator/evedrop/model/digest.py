@@ -1,4 +1,4 @@
-"""Digests of what a receiver received and believed, and sums over slots: their bits do not depend on where blocks begin.
+"""Digests of what a receiver received and estimated, and sums over slots: their bits do not depend on where blocks begin.
 
 Equal digests mean that two runs agree to the last bit.
 """

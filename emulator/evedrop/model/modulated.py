@@ -1,4 +1,4 @@
-"""Expected covariances behind a link whose quality follows a Markov chain or changes with time, or that delays packets.
+"""Theoretical covariances behind a link whose quality follows a Markov chain or changes with time, or that delays packets.
 
 A block of equal slots behind a chain is computed at once: the recursion as one linear operator. Streaks behind such a link are
 computed for a genie and with a μ_d for each slot, too.
@@ -20,10 +20,10 @@ from evedrop.model.slot.link_distribution import LinkDistribution, Segment
 from evedrop.model.theory.covariances import (
     LARGEST_OPERATOR,
     NOBODY,
-    ExpectedCovariance,
     Outcomes,
     OutcomesAt,
     SlotOutcomes,
+    TheoreticalCovariance,
     lyapunov,
     misled_covariances,
     radius,
@@ -34,7 +34,7 @@ from evedrop.model.theory.rare_events import REST, Streaks
 
 @final
 class ModulatedCovariance:
-    """E P_k of a receiver behind such a link, a number of slots at a time from k = 0, as `ExpectedCovariance`."""
+    """E P_k of a receiver behind such a link, a number of slots at a time from k = 0, as `TheoreticalCovariance`."""
 
     def __init__(
         self, process: Process, link: LinkDistribution, outcomes_at: OutcomesAt, slots_at: SlotOutcomes | None = None
@@ -44,7 +44,7 @@ class ModulatedCovariance:
         self._whole = SlotOdds.of(outcomes_at)
         self._slots_at = slots_at
         self._remaining = RemainingCovariances(process) if self._whole.leaks else None
-        self._sigma = ExpectedCovariance(process, NOBODY)
+        self._sigma = TheoreticalCovariance(process, NOBODY)
         self._k = 0
         self._settled: Floats | None = None
         self._window: deque[_Slot] = deque(maxlen=link.window)

@@ -90,7 +90,7 @@ class Belief(NamedTuple):
     x_hat: Floats
     """Estimate, (n, R)."""
     P: Floats
-    """Error covariance the receiver believes, (n, n, R)."""
+    """Error covariance the receiver reports, (n, n, R)."""
     action: Codes
     """`Action` of the slot, (R,)."""
     memory: tuple[NDArray[Any], ...] = ()

@@ -1,6 +1,6 @@
-"""The effect of a slot on the estimate, the believed covariance, the actual covariance and the error.
+"""The effect of a slot on the estimate, the reported covariance, the actual covariance and the error.
 
-| action | x̂ | believed P | actual P | error e = x − x̂ |
+| action | x̂ | reported P | actual P | error e = x − x̂ |
 |---|---|---|---|---|
 | lost, discarded | A x̂ | A P Aᵀ + Q | A P Aᵀ + Q | A e + w |
 | state used | z | 0 | 0 | 0 |
@@ -25,8 +25,8 @@ from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, cleare
 _STATE, _INNOVATION = int(Action.STATE), int(Action.INNOVATION)  # numpy compares with an int ten times as fast
 
 
-def believed_covariance(process: Process, k: int, P: Floats, action: Codes) -> Floats:
-    """P_k (n, n, R) as a receiver believes it, from P_{k−1} and the actions (R,)."""
+def reported_covariance(process: Process, k: int, P: Floats, action: Codes) -> Floats:
+    """P_k (n, n, R) as a receiver reports it, from P_{k−1} and the actions (R,)."""
     covariance: Floats = kernels.follow_covariance(process.A, process.Q, P, action[None], k == 0)[0]
     return covariance
 
@@ -50,12 +50,12 @@ def actual_covariance(process: Process, k: int, P: Floats, action: Codes, nu: Fl
     """P_k (n, n, R) of the error, from P_{k−1}, given the events: the mean of e eᵀ over all states and noises.
 
     action (R,); nu (R,): the packet contains an innovation; f (n, n): f_k of `theory.misled_covariances`. Its mean over
-    trials estimates `theory.expected_covariances`.
+    trials estimates `theory.theoretical_covariances`.
     """
     return select(
         (action == _STATE) & nu,
         lambda: np.repeat(f[:, :, None], P.shape[2], axis=2),
-        lambda: believed_covariance(process, k, P, action),
+        lambda: reported_covariance(process, k, P, action),
     )
 
 

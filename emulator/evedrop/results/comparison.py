@@ -55,7 +55,7 @@ class Match:
 
 @dataclass(frozen=True)
 class Theory:
-    """The trace of a receiver's expected error covariance."""
+    """The trace of a receiver's theoretical error covariance."""
 
     mean: float
     """Mean over the slots of the run."""

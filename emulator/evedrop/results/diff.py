@@ -26,7 +26,7 @@ class RunDifference:
 
 
 def difference(a: Results, b: Results) -> RunDifference:
-    """Compare all that the receivers received and believed, trial by trial, for the trials and receivers that both runs have."""
+    """Compare all that the receivers received and estimated, trial by trial, for the trials and receivers that both runs have."""
     blocks_a, blocks_b = _blocks(a), _blocks(b)
     ends_a, ends_b = _ends(a, blocks_a), _ends(b, blocks_b)
     common = [key for key in blocks_a.keys() & blocks_b.keys() if ends_a[key[0], key[2]] == ends_b[key[0], key[2]]]

@@ -31,7 +31,7 @@ SLOTS = pa.schema(
         ("mean_actual_trace_covariance", pa.float64()),
         ("standard_error", pa.float64()),
         ("mean_trace_covariance", pa.float64()),
-        ("expected_trace_covariance", pa.float64()),
+        ("theoretical_trace_covariance", pa.float64()),
         ("received_fraction", pa.float64()),
         ("used_fraction", pa.float64()),
         *((f"{quantity}_quantile_{level:g}", pa.float64()) for quantity in ("error", "trace") for level in LEVELS),
@@ -53,7 +53,7 @@ JOURNAL = pa.schema(
 NULLABLE = {
     "mean_squared_error",
     "mean_actual_trace_covariance",
-    "expected_trace_covariance",
+    "theoretical_trace_covariance",
     *(field.name for field in SLOTS if "quantile" in field.name),
 }
 """Columns in which NaN means that there is no value."""

@@ -37,7 +37,7 @@ class ThresholdMetrics(JsonFields):
     energy: float
     """In a slot on average."""
     eavesdroppers: dict[str, float]
-    """Eavesdropper → the trace of its expected error covariance in the limit; inf if it is unbounded."""
+    """Eavesdropper → the trace of its theoretical error covariance in the limit; inf if it is unbounded."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class BudgetDesign(JsonFields):
     encrypted: float
     """Energy of an encrypted packet."""
     user: float
-    """The trace of the user's expected error covariance in the limit, whatever the threshold is."""
+    """The trace of the user's theoretical error covariance in the limit, whatever the threshold is."""
     best: ThresholdMetrics
     """The least threshold that meets the budget."""
     others: tuple[ThresholdMetrics, ...]

@@ -25,7 +25,7 @@ from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link_distribution import LinkDistribution, distribution_of
 from evedrop.model.theory import covariances as theory
 from evedrop.model.theory.closed_forms import ClosedForm, Hijack, ReceiverConditions
-from evedrop.model.theory.covariances import ExpectedCovariance, Growth, Outcomes, OutcomesAt, SlotOutcomes, growth
+from evedrop.model.theory.covariances import Growth, Outcomes, OutcomesAt, SlotOutcomes, TheoreticalCovariance, growth
 from evedrop.model.theory.rare_events import Streaks, streaks, total_of
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.tables import Scenario
@@ -141,8 +141,8 @@ _ROUNDING = 1e-12  # of an error, relative to the state
 _SMALL = 1e-15  # of a squared error, relative to those of the first slots: above it none is rounding
 
 
-class ExpectedTraceStream(Protocol):
-    """Expected traces, a number of slots at a time."""
+class TheoreticalTraceStream(Protocol):
+    """Theoretical traces, a number of slots at a time."""
 
     def next_traces(self, slots: int) -> Floats:
         """The traces of the next slots, (slots,)."""
@@ -172,7 +172,7 @@ class _Unknown:
 
 @dataclass(frozen=True)
 class Expectation:
-    """One receiver's expected actual error covariance, by the chain that its link's losses follow."""
+    """One receiver's theoretical error covariance, by the chain that its link's losses follow."""
 
     process: Process
     link: LinkDistribution | None
@@ -226,18 +226,18 @@ class Expectation:
         """Whether there may be a limit: slots continue as they are, and do not follow a list that ends."""
         return self.slots_at is None
 
-    def stream(self) -> ExpectedTraceStream:
-        """The expected traces from slot 0 on; NaN without a theory."""
+    def stream(self) -> TheoreticalTraceStream:
+        """The theoretical traces from slot 0 on; NaN without a theory."""
         if self.closed is not None:
             return ClosedStream(self.closed)
         if self._outcomes is not None:
-            return ExpectedCovariance(self.process, self._outcomes)
+            return TheoreticalCovariance(self.process, self._outcomes)
         if self._known is None:
             return _Unknown()
         return modulated.ModulatedCovariance(self.process, *self._known, self.slots_at)
 
     def traces(self, slots: int) -> Floats:
-        """The expected traces of slots 0 … slots−1, (slots,); NaN without a theory."""
+        """The theoretical traces of slots 0 … slots−1, (slots,); NaN without a theory."""
         return self.stream().next_traces(slots)
 
     @property
@@ -256,7 +256,7 @@ class Expectation:
         outcomes = None if self.closed is not None else self._outcomes
         if outcomes is None:
             return None
-        stream, variances = ExpectedCovariance(self.process, outcomes), np.empty(slots)
+        stream, variances = TheoreticalCovariance(self.process, outcomes), np.empty(slots)
         for part in parts_of(range(slots)):
             variances[part.start : part.stop] = np.einsum("i,kij,j->k", v, stream.next(len(part)), v)
         return variances
@@ -266,7 +266,7 @@ class Expectation:
         process = self.process
         if error > _SMALL * float(np.trace(process.initial_covariance) + np.trace(process.Q)):
             return False  # the horizon of runs keeps the state from growing so far
-        own = total_of(ExpectedCovariance(process, theory.NOBODY).next_traces, slots) / slots
+        own = total_of(TheoreticalCovariance(process, theory.NOBODY).next_traces, slots) / slots
         return error < _ROUNDING**2 * own
 
     @property
@@ -373,6 +373,6 @@ def _bound(scheme: Scheme, quality: float) -> Outcomes:
     return outcomes
 
 
-def expected_traces_of(scenario: Scenario) -> dict[str, Floats]:
-    """Receiver → trace of the expected actual error covariance in every slot, (slots,); NaN without a theory."""
+def theoretical_traces_of(scenario: Scenario) -> dict[str, Floats]:
+    """Receiver → trace of the theoretical error covariance in every slot, (slots,); NaN without a theory."""
     return {name: expectation.traces(scenario.slots) for name, expectation in expectations_of(scenario).items()}

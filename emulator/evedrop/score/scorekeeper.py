@@ -19,7 +19,7 @@ from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.theory import Expectation, ExpectedTraceStream, expectations_of
+from evedrop.scenario.theory import Expectation, TheoreticalTraceStream, expectations_of
 from evedrop.score.closed_loop_tally import Acted
 from evedrop.score.directions import directions_of
 from evedrop.score.expectations_held import Evidence
@@ -43,18 +43,18 @@ class Scored(NamedTuple):
     """(c, R)."""
     sums: SlotSums
     expected: Floats
-    """Theory: trace of the expected actual error covariance, (c,)."""
+    """Trace of the theoretical error covariance, (c,)."""
 
 
 @final
 class Scorekeeper:
     """Scores the slots of a batch of trials, in order.
 
-    theory: receiver → its expected traces; computed if it is not given.
+    theory: receiver → its theoretical traces; computed if it is not given.
     """
 
     def __init__(
-        self, scenario: Scenario, trials: int, theory: Mapping[str, ExpectedTraceStream] | None = None
+        self, scenario: Scenario, trials: int, theory: Mapping[str, TheoreticalTraceStream] | None = None
     ) -> None:
         if theory is None:
             theory = {name: expectation.stream() for name, expectation in expectations_of(scenario).items()}

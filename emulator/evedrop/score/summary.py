@@ -40,13 +40,13 @@ class BuiltInMetrics(ABC):
 
     @property
     def mean_trace_covariance(self) -> float | None:
-        """Mean of tr P, the error covariance that the receiver believes."""
+        """Mean of tr P, the error covariance that the receiver reports."""
         return self.metric("mean_trace_covariance")
 
     @property
-    def expected_trace_covariance(self) -> float | None:
-        """Theory: the trace of the expected actual error covariance over the same slots; None if no theory covers it."""
-        return self.metric("expected_trace_covariance")
+    def theoretical_trace_covariance(self) -> float | None:
+        """The trace of the theoretical error covariance over the same slots; None if no theory covers it."""
+        return self.metric("theoretical_trace_covariance")
 
     @property
     def received_fraction(self) -> float | None:

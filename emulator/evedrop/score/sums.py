@@ -111,7 +111,7 @@ class SlotSums:
     """Squared error, or in a covariance-only study the trace of the actual covariance."""
     error_squared: Floats
     trace: Floats
-    """Believed tr P."""
+    """Reported tr P."""
     trace_squared: Floats
     received: Floats
     used: Floats
@@ -248,13 +248,13 @@ class Tally(ReceiverTally):
         self.packets = np.zeros((2, self.trials), np.int64)
 
     def add_slots(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
-        """Add the c slots from `first` on: their errors (c, R), sums, and expected traces (c,)."""
+        """Add the c slots from `first` on: their errors (c, R), sums, and theoretical traces (c,)."""
         count = len(error)
         self.done += count
         self.offered += count * self.trials
         self.error += float(sums.error.sum())
         self.trace += float(sums.trace.sum())
-        self.expected_trace += float(expected.sum()) * self.trials
+        self.theoretical_trace += float(expected.sum()) * self.trials
         self.received += int(sums.received.sum())
         self.used += int(sums.used.sum())
         windows = window_of(np.arange(first, first + count), self.slots)

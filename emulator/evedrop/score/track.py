@@ -31,7 +31,7 @@ class Track(IntEnum):
 
     IN_TRACK = 0
     DRIFTING = 1
-    """Its error is large, or it believes so, and its own covariance expects such an error."""
+    """Its error is large, or it reports so, and its own covariance expects such an error."""
     FOOLED = 2
     """Its error is far larger than its own covariance expects."""
 
@@ -42,7 +42,7 @@ class Track(IntEnum):
 
 
 def track_of(squared_error: Floats, trace: Floats, noise: float) -> Codes:
-    """The code of every slot (c,), from the squared error and the believed tr P, (c,) each, and the process noise tr Q.
+    """The code of every slot (c,), from the squared error and the reported tr P, (c,) each, and the process noise tr Q.
 
     Fooled: the squared error is above 20 times the larger of tr P and tr Q. Drifting: otherwise, the squared error or tr P is
     above 20 tr Q. In track: otherwise.
@@ -56,7 +56,7 @@ def track_of(squared_error: Floats, trace: Floats, noise: float) -> Codes:
 
 
 def is_fooled(squared_error: Floats, trace: Floats, noise: float) -> Flags:
-    """Whether squared errors are far above the traces that a receiver believes; also if one is not a number. noise: tr Q."""
+    """Whether squared errors are far above the traces that a receiver reports; also if one is not a number. noise: tr Q."""
     with np.errstate(invalid="ignore"):
         fooled: Flags = ~(squared_error <= FACTOR * np.maximum(trace, noise))
     return fooled

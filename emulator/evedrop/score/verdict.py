@@ -15,10 +15,10 @@ import numpy as np
 from evedrop.model.metrics.standard_error import ratio_error, skewed_test, student_test
 from evedrop.model.metrics.text import count_text, estimate
 from evedrop.model.process import Floats, parts_of
-from evedrop.model.theory.covariances import NOBODY, ExpectedCovariance
+from evedrop.model.theory.covariances import NOBODY, TheoreticalCovariance
 from evedrop.model.theory.rare_events import RARE
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.theory import Expectation, ExpectedTraceStream
+from evedrop.scenario.theory import Expectation, TheoreticalTraceStream
 from evedrop.score.rare_events import rare_events_of
 from evedrop.score.summary import RARE_FRACTION, LeakSummary, SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_bounds, window_means, window_of
@@ -318,12 +318,12 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
     heaviest = means.max(axis=1, keepdims=True)
     lost = math.nan if theory.link is None else 1.0 - float(theory.link.rates(range(1))[0])
     if math.isnan(lost) or 0.0 < lost * trials < RARE:
-        heaviest = np.maximum(heaviest, _window_averages(ExpectedCovariance(theory.process, NOBODY), slots))
+        heaviest = np.maximum(heaviest, _window_averages(TheoreticalCovariance(theory.process, NOBODY), slots))
     return np.asarray(means.mean(axis=1, keepdims=True) - math.log(ERROR_RATE) / trials * heaviest)
 
 
-def _window_averages(stream: ExpectedTraceStream, slots: int) -> Floats:
-    """The mean of expected traces over the slots of each window, (WINDOWS, 1); NaN for windows without slots."""
+def _window_averages(stream: TheoreticalTraceStream, slots: int) -> Floats:
+    """The mean of theoretical traces over the slots of each window, (WINDOWS, 1); NaN for windows without slots."""
     sums = np.zeros(WINDOWS + 1)
     for part in parts_of(range(slots)):
         np.add.at(sums, window_of(np.arange(part.start, part.stop), slots), stream.next_traces(len(part)))

@@ -25,7 +25,7 @@ class ReceiverChunk:
     error: Floats
     """The error of the mode, (c, R)."""
     trace: Floats
-    """Believed tr P, (c, R)."""
+    """Reported tr P, (c, R)."""
     action: Codes
     """(c, R)."""
     fates: Fates

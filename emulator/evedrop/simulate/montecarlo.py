@@ -26,7 +26,7 @@ from evedrop.scenario.arguments import number_argument, refuse_unless
 from evedrop.scenario.input_files import states_of
 from evedrop.scenario.progress_events import FolderMoved, OnEvent, RunProgress
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.theory import expected_traces_of
+from evedrop.scenario.theory import theoretical_traces_of
 from evedrop.scenario.words import listed
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.run_tally import RunTally
@@ -248,7 +248,7 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
                 f"--{mode.value} follows events, not packets, and the actions of {name} (strategy {table.strategy}) "
                 f"depend on more; leave --{mode.value} out, or remove {name} from the scenario"
             )
-    for name, expected in expected_traces_of(scenario).items():
+    for name, expected in theoretical_traces_of(scenario).items():
         beyond = np.flatnonzero(np.isinf(expected))
         if beyond.size:
             raise UsageError(
@@ -372,7 +372,7 @@ class Merger:
     def write(self, writer: ResultsWriter) -> None:
         """Write the rows of all slots that any trial reached, replacing the rows written before."""
         writer.restart_slots()
-        expected = expected_traces_of(self._scenario)
+        expected = theoretical_traces_of(self._scenario)
         for name in self._scenario.receivers:
             sums = self._sums[name].measured()
             quantiles = np.hstack([self._errors[name].quantiles(), self._traces[name].quantiles()])

@@ -190,7 +190,7 @@ class Simulation:
                         w,
                         lambda k=k: trajectory.predicted - self._chi(k),  # type: ignore[misc, union-attr]
                     )
-                    covariances[name] = update.believed_covariance(self._process, k, covariances[name], action)
+                    covariances[name] = update.reported_covariance(self._process, k, covariances[name], action)
                     values.error[row] = (errors[name] * errors[name]).sum(axis=0)
                     values.trace[row] = trace_of(covariances[name])
             return Chunk(chunk.start, measured)
@@ -204,11 +204,11 @@ class Simulation:
         priors = {name: receiver.prior().P for name, receiver in self._receivers.items()}
         # All receivers' beliefs side by side along the axis of trials: half of the time is the overhead of numpy calls.
         places = {name: slice(i * trials, (i + 1) * trials) for i, name in enumerate(self._receivers)}
-        believed = np.concatenate(list(priors.values()), axis=2)
+        reported = np.concatenate(list(priors.values()), axis=2)
         actual = {name: priors[name] for name in misled}
 
         def play(chunk: range, links: Mapping[str, LinkCore]) -> Chunk:
-            nonlocal believed
+            nonlocal reported
             traces = np.empty((len(chunk), count * trials))
             actions = np.empty(traces.shape, np.uint8)
             errors = {name: np.empty((len(chunk), trials)) for name in misled}
@@ -216,8 +216,8 @@ class Simulation:
             for row, k in enumerate(chunk):
                 for name, receiver in self._receivers.items():
                     actions[row, places[name]] = self._act(name, receiver, k, delivered[name][row])
-                believed = update.believed_covariance(self._process, k, believed, actions[row])
-                traces[row] = trace_of(believed)
+                reported = update.reported_covariance(self._process, k, reported, actions[row])
+                traces[row] = trace_of(reported)
                 for name, error in errors.items():
                     action, nu = actions[row, places[name]], self._nu(k)
                     actual[name] = update.actual_covariance(self._process, k, actual[name], action, nu, f[k])

@@ -170,7 +170,7 @@ class Splitter:
         return self._simulated(range(_PILOTS, _PILOTS + populations), pilots.splits)
 
     def _size(self, chunk: ReceiverChunk) -> Floats:
-        """What makes a trial important, (c, R): the error, and what the receiver believes of it where both scatter."""
+        """What makes a trial important, (c, R): the error, and what the receiver reports of it where both scatter."""
         return chunk.error if self._mode is Mode.COVARIANCE_ONLY else 0.5 * (chunk.error + chunk.trace)
 
     def _simulated(self, numbers: range, splits: Collection[int] | None) -> SplitMeans:

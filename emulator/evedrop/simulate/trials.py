@@ -18,7 +18,7 @@ from evedrop.model.metrics.metric import ScoredSlots
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import Account, Accountant
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.theory import KnownTraces, expected_traces_of
+from evedrop.scenario.theory import KnownTraces, theoretical_traces_of
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import Scorekeeper
 from evedrop.score.slots import Slots
@@ -124,7 +124,7 @@ def carry_out(task: TrialsTask, on_progress: OnProgress, stopped: Stopped) -> Ba
     recorded = max(0, min(scenario.first_trial + scenario.record_trials, task.stop) - task.start)
     simulation = Simulation(scenario, trials, task.mode)
     scale = float(np.trace(scenario.process.process.Q))
-    expected = expected_traces_of(scenario)
+    expected = theoretical_traces_of(scenario)
     blocks, keepers = zip(
         *(_empty_block(scenario, task, start, expected) for start in trials[::BLOCK_TRIALS]), strict=True
     )
@@ -170,7 +170,7 @@ def carry_out(task: TrialsTask, on_progress: OnProgress, stopped: Stopped) -> Ba
 def _empty_block(
     scenario: Scenario, task: TrialsTask, start: int, expected: Mapping[str, Floats]
 ) -> tuple[TrialBlock, Scorekeeper]:
-    """A block that begins with this trial, and the keeper of its score; expected: receiver → its expected traces, (slots,)."""
+    """A block that begins with this trial, and the keeper of its score; expected: receiver → its theoretical traces, (slots,)."""
     names = scenario.receivers
     trials = min(BLOCK_TRIALS, task.stop - start)
     keeper = Scorekeeper(scenario, trials, {name: KnownTraces(traces) for name, traces in expected.items()})

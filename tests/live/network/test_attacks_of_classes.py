@@ -162,7 +162,7 @@ def test_an_eavesdroppers_class_runs_in_its_own_process_alone(evedrop: Evedrop) 
             assert not any(str(evedrop.folder) in word for word in one["words"]), one
     assert by_pid[next(one["pid"] for one in reports if one["when"] == "made" and one["pid"] in by_pid)] == "eve"
     summary = Results.read(live.folder).summary
-    assert summary["peers"]["eve"]["expected_trace_covariance"] > 0.0, "theory knows the class all the same"
+    assert summary["peers"]["eve"]["theoretical_trace_covariance"] > 0.0, "theory knows the class all the same"
 
 
 def test_no_process_finds_it_where_it_only_asks(evedrop: Evedrop) -> None:

@@ -176,7 +176,7 @@ def test_an_eavesdropper_cannot_pose_as_the_router(stage: Bench) -> None:
             connected(router_address_of(lured), 20.0)
 
 
-def test_a_router_is_believed_at_its_own_names_alone(stage: Bench) -> None:
+def test_a_router_is_trusted_at_its_own_names_alone(stage: Bench) -> None:
     """The router of this run at a host that its certificate does not name: one line with the option that mends it."""
     brief = stage.briefs[EVE]
     port = brief.router.rpartition(":")[2]

@@ -169,14 +169,14 @@ def test_beliefs_are_the_same(
 @QUICK
 @given(RANDOM, SIZES, st.integers(0, 5), st.booleans(), st.data())
 def test_records_are_the_same(
-    random: np.random.Generator, sizes: tuple[int, int, int], width: int, believes: bool, data: st.DataObject
+    random: np.random.Generator, sizes: tuple[int, int, int], width: int, with_P: bool, data: st.DataObject
 ) -> None:
     """The bytes to digest, of some of the trials, with covariances and without."""
     slots, n, trials = sizes
     first = data.draw(st.integers(0, trials))
     count = data.draw(st.integers(0, trials - first))
-    a, P = numbers(random, slots, width, trials), numbers(random, slots, n, n, trials) if believes else None
-    size = 1 + 8 * (width + (n * (n + 1) // 2 if believes else 0))
+    a, P = numbers(random, slots, width, trials), numbers(random, slots, n, n, trials) if with_P else None
+    size = 1 + 8 * (width + (n * (n + 1) // 2 if with_P else 0))
     outs = [np.full((count, slots, size), 7, np.uint8) for _ in range(2)]
     marks = random.random((slots, trials)) < 0.5
     compiled.records(marks, a, P, outs[0], first)

@@ -54,8 +54,8 @@ def test_the_tutorial_works_as_it_is_typed(tutorial: Evedrop) -> None:
     assert again.status == 0
     assert digests_of(tutorial.folder / "again") == digests_of(tutorial.folder / "live")
     peers = Results.read(tutorial.folder / "live").summary["peers"]
-    assert peers["tracker"]["expected_trace_covariance"] is None
-    assert peers["legitimate"]["expected_trace_covariance"] == pytest.approx(0.00059, rel=0.02)
+    assert peers["tracker"]["theoretical_trace_covariance"] is None
+    assert peers["legitimate"]["theoretical_trace_covariance"] == pytest.approx(0.00059, rel=0.02)
 
 
 @pytest.mark.long

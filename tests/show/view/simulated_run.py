@@ -51,7 +51,7 @@ class Simulated:
                     p.squared_error[part],
                     p.standard_error[part],
                     p.trace[part],
-                    p.expected_trace[part],
+                    p.theoretical_trace[part],
                 )
                 for name, p in self.slots.peers.items()
             }

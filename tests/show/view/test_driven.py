@@ -30,7 +30,7 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_recording_holds_what_moves_the_plant(day: Path) -> None:
-    """Disturbances and inputs of every slot, levels and what is believed of them, and energy bought and sold."""
+    """Disturbances and inputs of every slot, levels and the estimates of them, and energy bought and sold."""
     path = replay(day)
     results = load_results(day)
     assert results.inputs is not None

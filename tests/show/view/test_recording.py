@@ -45,10 +45,10 @@ def rrd(run: Simulated, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_curves_are_logarithms_at_full_rate(run: Simulated, rrd: Path) -> None:
-    """Every receiver has its error, believed and expected trace in every slot; what is exact lies on a common floor."""
+    """Every receiver has its error, reported and theoretical trace in every slot; what is exact lies on a common floor."""
     lowest = []
     for name, peer in run.slots.peers.items():
-        for kind, values in (("error", peer.squared_error), ("trace", peer.trace), ("theory", peer.expected_trace)):
+        for kind, values in (("error", peer.squared_error), ("trace", peer.trace), ("theory", peer.theoretical_trace)):
             shown = rows(rrd, f"{kind}/{name}", "Scalars:scalars")
             curve = np.array([shown[k][0] for k in range(SLOTS)])
             above = curve > curve.min()

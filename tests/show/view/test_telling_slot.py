@@ -17,49 +17,49 @@ def errors_of(slots: int, **far: tuple[int, float]) -> dict[str, Floats]:
     return errors
 
 
-def believed(errors: dict[str, Floats], **traces: float) -> dict[str, Floats]:
-    """Receiver → the trace that it believes, 1 unless told otherwise."""
+def reported(errors: dict[str, Floats], **traces: float) -> dict[str, Floats]:
+    """Receiver → the trace that it reports, 1 unless told otherwise."""
     return {name: np.full(len(column), traces.get(name, 1.0)) for name, column in errors.items()}
 
 
 def test_the_slot_in_which_most_are_fooled_is_chosen() -> None:
     """An eavesdropper that knows how far it may be off does not count, however far it is."""
     errors = errors_of(1000, naive=(400, 50.0), drifting=(700, 900.0))
-    assert most_telling(errors, believed(errors, drifting=900.0), 0.1) == 400
-    assert most_telling(errors, believed(errors), 0.1) == 700
+    assert most_telling(errors, reported(errors, drifting=900.0), 0.1) == 400
+    assert most_telling(errors, reported(errors), 0.1) == 700
 
 
 def test_where_the_legitimate_estimator_errs_as_well_there_is_nothing_to_see() -> None:
     """The separation is a ratio."""
     errors = errors_of(1000, naive=(400, 50.0))
     errors["naive"][600], errors["legitimate"][600] = 500.0, 500.0
-    assert most_telling(errors, believed(errors), 0.1) == 400
+    assert most_telling(errors, reported(errors), 0.1) == 400
 
 
 def test_without_a_fooled_eavesdropper_all_count() -> None:
     """If no eavesdropper is ever fooled, drifting ones count."""
     errors = errors_of(1000, drifting=(700, 900.0))
-    assert most_telling(errors, believed(errors, drifting=900.0), 0.1) == 700
+    assert most_telling(errors, reported(errors, drifting=900.0), 0.1) == 700
 
 
 def test_without_an_eavesdropper_the_legitimate_estimator_counts() -> None:
     """The slot of its largest error is chosen."""
     errors = errors_of(1000, legitimate=(300, 2.0))
-    assert most_telling(errors, believed(errors), 0.1) == 300
+    assert most_telling(errors, reported(errors), 0.1) == 300
 
 
 def test_the_slots_around_it_fill_the_panels() -> None:
     """Neither the beginning nor the end is chosen; of a short run, the last slot is."""
     errors = errors_of(1000, naive=(20, 1e6), other=(990, 1e6))
     errors["naive"][500] = 100.0
-    assert most_telling(errors, believed(errors), 0.1) == 500
+    assert most_telling(errors, reported(errors), 0.1) == 500
     for slots in (1, 60, 105):
         errors = errors_of(slots, naive=(0, 5.0))
-        assert most_telling(errors, believed(errors), 0.1) == slots - 1
+        assert most_telling(errors, reported(errors), 0.1) == slots - 1
 
 
 def test_the_first_recorded_trial_decides(tmp_path: Path) -> None:
-    """It is the one that the view shows; the covariances are those that receivers believe."""
+    """It is the one that the view shows; the covariances are those that receivers report."""
     found = []
     for trials in (1, 3):
         montecarlo("vehicle", slots=400, record_trials=trials, trials=trials, out=tmp_path / str(trials))

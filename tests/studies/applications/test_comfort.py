@@ -37,10 +37,10 @@ def test_its_metrics_are_sums_over_slots(tmp_path: Path) -> None:
     assert sum(outside) > 0
     assert found["heating_energy"] == pytest.approx(sum(min(max(u, -1.0), 3.0) for (u,) in power) / 60)
     for name in scenario.receivers:
-        believed = [row["x_hat"][0] for row in trials if row["peer"] == name]
+        estimated = [row["x_hat"][0] for row in trials if row["peer"] == name]
         known = [
             (20.5 <= room <= 22.5) == (20.5 <= (guess) <= 22.5)
-            for guess, (room, _) in zip(believed, states, strict=True)
+            for guess, (room, _) in zip(estimated, states, strict=True)
         ]
         assert found["receivers"][name]["known_fraction"] == pytest.approx(np.mean(known))
 

@@ -69,7 +69,7 @@ def test_covariances_are_those_of_the_table(tmp_path: Path) -> None:
     results = montecarlo("microgrid", trials=200, slots=4000, out=tmp_path / "x", plan=COVARIANCES, **NO_PACKETS)
     for name in ("legitimate", "smart"):
         peer = results.summary["peers"][name]
-        assert peer["mean_actual_trace_covariance"] == pytest.approx(peer["expected_trace_covariance"], rel=0.02)
+        assert peer["mean_actual_trace_covariance"] == pytest.approx(peer["theoretical_trace_covariance"], rel=0.02)
 
 
 @pytest.mark.long
@@ -83,7 +83,7 @@ def test_a_day_of_covariances_is_the_table(mu_d: float, tmp_path: Path) -> None:
     wide = montecarlo(
         "microgrid", out=tmp_path / "wide", plan=COVARIANCES, process__initial_covariance=WIDE, **options
     ).summary["peers"]["naive"]  # fmt: skip
-    assert wide["mean_actual_trace_covariance"] == pytest.approx(wide["expected_trace_covariance"], rel=0.05)
+    assert wide["mean_actual_trace_covariance"] == pytest.approx(wide["theoretical_trace_covariance"], rel=0.05)
     assert wide["mean_actual_trace_covariance"] > 0.95e3
 
 

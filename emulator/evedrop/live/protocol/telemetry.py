@@ -155,7 +155,7 @@ class Report:
     action: Codes
     """`Action`, (c, R)."""
     P: Floats
-    """Believed covariance of the recorded trials, (c, n, n, recorded)."""
+    """Reported covariance of the recorded trials, (c, n, n, recorded)."""
     trace: Floats
     """Sum over all trials of tr P and of its square, (c, 2)."""
     late: NDArray[np.uint16] | None

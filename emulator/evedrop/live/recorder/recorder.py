@@ -108,7 +108,7 @@ def record(brief: Brief[RecorderPart], report: EndPrinter, serve: str | None = N
     except NoAnswer as error:  # of a class that is asked again after the operator's change of a link
         status, how = (
             RunError.exit_status,
-            f"an eavesdropper's class could not give the covariance expected of it: {error}",
+            f"an eavesdropper's class could not give its theoretical covariance: {error}",
         )
     except Exception as error:  # a bug in the recorder must not cost the results
         status, lack = RunError.exit_status, lack_of(error)

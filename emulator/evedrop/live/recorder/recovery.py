@@ -94,7 +94,7 @@ class Stall:
             return
         places = reported()
         for process, k in places.items():
-            # It reports at least once in every batch of slots: do not believe that it is further without a report.
+            # It reports at least once in every batch of slots: do not assume that it is further without a report.
             slot = min(self._answers[process].slot, k + self._batch) if process in self._answers else -1
             place = (slot, k)
             if process not in self._moved or self._moved[process][0] < place:

@@ -53,7 +53,7 @@ class Naive(PacketTaker):
 
 
 class Smart(PacketTaker):
-    """b_k = 1 − ν_k; it knows the schedule. Its believed covariance is the actual one.
+    """b_k = 1 − ν_k; it knows the schedule. Its reported covariance is the actual one.
 
     Source: the paper, smart eavesdropper.
     """

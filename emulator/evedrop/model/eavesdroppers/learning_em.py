@@ -144,7 +144,7 @@ class LearningEm(Learner):
         learned = Learned(posterior, theta, Moments.imagined(theta.A, ones), ones)
         none = np.zeros((0, trials), np.bool_), np.zeros((0, n, trials))
         memory = Memory(learned, np.zeros((n, trials)), np.full((1, trials), first), *none)
-        return self._believed(np.zeros(trials, np.uint8), memory)
+        return self._belief_of(np.zeros(trials, np.uint8), memory)
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
         """One component with covariance 0; its parameters stay."""
@@ -172,14 +172,14 @@ class LearningEm(Learner):
         action = np.where(
             gamma, np.where(state > 0.5, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0)
         )
-        return self._believed(action, memory._replace(learned=learned, largest=np.maximum(memory.largest, np.abs(z))))
+        return self._belief_of(action, memory._replace(learned=learned, largest=np.maximum(memory.largest, np.abs(z))))
 
     def learned(self, belief: Belief) -> Mapping[str, Floats]:
         """Its estimates."""
         theta = Memory.read(belief.memory).learned.theta
         return {"A": theta.A, "Q": covariance(theta.noise), "mu_d": theta.mu_d}
 
-    def _believed(self, action: Codes, memory: Memory) -> Belief:
+    def _belief_of(self, action: Codes, memory: Memory) -> Belief:
         """The mean and covariance of the posterior, made smaller where they are out of all proportion to the packets."""
         x_hat, P = moments_of(memory.learned.posterior.mixture)
         x_hat, P = self.in_proportion(x_hat, P, memory.largest)

@@ -169,7 +169,7 @@ class LearningParticle(Learner):
         ones = np.ones(self._count * self.trials)
         cloud = Cloud(unheard(self.known, ones), theta, self._imagined(theta, ones), np.zeros_like(ones))
         nothing = np.zeros((self.process.n, self.trials))
-        return self._believed(cloud, np.zeros(self.trials, np.uint8), np.ones(self.trials), nothing)
+        return self._belief_of(cloud, np.zeros(self.trials, np.uint8), np.ones(self.trials), nothing)
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
         """Every particle has the state; their parameters stay."""
@@ -200,7 +200,7 @@ class LearningParticle(Learner):
         action = np.where(
             gamma, np.where(state > 0.5, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0)
         )
-        return self._believed(cloud, action, scale, np.maximum(largest, np.abs(z)))
+        return self._belief_of(cloud, action, scale, np.maximum(largest, np.abs(z)))
 
     def learned(self, belief: Belief) -> Mapping[str, Floats]:
         """The means over the particles."""
@@ -252,7 +252,7 @@ class LearningParticle(Learner):
             total += fraction * values[..., p * self.trials : (p + 1) * self.trials]
         return total
 
-    def _believed(self, cloud: Cloud, action: Codes, scale: Floats, largest: Floats) -> Belief:
+    def _belief_of(self, cloud: Cloud, action: Codes, scale: Floats, largest: Floats) -> Belief:
         means, within = moments_of(cloud.posterior.mixture)
         portion = self._portion(cloud.weight)
         x_hat = self._mean(portion, means)

@@ -188,7 +188,7 @@ def follow(
     chi: Floats | None = None,
     initial: bool = False,
 ) -> tuple[Floats, Floats]:
-    """Estimates (c, n, R) and believed covariances (c, n, n, R) after c slots, from those before them.
+    """Estimates (c, n, R) and reported covariances (c, n, n, R) after c slots, from those before them.
 
     action (c, R); z (c, n, R): packets, read where they are used; χ (c, n, R): for a decoder, subtracted from innovations.
     initial: the first slot is slot 0, which is not predicted. The table in `evedrop.model.update` says what is computed.
@@ -208,7 +208,7 @@ def follow(
 
 @np.errstate(over="ignore", invalid="ignore")  # as in C: an unstable receiver's covariance may exceed double precision
 def follow_covariance(A: Floats, Q: Floats, P: Floats, action: Codes, initial: bool = False) -> Floats:
-    """The believed covariances (c, n, n, R) of `follow`, from P (n, n, R) and actions (c, R)."""
+    """The reported covariances (c, n, n, R) of `follow`, from P (n, n, R) and actions (c, R)."""
     (slots, trials), n = action.shape, len(A)
     expect_all((A, (n, n)), (Q, (n, n)), (P, (n, n, trials)))
     expect_bytes(action, (slots, trials))

@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 from evedrop.errors import NotRegistered
 from evedrop.model.metrics.built_in import (
-    ExpectedTraceCovariance,
     MeanActualTraceCovariance,
     MeanSquaredError,
     MeanTraceCovariance,
     ReceivedFraction,
+    TheoreticalTraceCovariance,
     UsedFraction,
 )
 from evedrop.model.metrics.metric import Metric, MetricColumn
@@ -24,7 +24,7 @@ from evedrop.names import LEGITIMATE
 _BUILT_IN: Mapping[str, type[Metric]] = {
     "mean_squared_error": MeanSquaredError,
     "mean_trace_covariance": MeanTraceCovariance,
-    "expected_trace_covariance": ExpectedTraceCovariance,
+    "theoretical_trace_covariance": TheoreticalTraceCovariance,
     "received_fraction": ReceivedFraction,
     "used_fraction": UsedFraction,
     "mean_actual_trace_covariance": MeanActualTraceCovariance,

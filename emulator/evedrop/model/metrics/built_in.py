@@ -1,6 +1,6 @@
 """The built-in metrics of a receiver: the fractions of packets that it received and used, its error, and covariances.
 
-Late packets are included. Of covariances there are the one that the receiver reports, and the one that theory expects. The
+Late packets are included. There are two covariances: the one that the receiver reports, and the theoretical one. The
 account of a link's packets has the entries that expectations can name.
 """
 
@@ -79,7 +79,7 @@ class MeanError(MeanMetric, TallyMetric):
     """The mean of the mode's error: |x − x̂|², or in a covariance-only study the trace of the actual covariance."""
 
     of_error = True
-    expected = "expected_trace_covariance"
+    expected = "theoretical_trace_covariance"
     sweep_column = MetricColumn("mean error", 0)
     sweep_picture = "marks"
 
@@ -120,14 +120,14 @@ class MeanActualTraceCovariance(MeanError):
 
 @final
 class MeanTraceCovariance(MeanMetric, TallyMetric):
-    """The mean of tr P, where P is the covariance that the receiver believes."""
+    """The mean of tr P, where P is the covariance that the receiver reports."""
 
-    meaning = "of tr P, the error covariance that the receiver believes"
+    meaning = "of tr P, the error covariance that the receiver reports"
     by_trial = False
     of_error = True
     rests_on = "recorded trials"
-    column = MetricColumn("believed tr P", 3)
-    sweep_column = MetricColumn("believed tr P", 2)
+    column = MetricColumn("reported tr P", 3)
+    sweep_column = MetricColumn("reported tr P", 2)
 
     @classmethod
     def of_tally(cls, tally: ReceiverTally) -> float:
@@ -146,34 +146,34 @@ class MeanTraceCovariance(MeanMetric, TallyMetric):
 
 
 @final
-class ExpectedTraceCovariance(TallyMetric):
-    """The mean trace of the actual error covariance that theory expects."""
+class TheoreticalTraceCovariance(TallyMetric):
+    """The mean trace of the theoretical error covariance."""
 
     meaning = (
-        "theory: trace of the expected actual error covariance over the same slots; null if no theory covers the losses "
+        "trace of the theoretical error covariance over the same slots; null if no theory covers the losses "
         "of its link, or if no closed form is known for its strategy"
     )
     needs_theory = True
     rests_on = "theory"
-    column = MetricColumn("expected tr P", 4)
-    sweep_column = MetricColumn("expected tr P", 1)
+    column = MetricColumn("theoretical tr P", 4)
+    sweep_column = MetricColumn("theoretical tr P", 1)
     sweep_picture = "lines"
 
     @classmethod
     def of_tally(cls, tally: ReceiverTally) -> float:
         """Its mean over the run; NaN without theory."""
-        return tally.expected_trace / max(1, tally.offered)
+        return tally.theoretical_trace / max(1, tally.offered)
 
     @classmethod
     def tally(cls, trials: int) -> MetricTally:
         """A tally of no slots yet."""
         del trials
-        return ExpectedTraces()
+        return TheoreticalTraces()
 
 
 @final
-class ExpectedTraces(MetricTally):
-    """The expected traces of some slots, which are the same for all trials."""
+class TheoreticalTraces(MetricTally):
+    """The theoretical traces of some slots, which are the same for all trials."""
 
     def __init__(self) -> None:
         self._traces: list[Floats] = []
@@ -183,7 +183,7 @@ class ExpectedTraces(MetricTally):
         self._traces.append(slots.expected.copy())
 
     @classmethod
-    def merged(cls, parts: Sequence[ExpectedTraces]) -> ExpectedTraces:
+    def merged(cls, parts: Sequence[TheoreticalTraces]) -> TheoreticalTraces:
         """The traces of the first set of trials, which are those of all."""
         return parts[0]
 

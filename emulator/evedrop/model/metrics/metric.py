@@ -34,9 +34,9 @@ class ScoredSlots:
     action: Codes
     """`Action`, (c, R)."""
     trace: Floats
-    """Believed tr P, summed over trials, (c,): a live run does not know it trial by trial."""
+    """Reported tr P, summed over trials, (c,): a live run does not know it trial by trial."""
     expected: Floats
-    """Theory: trace of the expected actual error covariance, (c,)."""
+    """Trace of the theoretical error covariance, (c,)."""
     late: Late | None = None
     """Counts of packets of earlier slots that arrived, and that were used, (c, R) each; None if the receiver accepts none."""
     x: Floats | None = None
@@ -112,7 +112,7 @@ class ReceiverTally:
     unsent: int = 0
     error: float = 0.0
     trace: float = 0.0
-    expected_trace: float = 0.0
+    theoretical_trace: float = 0.0
     received: int = 0
     used: int = 0
     unexplained: int = 0

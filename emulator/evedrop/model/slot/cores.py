@@ -331,7 +331,7 @@ class ReceiverCore:
 class Absence:
     """The estimate of a receiver that is away: it is predicted from slot to slot.
 
-    A receiver that is away believes nothing; these are its beliefs for these slots once it is back.
+    A receiver that is away reports nothing; these are its beliefs for these slots once it is back.
     """
 
     def __init__(self, process: Process, belief: Belief) -> None:

@@ -43,7 +43,7 @@ Hears = Callable[[bool, bool], float]
 
 
 class ClosedForm(ABC):
-    """One receiver's expected error covariance over the slots of a run."""
+    """One receiver's theoretical error covariance over the slots of a run."""
 
     bound: bool = False
     """Whether this is only a lower bound, in every slot; its limit is exact."""
@@ -548,7 +548,7 @@ _RANK = 1e-9  # relative: a smaller singular value is taken for 0
 @final
 @dataclass(frozen=True)
 class ClearStatesForm(ClosedForm):
-    """The expected error covariance of a receiver that reads the unencrypted states, slot by slot, without a closed formula.
+    """The theoretical error covariance of a receiver that reads the unencrypted states, slot by slot, without a closed formula.
 
     Behind a perfect link, with packets that are all states (μ_d = 1) or, after slot 0, all innovations (μ_d = 0), it is the same
     in every trial. Otherwise it is that of a receiver that hears more than any: all packets, and with 0 < μ_d < 1 both types in

@@ -74,7 +74,7 @@ class Outcomes:
         return cls(1.0 - mu_e, mu_e * mu_d, misled=0.0, decoded=0.0, initial=1.0 - mu_e, leaked=mu_e * (1.0 - mu_d))
 
     @property
-    def believed(self) -> Outcomes:
+    def reported(self) -> Outcomes:
         """The same with every used packet counted as the state, as the receiver's own covariance assumes."""
         return replace(self, state=self.state + self.misled, misled=0.0)
 
@@ -98,7 +98,7 @@ def state_covariances(process: Process, slots: int) -> Floats:
 
     Source: docs/mathematics.md, model.
     """
-    return expected_covariances(process, NOBODY, slots)
+    return theoretical_covariances(process, NOBODY, slots)
 
 
 @final
@@ -109,7 +109,7 @@ class NoiseCovariances:
     """
 
     def __init__(self, process: Process) -> None:
-        self._A, self._states = process.A, ExpectedCovariance(process, NOBODY)
+        self._A, self._states = process.A, TheoreticalCovariance(process, NOBODY)
         self._first = True
 
     def next(self, slots: int) -> Floats:
@@ -140,7 +140,7 @@ def misled_covariances(process: Process, slots: int) -> Floats:
 
 
 @final
-class ExpectedCovariance:
+class TheoreticalCovariance:
     """E P_k of a receiver, a number of slots at a time from k = 0.
 
     E_0 = p_0 Σ0, E_k = p_k (A E_{k−1} Aᵀ) + p_d Q + p_i f_k with p_k = `kept`, solved for a block of slots at once: for
@@ -218,20 +218,20 @@ class ExpectedCovariance:
         return block
 
 
-def expected_covariances(process: Process, outcomes: Outcomes, slots: int) -> Floats:
-    """E P_k for k = 0 … slots−1, (slots, n, n); inf from where it overflows. `outcomes.believed` gives E of the belief.
+def theoretical_covariances(process: Process, outcomes: Outcomes, slots: int) -> Floats:
+    """E P_k for k = 0 … slots−1, (slots, n, n); inf from where it overflows. `outcomes.reported` gives E of the reported P.
 
     Source: docs/mathematics.md, expectations.
     """
-    return ExpectedCovariance(process, outcomes).next(slots)
+    return TheoreticalCovariance(process, outcomes).next(slots)
 
 
-def expected_traces(process: Process, outcomes: Outcomes, slots: int) -> Floats:
+def theoretical_traces(process: Process, outcomes: Outcomes, slots: int) -> Floats:
     """Trace of E P_k for k = 0 … slots−1, (slots,); inf from where it overflows.
 
     Source: docs/mathematics.md, expectations.
     """
-    return ExpectedCovariance(process, outcomes).next_traces(slots)
+    return TheoreticalCovariance(process, outcomes).next_traces(slots)
 
 
 def radius(process: Process) -> float:

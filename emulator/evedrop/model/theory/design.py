@@ -16,7 +16,7 @@ import numpy as np
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
 from evedrop.model.receiver import Flags
-from evedrop.model.theory.covariances import Outcomes, expected_traces, limit_trace, stability_bound
+from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bound, theoretical_traces
 from evedrop.model.theory.json_values import json_value
 from evedrop.model.theory.ratio import (
     ATTAINED,
@@ -161,11 +161,11 @@ def design(
     """
     bound = stability_bound(process, mu)
     own = Outcomes.legitimate(mu, mu_d)
-    ours = expected_traces(process, own, slots)
+    ours = theoretical_traces(process, own, slots)
     trace = limit_trace(process, own)
 
     def against(adversary: Adversary) -> Against:
-        theirs = expected_traces(process, adversary.outcomes(mu_d), slots)
+        theirs = theoretical_traces(process, adversary.outcomes(mu_d), slots)
         violated = _stretches(~(ours[1:] < theirs[1:]))
         held_from = violated[-1][1] + 1 if violated else 1
         its_trace = limit_trace(process, adversary.outcomes(mu_d))

@@ -138,7 +138,7 @@ class PolicyMetrics(JsonFields):
     """The metrics of one policy in the limit: exact, by the stationary distribution of its chain."""
 
     user: float
-    """Trace of the user's expected error covariance; inf if it is unbounded."""
+    """Trace of the user's theoretical error covariance; inf if it is unbounded."""
     eavesdropper: float
     """The eavesdropper's."""
     transmissions: float

@@ -20,7 +20,7 @@ from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief, Beliefs, Receiver, Reception
 from evedrop.model.schemes.scheme import Encoder, PacketBlock, Scheme
-from evedrop.model.theory.covariances import ExpectedCovariance, OutcomesAt
+from evedrop.model.theory.covariances import OutcomesAt, TheoreticalCovariance
 from evedrop.scenario.conformance.problems import (
     QUALITY,
     Problem,
@@ -128,13 +128,13 @@ def expect_actions(receiver: Receiver, steps: Sequence[Step], problem: Problem, 
             raise Broken(
                 f"slot {k}, trial {problem.batch.first_trial + at}: {contradiction}; make them agree, or {remedy}"
             )
-        P = update.believed_covariance(problem.process, k, before.P, action)
+        P = update.reported_covariance(problem.process, k, before.P, action)
         unlike = (P != after.P).any(axis=(0, 1))
         if unlike.any():
             at = int(np.argmax(unlike))
             raise Broken(
                 f"slot {k}, trial {problem.batch.first_trial + at}: Belief.P after {_action_name(action[at])} is not that of "
-                f"update.believed_covariance; use that function, or {remedy}"
+                f"update.reported_covariance; use that function, or {remedy}"
             )
 
 
@@ -155,7 +155,7 @@ def expect_expected(
         raise Broken(
             f"outcomes sum to {sum_in_order(parts):.6g}, the least is {min(parts):.3g}; expected probabilities that sum to 1"
         )
-    expected = ExpectedCovariance(problem.process, outcomes).next_traces(len(errors))
+    expected = TheoreticalCovariance(problem.process, outcomes).next_traces(len(errors))
     for k, error in enumerate(errors):
         chance = SIGMAS * float(error.std()) / float(np.sqrt(len(error))) + _SLACK * float(expected[k]) + 1e-9
         if abs(float(error.mean()) - float(expected[k])) > chance:

@@ -183,7 +183,7 @@ class RunSource:
         columns = ["slot", "mean_squared_error", "mean_actual_trace_covariance", "standard_error"]
         table = SlotRows(self.results, "slots", self.summary.peers)
         groups = {name: GroupMeans(extent.rows, POINTS, 5) for name, extent in table.extents.items()}
-        for name, rows in table.pieces([*columns, "expected_trace_covariance"]):
+        for name, rows in table.pieces([*columns, "theoretical_trace_covariance"]):
             groups[name].add(_means(rows))
         return {
             name: SlotMeans(extent.first, extent.last, *groups[name].means) for name, extent in table.extents.items()
@@ -210,7 +210,7 @@ def _means(rows: pa.Table) -> Floats:
     actual = _numbers(rows["mean_actual_trace_covariance"])
     error = np.where(np.isnan(error), actual, error)
     scatter = _INTERVAL * _numbers(rows["standard_error"])
-    theory = _numbers(rows["expected_trace_covariance"])
+    theory = _numbers(rows["theoretical_trace_covariance"])
     return np.stack([_numbers(rows["slot"]), error, error - scatter, error + scatter, theory])
 
 

@@ -92,7 +92,7 @@ def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | Non
             mine = mine.filter(pc.is_in(mine["slot"], pa.array(slots, pa.int64())))
         columns = {column: mine[column].to_numpy() for column in mine.column_names if column != "peer"}
         ink = hexadecimal(colour(i))
-        error, theory = columns["mean_squared_error"], columns["expected_trace_covariance"]
+        error, theory = columns["mean_squared_error"], columns["theoretical_trace_covariance"]
         if np.isnan(error).all():
             error = columns["mean_actual_trace_covariance"]
         heights += [error, theory]

@@ -68,7 +68,7 @@ class PeerSlots:
     x_hat: Floats
     """Estimate in the first recorded trial, (c, n)."""
     P: Floats
-    """Covariance that it believes in the first recorded trial, (c, n, n)."""
+    """Covariance that it reports in the first recorded trial, (c, n, n)."""
     action: Codes
     """`Action` in the first recorded trial, (c,)."""
     squared_error: Floats
@@ -76,8 +76,8 @@ class PeerSlots:
     standard_error: Floats
     """The standard error of this mean, (c,); NaN for one trial."""
     trace: Floats
-    """tr P that it believes, mean over trials, (c,)."""
-    expected_trace: Floats
+    """tr P that it reports, mean over trials, (c,)."""
+    theoretical_trace: Floats
     """Trace of the actual error covariance by theory, (c,); NaN where there is none."""
 
     def mapped(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> PeerSlots:

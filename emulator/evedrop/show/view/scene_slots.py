@@ -166,7 +166,7 @@ def shown(
             squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
             standard_error=scored[name].sums.standard_errors,
             trace=receiver.trace[:, 0] / slots.trials,
-            expected_trace=scored[name].expected,
+            theoretical_trace=scored[name].expected,
         )
         for name, receiver in slots.receivers.items()
     }
@@ -281,7 +281,7 @@ def _peer(results: Results, name: str) -> PeerSlots:
         squared_error=means["mean_squared_error"].to_numpy(),
         standard_error=means["standard_error"].to_numpy(),
         trace=means["mean_trace_covariance"].to_numpy(),
-        expected_trace=means["expected_trace_covariance"].to_numpy(),
+        theoretical_trace=means["theoretical_trace_covariance"].to_numpy(),
     )
 
 

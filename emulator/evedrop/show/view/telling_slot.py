@@ -42,7 +42,7 @@ def telling_slot(results: Results) -> int | None:
 def most_telling(errors: Mapping[str, Floats], traces: Mapping[str, Floats], noise: float) -> int:
     """The slot with the largest separation between the eavesdroppers that are fooled and the legitimate estimator.
 
-    errors, traces: receiver → its squared error, and the trace of the covariance that it believes, (slots,). noise: trace of Q.
+    errors, traces: receiver → its squared error, and the trace of the covariance that it reports, (slots,). noise: trace of Q.
     """
     legitimate = errors[LEGITIMATE]
     others = [name for name in errors if name != LEGITIMATE]

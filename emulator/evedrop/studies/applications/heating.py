@@ -82,8 +82,8 @@ class ComfortTally(ApplicationTally):
             self._outside = self._outside + row
             self._power = self._power + self._plant.limited(inputs)[self._heater]
         for name, count in self._known.items():
-            believed = self._range.outside(estimates[name][:, state])
-            self._known[name] = count + np.count_nonzero((believed > 0.0) == (outside > 0.0), axis=0)
+            estimated = self._range.outside(estimates[name][:, state])
+            self._known[name] = count + np.count_nonzero((estimated > 0.0) == (outside > 0.0), axis=0)
 
     @classmethod
     def merged(cls, parts: Sequence[Self]) -> Self:
@@ -121,7 +121,7 @@ class ComfortTally(ApplicationTally):
 
 @final
 class ComfortFeed(PanelFeed):
-    """The heating energy and the discomfort that each receiver believes, since slot 0, in one trial."""
+    """The heating energy and the discomfort as each receiver estimates it, since slot 0, in one trial."""
 
     def __init__(self, loop: ControlledPlant, table: ComfortTable) -> None:
         self._range, self._heater, self._hours = (
@@ -175,13 +175,13 @@ class Comfort(Application):
 
     @classmethod
     def panels(cls, loop: ControlledPlant, table: Table) -> tuple[Panel, ...]:
-        """The heater's energy, and the discomfort that each receiver believes."""
+        """The heater's energy, and the discomfort as each receiver estimates it."""
         del table
         return (
             Panel(_ENERGY, "Heating energy (kWh)", (PanelCurve("energy", PLANT[0]),)),
             Panel(
                 _DISCOMFORT,
-                "Discomfort that each believes (K h)",
+                "Discomfort as each estimates it (K h)",
                 tuple(PanelCurve(name, width=1.2) for name in loop.receivers),
                 with_beliefs=True,
             ),

@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 
 from evedrop.model.process import Floats
-from evedrop.model.theory.covariances import Outcomes, expected_traces, stability_bound
+from evedrop.model.theory.covariances import Outcomes, stability_bound, theoretical_traces
 from evedrop.model.theory.design import Against
 from evedrop.model.theory.ratio import Adversary, adversary_bound
 from evedrop.studies.papers import chain, microgrid, numerical, strategies
@@ -60,7 +60,7 @@ def formulas() -> str:
         rest = outcomes.predicted * noise + outcomes.misled * 2.0 * carried
         printed = outcomes.kept * (carried if name == "legitimate" else start) + rest
         corrected = outcomes.initial * outcomes.kept * carried + rest
-        recursion = expected_traces(process, outcomes, 2)[1]
+        recursion = theoretical_traces(process, outcomes, 2)[1]
         lines.append(f"| {name} | {printed:.4f} | {corrected:.4f} | {recursion:.4f} |")
     return "\n".join(lines)
 

@@ -16,7 +16,7 @@ from evedrop.model.receiver import Action
 from evedrop.model.schedule import Schedule
 from evedrop.model.slot.link import deliveries, link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
-from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
+from evedrop.model.theory.covariances import Outcomes, misled_covariances, theoretical_traces
 from evedrop.model.update import actual_covariance
 from evedrop.show.view.figure_style import BLUE, GREEN, GREY, RED, panels
 
@@ -59,7 +59,7 @@ def theory(slots: int, mu_ds: Sequence[float] = STATE_PROBABILITIES) -> Floats:
     """Day means by the finite-k expectations, (receivers, μ_d)."""
     return np.array(
         [
-            [expected_traces(_process_of(receiver), outcomes(receiver, mu_d), slots).mean() for mu_d in mu_ds]
+            [theoretical_traces(_process_of(receiver), outcomes(receiver, mu_d), slots).mean() for mu_d in mu_ds]
             for receiver in RECEIVERS
         ]
     )

@@ -1,4 +1,4 @@
-"""Finite-k expectations of every receiver compared with simulation: the actual error, and the error it believes.
+"""Finite-k expectations of every receiver compared with simulation: the actual error, and the error it reports.
 
 Source: Theorem IV.3 and Theorem V.2, corrected (docs/mathematics.md, expectations).
 """
@@ -18,7 +18,7 @@ from evedrop.model.receiver import Receiver, Reception
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.slot.link import deliveries, link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
-from evedrop.model.theory.covariances import Outcomes, expected_traces
+from evedrop.model.theory.covariances import Outcomes, theoretical_traces
 from evedrop.show.view.figure_style import BLUE, GREEN, ORANGE, RED, panels
 
 MU, MU_D, SLOTS = 0.9, 0.85, 26
@@ -53,7 +53,7 @@ class SimulatedRuns:
     """Means over trials and their standard errors, (slots,), by receiver: squared error, and trace of its own P."""
 
     squared_error: dict[str, tuple[Floats, Floats]]
-    believed: dict[str, tuple[Floats, Floats]]
+    reported: dict[str, tuple[Floats, Floats]]
     trials: int
 
 
@@ -73,14 +73,14 @@ def simulate(trials: int, progress: Callable[[str], None]) -> SimulatedRuns:
 def draw(path: Path, runs: SimulatedRuns) -> str:
     """Draw the figure; returns its caption."""
     k = np.arange(SLOTS)
-    with panels(path, 2, 9.6, 4.2) as (actual, believed):
+    with panels(path, 2, 9.6, 4.2) as (actual, reported):
         for name, (colour, mark, line) in _LOOKS.items():
             theory = outcomes()[name]
             for axes, expected, (mean, error) in (
                 (actual, theory, runs.squared_error[name]),
-                (believed, theory.believed, runs.believed[name]),
+                (reported, theory.reported, runs.reported[name]),
             ):
-                axes.plot(k, expected_traces(process(), expected, SLOTS), line, color=colour, label=name)
+                axes.plot(k, theoretical_traces(process(), expected, SLOTS), line, color=colour, label=name)
                 axes.errorbar(
                     k, mean, 2.58 * error, fmt=mark, color=colour, markersize=4, capsize=2, elinewidth=0.9,
                     markerfacecolor="white",
@@ -88,10 +88,10 @@ def draw(path: Path, runs: SimulatedRuns) -> str:
                 axes.set_yscale("log")
                 axes.set_xlabel("slot k")
         actual.set_title("(a) actual error")
-        believed.set_title("(b) what each believes")
+        reported.set_title("(b) what each reports")
         actual.set_ylabel(r"E $\|x_k - \hat x_k\|^2$ (units of $x$, squared)")
-        believed.set_ylabel(r"E tr $P_k$ of its own (units of $x$, squared)")
-        believed.set_ylim(1.5e-4, 3e-3)
+        reported.set_ylabel(r"E tr $P_k$ of its own (units of $x$, squared)")
+        reported.set_ylim(1.5e-4, 3e-3)
         actual.legend(loc="upper left", title="lines: theory; marks: simulated")
     return (
         f"Every receiver of the innovation scheme slot by slot: the paper's A and Q, Σ0 = Q, μ = μ_e = {MU}, "

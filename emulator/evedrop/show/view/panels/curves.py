@@ -143,7 +143,7 @@ class SquaredError(ViewPanel):
                 yield from logarithms(self.scene, f"{_BAND}/{shown.name}/{side}", slots.numbers, edge)
 
 
-_BELIEVED, _THEORY = "trace", "theory"
+_REPORTED, _THEORY = "trace", "theory"
 
 
 @final
@@ -153,15 +153,15 @@ class TraceOfP(ViewPanel):
     def views(self) -> Iterator[PlacedView]:
         """One view, below the squared error."""
         if not self.scene.moving:
-            title = "tr P   log10, dim: theory"
-            yield PlacedView(receivers_view(title, [_BELIEVED, _THEORY], recent_slots(self.scene)), "middle")
+            title = "tr P   log10, dim: theoretical"
+            yield PlacedView(receivers_view(title, [_REPORTED, _THEORY], recent_slots(self.scene)), "middle")
 
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each receiver's colour: bright for its belief, dim for theory."""
         styles = {}
         for i, shown in enumerate(self.scene.receivers):
             bright, label = colour(i), shown.name
-            styles[f"{_BELIEVED}/{label}"] = rr.SeriesLines(
+            styles[f"{_REPORTED}/{label}"] = rr.SeriesLines(
                 names=label, colors=bright, widths=1.5, interpolation_mode="StepAfter", aggregation_policy=LARGEST
             )
             styles[f"{_THEORY}/{label}"] = rr.SeriesLines(
@@ -173,8 +173,8 @@ class TraceOfP(ViewPanel):
         """Two curves for each receiver; only the first if no theory covers it."""
         for shown in self.scene.receivers:
             peer = slots.peers[shown.name]
-            yield from logarithms(self.scene, f"{_BELIEVED}/{shown.name}", slots.numbers, peer.trace)
-            yield from logarithms(self.scene, f"{_THEORY}/{shown.name}", slots.numbers, peer.expected_trace)
+            yield from logarithms(self.scene, f"{_REPORTED}/{shown.name}", slots.numbers, peer.trace)
+            yield from logarithms(self.scene, f"{_THEORY}/{shown.name}", slots.numbers, peer.theoretical_trace)
 
 
 _STATE_PATH = "plane"

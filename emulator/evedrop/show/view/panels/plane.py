@@ -1,6 +1,6 @@
 """The panels of two dimensions, recorded at the view's frames: the plane of the first two states, and the map of receivers.
 
-The plane shows truth, estimates with their recent paths, and the covariance ellipses believed. It follows the truth and the
+The plane shows truth, estimates with their recent paths, and the reported covariance ellipses. It follows the truth and the
 legitimate estimator. An eavesdropper that is farther away is an arrow at the border.
 
 The map, for links whose losses depend on distance, is drawn by Evedrop: Rerun's own map would load its tiles from another host.
@@ -56,7 +56,7 @@ class StatePlane(ViewPanel):
         }
         trails[_trail(TRUTH_NAME)] = self._past(_TRUTH_TRAIL)
         view = rrb.Spatial2DView(
-            name="State plane   ellipses: 2σ believed",
+            name="State plane   ellipses: 2σ reported",
             origin=_PLANE_PATH,
             background=list(GROUND),
             overrides=trails,  # type: ignore[arg-type]

@@ -280,7 +280,7 @@ class PerfectLoop:
         return self._u
 
 
-_BELIEVED = 0.9
+_TRUSTED_FRACTION = 0.9
 """The fraction of a guess that the copy of the controller is told. A controller that compensates the load at once leaves no
 trace in the level, and a copy that is told all of a wrong guess would confirm that guess forever."""
 
@@ -316,7 +316,7 @@ class LoadGuess:
         d = np.zeros((assignment.plant.disturbance_matrix.shape[1], x_hat.shape[1]))
         if self._level is not None:
             guess = (x_hat[house.battery] - self._level) / self._disturbed[house.battery, house.load]
-            d[house.load] = _BELIEVED * np.maximum(guess, 0.0)
+            d[house.load] = _TRUSTED_FRACTION * np.maximum(guess, 0.0)
         shone = self._sun[k : k + assignment.period]
         if house.sun is not None and len(shone):
             d[house.sun] = shone[0]
