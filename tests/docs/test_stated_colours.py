@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.scenario.loading import load
-from evedrop.score.track import FACTOR
+from evedrop.score.synchronisation import FACTOR
 from evedrop.show.view.palette import KNOWLEDGE, RECEIVERS, Colour
 
 ROOT = Path(__file__).parents[2]

@@ -44,7 +44,7 @@ EVENTFUL: dict[str, Any] = {
     "expect": [
         {"metric": "naive.mean_squared_error", "slots": [100, 200], "quantile": 0.5, "above": 0.0},
         {"metric": "legitimate.mean_squared_error", "below": 1e-9},
-        {"in_step": "smart", "by": 290},
+        {"synchronised": "smart", "by": 290},
         {"link": "naive"},
     ],
 }

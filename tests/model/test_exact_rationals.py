@@ -21,10 +21,10 @@ from evedrop.model.process import Process, mistakes_of
 from evedrop.model.slot.link_distribution import LinkDistribution
 from evedrop.model.theory.closed_forms import (
     encrypted_schedule,
-    in_sync_probability,
     reference_covariances,
     scheduled,
     step_probabilities,
+    synchronised_probability,
     twin_track_bound,
     word_probability,
 )
@@ -309,11 +309,11 @@ def test_the_limiting_distribution(mu: float, mu_d: float, innovations: int, dro
     """π_0 and the probabilities of words and steps, down to links that hardly ever lose and states that are hardly ever sent."""
     assume(mu * mu_d > 1e-300)
     p_d, p_i, p_r = 1 - Fraction(mu), Fraction(mu) * (1 - Fraction(mu_d)), Fraction(mu) * Fraction(mu_d)
-    in_sync = p_r / (1 - p_i)
-    assert close(in_sync_probability(mu, mu_d), in_sync)
-    word = p_i**innovations * p_d ** (drops + 1) * in_sync
+    synchronised = p_r / (1 - p_i)
+    assert close(synchronised_probability(mu, mu_d), synchronised)
+    word = p_i**innovations * p_d ** (drops + 1) * synchronised
     assert close(word_probability(mu, mu_d, innovations, drops), word) or word < Fraction(1, 10**300)
-    steps = [in_sync, *(p_d * in_sync * (p_i + p_d) ** (i - 1) for i in range(1, 6))]
+    steps = [synchronised, *(p_d * synchronised * (p_i + p_d) ** (i - 1) for i in range(1, 6))]
     for found, expected in zip(step_probabilities(mu, mu_d, 6), steps, strict=True):
         assert close(found, expected) or expected < Fraction(1, 10**300)
 

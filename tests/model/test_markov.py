@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.model.process import Process
-from evedrop.model.theory.closed_forms import in_sync_probability, step_probabilities, word_probability
+from evedrop.model.theory.closed_forms import step_probabilities, synchronised_probability, word_probability
 from evedrop.model.theory.covariances import Outcomes, limit
 from evedrop.studies.papers import chain
 
@@ -39,11 +39,11 @@ def test_distribution_is_stationary(mu: float, mu_d: float) -> None:
     assert p[2:] == pytest.approx((p_i + p_d) * p[1:-1], rel=1e-12)
 
 
-def test_lossless_link_is_always_in_sync() -> None:
+def test_lossless_link_is_always_synchronised() -> None:
     """With μ = 1 nothing ever drops, even if no state is ever sent."""
-    assert in_sync_probability(1.0, 0.0) == in_sync_probability(1.0, 0.5) == 1.0
+    assert synchronised_probability(1.0, 0.0) == synchronised_probability(1.0, 0.5) == 1.0
     assert np.array_equal(step_probabilities(1.0, 0.5, 4), [1.0, 0.0, 0.0, 0.0])
-    assert in_sync_probability(0.9, 0.0) == 0.0
+    assert synchronised_probability(0.9, 0.0) == 0.0
 
 
 def test_chain_gives_the_limit_of_the_expectation() -> None:

@@ -31,13 +31,13 @@ def expecting(*expectations: dict[str, Any], **changes: Any) -> Scenario:
 @pytest.mark.parametrize(
     ("expectation", "said"),
     [
-        ({}, 'metric: is missing; expected metric = "legitimate.mean_squared_error", or one of link, secrecy, in_step'),
-        ({"by": 3}, 'in_step: is missing; expected in_step = "legitimate"'),
+        ({}, 'metric: is missing; expected metric = "legitimate.mean_squared_error", or one of link, secrecy, synchronised'),
+        ({"by": 3}, 'synchronised: is missing; expected synchronised = "legitimate"'),
         ({"against": "smart"}, 'secrecy: is missing; expected secrecy = "relative"'),
         ({"metric": ERROR, "below": 1.0, "link": "smart"}, "link: is given together with metric; expected one of metric, link"),
         ({"secrecy": "relative", "metric": ERROR}, "secrecy: is given together with metric; expected one of metric, link, sec"),
         ({"link": "smart", "below": 1.0}, "below: is set, but link has no such entry; remove the line"),
-        ({"in_step": "smart", "by": 9, "slots": [0, 9]}, "slots: is set, but in_step has no such entry"),
+        ({"synchronised": "smart", "by": 9, "slots": [0, 9]}, "slots: is set, but synchronised has no such entry"),
         ({"metric": ERROR}, "below: is missing, and so is above; add below, above or near"),
         ({"metric": ERROR, "within": 1.0}, "within: is set without near; expected near = 0.01 as well"),
         ({"metric": ERROR, "within_relative": 0.1, "below": 1.0}, "within_relative: is set without near"),
@@ -68,10 +68,10 @@ def expecting(*expectations: dict[str, Any], **changes: Any) -> Scenario:
         ({"secrecy": "total", "against": "smart"}, 'secrecy: is "total"; expected perfect or relative'),
         ({"secrecy": "relative"}, "against: is missing; expected the name of an eavesdropper"),
         ({"secrecy": "relative", "against": "legitimate"}, 'against: is "legitimate"; expected smart'),
-        ({"in_step": "smart"}, "by: is missing; expected the last slot by which it must be in step, such as by = 40"),
-        ({"in_step": "smart", "by": 50}, "by: is 50; expected a slot of the run, 0 to 49"),
-        ({"in_step": "smart", "by": 9, "since": 10}, "by: is 9, before since, which is 10; expected since ≤ by"),
-        ({"in_step": "smart", "by": -1}, "by: is -1; expected a number at least 0"),
+        ({"synchronised": "smart"}, "by: is missing; expected the last slot by which it must be synchronised, such as by = 40"),
+        ({"synchronised": "smart", "by": 50}, "by: is 50; expected a slot of the run, 0 to 49"),
+        ({"synchronised": "smart", "by": 9, "since": 10}, "by: is 9, before since, which is 10; expected since ≤ by"),
+        ({"synchronised": "smart", "by": -1}, "by: is -1; expected a number at least 0"),
         ({"metric": ERROR, "blow": 1.0}, "blow: is not an entry of this table; did you mean below?"),
     ],
 )  # fmt: skip
@@ -87,7 +87,7 @@ AT_ONCE: dict[str, tuple[list[dict[str, Any]], set[str]]] = {
             {"metric": "smart.mean_eror", "near": 1, "slots": [3, 99]},
             {"metric": ERROR, "below": "1", "quantile": 2.0},
             {"secrecy": "relative", "by": 3},
-            {"in_step": "nobody", "by": 99, "since": 100},
+            {"synchronised": "nobody", "by": 99, "since": 100},
         ],
         {"0.within", "1.below", "1.quantile", "2.by", "2.against", "3.by"},
     ),
@@ -96,9 +96,9 @@ AT_ONCE: dict[str, tuple[list[dict[str, Any]], set[str]]] = {
             {"metric": "smart.mean_eror", "below": 1, "slots": [3, 99]},
             {"secrecy": "relative", "against": "nobody"},
             {"link": "nobody"},
-            {"in_step": "nobody", "by": 99, "since": 98},
+            {"synchronised": "nobody", "by": 99, "since": 98},
         ],
-        {"0.metric", "0.slots", "1.against", "2.link", "3.in_step", "3.by", "3.since"},
+        {"0.metric", "0.slots", "1.against", "2.link", "3.synchronised", "3.by", "3.since"},
     ),
 }
 
@@ -165,8 +165,8 @@ def test_what_is_wanted_of_a_metric(
     [
         ({"link": "smart"}, "link smart within its confidence interval"),
         ({"secrecy": "perfect", "against": "smart"}, "perfect secrecy against smart promised by theory and shown by the run"),
-        ({"in_step": "legitimate", "by": 9}, "legitimate in step by slot 9"),
-        ({"in_step": "legitimate", "by": 9, "since": 5}, "legitimate in step by slot 9, since slot 5"),
+        ({"synchronised": "legitimate", "by": 9}, "legitimate synchronised by slot 9"),
+        ({"synchronised": "legitimate", "by": 9, "since": 5}, "legitimate synchronised by slot 9, since slot 5"),
     ],
 )  # fmt: skip
 def test_what_is_wanted_of_other_things(expectation: dict[str, Any], text: str) -> None:

@@ -24,7 +24,7 @@ from evedrop.score.expectations_held import Evidence
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
-from evedrop.score.watched_tally import IN_STEP, WatchedSlots, WatchedTally
+from evedrop.score.watched_tally import SYNCHRONISED, WatchedSlots, WatchedTally
 from evedrop.simulate.montecarlo import Plan
 from tests.conftest import Evedrop
 
@@ -43,9 +43,9 @@ OTHERS: list[dict[str, Any]] = [
     {"link": "naive"},
     {"secrecy": "relative", "against": "naive"},
     {"secrecy": "perfect", "against": "smart"},
-    {"in_step": "suspicious", "by": 80},
-    {"in_step": "suspicious", "by": 80, "since": FIRST},
-    {"in_step": "suspicious", "by": 0},
+    {"synchronised": "suspicious", "by": 80},
+    {"synchronised": "suspicious", "by": 80, "since": FIRST},
+    {"synchronised": "suspicious", "by": 0},
 ]
 OPTIONS: dict[str, Any] = {"slots": SLOTS, "trials": TRIALS, "record_trials": TRIALS, "expect": ON_SUSPICIOUS + OTHERS}
 
@@ -102,7 +102,7 @@ def test_metrics_of_ranges_and_quantiles_are_those_of_the_table(made: Runs) -> N
 
 
 def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
-    """Traces over a range, a link's account, secrecy by theory and run, and the slot by which all were in step."""
+    """Traces over a range, a link's account, secrecy by theory and run, and the slot by which all were synchronised."""
     results = made("live")
     found = {one["text"]: one for one in results.summary["expectations"]}
     rows = [row for row in results.slots.to_pylist() if row["peer"] == "naive" and FIRST <= row["slot"] < 70]
@@ -117,10 +117,10 @@ def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
     assert (perfect["held"], perfect["found"]) == (False, "theory denies it, the run shows that it fails")
     states = np.isin(of_trials(results, "suspicious")["action"], ("state", "misled"))
     for since, text in ((0, ""), (FIRST, f", since slot {FIRST}")):
-        one = found[f"suspicious in step by slot 80{text}"]
+        one = found[f"suspicious synchronised by slot 80{text}"]
         assert one["found"] == since + states[since:].argmax(axis=0).max()
         assert one["held"] is (one["found"] <= 80)
-    late = found["suspicious in step by slot 0"]
+    late = found["suspicious synchronised by slot 0"]
     assert late["found"] > 0
     assert late["held"] is False
 
@@ -146,7 +146,7 @@ def test_what_is_watched_does_not_depend_on_how_it_is_cut(cuts: set[int], blocks
     draw = np.random.default_rng(1)
     error, action = draw.lognormal(size=(40, 7)), draw.integers(0, 4, (40, 7)).astype(np.uint8)
     watches = [WatchedSlots(metric, *span) for metric in METRICS for span in ((0, 40), (7, 21))]
-    steps = [WatchedSlots(IN_STEP, 0, 40), WatchedSlots(IN_STEP, 11, 40)]
+    steps = [WatchedSlots(SYNCHRONISED, 0, 40), WatchedSlots(SYNCHRONISED, 11, 40)]
 
     def watched(trials: slice, ends: list[int]) -> WatchedTally:
         one = WatchedTally([*watches, *steps], error[:, trials].shape[1])
@@ -169,15 +169,15 @@ def test_what_is_watched_does_not_depend_on_how_it_is_cut(cuts: set[int], blocks
         assert parts.tally(watch).value == whole.tally(watch).value == max(firsts)
 
 
-def test_a_trial_that_never_is_in_step_is_found_as_nothing(tmp_path: Path) -> None:
+def test_a_trial_that_never_is_synchronised_is_found_as_nothing(tmp_path: Path) -> None:
     """Null, not held, and the report says so; a run that ended too early to tell is neither."""
-    expect = [{"in_step": "legitimate", "by": 3}]
+    expect = [{"synchronised": "legitimate", "by": 3}]
     results = montecarlo(
         "eavesdroppers", slots=9, trials=5, legitimate__link__quality=0.0, expect=expect, out=tmp_path / "a"
     )
     (one,) = results.summary["expectations"]
     assert (one["held"], one["found"], one["wanted"]) == (False, None, "by slot 3")
-    assert Judged(**one).sentence == "expected legitimate in step by slot 3: FAILED, found none"
+    assert Judged(**one).sentence == "expected legitimate synchronised by slot 3: FAILED, found none"
     ranged = {"metric": "smart.used_fraction", "slots": [3, 9], "below": 1}
     secret = {"secrecy": "relative", "against": "smart"}
     scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged, secret]})
@@ -237,7 +237,7 @@ def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: 
     done = evedrop(
         command, "eavesdroppers", "--slots", "40", "--trials", "10", "--seed", "3", "--first-trial", "5", *view,
         "--set", "expect.0={metric = 'smart.mean_squared_error', slots = [9, 40], quantile = 0.9, above = 9.0}",
-        "--set", "expect.1={in_step = 'suspicious', by = 0}", "--out", "a run",
+        "--set", "expect.1={synchronised = 'suspicious', by = 0}", "--out", "a run",
     )  # fmt: skip
     assert (done.status, done.err) == (1, "")
     first = Results.read(evedrop.folder / "a run").summary["expectations"]

@@ -183,8 +183,8 @@ def test_heavy_tails_agree_by_quantiles() -> None:
             P = A @ P @ A.T + (Q if one else 0.0)
         error = np.linalg.cholesky(P) @ random.standard_normal(2) if lost.any() else np.zeros(2)
         samples.append(float(error @ error))
-    in_sync = 0.54 / (1 - 0.9 * 0.4)
-    assert abs((found == 0.0).mean() - in_sync) < SURE * np.sqrt(in_sync * (1 - in_sync) / 6000)
+    synchronised = 0.54 / (1 - 0.9 * 0.4)
+    assert abs((found == 0.0).mean() - synchronised) < SURE * np.sqrt(synchronised * (1 - synchronised) / 6000)
     for level in (0.86, 0.9, 0.93, 0.96, 0.98):
         edge = np.quantile(samples, level)
         below = float((found <= edge).mean())

@@ -99,6 +99,7 @@ GLOSSARY = ROOT / "docs" / "glossary.md"
 FORMER = {
     "believed": "reported",
     "believes": "reports",
+    "caught a state": "regained synchronisation",
     "Crossing": "WireFate",
     "deviation": "standard_deviation",
     "expected_covariance": "theoretical_covariance",
@@ -116,12 +117,19 @@ FORMER = {
     "heeding": "heed rule",
     "in clear": "unencrypted",
     "in_clear": "unencrypted",
+    "in step": "synchronised",
+    "in_step": "synchronised",
+    "in sync": "synchronised",
+    "in_sync": "synchronised",
+    "in track": "synchronised",
+    "in_track": "synchronised",
     "is_regular": "is_nonsingular",
     "launcher_news": "launcher_pipe, launcher_events",
     "law": "distribution",
     "laws": "distributions",
     "lifeline": "watchdog",
     "look_seconds": "poll_seconds",
+    "lost track": "lost synchronisation",
     "observer": "recorder",
     "rare_share": "rare_fraction",
     "read_news": "read_event",
@@ -172,6 +180,7 @@ MEANT_OTHERWISE = {
 }
 """Former word → the files in which it, or its plural, means something else: here a picture."""
 OTHER_TERMS = (
+    r"(?:uses|run)\W in step",
     "deviation from",
     "evedrop figures",
     r"for i in clear\]",
@@ -179,6 +188,7 @@ OTHER_TERMS = (
     "permanent deviation",
     "power[- ]law",
     "runs/figures",
+    r"seconds in step\b",
     "standard[ _]deviation",
 )
 """Patterns of terms that contain a former word and stay, anywhere."""

@@ -438,10 +438,10 @@ def _begun(process: Process, distributions: _SlotDistributions) -> list[tuple[Fl
     decoded = odds["kept"] - leaving
     state = 1.0 - odds["kept"] - odds["misled"]
     first = (stationary * odds["initial"])[:1]
-    before, in_step = np.zeros(stationary.shape), stationary[0] - first[0]
+    before, synchronised = np.zeros(stationary.shape), stationary[0] - first[0]
     for k in range(1, len(stationary)):
-        before[k] = in_step @ distributions.transitions[k]
-        in_step = stationary[k] * state[k] + decoded[k] * before[k]
+        before[k] = synchronised @ distributions.transitions[k]
+        synchronised = stationary[k] * state[k] + decoded[k] * before[k]
     misled = stationary * odds["misled"]
     misled[0] = 0.0
     misled = misled if misled.any() else misled[:1]

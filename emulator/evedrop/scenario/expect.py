@@ -1,4 +1,4 @@
-"""`[[expect]]`: a condition that a run must meet: on a metric, on a link, on secrecy, or on when a receiver is in step.
+"""`[[expect]]`: a condition that a run must meet: on a metric, on a link, on secrecy, or on when a receiver is synchronised.
 
 Source: docs/scenario.md, expect.
 """
@@ -29,14 +29,14 @@ _ENTRIES: Mapping[str, tuple[str, ...]] = {
     "metric": (*_COMPARISONS, "slots", "quantile"),
     "link": (),
     "secrecy": ("against", "direction"),
-    "in_step": ("by", "since"),
+    "synchronised": ("by", "since"),
 }
 """The subjects an expectation may have → the entries that go with each."""
 _EXAMPLES: Mapping[str, str] = {
     "metric": 'metric = "legitimate.mean_squared_error"',
     "link": 'link = "legitimate"',
     "secrecy": 'secrecy = "relative"',
-    "in_step": 'in_step = "legitimate"',
+    "synchronised": 'synchronised = "legitimate"',
 }
 
 
@@ -60,7 +60,7 @@ Slot = Annotated[int, Field(strict=True, ge=0)]
 
 
 class ExpectTable(Table):
-    """`[[expect]]`: one of `metric`, `link`, `secrecy` and `in_step`, with the entries that go with it."""
+    """`[[expect]]`: one of `metric`, `link`, `secrecy` and `synchronised`, with the entries that go with it."""
 
     metric: Annotated[str | None, Field(examples=["legitimate.mean_squared_error"])] = None
     below: Annotated[Number | None, Field(examples=[0.01])] = None
@@ -74,7 +74,7 @@ class ExpectTable(Table):
     secrecy: Annotated[Secrecy | None, Field(examples=["relative"])] = None
     against: Annotated[str | None, Field(examples=["smart"])] = None
     direction: Annotated[str | None, Field(examples=["position"])] = None
-    in_step: Annotated[str | None, Field(examples=["legitimate"])] = None
+    synchronised: Annotated[str | None, Field(examples=["legitimate"])] = None
     by: Annotated[Slot | None, Field(examples=[40])] = None
     since: Annotated[Slot | None, Field(examples=[0])] = None
 
@@ -102,9 +102,11 @@ class ExpectTable(Table):
             mistakes += self._metric_mistakes(self.metric)
         if kind == "secrecy" and self.against is None:
             mistakes.append(("against", "is missing; expected the name of an eavesdropper"))
-        if kind == "in_step" and self.by is None:
-            mistakes.append(("by", "is missing; expected the last slot by which it must be in step, such as by = 40"))
-        elif kind == "in_step" and self.by is not None and self.since is not None and self.by < self.since:
+        if kind == "synchronised" and self.by is None:
+            mistakes.append(
+                ("by", "is missing; expected the last slot by which it must be synchronised, such as by = 40")
+            )
+        elif kind == "synchronised" and self.by is not None and self.since is not None and self.by < self.since:
             mistakes.append(("by", f"is {self.by}, before since, which is {self.since}; expected since ≤ by"))
         return mistakes
 
@@ -142,7 +144,7 @@ class ExpectTable(Table):
 
     @property
     def kind(self) -> str:
-        """Its subject: `metric`, `link`, `secrecy` or `in_step`."""
+        """Its subject: `metric`, `link`, `secrecy` or `synchronised`."""
         return next(kind for kind in _ENTRIES if getattr(self, kind) is not None)
 
     @property
@@ -154,7 +156,7 @@ class ExpectTable(Table):
             case "secrecy":
                 both = self.direction is None or self.secrecy == "perfect"
                 return "promised by theory and shown by the run" if both else "shown by the run"
-            case "in_step":
+            case "synchronised":
                 return f"by slot {self.by}" + ("" if self.since is None else f", since slot {self.since}")
         bounds = [f"{name} {value:.10g}" for name in ("below", "above") if (value := getattr(self, name)) is not None]
         if self.near is not None:
@@ -170,7 +172,7 @@ class ExpectTable(Table):
             "metric": self.metric,
             "link": f"link {self.link}",
             "secrecy": f"{self.secrecy} secrecy{of_direction} against {self.against}",
-            "in_step": f"{self.in_step} in step",
+            "synchronised": f"{self.synchronised} synchronised",
         }[self.kind]
         if self.quantile is not None:
             subject = f"{self.quantile:.10g} quantile of {subject}"
@@ -227,7 +229,7 @@ class Around:
                     f"is set, but the {application}'s metrics are means over trials of the whole run; remove the line"
                 )
                 mistakes += [(name, mean) for name in ("slots", "quantile") if getattr(expectation, name) is not None]
-        names = {"link": self.receivers, "in_step": self.receivers, "against": self.receivers[1:]}
+        names = {"link": self.receivers, "synchronised": self.receivers, "against": self.receivers[1:]}
         for entry, names_ in names.items():
             name = getattr(expectation, entry)
             if name is not None and name not in names_:

@@ -58,7 +58,12 @@ class Evidence:
         return [self._judged(expect, replay) for expect in self.scenario.expect]
 
     def _judged(self, expect: ExpectTable, replay: str | None) -> Judged:
-        judge = {"metric": self._metric, "link": self._link, "secrecy": self._secrecy, "in_step": self._in_step}
+        judge = {
+            "metric": self._metric,
+            "link": self._link,
+            "secrecy": self._secrecy,
+            "synchronised": self._synchronised,
+        }
         value, held = judge[expect.kind](expect)
         return Judged(expect.text, held, value, expect.wanted, replay if held is False else None)
 
@@ -130,8 +135,8 @@ class Evidence:
         complete = all(tally.done == tally.slots for tally in self.tallies.values())
         return f"{promise}{run}", held if complete else None
 
-    def _in_step(self, expect: ExpectTable) -> tuple[Found, bool | None]:
-        """The slot by which it was in step in all trials; undecided if the run was cut short before `by`."""
+    def _synchronised(self, expect: ExpectTable) -> tuple[Found, bool | None]:
+        """The slot by which it was synchronised in all trials; undecided if the run was cut short before `by`."""
         wanted = watch_of(self.scenario, expect)
         assert wanted is not None  # noqa: S101 - every such expectation has one
         tally = self.tallies[wanted[0]]

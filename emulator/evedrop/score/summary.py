@@ -65,7 +65,7 @@ class BuiltInMetrics(ABC):
 
 
 Found = float | int | str | None
-"""The value found for an expectation. None: the run does not tell, or a receiver that must be in step never was."""
+"""The value found for an expectation. None: the run does not tell, or a receiver that must be synchronised never was."""
 
 
 StandardErrors = Mapping[str, float | Mapping[str, float | None] | None]

@@ -1,4 +1,4 @@
-"""Quantities of a receiver that its tally does not have: metrics over some slots, packages' metrics, when it was in step.
+"""Quantities of a receiver that its tally does not have: metrics over some slots, packages' metrics, when it was synchronised.
 
 They take a number for each trial and expectation. A trial's numbers are added slot by slot, so they have the same bits
 however its slots and the other trials were divided, live and in memory.
@@ -97,7 +97,7 @@ def _numbers(answer: object, trials: int) -> Floats:
     raise NoAnswer(f"of_trials gave {answer!r:.40}; expected an array of {trials} numbers")
 
 
-IN_STEP = "in_step"
+SYNCHRONISED = "synchronised"
 _NEVER = -1
 
 
@@ -105,15 +105,15 @@ class WatchedSlots(NamedTuple):
     """A quantity to keep, over the slots from `first` to before `end`."""
 
     what: str
-    """A metric's name, or `in_step`."""
+    """A metric's name, or `synchronised`."""
     first: int
     end: int
 
 
 def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedSlots] | None:
     """The receiver and the quantity that an expectation needs; None if the summary's metrics are enough."""
-    if expect.in_step is not None:
-        return expect.in_step, WatchedSlots(IN_STEP, _since(scenario, expect), scenario.slots)
+    if expect.synchronised is not None:
+        return expect.synchronised, WatchedSlots(SYNCHRONISED, _since(scenario, expect), scenario.slots)
     if expect.metric is None or (expect.slots is None and expect.quantile is None):
         return None
     receiver, _, name = expect.metric.partition(".")
@@ -125,7 +125,7 @@ def _since(scenario: Scenario, expect: ExpectTable) -> int:
     if expect.since is not None:
         return expect.since
     by = scenario.slots if expect.by is None else expect.by
-    over = [act.at for act in scenario.timeline.acts if expect.in_step in act.names and act.at <= by]
+    over = [act.at for act in scenario.timeline.acts if expect.synchronised in act.names and act.at <= by]
     return max(over, default=0)
 
 
@@ -171,7 +171,7 @@ class FirstState(MetricTally):
 
 def _tally(name: str, trials: int) -> MetricTally:
     """A tally of a quantity, of no slots yet."""
-    if name == IN_STEP:
+    if name == SYNCHRONISED:
         return FirstState(trials)
     return GuardedTally(name, trials) if METRICS.foreign(name) else metric(name).tally(trials)
 
@@ -187,7 +187,7 @@ class WatchedTally:
         """Add the next slots."""
         for watch, kept in self._kept.items():
             start, stop = max(watch.first - slots.first, 0), min(watch.end - slots.first, len(slots.error))
-            stateless = slots.x is None and watch.what != IN_STEP and metric(watch.what).needs_states
+            stateless = slots.x is None and watch.what != SYNCHRONISED and metric(watch.what).needs_states
             if start < stop and not stateless:
                 kept.add(slots if (start, stop) == (0, len(slots.error)) else slots.part(start, stop))
 

@@ -32,7 +32,7 @@ from PIL import Image
 from evedrop import montecarlo
 from evedrop.errors import UsageError
 from evedrop.results.reading import Results
-from evedrop.score.track import LongestSpans, LostSpan, Track, lost_spans, track_of
+from evedrop.score.synchronisation import LongestSpans, LostSpan, Synchronisation, lost_spans, synchronisation_of
 from evedrop.show.report import closing
 from evedrop.show.report.chart import Curve, GroupCounts, GroupMeans, LogChart
 from evedrop.show.report.page import Page, Part, made
@@ -78,7 +78,7 @@ def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -
     said = "".join(page.texts)
     assert page.headings == [
         HOSTILE,
-        "Verdicts", "Expectations", "Metrics", "Errors", "Lost track", "Links", "Repeat it",
+        "Verdicts", "Expectations", "Metrics", "Errors", "Lost synchronisation", "Links", "Repeat it",
     ]  # fmt: skip
     assert "1 of 2 expectations FAILED" in page.texts
     cells = [cell for row in closing.receivers_table(summary).rows for cell in row]
@@ -125,7 +125,7 @@ def test_a_folder_of_another_version_has_the_parts_that_can_be_read(study: Path,
     write_report(tmp_path)
     page = checked(tmp_path)
     assert any("slots.parquet cannot be read" in text and "standard_error" in text for text in page.texts)
-    assert {"Lost track", "Links", "Repeat it"} <= set(page.headings)
+    assert {"Lost synchronisation", "Links", "Repeat it"} <= set(page.headings)
 
 
 def test_a_page_has_cautions_events_and_outages_and_does_not_depend_on_the_order_of_rows(
@@ -213,7 +213,7 @@ def test_a_slot_without_a_packet_is_silent_in_its_lane(study: Path, tmp_path: Pa
 
 
 def test_the_longest_spans_are_listed_in_the_order_of_time() -> None:
-    """Of many spans without track those that say most."""
+    """Of many spans without synchronisation those that say most."""
     spans = [LostSpan(100 * i, 100 * i + length, 0) for i, length in enumerate([5, 1, *range(10, 21)])]
     errors = np.zeros(1400)
     for span in spans:
@@ -225,7 +225,7 @@ def test_the_longest_spans_are_listed_in_the_order_of_time() -> None:
     rows = {"sent": pa.array(["state"] * 1400), "action": words, "squared_error": errors, "trace_covariance": traces}
     trial.add(pa.table(rows))
     source: Any = SimpleNamespace(summary=SimpleNamespace(first_trial=0), trial={"smart": trial})
-    (listed,) = (node for node in RUN_SECTIONS["Lost track"](source) if "<details>" in node)
+    (listed,) = (node for node in RUN_SECTIONS["Lost synchronisation"](source) if "<details>" in node)
     said = [text.partition(":")[0] for text in Checked(listed).texts if text.startswith("slots ")]
     assert said == [f"slots {one.first:,} to {one.last:,}" for one in spans if one.slots > 2]
 
@@ -247,7 +247,7 @@ def slot_by_slot(errors: list[float], traces: list[float], noise: float) -> Iter
         elif error > 20 * noise or trace > 20 * noise:
             yield "drifting"
         else:
-            yield "in track"
+            yield "synchronised"
 
 
 numbers = st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), max_size=60)
@@ -258,17 +258,17 @@ numbers = st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), max_size=60)
 def test_spans_cover_exactly_the_slots_off_the_track(
     slots: list[tuple[float, float]], noise: float, first: int
 ) -> None:
-    """Each slot by the rule; a span begins and ends off the track, and between two spans are more than three slots in track."""
+    """Each slot by the rule; a span begins and ends not synchronised; more than three synchronised slots separate two spans."""
     errors, traces = [error for error, _ in slots], [trace for _, trace in slots]
-    codes = track_of(np.array(errors), np.array(traces), noise)
+    codes = synchronisation_of(np.array(errors), np.array(traces), noise)
     words = list(slot_by_slot(errors, traces, noise))
-    assert [Track(code).word for code in codes] == words
+    assert [Synchronisation(code).word for code in codes] == words
     spans = lost_spans(codes, first)
     covered = [k - first for span in spans for k in range(span.first, span.last + 1)]
-    assert {k for k, word in enumerate(words) if word != "in track"} <= set(covered)
+    assert {k for k, word in enumerate(words) if word != "synchronised"} <= set(covered)
     for span in spans:
-        assert "in track" not in {words[span.first - first], words[span.last - first]}
-        off = [k for k in range(span.first - first, span.last - first + 1) if words[k] != "in track"]
+        assert "synchronised" not in {words[span.first - first], words[span.last - first]}
+        off = [k for k in range(span.first - first, span.last - first + 1) if words[k] != "synchronised"]
         assert all(after - before <= 3 for before, after in pairwise(off))
         assert span.fooled == words[span.first - first : span.last - first + 1].count("fooled")
     for one, other in pairwise(spans):

@@ -27,18 +27,20 @@ def test_stretch_is_told_when_long_and_when_over() -> None:
     """Three slots without a state are told in the third, with how many misled, and their end in the slot that ends them."""
     assert watch([STATE, LOST, MISLED, LOST, LOST, STATE], [3]) == [
         Event(2, "WARN", "eve took an innovation for the state, for the first time"),
-        Event(3, "WARN", "eve lost track: 3 slots without a state, 1 misled"),
-        Event(5, "INFO", "eve caught a state again after 4 slots"),
+        Event(3, "WARN", "eve lost synchronisation: 3 slots without a state, 1 misled"),
+        Event(5, "INFO", "eve regained synchronisation after 4 slots"),
     ]
 
 
 def test_silence_is_no_loss() -> None:
     """Where nothing was sent in some slots of a stretch, it is told in how many, and no packet is called lost."""
     codes = [STATE, SILENT, LOST, SILENT, STATE]
-    assert watch(codes, [2])[0] == Event(3, "WARN", "eve lost track: 3 slots without a state, 2 of them silent")
+    assert watch(codes, [2])[0] == Event(
+        3, "WARN", "eve lost synchronisation: 3 slots without a state, 2 of them silent"
+    )
     assert watch(codes, [2], role="legitimate") == [
         Event(3, "WARN", "eve had no packet for 3 slots, 2 of them silent"),
-        Event(4, "INFO", "eve is in step again after 3 slots"),
+        Event(4, "INFO", "eve regained synchronisation after 3 slots"),
     ]
     lost = watch([STATE, LOST, LOST, LOST, STATE], [], role="legitimate")
     assert lost[0] == Event(3, "WARN", "eve lost 3 packets in a row")

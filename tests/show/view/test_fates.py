@@ -8,10 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from evedrop.score.track import Track
+from evedrop.score.synchronisation import Synchronisation
 from evedrop.show.view import lanes
 from evedrop.show.view.lanes import knowledge
-from evedrop.show.view.palette import DROPPED_TEXT, IN_TRACK_TEXT, MISLED, RUN_TEXTS, STATE, TRUTH, TRUTH_CURVE, Colour
+from evedrop.show.view.palette import (
+    DROPPED_TEXT,
+    MISLED,
+    RUN_TEXTS,
+    STATE,
+    SYNCHRONISED_TEXT,
+    TRUTH,
+    TRUTH_CURVE,
+    Colour,
+)
 from evedrop.show.view.panels.fates import FATES, KNOWN, LastPacket, Packets
 from evedrop.show.view.recording import ViewRecording
 from tests.show.view.read_back import rows
@@ -22,7 +31,7 @@ COLOURS = {
     **dict.fromkeys(("misled", "drifting"), MISLED),
     **dict.fromkeys(("dropped", "fooled"), DROPPED_TEXT),
     **dict.fromkeys(("discarded", "silent"), TRUTH_CURVE),
-    "in track": IN_TRACK_TEXT,
+    "synchronised": SYNCHRONISED_TEXT,
 }
 """Word → its colour: blue for what was used, amber for what misleads, red for what is lost, green for what is known."""
 
@@ -51,10 +60,10 @@ def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], t
             peer = run.slots.peers[one.name]
             word = lanes.lane_of(one).words[int(lanes.received(one, run.slots)[k])]
             assert shown[2 + i] == word
-            track = Track(knowledge(run.scene, run.slots.x, peer)[k])
+            status = Synchronisation(knowledge(run.scene, run.slots.x, peer)[k])
             name, _, rest = shown[2 + len(receivers) + i].partition(": ")
             what, _, off = rest.partition(", ")
-            assert (name, what) == (one.name, track.word)
+            assert (name, what) == (one.name, status.word)
             inks = [coloured(colours[k][at + i]) for at in (2, 2 + len(receivers))]
             assert inks == [COLOURS[word], COLOURS[what]]
             distance = float(off.removesuffix(" off").replace(",", ""))
@@ -64,7 +73,7 @@ def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], t
 def test_every_fate_and_state_has_a_colour_of_the_table() -> None:
     """The graph can show everything that a lane shows."""
     assert {*lanes.LEGITIMATE.words, *lanes.EAVESDROPPER.words} == set(FATES)
-    assert set(KNOWN) == set(Track)
+    assert set(KNOWN) == set(Synchronisation)
     assert {*FATES.values(), *KNOWN.values()} <= set(RUN_TEXTS)
 
 

@@ -1,4 +1,4 @@
-"""Whether a receiver is in track, drifting or fooled, and the lanes that show it."""
+"""Whether a receiver is synchronised, drifting or fooled, and the lanes that show it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 from evedrop.model.process import Floats
-from evedrop.score.track import FACTOR, Track
+from evedrop.score.synchronisation import FACTOR, Synchronisation
 from evedrop.show.view.lanes import KNOWLEDGE, ErrorDistance, knowledge
 from evedrop.show.view.panels.fates import WhoKnowsWhat
 from evedrop.show.view.panels.texts import Title
@@ -25,30 +25,30 @@ from tests.show.view.simulated_run import Simulated
 SCENE = Scene("", "r", 10, 1, 2, 0.0, (Shown("smart", "eavesdropper", "smart", 1.0),), noise=0.05, units=("m", "m"))
 
 
-def known(error: float, trace: float, scene: Scene = SCENE) -> Track:
+def known(error: float, trace: float, scene: Scene = SCENE) -> Synchronisation:
     """What a receiver knows with this squared error and tr P, shared by two states."""
     none = np.zeros(1)
     P = np.diag([trace / 4, 3 * trace / 4])[None]
     off = np.sqrt(error / 4), -np.sqrt(3 * error / 4)
     peer = PeerSlots(np.array([off]), P, none.astype(np.uint8), none, none, none, none)
-    return Track(knowledge(scene, np.zeros((1, 2)), peer)[0])
+    return Synchronisation(knowledge(scene, np.zeros((1, 2)), peer)[0])
 
 
 @pytest.mark.parametrize(
     ("error", "trace", "expected"),
     [
-        (0.0, 0.0, Track.IN_TRACK),
-        (0.99, 0.0, Track.IN_TRACK),  # 20 times the noise of a step is 1
-        (1.01, 0.0, Track.FOOLED),
-        (1.01, 0.1, Track.DRIFTING),
-        (0.0, 1.01, Track.DRIFTING),  # near the truth by chance
-        (99.0, 5.0, Track.DRIFTING),
-        (101.0, 5.0, Track.FOOLED),
-        (np.nan, 5.0, Track.FOOLED),
-        (np.inf, 5.0, Track.FOOLED),
+        (0.0, 0.0, Synchronisation.SYNCHRONISED),
+        (0.99, 0.0, Synchronisation.SYNCHRONISED),  # 20 times the noise of a step is 1
+        (1.01, 0.0, Synchronisation.FOOLED),
+        (1.01, 0.1, Synchronisation.DRIFTING),
+        (0.0, 1.01, Synchronisation.DRIFTING),  # near the truth by chance
+        (99.0, 5.0, Synchronisation.DRIFTING),
+        (101.0, 5.0, Synchronisation.FOOLED),
+        (np.nan, 5.0, Synchronisation.FOOLED),
+        (np.inf, 5.0, Synchronisation.FOOLED),
     ],
 )
-def test_a_word_for_error_and_covariance(error: float, trace: float, expected: Track) -> None:
+def test_a_word_for_error_and_covariance(error: float, trace: float, expected: Synchronisation) -> None:
     """The bounds of docs/view.md."""
     assert known(error, trace) is expected
 
@@ -72,11 +72,11 @@ def test_words_say_the_largest_distance_of_a_stretch() -> None:
     distance = ErrorDistance(SCENE)
     first = walk([0.2, 3.0, 30.0, 9.0], [0, 2, 2, 2], distance)
     more = "off by more than"
-    assert first == ["in track, within 1 m", f"fooled, {more} 1 m", f"fooled, {more} 10 m", f"fooled, {more} 10 m"]
+    assert first == ["synchronised, within 1 m", f"fooled, {more} 1 m", f"fooled, {more} 10 m", f"fooled, {more} 10 m"]
     assert walk([9.0, 0.5, 0.9, 5.0], [2, 1, 0, 1], distance) == [
         f"fooled, {more} 10 m",
         "drifting, off by less than 1 m",
-        "in track, within 1 m",
+        "synchronised, within 1 m",
         f"drifting, {more} 1 m",
     ]
     assert walk([np.inf, np.nan], [2, 2], distance)[0] == f"fooled, {more} 1e+09 m"

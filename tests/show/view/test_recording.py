@@ -116,7 +116,7 @@ def test_trail_passes_through_every_slot(run: Simulated, rrd: Path) -> None:
 def test_events_name_receivers_and_notes(run: Simulated, rrd: Path) -> None:
     """There are lines about the run, about a long stretch without packets, and the note."""
     assert rows(rrd, "events/run", "TextLog:text")[5] == ["a note"]
-    assert any("lost track" in text[0] for text in rows(rrd, "events/smart", "TextLog:text").values())
+    assert any("lost synchronisation" in text[0] for text in rows(rrd, "events/smart", "TextLog:text").values())
     assert any("for the first time" in text[0] for text in rows(rrd, "events/naive", "TextLog:text").values())
 
 

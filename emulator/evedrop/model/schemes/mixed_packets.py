@@ -65,7 +65,7 @@ class RandomCode(Scheme):
     """With probability α the state, otherwise the state minus a reference, as `acknowledged` sends it.
 
     A flipped acknowledgement leaves user and sensor with different references; the next state that the user receives, if its
-    acknowledgement is not flipped, puts them in step again.
+    acknowledgement is not flipped, synchronises them again.
 
     Source: Lücke, Lu, Quevedo (2022); docs/mathematics.md, flipped acknowledgements.
     """

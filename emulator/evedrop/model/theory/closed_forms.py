@@ -400,7 +400,7 @@ def _hear(
     carried[s, unacknowledged] += 1.0 - received - unheard
 
 
-def in_sync_probability(mu: float, mu_d: float) -> float:
+def synchronised_probability(mu: float, mu_d: float) -> float:
     """π_0 = μμ_d / (1 − μ(1−μ_d)): the fraction of time without error. 1 for μ = 1, whatever μ_d is.
 
     Source: Proposition (limiting distribution), first part.
@@ -415,7 +415,7 @@ def word_probability(mu: float, mu_d: float, innovations: int, drops: int) -> fl
     """
     lost = 1.0 - mu
     decoded = mu * (1.0 - mu_d)
-    return float(decoded**innovations * lost ** (drops + 1) * in_sync_probability(mu, mu_d))
+    return float(decoded**innovations * lost ** (drops + 1) * synchronised_probability(mu, mu_d))
 
 
 def step_probabilities(mu: float, mu_d: float, steps: int) -> Floats:
@@ -423,10 +423,10 @@ def step_probabilities(mu: float, mu_d: float, steps: int) -> Floats:
 
     Source: Proposition (limiting distribution), summed over the 2^{i−1} words of a step.
     """
-    in_sync = in_sync_probability(mu, mu_d)
+    synchronised = synchronised_probability(mu, mu_d)
     not_the_state = (1.0 - mu) + mu * (1.0 - mu_d)
-    probabilities: Floats = (1.0 - mu) * in_sync * not_the_state ** np.maximum(np.arange(steps) - 1.0, 0.0)
-    probabilities[:1] = in_sync
+    probabilities: Floats = (1.0 - mu) * synchronised * not_the_state ** np.maximum(np.arange(steps) - 1.0, 0.0)
+    probabilities[:1] = synchronised
     return probabilities
 
 

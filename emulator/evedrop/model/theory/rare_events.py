@@ -111,7 +111,7 @@ def _begun(process: Process, outcomes: Outcomes, slots: int, last: int) -> tuple
 
     And Σ f_k so far, (last, n, n); None for a receiver that is never misled.
     """
-    number, noise = _InStep(outcomes), NoiseCovariances(process) if outcomes.misled else None
+    number, noise = _Synchronised(outcomes), NoiseCovariances(process) if outcomes.misled else None
     begun, spread = np.zeros(1), np.zeros((1, process.n, process.n))
     kept: list[tuple[Floats, Floats]] = []
     for part in parts_of(range(slots)):
@@ -126,8 +126,8 @@ def _begun(process: Process, outcomes: Outcomes, slots: int, last: int) -> tuple
 
 
 @final
-class _InStep:
-    """The probability that the error is 0 before slot k, a number of slots at a time from k = 0; 0 for k = 0."""
+class _Synchronised:
+    """The probability of synchronisation (error 0) before slot k, a number of slots at a time from k = 0; 0 for k = 0."""
 
     def __init__(self, outcomes: Outcomes) -> None:
         self._outcomes = outcomes

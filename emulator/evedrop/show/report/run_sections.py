@@ -30,7 +30,7 @@ from evedrop.results.reading import Results
 from evedrop.scenario.recorded import recorded_noise
 from evedrop.score.expectations_held import repeating
 from evedrop.score.summary import Summary
-from evedrop.score.track import FACTOR, LongestSpans, LostSpan, Track, track_of
+from evedrop.score.synchronisation import FACTOR, LongestSpans, LostSpan, Synchronisation, synchronisation_of
 from evedrop.show.report import closing
 from evedrop.show.report.chart import POINTS, Curve, GroupCounts, GroupMeans, LogChart
 from evedrop.show.report.page import facts_table, made
@@ -96,7 +96,7 @@ _MOST_BYTES = 2**24
 OUTCOMES = EAVESDROPPER.words
 """The fates of a packet; the index of a word is its code."""
 MOST_SPANS = 12
-"""The most spans without track that a report lists for a receiver."""
+"""The most spans without synchronisation that a report lists for a receiver."""
 PIXELS = 2000
 """The most pixels of a lane. Each of a long run stands for several slots: for their most frequent code, or the highest."""
 _INTERVAL = 1.96  # standard errors on either side: 95 %
@@ -127,9 +127,9 @@ class RecordedTrial:
         """The last slot."""
         self.outcome = GroupCounts(extent.rows, PIXELS, len(OUTCOMES))
         """What became of every packet, as indices into `OUTCOMES`."""
-        self.track = GroupCounts(extent.rows, PIXELS, len(Track))
+        self.synchronisation = GroupCounts(extent.rows, PIXELS, len(Synchronisation))
         self.lost = LongestSpans(MOST_SPANS, extent.first)
-        """The spans in which it lost track."""
+        """The spans in which it lost synchronisation."""
 
     def add(self, rows: pa.Table) -> None:
         """The rows of the next slots. Raises UsageError if one has an unknown action."""
@@ -140,9 +140,9 @@ class RecordedTrial:
         codes = np.array([OUTCOMES.index(word) for word in actions[1]], np.uint8)[actions[0]]
         silent = np.array([word == NOTHING for word in sent[1]], np.bool_)[sent[0]]
         self.outcome.add(np.where(silent, np.uint8(OUTCOMES.index(SILENT)), codes))
-        track = track_of(_numbers(rows["squared_error"]), _numbers(rows["trace_covariance"]), self._noise)
-        self.track.add(track)
-        self.lost.add(track)
+        codes = synchronisation_of(_numbers(rows["squared_error"]), _numbers(rows["trace_covariance"]), self._noise)
+        self.synchronisation.add(codes)
+        self.lost.add(codes)
 
 
 @dataclass(frozen=True)
@@ -279,25 +279,25 @@ def _errors(of: RunSource) -> Iterator[Markup]:
     yield chart.figure or Markup()
 
 
-def _lost_track(of: RunSource) -> Iterator[Markup]:
-    """The spans in which each receiver lost track, in the first recorded trial."""
+def _lost_synchronisation(of: RunSource) -> Iterator[Markup]:
+    """The spans in which each receiver lost synchronisation, in the first recorded trial."""
     if not of.trial:
         return
     yield made(
         "paragraph",
         f"Trial {of.summary.first_trial}, slot by slot. A receiver is fooled where its squared error is more than "
         f"{FACTOR:g} times what its own covariance tr P expects, and than tr Q, the noise of one step. Otherwise it drifts "
-        f"where its squared error or tr P is more than {FACTOR:g} tr Q, and is in track elsewhere.",
+        f"where its squared error or tr P is more than {FACTOR:g} tr Q, and is synchronised elsewhere.",
     )
-    table = TextTable.headed(["receiver"], ["in track", "drifting", "fooled", "spans lost", "longest"])
+    table = TextTable.headed(["receiver"], ["synchronised", "drifting", "fooled", "spans lost", "longest"])
     for name, recorded in of.trial.items():
         table.add(
             name,
-            *(f"{fraction:.1%}" for fraction in recorded.track.fractions),
+            *(f"{fraction:.1%}" for fraction in recorded.synchronisation.fractions),
             f"{recorded.lost.count:,}",
             f"slots {_where(recorded.lost.spans[0])}" if recorded.lost.count else "–",
         )
-    yield made("table", table, "Fractions of the slots, and spans in which the receiver lost track")
+    yield made("table", table, "Fractions of the slots, and spans in which the receiver lost synchronisation")
     used = {code for lanes in of.trial.values() for code, fraction in enumerate(lanes.outcome.fractions) if fraction}
     yield made("legend", "Upper lanes:", KNOWLEDGE.legend())
     yield made("legend", "Lower lanes, packets:", EAVESDROPPER.legend(used))
@@ -313,8 +313,9 @@ def _lanes(name: str, recorded: RecordedTrial) -> Iterator[Markup]:
     """The two lanes of a receiver, and its longest spans."""
     spans = recorded.lost.spans
     yield made("heading", name)
-    label = f"{name}: in track in {recorded.track.fractions[Track.IN_TRACK]:.1%} of the slots 0 to {recorded.last:,}"
-    yield lane_picture(KNOWLEDGE, recorded.track.highest, label)
+    fraction = recorded.synchronisation.fractions[Synchronisation.SYNCHRONISED]
+    label = f"{name}: synchronised in {fraction:.1%} of the slots 0 to {recorded.last:,}"
+    yield lane_picture(KNOWLEDGE, recorded.synchronisation.highest, label)
     counted = ", ".join(
         f"{fraction:.1%} {word}"
         for word, fraction in zip(OUTCOMES, recorded.outcome.fractions, strict=True)
@@ -323,7 +324,7 @@ def _lanes(name: str, recorded: RecordedTrial) -> Iterator[Markup]:
     yield lane_picture(EAVESDROPPER, recorded.outcome.commonest, f"{name}: packets by what became of them: {counted}")
     if spans:
         items = [
-            f"slots {_where(span)}: lost track for {span.slots:,}"
+            f"slots {_where(span)}: lost synchronisation for {span.slots:,}"
             + (f", fooled in {span.fooled:,}" if span.fooled else "")
             for span in sorted(spans, key=lambda span: span.first)
         ]
@@ -404,7 +405,7 @@ RUN_SECTIONS: Mapping[str, Callable[[RunSource], Iterator[Markup]]] = {
     "Expectations": _expectations,
     "Metrics": _metrics,
     "Errors": _errors,
-    "Lost track": _lost_track,
+    "Lost synchronisation": _lost_synchronisation,
     "Links": _links,
     "Events": _events,
     "Repeat it": _repeat,

@@ -92,8 +92,7 @@ class Watcher:
 
     def _recover(self, k: int, events: list[Event]) -> None:
         if self._told:
-            how = "is in step again" if self._legitimate else "caught a state again"
-            events.append(Event(k, "INFO", f"{self._name} {how} after {self._bad} slots"))
+            events.append(Event(k, "INFO", f"{self._name} regained synchronisation after {self._bad} slots"))
             self._told = False
             self._reported += 1
             if self._reported > 3 + k // self._spacing:
@@ -103,7 +102,7 @@ class Watcher:
     def _lost(self, fooled: int, unsent: int) -> str:
         if self._legitimate and not unsent:
             return f"{self._name} lost {self._long} packets in a row"
-        line = f"{self._name} lost track: {self._long} slots without a state"
+        line = f"{self._name} lost synchronisation: {self._long} slots without a state"
         if self._legitimate:
             line = f"{self._name} had no packet for {self._long} slots"
         line = f"{line}, {unsent} of them silent" if unsent else line

@@ -1,6 +1,6 @@
 """The coloured lanes: what became of each packet, and what each receiver knows. Does not use Rerun.
 
-A receiver is in track, drifting or fooled in each slot.
+A receiver is synchronised, drifting or fooled in each slot.
 
 Source: docs/view.md, who knows what.
 """
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
 from evedrop.model.receiver import DISCARDED, DROPPED, INNOVATION, MISLED, SILENT, STATE, Action, Codes
-from evedrop.score.track import FACTOR, Track, track_of
+from evedrop.score.synchronisation import FACTOR, Synchronisation, synchronisation_of
 from evedrop.show.view import palette
 from evedrop.show.view.palette import Colour
 from evedrop.show.view.scene import PeerSlots, Scene, SceneSlots, Shown
@@ -55,8 +55,8 @@ LEGITIMATE = Lane(
     (palette.DROPPED, palette.STATE, palette.DECODED, palette.DISCARDED, palette.SILENT),
 )
 EAVESDROPPER = Lane((*LEGITIMATE.words, MISLED), (*LEGITIMATE.colours, palette.MISLED))
-KNOWLEDGE = Lane(tuple(track.word for track in Track), palette.KNOWLEDGE)
-"""What a receiver knows; a `Track` is its code."""
+KNOWLEDGE = Lane(tuple(status.word for status in Synchronisation), palette.KNOWLEDGE)
+"""What a receiver knows; a `Synchronisation` is its code."""
 SILENT_CODE = np.uint8(EAVESDROPPER.words.index(SILENT))
 """Code of a slot in which nothing was sent, so that nothing could be lost."""
 MISLED_CODE = np.uint8(EAVESDROPPER.words.index(MISLED))
@@ -93,11 +93,11 @@ def received(shown: Shown, slots: SceneSlots) -> Codes:
 
 
 def knowledge(scene: Scene, x: Floats, peer: PeerSlots) -> Codes:
-    """Codes of the lane `KNOWLEDGE`, (c,), in the first recorded trial, by the rule of `track_of`; x: true states, (c, n)."""
+    """Codes of the lane `KNOWLEDGE`, (c,), in the first recorded trial, by `synchronisation_of`; x: true states, (c, n)."""
     with np.errstate(all="ignore"):
         squared = np.sum((x - peer.x_hat) ** 2, axis=1)
         trace = np.trace(peer.P, axis1=1, axis2=2)
-    return track_of(squared, trace, scene.noise)
+    return synchronisation_of(squared, trace, scene.noise)
 
 
 @final
@@ -123,11 +123,14 @@ class ErrorDistance:
     def lane(self) -> Lane:
         """All words of `codes`, such as "drifting, off by more than 10 m", in the colours of what they say."""
         near = self._text(self._near)
-        words, colours = [f"{Track.IN_TRACK.word}, within {near}"], [KNOWLEDGE.colours[Track.IN_TRACK]]
-        for track in (Track.DRIFTING, Track.FOOLED):
-            words.append(f"{track.word}, off by less than {near}")
-            words += [f"{track.word}, off by more than {self._text(step)}" for step in self._steps]
-            colours += [KNOWLEDGE.colours[track]] * (1 + len(self._steps))
+        words, colours = (
+            [f"{Synchronisation.SYNCHRONISED.word}, within {near}"],
+            [KNOWLEDGE.colours[Synchronisation.SYNCHRONISED]],
+        )
+        for status in (Synchronisation.DRIFTING, Synchronisation.FOOLED):
+            words.append(f"{status.word}, off by less than {near}")
+            words += [f"{status.word}, off by more than {self._text(step)}" for step in self._steps]
+            colours += [KNOWLEDGE.colours[status]] * (1 + len(self._steps))
         return Lane(tuple(words), tuple(colours))
 
     def of(self, x: Floats, x_hat: Floats) -> Floats:

@@ -41,7 +41,7 @@ LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT)
 """The outcomes of a packet."""
 
 KNOWLEDGE: tuple[Colour, ...] = (DECODED, MISLED, DROPPED)
-"""What a receiver knows: in track, drifting, fooled."""
+"""What a receiver knows: synchronised, drifting, fooled."""
 
 WIRE_LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT, TRUTH)
 """The fates of the messages of a wire's link; white is cut."""
@@ -51,9 +51,9 @@ DROPPED_TEXT: Colour = (230, 78, 44)
 WIRE_TEXTS: tuple[Colour, ...] = (STATE, MISLED, DROPPED_TEXT, TRUTH_CURVE, TRUTH)
 """The links of a wire's graph by the fraction that they lost, those without messages, and the sides."""
 
-IN_TRACK_TEXT: Colour = (80, 255, 180)
+SYNCHRONISED_TEXT: Colour = (80, 255, 180)
 """`DECODED` for letters on the background of the theme."""
-RUN_TEXTS: tuple[Colour, ...] = (TRUTH, TRUTH_CURVE, STATE, MISLED, DROPPED_TEXT, IN_TRACK_TEXT)
+RUN_TEXTS: tuple[Colour, ...] = (TRUTH, TRUTH_CURVE, STATE, MISLED, DROPPED_TEXT, SYNCHRONISED_TEXT)
 """The nodes of a run's graph: packets by their fate, and receivers by what they know."""
 
 BLUE: Colour = (0, 114, 178)

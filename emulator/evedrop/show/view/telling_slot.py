@@ -14,7 +14,7 @@ from evedrop.model.process import Floats
 from evedrop.names import LEGITIMATE
 from evedrop.results.reading import Results
 from evedrop.scenario.recorded import recorded
-from evedrop.score.track import is_fooled
+from evedrop.score.synchronisation import is_fooled
 
 _BEFORE, _AFTER = 105, 25  # slots that the panels show on either side, so that the picture is filled
 

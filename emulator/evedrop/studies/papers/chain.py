@@ -80,9 +80,9 @@ def draw(path: Path, result: list[Occupation]) -> str:
             )  # fmt: skip
         left.set_yscale("log")
         left.set_ylim(3e-7, 1.5)
-        left.set_xlabel(r"steps out of sync, $\Delta$")
+        left.set_xlabel(r"steps without synchronisation, $\Delta$")
         left.set_ylabel("fraction of slots")
-        left.set_title(r"(a) steps; $\Delta = 0$ is in sync")
+        left.set_title(r"(a) steps; $\Delta = 0$ is synchronised")
         left.legend(loc="lower left")
         right.set_yscale("log")
         right.set_xticks(np.arange(len(WORDS)), WORDS)

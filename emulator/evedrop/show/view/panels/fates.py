@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from rerun import AsComponents
 
 from evedrop.model import receiver
-from evedrop.score.track import Track
+from evedrop.score.synchronisation import Synchronisation
 from evedrop.show.view import lanes
 from evedrop.show.view.column import Column
 from evedrop.show.view.lanes import ErrorDistance, Lane, knowledge
-from evedrop.show.view.palette import DROPPED_TEXT, IN_TRACK_TEXT, MISLED, STATE, TRUTH, TRUTH_CURVE, Colour
+from evedrop.show.view.palette import DROPPED_TEXT, MISLED, STATE, SYNCHRONISED_TEXT, TRUTH, TRUTH_CURVE, Colour
 from evedrop.show.view.panels.curves import recent_slots
 from evedrop.show.view.panels.panel import FIXED_HEIGHT, PlacedView, ViewPanel, crowded, lanes_height
 from evedrop.show.view.panels.plane import frames
@@ -74,7 +74,7 @@ _KNOWLEDGE_PATH = "knows"
 
 @final
 class WhoKnowsWhat(ViewPanel):
-    """A lane for each receiver: in track, drifting or fooled, with its error in words."""
+    """A lane for each receiver: synchronised, drifting or fooled, with its error in words."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
@@ -197,7 +197,11 @@ FATES = {
     receiver.SILENT: TRUTH_CURVE,
 }
 """The colour of each word of a lane."""
-KNOWN = {Track.IN_TRACK: IN_TRACK_TEXT, Track.DRIFTING: MISLED, Track.FOOLED: DROPPED_TEXT}
+KNOWN = {
+    Synchronisation.SYNCHRONISED: SYNCHRONISED_TEXT,
+    Synchronisation.DRIFTING: MISLED,
+    Synchronisation.FOOLED: DROPPED_TEXT,
+}
 """The colour of what a receiver knows."""
 
 
@@ -263,8 +267,8 @@ class LastPacket(ViewPanel):
     def _known(self, shown: Shown, slots: SceneSlots, at: list[int]) -> list[tuple[str, Colour]]:
         peer = slots.peers[shown.name]
         distances = self._distance.of(slots.x[at], peer.x_hat[at]).tolist()
-        tracks = [Track(code) for code in knowledge(self.scene, slots.x, peer)[at].tolist()]
+        statuses = [Synchronisation(code) for code in knowledge(self.scene, slots.x, peer)[at].tolist()]
         return [
-            (f"{shown.name}: {track.word}, {self._distance.text(distance)} off", KNOWN[track])
-            for track, distance in zip(tracks, distances, strict=True)
+            (f"{shown.name}: {status.word}, {self._distance.text(distance)} off", KNOWN[status])
+            for status, distance in zip(statuses, distances, strict=True)
         ]

@@ -5,7 +5,7 @@ whatever the number of states: of all Gaussian errors with this trace, one along
 and Bakirov 2003), and there 20 is exceeded with probability 7.7e-6. Errors up to 20 times those of one step's noise, tr Q, are
 those of a receiver that follows the process step by step.
 
-Source: docs/view.md, who knows what; docs/results.md, lost track.
+Source: docs/view.md, who knows what; docs/results.md, lost synchronisation.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ JOINED = 3
 """Spans that are at most this many slots apart are one."""
 
 
-class Track(IntEnum):
+class Synchronisation(IntEnum):
     """What a receiver knows of the process in a slot."""
 
-    IN_TRACK = 0
+    SYNCHRONISED = 0
     DRIFTING = 1
     """Its error is large, or it reports so, and its own covariance expects such an error."""
     FOOLED = 2
@@ -38,20 +38,22 @@ class Track(IntEnum):
     @property
     def word(self) -> str:
         """The code as a word."""
-        return self.name.lower().replace("_", " ")
+        return self.name.lower()
 
 
-def track_of(squared_error: Floats, trace: Floats, noise: float) -> Codes:
+def synchronisation_of(squared_error: Floats, trace: Floats, noise: float) -> Codes:
     """The code of every slot (c,), from the squared error and the reported tr P, (c,) each, and the process noise tr Q.
 
     Fooled: the squared error is above 20 times the larger of tr P and tr Q. Drifting: otherwise, the squared error or tr P is
-    above 20 tr Q. In track: otherwise.
+    above 20 tr Q. Synchronised: otherwise.
     """
     fooled = is_fooled(squared_error, trace, noise)
     with np.errstate(invalid="ignore"):
         drifting = np.maximum(squared_error, trace) > FACTOR * noise
     return np.where(
-        fooled, np.uint8(Track.FOOLED), np.where(drifting, np.uint8(Track.DRIFTING), np.uint8(Track.IN_TRACK))
+        fooled,
+        np.uint8(Synchronisation.FOOLED),
+        np.where(drifting, np.uint8(Synchronisation.DRIFTING), np.uint8(Synchronisation.SYNCHRONISED)),
     )
 
 
@@ -64,7 +66,7 @@ def is_fooled(squared_error: Floats, trace: Floats, noise: float) -> Flags:
 
 @dataclass(frozen=True)
 class LostSpan:
-    """Slots in which a receiver was off the track, the last one included."""
+    """Slots in which a receiver was not synchronised, the last one included."""
 
     first: int
     last: int
@@ -78,13 +80,13 @@ class LostSpan:
 
 
 def lost_spans(codes: Codes, first: int = 0) -> list[LostSpan]:
-    """The spans off the track, in order; codes: of the slots from `first` on."""
-    off = np.flatnonzero(codes != Track.IN_TRACK)
+    """The spans without synchronisation, in order; codes: of the slots from `first` on."""
+    off = np.flatnonzero(codes != Synchronisation.SYNCHRONISED)
     if not off.size:
         return []
     breaks = np.flatnonzero(np.diff(off) > JOINED)
     begins, ends = off[np.append(0, breaks + 1)], off[np.append(breaks, len(off) - 1)]
-    so_far = np.append(0, np.cumsum(codes == int(Track.FOOLED)))
+    so_far = np.append(0, np.cumsum(codes == int(Synchronisation.FOOLED)))
     fooled = so_far[ends + 1] - so_far[begins]
     spans = zip((begins + first).tolist(), (ends + first).tolist(), fooled.tolist(), strict=True)
     return [LostSpan(*span) for span in spans]
@@ -92,7 +94,7 @@ def lost_spans(codes: Codes, first: int = 0) -> list[LostSpan]:
 
 @final
 class LongestSpans:
-    """The longest spans off the track, found in consecutive pieces of slots, and how many there are in all."""
+    """The longest spans without synchronisation, found in consecutive pieces of slots, and how many there are in all."""
 
     def __init__(self, most: int, first: int = 0) -> None:
         """most: how many are kept, of equally long ones the earlier; first: the first slot of the first piece."""
