@@ -30,10 +30,10 @@ class Synchronisation(IntEnum):
     """What a receiver knows of the process in a slot."""
 
     SYNCHRONISED = 0
-    DRIFTING = 1
-    """Its error is large, or it reports so, and its own covariance expects such an error."""
-    FOOLED = 2
-    """Its error is far larger than its own covariance expects."""
+    UNCERTAIN = 1
+    """Its error is large, or it reports so, and its own covariance allows such an error."""
+    OVERCONFIDENT = 2
+    """Its error is far larger than its own covariance allows."""
 
     @property
     def word(self) -> str:
@@ -44,24 +44,24 @@ class Synchronisation(IntEnum):
 def synchronisation_of(squared_error: Floats, trace: Floats, noise: float) -> Codes:
     """The code of every slot (c,), from the squared error and the reported tr P, (c,) each, and the process noise tr Q.
 
-    Fooled: the squared error is above 20 times the larger of tr P and tr Q. Drifting: otherwise, the squared error or tr P is
-    above 20 tr Q. Synchronised: otherwise.
+    Overconfident: the squared error is above 20 times the larger of tr P and tr Q. Uncertain: otherwise, the squared error or
+    tr P is above 20 tr Q. Synchronised: otherwise.
     """
-    fooled = is_fooled(squared_error, trace, noise)
+    overconfident = is_overconfident(squared_error, trace, noise)
     with np.errstate(invalid="ignore"):
-        drifting = np.maximum(squared_error, trace) > FACTOR * noise
+        uncertain = np.maximum(squared_error, trace) > FACTOR * noise
     return np.where(
-        fooled,
-        np.uint8(Synchronisation.FOOLED),
-        np.where(drifting, np.uint8(Synchronisation.DRIFTING), np.uint8(Synchronisation.SYNCHRONISED)),
+        overconfident,
+        np.uint8(Synchronisation.OVERCONFIDENT),
+        np.where(uncertain, np.uint8(Synchronisation.UNCERTAIN), np.uint8(Synchronisation.SYNCHRONISED)),
     )
 
 
-def is_fooled(squared_error: Floats, trace: Floats, noise: float) -> Flags:
+def is_overconfident(squared_error: Floats, trace: Floats, noise: float) -> Flags:
     """Whether squared errors are far above the traces that a receiver reports; also if one is not a number. noise: tr Q."""
     with np.errstate(invalid="ignore"):
-        fooled: Flags = ~(squared_error <= FACTOR * np.maximum(trace, noise))
-    return fooled
+        overconfident: Flags = ~(squared_error <= FACTOR * np.maximum(trace, noise))
+    return overconfident
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ class LostSpan:
 
     first: int
     last: int
-    fooled: int
-    """In how many of them it was fooled."""
+    overconfident: int
+    """In how many of them it was overconfident."""
 
     @property
     def slots(self) -> int:
@@ -86,9 +86,9 @@ def lost_spans(codes: Codes, first: int = 0) -> list[LostSpan]:
         return []
     breaks = np.flatnonzero(np.diff(off) > JOINED)
     begins, ends = off[np.append(0, breaks + 1)], off[np.append(breaks, len(off) - 1)]
-    so_far = np.append(0, np.cumsum(codes == int(Synchronisation.FOOLED)))
-    fooled = so_far[ends + 1] - so_far[begins]
-    spans = zip((begins + first).tolist(), (ends + first).tolist(), fooled.tolist(), strict=True)
+    so_far = np.append(0, np.cumsum(codes == int(Synchronisation.OVERCONFIDENT)))
+    overconfident = so_far[ends + 1] - so_far[begins]
+    spans = zip((begins + first).tolist(), (ends + first).tolist(), overconfident.tolist(), strict=True)
     return [LostSpan(*span) for span in spans]
 
 
@@ -110,7 +110,7 @@ class LongestSpans:
         self._next += len(codes)
         if self._open is not None:
             if spans and spans[0].first - self._open.last <= JOINED:
-                spans[0] = LostSpan(self._open.first, spans[0].last, self._open.fooled + spans[0].fooled)
+                spans[0] = LostSpan(self._open.first, spans[0].last, self._open.overconfident + spans[0].overconfident)
             else:
                 spans.insert(0, self._open)
         self._open = spans.pop() if spans else None

@@ -220,7 +220,7 @@ def test_the_longest_spans_are_listed_in_the_order_of_time() -> None:
         errors[span.first : span.last + 1] = 100.0
     words = pa.array([OUTCOMES[0]] * 1400)
     trial = RecordedTrial(RowExtent(1400, 0, 1399), 1.0)
-    traces = np.full(1400, 50.0)  # it expects such errors: it drifts, and is never fooled
+    traces = np.full(1400, 50.0)  # it allows such errors: it is uncertain, and never overconfident
     traces[errors == 0.0] = 1.0
     rows = {"sent": pa.array(["state"] * 1400), "action": words, "squared_error": errors, "trace_covariance": traces}
     trial.add(pa.table(rows))
@@ -243,9 +243,9 @@ def slot_by_slot(errors: list[float], traces: list[float], noise: float) -> Iter
     """The rule of docs/results.md, written out."""
     for error, trace in zip(errors, traces, strict=True):
         if error > 20 * trace and error > 20 * noise:
-            yield "fooled"
+            yield "overconfident"
         elif error > 20 * noise or trace > 20 * noise:
-            yield "drifting"
+            yield "uncertain"
         else:
             yield "synchronised"
 
@@ -270,7 +270,7 @@ def test_spans_cover_exactly_the_slots_off_the_track(
         assert "synchronised" not in {words[span.first - first], words[span.last - first]}
         off = [k for k in range(span.first - first, span.last - first + 1) if words[k] != "synchronised"]
         assert all(after - before <= 3 for before, after in pairwise(off))
-        assert span.fooled == words[span.first - first : span.last - first + 1].count("fooled")
+        assert span.overconfident == words[span.first - first : span.last - first + 1].count("overconfident")
     for one, other in pairwise(spans):
         assert other.first - one.last > 3
 

@@ -116,8 +116,8 @@ def expected(process: Process, shown: Shown, q: float, slots: int) -> Floats:
             if shown.role == "legitimate":
                 M = (1 - q) * (carried + Q) + q * (1 - d) * carried
             else:
-                used, fooled = q * d * use_state, q * (1 - d) * misled
-                M = (1 - used - fooled) * (carried + Q) + fooled * 2 * (A @ Sigma @ A.T)
+                used, taken = q * d * use_state, q * (1 - d) * misled
+                M = (1 - used - taken) * (carried + Q) + taken * 2 * (A @ Sigma @ A.T)
             Sigma = A @ Sigma @ A.T + Q
         traces.append(np.trace(M))
     return np.array(traces)

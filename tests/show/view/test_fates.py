@@ -28,8 +28,8 @@ from tests.show.view.simulated_run import Simulated
 
 COLOURS = {
     **dict.fromkeys(("state", "innovation"), STATE),
-    **dict.fromkeys(("misled", "drifting"), MISLED),
-    **dict.fromkeys(("dropped", "fooled"), DROPPED_TEXT),
+    **dict.fromkeys(("misled", "uncertain"), MISLED),
+    **dict.fromkeys(("dropped", "overconfident"), DROPPED_TEXT),
     **dict.fromkeys(("discarded", "silent"), TRUTH_CURVE),
     "synchronised": SYNCHRONISED_TEXT,
 }

@@ -1,4 +1,4 @@
-"""Whether a receiver is synchronised, drifting or fooled, and the lanes that show it."""
+"""Whether a receiver is synchronised, uncertain or overconfident, and the lanes that show it."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def known(error: float, trace: float, scene: Scene = SCENE) -> Synchronisation:
     [
         (0.0, 0.0, Synchronisation.SYNCHRONISED),
         (0.99, 0.0, Synchronisation.SYNCHRONISED),  # 20 times the noise of a step is 1
-        (1.01, 0.0, Synchronisation.FOOLED),
-        (1.01, 0.1, Synchronisation.DRIFTING),
-        (0.0, 1.01, Synchronisation.DRIFTING),  # near the truth by chance
-        (99.0, 5.0, Synchronisation.DRIFTING),
-        (101.0, 5.0, Synchronisation.FOOLED),
-        (np.nan, 5.0, Synchronisation.FOOLED),
-        (np.inf, 5.0, Synchronisation.FOOLED),
+        (1.01, 0.0, Synchronisation.OVERCONFIDENT),
+        (1.01, 0.1, Synchronisation.UNCERTAIN),
+        (0.0, 1.01, Synchronisation.UNCERTAIN),  # near the truth by chance
+        (99.0, 5.0, Synchronisation.UNCERTAIN),
+        (101.0, 5.0, Synchronisation.OVERCONFIDENT),
+        (np.nan, 5.0, Synchronisation.OVERCONFIDENT),
+        (np.inf, 5.0, Synchronisation.OVERCONFIDENT),
     ],
 )
 def test_a_word_for_error_and_covariance(error: float, trace: float, expected: Synchronisation) -> None:
@@ -53,7 +53,7 @@ def test_a_word_for_error_and_covariance(error: float, trace: float, expected: S
     assert known(error, trace) is expected
 
 
-def test_a_right_covariance_is_hardly_ever_called_fooled() -> None:
+def test_a_right_covariance_is_hardly_ever_called_overconfident() -> None:
     """The bound of the docstring; errors in one direction exceed it most often, and those in several hardly ever."""
     assert stats.chi2.sf(FACTOR, 1) < 1e-5
     for n in (2, 4, 10):
@@ -72,14 +72,19 @@ def test_words_say_the_largest_distance_of_a_stretch() -> None:
     distance = ErrorDistance(SCENE)
     first = walk([0.2, 3.0, 30.0, 9.0], [0, 2, 2, 2], distance)
     more = "off by more than"
-    assert first == ["synchronised, within 1 m", f"fooled, {more} 1 m", f"fooled, {more} 10 m", f"fooled, {more} 10 m"]
-    assert walk([9.0, 0.5, 0.9, 5.0], [2, 1, 0, 1], distance) == [
-        f"fooled, {more} 10 m",
-        "drifting, off by less than 1 m",
+    assert first == [
         "synchronised, within 1 m",
-        f"drifting, {more} 1 m",
+        f"overconfident, {more} 1 m",
+        f"overconfident, {more} 10 m",
+        f"overconfident, {more} 10 m",
     ]
-    assert walk([np.inf, np.nan], [2, 2], distance)[0] == f"fooled, {more} 1e+09 m"
+    assert walk([9.0, 0.5, 0.9, 5.0], [2, 1, 0, 1], distance) == [
+        f"overconfident, {more} 10 m",
+        "uncertain, off by less than 1 m",
+        "synchronised, within 1 m",
+        f"uncertain, {more} 1 m",
+    ]
+    assert walk([np.inf, np.nan], [2, 2], distance)[0] == f"overconfident, {more} 1e+09 m"
     words, colours = distance.lane.words, distance.lane.colours
     assert len(set(words)) == len(words)
     inks = dict(zip(KNOWLEDGE.words, KNOWLEDGE.colours, strict=True))
@@ -104,7 +109,7 @@ def test_distances_of_rounding_are_none() -> None:
 
 
 def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
-    """However slots are handed over, a lane has the words of its receiver; a naive eavesdropper is fooled, a smart one is not."""
+    """However slots are handed over, a lane has the words of its receiver; naive is overconfident, smart is not."""
     run, lanes = simulated(300), {}
     for length in (7, 300):
         recording = ViewRecording(tmp_path / f"{length}.rrd", run.scene)
@@ -120,10 +125,10 @@ def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp
         expected = knowledge(run.scene, run.slots.x, run.slots.peers[shown.name])
         assert [word.split(",")[0] for word in lanes[shown.name, 7]] == [KNOWLEDGE.words[code] for code in expected]
     words = {name: " ".join(found) for (name, _), found in lanes.items()}
-    assert "fooled" in words["naive"]
-    assert "fooled" not in words["smart"]
-    assert "drifting" in words["smart"]
-    assert set(words["legitimate"].split()) & {"fooled", "drifting"} == set()
+    assert "overconfident" in words["naive"]
+    assert "overconfident" not in words["smart"]
+    assert "uncertain" in words["smart"]
+    assert set(words["legitimate"].split()) & {"overconfident", "uncertain"} == set()
     assert set(WhoKnowsWhat(run.scene).styles()) == {
         f"knows/{i + 1}_{s.name}" for i, s in enumerate(run.scene.receivers)
     }

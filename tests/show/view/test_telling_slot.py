@@ -22,10 +22,10 @@ def reported(errors: dict[str, Floats], **traces: float) -> dict[str, Floats]:
     return {name: np.full(len(column), traces.get(name, 1.0)) for name, column in errors.items()}
 
 
-def test_the_slot_in_which_most_are_fooled_is_chosen() -> None:
+def test_the_slot_in_which_most_are_overconfident_is_chosen() -> None:
     """An eavesdropper that knows how far it may be off does not count, however far it is."""
-    errors = errors_of(1000, naive=(400, 50.0), drifting=(700, 900.0))
-    assert most_telling(errors, reported(errors, drifting=900.0), 0.1) == 400
+    errors = errors_of(1000, naive=(400, 50.0), uncertain=(700, 900.0))
+    assert most_telling(errors, reported(errors, uncertain=900.0), 0.1) == 400
     assert most_telling(errors, reported(errors), 0.1) == 700
 
 
@@ -36,10 +36,10 @@ def test_where_the_legitimate_estimator_errs_as_well_there_is_nothing_to_see() -
     assert most_telling(errors, reported(errors), 0.1) == 400
 
 
-def test_without_a_fooled_eavesdropper_all_count() -> None:
-    """If no eavesdropper is ever fooled, drifting ones count."""
-    errors = errors_of(1000, drifting=(700, 900.0))
-    assert most_telling(errors, reported(errors, drifting=900.0), 0.1) == 700
+def test_without_an_overconfident_eavesdropper_all_count() -> None:
+    """If no eavesdropper is ever overconfident, uncertain ones count."""
+    errors = errors_of(1000, uncertain=(700, 900.0))
+    assert most_telling(errors, reported(errors, uncertain=900.0), 0.1) == 700
 
 
 def test_without_an_eavesdropper_the_legitimate_estimator_counts() -> None:

@@ -285,11 +285,11 @@ def _lost_synchronisation(of: RunSource) -> Iterator[Markup]:
         return
     yield made(
         "paragraph",
-        f"Trial {of.summary.first_trial}, slot by slot. A receiver is fooled where its squared error is more than "
-        f"{FACTOR:g} times what its own covariance tr P expects, and than tr Q, the noise of one step. Otherwise it drifts "
+        f"Trial {of.summary.first_trial}, slot by slot. A receiver is overconfident where its squared error is more than "
+        f"{FACTOR:g} times what its own covariance tr P allows, and than tr Q, the noise of one step. Otherwise it is uncertain "
         f"where its squared error or tr P is more than {FACTOR:g} tr Q, and is synchronised elsewhere.",
     )
-    table = TextTable.headed(["receiver"], ["synchronised", "drifting", "fooled", "spans lost", "longest"])
+    table = TextTable.headed(["receiver"], ["synchronised", "uncertain", "overconfident", "spans lost", "longest"])
     for name, recorded in of.trial.items():
         table.add(
             name,
@@ -325,7 +325,7 @@ def _lanes(name: str, recorded: RecordedTrial) -> Iterator[Markup]:
     if spans:
         items = [
             f"slots {_where(span)}: lost synchronisation for {span.slots:,}"
-            + (f", fooled in {span.fooled:,}" if span.fooled else "")
+            + (f", overconfident in {span.overconfident:,}" if span.overconfident else "")
             for span in sorted(spans, key=lambda span: span.first)
         ]
         title = f"Its {len(spans)} longest spans" if len(spans) > 1 else "Its only span"

@@ -82,9 +82,9 @@ class Watcher:
         length = self._bad + some.stop - some.start
         if not self._told and length >= self._long:
             turn = some.start + self._long - self._bad  # the slot after the one that made it long
-            fooled = self._misled + int(np.count_nonzero(misled[some.start : turn]))
+            deceived = self._misled + int(np.count_nonzero(misled[some.start : turn]))
             unsent = self._silent + int(np.count_nonzero(silent[some.start : turn]))
-            events.append(Event(first + turn - 1, "WARN", self._lost(fooled, unsent)))
+            events.append(Event(first + turn - 1, "WARN", self._lost(deceived, unsent)))
             self._told = True
         self._bad = length
         self._misled += int(np.count_nonzero(misled[some]))
@@ -99,11 +99,11 @@ class Watcher:
                 self._long += 1
         self._bad = self._misled = self._silent = 0
 
-    def _lost(self, fooled: int, unsent: int) -> str:
+    def _lost(self, deceived: int, unsent: int) -> str:
         if self._legitimate and not unsent:
             return f"{self._name} lost {self._long} packets in a row"
         line = f"{self._name} lost synchronisation: {self._long} slots without a state"
         if self._legitimate:
             line = f"{self._name} had no packet for {self._long} slots"
         line = f"{line}, {unsent} of them silent" if unsent else line
-        return f"{line}, {fooled} misled" if fooled else line
+        return f"{line}, {deceived} misled" if deceived else line

@@ -1,6 +1,6 @@
 """The coloured lanes: what became of each packet, and what each receiver knows. Does not use Rerun.
 
-A receiver is synchronised, drifting or fooled in each slot.
+A receiver is synchronised, uncertain or overconfident in each slot.
 
 Source: docs/view.md, who knows what.
 """
@@ -121,13 +121,13 @@ class ErrorDistance:
 
     @property
     def lane(self) -> Lane:
-        """All words of `codes`, such as "drifting, off by more than 10 m", in the colours of what they say."""
+        """All words of `codes`, such as "uncertain, off by more than 10 m", in the colours of what they say."""
         near = self._text(self._near)
         words, colours = (
             [f"{Synchronisation.SYNCHRONISED.word}, within {near}"],
             [KNOWLEDGE.colours[Synchronisation.SYNCHRONISED]],
         )
-        for status in (Synchronisation.DRIFTING, Synchronisation.FOOLED):
+        for status in (Synchronisation.UNCERTAIN, Synchronisation.OVERCONFIDENT):
             words.append(f"{status.word}, off by less than {near}")
             words += [f"{status.word}, off by more than {self._text(step)}" for step in self._steps]
             colours += [KNOWLEDGE.colours[status]] * (1 + len(self._steps))

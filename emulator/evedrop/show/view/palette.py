@@ -41,7 +41,7 @@ LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT)
 """The outcomes of a packet."""
 
 KNOWLEDGE: tuple[Colour, ...] = (DECODED, MISLED, DROPPED)
-"""What a receiver knows: synchronised, drifting, fooled."""
+"""What a receiver knows: synchronised, uncertain, overconfident."""
 
 WIRE_LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT, TRUTH)
 """The fates of the messages of a wire's link; white is cut."""

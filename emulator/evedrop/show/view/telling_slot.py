@@ -14,7 +14,7 @@ from evedrop.model.process import Floats
 from evedrop.names import LEGITIMATE
 from evedrop.results.reading import Results
 from evedrop.scenario.recorded import recorded
-from evedrop.score.synchronisation import is_fooled
+from evedrop.score.synchronisation import is_overconfident
 
 _BEFORE, _AFTER = 105, 25  # slots that the panels show on either side, so that the picture is filled
 
@@ -40,17 +40,18 @@ def telling_slot(results: Results) -> int | None:
 
 
 def most_telling(errors: Mapping[str, Floats], traces: Mapping[str, Floats], noise: float) -> int:
-    """The slot with the largest separation between the eavesdroppers that are fooled and the legitimate estimator.
+    """The slot with the largest separation between the eavesdroppers that are overconfident and the legitimate estimator.
 
     errors, traces: receiver → its squared error, and the trace of the covariance that it reports, (slots,). noise: trace of Q.
     """
     legitimate = errors[LEGITIMATE]
     others = [name for name in errors if name != LEGITIMATE]
     if others:
-        fooled = {name: is_fooled(errors[name], traces[name], noise) for name in others}
-        some = any(flags[_candidates(len(flags))].any() for flags in fooled.values())
+        overconfident = {name: is_overconfident(errors[name], traces[name], noise) for name in others}
+        some = any(flags[_candidates(len(flags))].any() for flags in overconfident.values())
         separation = sum(
-            np.log10((errors[name] + noise) / (legitimate + noise)) * (fooled[name] if some else 1.0) for name in others
+            np.log10((errors[name] + noise) / (legitimate + noise)) * (overconfident[name] if some else 1.0)
+            for name in others
         )
     else:
         separation = legitimate

@@ -74,7 +74,7 @@ _KNOWLEDGE_PATH = "knows"
 
 @final
 class WhoKnowsWhat(ViewPanel):
-    """A lane for each receiver: synchronised, drifting or fooled, with its error in words."""
+    """A lane for each receiver: synchronised, uncertain or overconfident, with its error in words."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
@@ -199,8 +199,8 @@ FATES = {
 """The colour of each word of a lane."""
 KNOWN = {
     Synchronisation.SYNCHRONISED: SYNCHRONISED_TEXT,
-    Synchronisation.DRIFTING: MISLED,
-    Synchronisation.FOOLED: DROPPED_TEXT,
+    Synchronisation.UNCERTAIN: MISLED,
+    Synchronisation.OVERCONFIDENT: DROPPED_TEXT,
 }
 """The colour of what a receiver knows."""
 
@@ -231,7 +231,7 @@ class LastPacket(ViewPanel):
         """One view, right of the strip; with many receivers, packets have this place, and the letters would be too small."""
         if crowded(self.scene):
             return
-        longest = max(len(shown.name) for shown in self.scene.receivers) + len(": drifting, 0.32 m off")
+        longest = max(len(shown.name) for shown in self.scene.receivers) + len(": overconfident, 0.32 m off")
         view: rrb.View = self._drawn.view("The last packet, and what each knows", (LETTER * longest / 2, LINE / 2))
         yield PlacedView(view, "top", 0.8, lanes_height(len(self.scene.receivers)))
 
