@@ -45,11 +45,11 @@ def test_the_budget_is_met_exactly(scenario: Path) -> None:
 
 
 def test_errors_are_those_of_runs(scenario: Path, tmp_path: Path) -> None:
-    """The limits of user and eavesdropper are those of the threshold's own scenario."""
+    """The limits of legitimate estimator and eavesdropper are those of the threshold's own scenario."""
     design = design_budget(scenario, 1.4)
     made = load(scenario, {"encoding.threshold": design.best.threshold})
     peers = montecarlo(made, trials=300, out=tmp_path / "run").summary["peers"]
-    for name, limit in (("legitimate", design.user), ("listener", design.best.eavesdroppers["listener"])):
+    for name, limit in (("legitimate", design.legitimate), ("listener", design.best.eavesdroppers["listener"])):
         error = peers[name]["standard_errors"]["mean_squared_error"]
         assert abs(peers[name]["mean_squared_error"] - limit) < 5.0 * error + 0.01 * limit  # the first slots differ
     energies = [one.energy for one in design.others]
@@ -66,7 +66,7 @@ def test_the_table_has_the_threshold(evedrop: Evedrop, scenario: Path, budget: f
     assert done.out.splitlines()[-1].startswith("threshold = ")
     found = json.loads(evedrop("design", str(scenario), "--budget", str(budget), "--json").out)
     assert found["best"]["threshold"] == pytest.approx(threshold)
-    assert set(found) == {"budget", "unencrypted", "encrypted", "user", "best", "others"}
+    assert set(found) == {"budget", "unencrypted", "encrypted", "legitimate", "best", "others"}
 
 
 def test_what_has_no_limit_is_unbounded(evedrop: Evedrop, scenario: Path) -> None:
@@ -74,10 +74,10 @@ def test_what_has_no_limit_is_unbounded(evedrop: Evedrop, scenario: Path) -> Non
     spy = 'eavesdroppers.spy={strategy = "naive", link = {quality = 0.5}}'
     words = ("design", str(scenario), "--budget", "1.5", "--set", "process.A=[[1.0, 0.3], [0.0, 0.8]]", "--set", spy)
     done = evedrop(*words)
-    assert "the user's is ∞" in done.out
+    assert "the legitimate one is ∞" in done.out
     assert "left out: spy (naive)" in done.out
     found = json.loads(evedrop(*words, "--json").out)
-    assert found["user"] is None
+    assert found["legitimate"] is None
     assert found["best"]["eavesdroppers"] == {"listener": None}
     assert found["left_out"] == {"spy": "naive"}
 

@@ -61,12 +61,12 @@ def test_json(evedrop: Evedrop, scenario: str) -> None:
         assert one["scheduled"][2]["transmissions"] == pytest.approx((1 / 0.81) / (2 + 1 / 0.81))
         for row in one["policies"]:
             assert list(row) == [
-                "weights", "price", "thresholds", "user", "eavesdropper", "transmissions", "scheduled",
+                "weights", "price", "thresholds", "legitimate", "eavesdropper", "transmissions", "scheduled",
             ]  # fmt: skip
             assert len(row["thresholds"]) == 6
         assert one["policies"][-1]["weights"][1] == 1.0
     assert found["eavesdroppers"]["far"]["scheduled"][5]["eavesdropper"] is None
-    assert found["eavesdroppers"]["far"]["scheduled"][0]["user"] == pytest.approx(2.2837e-4, rel=1e-4)
+    assert found["eavesdroppers"]["far"]["scheduled"][0]["legitimate"] == pytest.approx(2.2837e-4, rel=1e-4)
 
 
 def test_for_people(evedrop: Evedrop, scenario: str) -> None:

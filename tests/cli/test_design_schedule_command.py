@@ -23,7 +23,7 @@ SHORT = ("--schedule", "8", "--max-trace", "0.004")
 
 
 def test_json(evedrop: Evedrop) -> None:
-    """Exactly the promised keys; the user's error within Ω in every slot; what has no closed form is named."""
+    """Exactly the promised keys; the legitimate error within Ω in every slot; what has no closed form is named."""
     done = evedrop("design", "numerical", *SHORT, "--set", MIXED, "--json")
     assert (done.status, done.err) == (0, "")
     found = json.loads(done.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
@@ -32,9 +32,9 @@ def test_json(evedrop: Evedrop) -> None:
     smart = found["eavesdroppers"]["smart"]
     assert list(smart) == ["best", "constant", "grid", "exact"]
     best = smart["best"]
-    assert list(best) == ["mu_d", "user", "eavesdropper", "value"]
-    assert {len(best[key]) for key in ("mu_d", "user", "eavesdropper")} == {8}
-    assert max(best["user"]) <= 0.004 * (1 + 1e-9)
+    assert list(best) == ["mu_d", "legitimate", "eavesdropper", "value"]
+    assert {len(best[key]) for key in ("mu_d", "legitimate", "eavesdropper")} == {8}
+    assert max(best["legitimate"]) <= 0.004 * (1 + 1e-9)
     assert best["value"] == pytest.approx(sum(best["eavesdropper"]))
     assert best["value"] > smart["constant"]["value"]
 
@@ -48,7 +48,7 @@ def test_for_people(evedrop: Evedrop) -> None:
     for words in (
         "against smart: the sum is",
         "the best constant μ_d",
-        "user's error",
+        "legitimate error",
         "best schedule",
         "wise (bayesian)",
     ):
@@ -67,7 +67,7 @@ def test_in_python() -> None:
     assert best.mu_d[1] == best.mu_d[4]
     assert best.mu_d[5] == best.mu_d[8]
     expected = SlotRecursion(UNSTABLE, lambda mu_d: Outcomes.legitimate(0.9, mu_d), 9)
-    assert best.user == pytest.approx(expected.traces(np.array([best.mu_d]))[0].tolist())
+    assert best.legitimate == pytest.approx(expected.traces(np.array([best.mu_d]))[0].tolist())
 
 
 @pytest.mark.parametrize(

@@ -210,8 +210,8 @@ def test_blocked_acknowledgements_open_every_packet() -> None:
             assert not belief.P[:, :, gamma_e[k]].any()
 
 
-def test_one_forged_acknowledgement_loses_the_user() -> None:
-    """Acknowledged in its name where it heard nothing, the user never again has an error below A^m P A^mᵀ."""
+def test_one_forged_acknowledgement_loses_the_legitimate_estimator() -> None:
+    """Acknowledged in its name where it heard nothing, the legitimate estimator never again has an error below A^m P A^mᵀ."""
     gamma, forged = np.ones((12, 1), bool), np.ones((12, 1), bool)
     gamma[4] = False
     belief = played_over(UNSTABLE, gamma, gamma, forged, OpenLoop).beliefs["legitimate"]

@@ -23,7 +23,7 @@ from tests.model.slot_loop import STABLE
 @pytest.mark.parametrize("process", [UNSTABLE, DRIFTING])
 @pytest.mark.parametrize("rule", ["honest", "blocked", "critical blocked", "forged"])
 def test_expectations_are_the_recursion(process: Process, rule: str) -> None:
-    """E P of user and eavesdropper over every course of four slots, each with its probability, is the recursion's, exactly."""
+    """E P of both receivers over every course of four slots, each with its probability, is the recursion's, exactly."""
     gamma, gamma_e, link = all_events(4)
     acks = {
         "honest": gamma & link,
@@ -77,19 +77,19 @@ def test_the_floor_follows_many_slots() -> None:
     ("initial", "honest"), [(1e-3 * np.eye(2), 4.91e7), (np.eye(2), 2.36e10)], ids=["from Q", "from I"]
 )
 def test_the_papers_example(initial: np.ndarray, honest: float) -> None:
-    """Slot 40, μ = μ_e = 0.9: lost for good with honest acknowledgements; as good as the user where the critical ones fail."""
+    """Slot 40, μ = μ_e = 0.9: lost for good with honest acknowledgements; as good as legitimate where the critical ones fail."""
     process = Process(UNSTABLE.A, UNSTABLE.Q, initial)
     found = reference_covariances(process, 0.9, (0.81, 0.09), 41)
     assert np.trace(found[40]) == pytest.approx(honest, rel=2e-3)
-    user = np.trace(theoretical_covariances(process, Acknowledged(process).outcomes(0.9), 41)[40])
-    assert user == pytest.approx(2.284e-4, rel=2e-4)
+    legitimate = np.trace(theoretical_covariances(process, Acknowledged(process).outcomes(0.9), 41)[40])
+    assert legitimate == pytest.approx(2.284e-4, rel=2e-4)
     for acknowledged in ((0.0, 0.0), (0.81, 0.0)):
         blocked = np.trace(reference_covariances(process, 0.9, acknowledged, 41)[40])
-        assert blocked == pytest.approx(user, rel=1e-12)
+        assert blocked == pytest.approx(legitimate, rel=1e-12)
 
 
 def test_an_error_that_is_bounded_is_expected_to_be() -> None:
-    """With L = A and a stable process, what the eavesdropper and a user of forged acknowledgements lost is forgotten."""
+    """With L = A and a stable process, what the eavesdropper and an estimator of forged acknowledgements lost is forgotten."""
     tables: dict[str, Any] = {
         "title": "Forged",
         "slots": 400,

@@ -51,8 +51,8 @@ def test_rates_are_those_of_the_arrivals(attack: str) -> None:
     rates = rates_of(attack, mu, mu_e, quality, 0.2)
     for found, rate in (
         (arrived, rates.arrives),
-        (arrived & gamma, rates.user[0]),
-        (arrived & ~gamma, rates.user[1]),
+        (arrived & gamma, rates.legitimate[0]),
+        (arrived & ~gamma, rates.legitimate[1]),
         (arrived & gamma_e, rates.eavesdropper[0]),
         (arrived & ~gamma_e, rates.eavesdropper[1]),
     ):
@@ -72,7 +72,7 @@ def test_what_was_not_sent_is_not_acknowledged() -> None:
 
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_attacks_on_state_secrecy_codes_cost_what_theory_says(attack: str) -> None:
-    """Mean reported trace after a few slots, user's and eavesdropper's, by the recursion, at 5 standard errors."""
+    """Mean reported trace after a few slots, both receivers, by the recursion, at 5 standard errors."""
     mu, mu_e, slots, trials = 0.8, 0.7, 6, 20_000
     batch = Batch(slots, trials)
     quality = 0.6 if attack == "hijack" else 0.9  # above μ_e a hijacked sensor has a memory, and theory another form
@@ -86,7 +86,7 @@ def test_attacks_on_state_secrecy_codes_cost_what_theory_says(attack: str) -> No
         lambda k, sent, received: channel.arrived(k, sent, received["legitimate"], received["eve"]),
     )
     rates = rates_of(attack, mu, mu_e, quality)
-    for name, quality, acknowledged in (("legitimate", mu, rates.user), ("eve", mu_e, rates.eavesdropper)):
+    for name, quality, acknowledged in (("legitimate", mu, rates.legitimate), ("eve", mu_e, rates.eavesdropper)):
         expected = np.trace(reference_covariances(UNSTABLE, quality, acknowledged, slots), axis1=1, axis2=2)
         for found in (played.trace(name), played.squared_error(name)):
             assert (np.abs(found.mean(1) - expected) < 5.0 * found.std(1) / np.sqrt(trials) + 1e-18).all()

@@ -1,4 +1,4 @@
-"""The stream cipher: the user reads everything, other receivers nothing."""
+"""The stream cipher: the legitimate estimator reads everything, other receivers nothing."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def masked_in_words(process: Process, k: int, x: np.ndarray, trial: int) -> list
 @pytest.mark.parametrize("process", [STABLE, UNSTABLE, DRIFTING])
 @pytest.mark.parametrize("k", [0, 1, 7, 40])
 def test_masking_is_addition_on_the_grid(process: Process, k: int) -> None:
-    """State plus pad modulo the range, and the user's own state again within half a step of the grid."""
+    """State plus pad modulo the range, and the legitimate estimator's own state again within half a step of the grid."""
     x = 3.0 * np.sqrt(np.diag(state_covariances(process, k + 1)[k]))[:, None] * np.linspace(-1, 1, 5)
     mask = Mask(process, KEY, Batch(50, 5, 11))
     z = mask.hide(k, x)
@@ -83,7 +83,7 @@ def test_packets_say_nothing_of_the_state() -> None:
 
 
 def test_errors_are_the_closed_form() -> None:
-    """The user's mean squared error and mean P are the plain scheme's, at 5 standard errors."""
+    """The legitimate estimator's mean squared error and mean P are the plain scheme's, at 5 standard errors."""
     slots, trials = 25, 20_000
     played = play(Cipher(DRIFTING), Batch(slots, trials), {"legitimate": coins(0.7, slots, trials)})
     expected = np.trace(theoretical_covariances(DRIFTING, Cipher(DRIFTING).outcomes(0.7), slots), axis1=1, axis2=2)

@@ -185,7 +185,7 @@ def test_item_6_successive_packets_tell_types_apart() -> None:
 
 
 def test_item_6_size_of_the_leak() -> None:
-    """An eavesdropper that knows the schedule and uses the leak does better than smart, and not better than the user."""
+    """An eavesdropper that knows the schedule and uses the leak does better than smart, and not better than the estimator."""
     process = Process(A, Q, Q)
     for mu_d, values in ((0.9, (2.672e-4, 4.462e-4, 5.077e-4)), (0.7, (4.756e-4, 1.545e-3, 1.760e-3))):
         information, genie = np.linalg.inv(process.initial_covariance), (1 - MU) * process.initial_covariance
@@ -195,9 +195,9 @@ def test_item_6_size_of_the_leak() -> None:
             leak = Q - A @ np.linalg.solve(inner, A.T)  # Q Σ_k⁻¹ Q, without forming Σ_k, which is soon singular
             information = np.linalg.solve(Q, leak) @ np.linalg.inv(Q)
             genie = kept * (A @ genie @ A.T + Q) - MU * (1 - mu_d) * leak
-        user = theoretical_traces(process, Outcomes.legitimate(MU, mu_d), 61)[-1]
+        legitimate = theoretical_traces(process, Outcomes.legitimate(MU, mu_d), 61)[-1]
         smart = theoretical_traces(process, Outcomes.eavesdropper(MU, mu_d, 1.0, 0.0), 61)[-1]
-        assert (user, np.trace(genie), smart) == pytest.approx(values, rel=5e-4)
+        assert (legitimate, np.trace(genie), smart) == pytest.approx(values, rel=5e-4)
 
 
 def test_item_7_kalman_innovations_can_be_singular_and_betray_the_type() -> None:

@@ -61,7 +61,7 @@ def test_the_rates_of_flipped_acknowledgements() -> None:
     """An acknowledgement arrives with μ(1 − p) + (1 − μ)p, of a packet that the eavesdropper heard as often as any."""
     rates = rates_of("flip", 0.8, 0.6, 0.9, FLIP)
     assert rates.arrives == pytest.approx(0.9 * (0.8 * 0.8 + 0.2 * 0.2))
-    assert rates.user == pytest.approx((0.9 * 0.8 * 0.8, 0.9 * 0.2 * 0.2))
+    assert rates.legitimate == pytest.approx((0.9 * 0.8 * 0.8, 0.9 * 0.2 * 0.2))
     assert rates.eavesdropper == pytest.approx((0.6 * rates.arrives, 0.4 * rates.arrives))
 
 
@@ -160,7 +160,7 @@ def test_the_upper_bound_of_the_random_policy(process: Process, open_loop: bool)
 
 
 def test_the_upper_bound_holds_in_simulation() -> None:
-    """The mean traces of user and eavesdropper after some slots, above by many standard errors, and of the same size."""
+    """The mean traces of both receivers after some slots, above by many standard errors, and of the same size."""
     alpha, code = 0.5, ReferenceCode(STABLE)
     means = mean_traces(STABLE, TransmissionPolicy(alpha=alpha), (0.8, 0.6), 400, 50)
     for found, quality, acknowledged in zip(means, (0.8, 0.6), ((0.72, 0.02), (0.74 * 0.6, 0.74 * 0.4)), strict=True):
@@ -209,7 +209,7 @@ PUBLISHED = [
     (0.6, {"plain_probability": 0.3}, 0.360, 1.709),
     (0.6, {"lost_belief": 0.1}, 0.304, 1.684),
 ]
-"""The eavesdropper's link, the policy, and the mean traces of user and eavesdropper: A = 0.9, Q = 1, μ = 0.8, p = 0.1."""
+"""The eavesdropper's link, the policy, and the mean traces of both receivers: A = 0.9, Q = 1, μ = 0.8, p = 0.1."""
 
 
 def flipped(mu_e: float, policy: dict[str, float], **more: Any) -> dict[str, Any]:
@@ -229,7 +229,7 @@ def flipped(mu_e: float, policy: dict[str, float], **more: Any) -> dict[str, Any
 def traces_of(
     mu_e: float, policy: dict[str, float], slots: int, trials: int, out: Path
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of tr P over the slots, user and eavesdropper, and its standard error, by the means over slots of each."""
+    """The mean of tr P over the slots, both receivers, and its standard error, by the means over slots of each."""
     found = montecarlo(checked(flipped(mu_e, policy, slots=slots, seed=3), "it"), trials=trials, out=out)
     table = found.slots.to_pydict()
     means = {name: [] for name in ("legitimate", "eve")}  # type: dict[str, list[float]]
@@ -241,24 +241,30 @@ def traces_of(
     return blocks.mean(axis=1), blocks.std(axis=1, ddof=1) / np.sqrt(blocks.shape[1])
 
 
-@pytest.mark.parametrize(("mu_e", "policy", "user", "eve"), mostly_long([PUBLISHED[1], PUBLISHED[4]], [PUBLISHED[1]]))
-def test_the_published_numbers(mu_e: float, policy: dict[str, float], user: float, eve: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("mu_e", "policy", "legitimate", "eve"), mostly_long([PUBLISHED[1], PUBLISHED[4]], [PUBLISHED[1]])
+)
+def test_the_published_numbers(
+    mu_e: float, policy: dict[str, float], legitimate: float, eve: float, tmp_path: Path
+) -> None:
     """40,000 slots, within 4.5 standard errors, and 1 % for the standard error of the published numbers."""
     found, error = traces_of(mu_e, policy, 550, 80, tmp_path)
     assert (error < 0.03 * found).all()
-    assert (np.abs(found - [user, eve]) < 4.5 * error + 0.01 * found).all()
+    assert (np.abs(found - [legitimate, eve]) < 4.5 * error + 0.01 * found).all()
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("mu_e", "policy", "user", "eve"), PUBLISHED)
-def test_all_published_numbers(mu_e: float, policy: dict[str, float], user: float, eve: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("mu_e", "policy", "legitimate", "eve"), PUBLISHED)
+def test_all_published_numbers(
+    mu_e: float, policy: dict[str, float], legitimate: float, eve: float, tmp_path: Path
+) -> None:
     """200,000 slots: within 2 %, or 4.5 standard errors of the difference of two such runs, whichever is more.
 
     A published number is the mean of one run of 200,000 slots, whose standard error is up to 2 % itself.
     """
     found, error = traces_of(mu_e, policy, 2050, 100, tmp_path)
     assert (error < 0.02 * found).all()
-    assert (np.abs(found - [user, eve]) < np.maximum(0.02 * found, 4.5 * np.sqrt(2.0) * error)).all()
+    assert (np.abs(found - [legitimate, eve]) < np.maximum(0.02 * found, 4.5 * np.sqrt(2.0) * error)).all()
 
 
 def test_live_and_memory_are_the_same_bits(tmp_path: Path) -> None:

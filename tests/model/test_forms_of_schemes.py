@@ -18,7 +18,7 @@ from evedrop.model.theory.covariances import LARGEST_OPERATOR
 STABLE = Process(np.array([[0.9, 0.3], [0.0, 0.8]]), np.eye(2), np.eye(2))
 UNSTABLE = Process(np.array([[1.2, 0.1], [0.0, 0.5]]), np.eye(2), np.eye(2))
 HEARS = ReceiverConditions(6, False, 0.7, None, (0.56, 0.16))
-HIJACK = Hijack(0.8, 0.5, HeedRule(1, 0.5), lambda user, served: float(served))  # noqa: ARG005 - the served eavesdropper's own
+HIJACK = Hijack(0.8, 0.5, HeedRule(1, 0.5), lambda legitimate, served: float(served))  # noqa: ARG005 - the served eavesdropper's own
 CHAINS = [("scheduled", "naive"), ("encrypted-schedule", "selective"), ("quantised-schedule", "selective")]
 
 
@@ -76,10 +76,10 @@ def test_only_schedules_and_users_that_read_all_know_a_hijacked_sensor() -> None
 
 def test_references_of_a_user_matter_only_if_they_are_forged() -> None:
     """Else it never misses one. A bound takes the place of a form where packets are independent of the state."""
-    user = replace(HEARS, legitimate=True, received=0.8, acknowledged=(0.72, 0.2))
+    legitimate = replace(HEARS, legitimate=True, received=0.8, acknowledged=(0.72, 0.2))
     for scheme, bound in (("acknowledged", True), ("open-loop", False)):
-        assert form_of(scheme, "legitimate", user) is None
-        found = form_of(scheme, "legitimate", replace(user, forged=True))
+        assert form_of(scheme, "legitimate", legitimate) is None
+        found = form_of(scheme, "legitimate", replace(legitimate, forged=True))
         assert found is not None
         assert found.bound is bound
         lost = form_of(scheme, "reference", HEARS, UNSTABLE)

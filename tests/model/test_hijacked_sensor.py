@@ -26,15 +26,15 @@ MU, MU_E = 0.9, 0.9
 
 
 def hears(whose: str) -> Hears:
-    """The user hears what the user hears, and the eavesdropper what that hears."""
-    return lambda user, served: float(user if whose == "user" else served)
+    """The legitimate estimator hears what it hears, and the eavesdropper what that hears."""
+    return lambda legitimate, served: float(legitimate if whose == "legitimate" else served)
 
 
 def limits(alpha: float, attack: str, threshold: int = 4) -> dict[str, float]:
-    """The traces of user's and eavesdropper's limit under `scheduled`."""
+    """The traces of legitimate estimator's and eavesdropper's limit under `scheduled`."""
     rates, heed_rule = rates_of(attack, MU, MU_E, alpha), heed_rule_of(attack, alpha, MU_E)
     found = {}
-    for whose, split in (("user", rates.user), ("eve", rates.eavesdropper)):
+    for whose, split in (("legitimate", rates.legitimate), ("eve", rates.eavesdropper)):
         chain = scheduled(threshold, 0.9, split)
         if heed_rule is not None:
             chain = hijacked_schedule(threshold, MU, MU_E, heed_rule, hears(whose))
@@ -76,7 +76,7 @@ def test_the_rates_are_those_of_the_honest_sensor(mu: float, mu_e: float, alpha:
     """With γ and without; and no more packets are critical."""
     honest, hijacked = (rates_of(attack, mu, mu_e, alpha) for attack in ("none", "hijack"))
     assert hijacked.arrives == pytest.approx(honest.arrives, abs=1e-9)
-    assert hijacked.user == pytest.approx(honest.user, abs=1e-9)
+    assert hijacked.legitimate == pytest.approx(honest.legitimate, abs=1e-9)
     assert hijacked.eavesdropper[1] <= honest.eavesdropper[1] + 1e-9
 
 
@@ -132,16 +132,16 @@ def test_without_lost_acknowledgements_it_is_the_honest_sensor() -> None:
 def test_perfect_secrecy_needs_an_acknowledgement_channel_that_loses_nothing(
     threshold: int, alpha: float, honest: float, hijacked: float
 ) -> None:
-    """Of `scheduled`: the table of docs/schemes.md. The user's error stays what it was, and so does the rate of packets."""
+    """Of `scheduled`: the table of docs/schemes.md. The legitimate error stays what it was, and so does the rate of packets."""
     before, after = limits(alpha, "none", threshold), limits(alpha, "hijack", threshold)
-    assert after["user"] == pytest.approx(before["user"])
+    assert after["legitimate"] == pytest.approx(before["legitimate"])
     assert before["eve"] == pytest.approx(honest, rel=1e-3)
     assert after["eve"] == pytest.approx(hijacked, rel=1e-3)
     if alpha <= MU_E:
-        assert after["eve"] == pytest.approx(after["user"])
+        assert after["eve"] == pytest.approx(after["legitimate"])
     heed_rule = HeedRule.of(alpha, MU_E)
     if heed_rule is not None:
-        chain = hijacked_schedule(threshold, MU, MU_E, heed_rule, hears("user"))
+        chain = hijacked_schedule(threshold, MU, MU_E, heed_rule, hears("legitimate"))
         assert np.allclose((chain.reset + chain.carried).sum(axis=1), 1.0)
         in_last = chain.stationary[(threshold - 1) * (heed_rule.patience + 2) :].sum()
         assert in_last == pytest.approx(1.0 / (MU * alpha) / (threshold - 1 + 1.0 / (MU * alpha)))
@@ -176,7 +176,7 @@ def attacked(attack: str) -> dict[str, Any]:
 
 
 def test_it_sends_as_often_and_the_eavesdropper_gains() -> None:
-    """In 400 trials of 100 slots: equal rates and user's errors within five standard errors, an error below by more."""
+    """In 400 trials of 100 slots: equal rates and legitimate errors within five standard errors, an error below by more."""
     sent, errors = {}, {}
     for attack in ("none", "hijack"):
         scenario = checked(attacked(attack), attack)

@@ -1,4 +1,4 @@
-"""Schemes that go by the user's holding time: what they send, what it costs, what an eavesdropper gets."""
+"""Schemes that go by the legitimate estimator's holding time: what they send, what it costs, what an eavesdropper gets."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_packets_go_by_the_holding_time(threshold: int) -> None:
 
 @pytest.mark.parametrize("name", READERS)
 def test_what_is_received_in_a_way_one_can_read_is_the_state(name: str) -> None:
-    """The user reads every packet, the eavesdropper every unencrypted one; it leaves encrypted ones alone."""
+    """The legitimate estimator reads every packet, the eavesdropper every unencrypted one; it leaves encrypted ones alone."""
     rng = np.random.default_rng(2)
     events = tuple(rng.random((3, 30, 60)) < 0.7)
     played = played_over(name, UNSTABLE, 3, events)
@@ -92,7 +92,7 @@ def test_what_is_received_in_a_way_one_can_read_is_the_state(name: str) -> None:
 @pytest.mark.parametrize("process", [UNSTABLE, DRIFTING])
 @pytest.mark.parametrize("threshold", [1, 2, 3])
 def test_expectations_are_the_chains(name: str, process: Process, threshold: int) -> None:
-    """E P over every course of five slots, each with its probability, is the chain's, for user and eavesdropper, exactly."""
+    """E P over every course of five slots, each with its probability, is the chain's, for both receivers, exactly."""
     slots = 5
     gamma, gamma_e, link = all_events(slots)
     weights = np.where(gamma, MU, 1 - MU) * np.where(gamma_e, MU_E, 1 - MU_E) * np.where(link, ARRIVES, 1 - ARRIVES)
@@ -102,8 +102,8 @@ def test_expectations_are_the_chains(name: str, process: Process, threshold: int
     form = {"scheduled": closed_forms.scheduled, "encrypted-schedule": closed_forms.encrypted_schedule}[name]
     expected = {"eve": form(threshold, *eve).covariances(process, slots)}
     if name == "scheduled":
-        user = closed_forms.scheduled(threshold, MU, (MU * ARRIVES, 0.0))
-        expected["legitimate"] = user.covariances(process, slots)
+        legitimate = closed_forms.scheduled(threshold, MU, (MU * ARRIVES, 0.0))
+        expected["legitimate"] = legitimate.covariances(process, slots)
     for receiver, covariances in expected.items():
         for k, belief in enumerate(played.beliefs[receiver]):
             assert np.allclose(belief.P @ chances, covariances[k], rtol=1e-9, atol=1e-13)
@@ -118,17 +118,17 @@ def test_limits_are_where_the_expectations_go(threshold: int) -> None:
         assert np.allclose(chain.stationary @ (chain.reset + chain.carried), chain.stationary)
         found = chain.limit(STABLE)
         assert np.allclose(found, chain.covariances(STABLE, 2000)[-1], rtol=1e-9)
-    user = closed_forms.scheduled(threshold, 0.9, (0.9, 0.0))
-    assert np.isfinite(user.limit(UNSTABLE)).all()
+    legitimate = closed_forms.scheduled(threshold, 0.9, (0.9, 0.0))
+    assert np.isfinite(legitimate.limit(UNSTABLE)).all()
     if threshold == 1:
-        assert np.allclose(user.limit(UNSTABLE), limit(UNSTABLE, EncryptedSchedule(UNSTABLE, 1).outcomes(0.9)))
-    assert user.stationary[-1] == pytest.approx((1 / 0.9) / (threshold - 1 + 1 / 0.9))
+        assert np.allclose(legitimate.limit(UNSTABLE), limit(UNSTABLE, EncryptedSchedule(UNSTABLE, 1).outcomes(0.9)))
+    assert legitimate.stationary[-1] == pytest.approx((1 / 0.9) / (threshold - 1 + 1 / 0.9))
     hidden = closed_forms.encrypted_schedule(threshold, 0.9, (0.81, 0.09))
     assert hidden.stationary[-1] == pytest.approx(0.1 ** (threshold - 1))
 
 
 def test_long_silences_keep_an_eavesdropper_out_of_an_unstable_process() -> None:
-    """With links as good as each other there is a threshold from which the user is bounded and the eavesdropper is not."""
+    """With links as good as each other there is a threshold from which the estimator is bounded and the eavesdropper is not."""
     bounded = []
     for threshold in range(1, 12):
         eve = closed_forms.scheduled(threshold, 0.9, (0.81, 0.09)).limit(UNSTABLE)

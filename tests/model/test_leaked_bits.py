@@ -148,7 +148,7 @@ def test_the_rates_of_a_link() -> None:
 
 @settings(deadline=None, max_examples=examples(30))
 @given(st.floats(1.05, 1.6), st.floats(0.3, 1.0), st.floats(0.1, 1.0), st.floats(0.0, 1.0))
-def test_a_bounded_user_error_reveals_information(rho: float, mu: float, mu_e: float, mu_d: float) -> None:
+def test_a_bounded_legitimate_error_reveals_information(rho: float, mu: float, mu_e: float, mu_d: float) -> None:
     """With a filter of covariance P̄ at the sensor: the bits of the states heard, each by the slots since the last, exceed it.
 
     The bound is positive although the eavesdropper's own error may be unbounded.

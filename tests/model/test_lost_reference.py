@@ -19,7 +19,7 @@ from tests.model.acknowledged_runs import MIXED
 from tests.model.mixed_runs import covariances
 from tests.model.slot_loop import STABLE
 
-USER = (0.72, 0.02)
+LEGITIMATE_RATES = (0.72, 0.02)
 """μ = 0.8, p = 0.1: a packet is acknowledged and received, and acknowledged and not received."""
 NOTHING = Process(np.zeros((1, 1)), np.eye(1), np.eye(1))
 
@@ -28,33 +28,37 @@ NOTHING = Process(np.zeros((1, 1)), np.eye(1), np.eye(1))
 @pytest.mark.parametrize("process", [MIXED, STABLE, UNSTABLE])
 def test_the_factor_of_a_phase_solves_its_equations(process: Process, coded: int) -> None:
     """x_s = ρ²(P(next) x_{s+1} + P(stay) x_s) over the coded packets and the phase, which ends with a missed, forged one."""
-    square, arrives = process.spectral_radius**2, sum(USER)
-    stay = [1.0 - arrives] * coded + [1.0 - 0.8 - USER[1]]
-    step = [arrives] * coded + [USER[1]]
+    square, arrives = process.spectral_radius**2, sum(LEGITIMATE_RATES)
+    stay = [1.0 - arrives] * coded + [1.0 - 0.8 - LEGITIMATE_RATES[1]]
+    step = [arrives] * coded + [LEGITIMATE_RATES[1]]
     equations = np.eye(coded + 1) - square * (np.diag(stay) + np.diag(step[:-1], 1))
     right = np.zeros(coded + 1)
     right[-1] = square * step[-1]
     expected = np.linalg.solve(equations, right)[0]
-    assert growth_by_phases(process, coded, 0.8, USER) == pytest.approx(expected)
+    assert growth_by_phases(process, coded, 0.8, LEGITIMATE_RATES) == pytest.approx(expected)
 
 
 def test_factors_at_the_edges() -> None:
     """Nothing is lost; nothing is remembered; no phase comes, or none ends in time; more than a double holds."""
     assert growth_by_coin(MIXED, 0.5, 0.8) == pytest.approx(1.44 * 0.6)
     assert growth_by_phases(MIXED, 3, 0.8, (0.8, 0.0)) == 0.0
-    assert growth_by_phases(NOTHING, 3, 0.8, USER) == 0.0
-    assert growth_by_phases(MIXED, math.inf, 0.8, USER) == math.inf
+    assert growth_by_phases(NOTHING, 3, 0.8, LEGITIMATE_RATES) == 0.0
+    assert growth_by_phases(MIXED, math.inf, 0.8, LEGITIMATE_RATES) == math.inf
     assert growth_by_phases(MIXED, 3, 0.2, (0.1, 0.01)) == math.inf
-    assert growth_by_phases(MIXED, 10**5, 0.8, USER) == math.inf
+    assert growth_by_phases(MIXED, 10**5, 0.8, LEGITIMATE_RATES) == math.inf
 
 
 def test_the_most_coded_packets() -> None:
     """The last number whose factor is below 1; none if even a single phase is too much; any number if nothing grows."""
     for process in (MIXED, UNSTABLE):
-        most = most_coded(process, 0.8, USER)
-        assert growth_by_phases(process, most, 0.8, USER) < 1.0 <= growth_by_phases(process, most + 1.0, 0.8, USER)
+        most = most_coded(process, 0.8, LEGITIMATE_RATES)
+        assert (
+            growth_by_phases(process, most, 0.8, LEGITIMATE_RATES)
+            < 1.0
+            <= growth_by_phases(process, most + 1.0, 0.8, LEGITIMATE_RATES)
+        )
     assert most_coded(MIXED, 0.2, (0.1, 0.01)) == -1.0
-    assert most_coded(DRIFTING, 0.8, USER) == most_coded(STABLE, 0.8, (0.8, 0.0)) == math.inf
+    assert most_coded(DRIFTING, 0.8, LEGITIMATE_RATES) == most_coded(STABLE, 0.8, (0.8, 0.0)) == math.inf
 
 
 def test_the_error_grows_with_the_code_of_the_project_too() -> None:
@@ -76,14 +80,14 @@ def test_the_error_grows_with_the_code_of_the_project_too() -> None:
 )
 def test_the_remedy_is_the_bound(spec: dict[str, Any], entry: str) -> None:
     """The parameter it names bounds the error on the one side, and not on the other."""
-    lost = scheme_of(MIXED, spec).lost_reference(0.8, USER)
+    lost = scheme_of(MIXED, spec).lost_reference(0.8, LEGITIMATE_RATES)
     assert lost is not None
     assert lost.growth >= 1.0
     assert lost.remedy.startswith(entry)
     bound = float(lost.remedy.split()[-1])
     growths = []
     for value in (bound - 1e-5, bound + 1e-5):
-        found = scheme_of(MIXED, {**spec, entry: value}).lost_reference(0.8, USER)
+        found = scheme_of(MIXED, {**spec, entry: value}).lost_reference(0.8, LEGITIMATE_RATES)
         assert found is not None
         growths.append(found.growth)
     below, above = growths
@@ -97,14 +101,16 @@ def test_which_schemes_have_references() -> None:
     """These four; a sensor that expects no flips never sends the state again, and one that expects only forged ones always."""
     with_references = {name for name in SCHEMES if SCHEMES[name].lost_reference is not Scheme.lost_reference}
     assert with_references == {"acknowledged", "open-loop", "random-code", "threshold-code"}
-    assert scheme_of(MIXED, {"scheme": "plain"}).lost_reference(0.8, USER) is None
+    assert scheme_of(MIXED, {"scheme": "plain"}).lost_reference(0.8, LEGITIMATE_RATES) is None
     threshold = {"scheme": "threshold-code", "lost_belief": 0.1, "assumed_quality": 0.8, "assumed_flip": 0.0}
-    lost = scheme_of(MIXED, threshold).lost_reference(0.8, USER)
+    lost = scheme_of(MIXED, threshold).lost_reference(0.8, LEGITIMATE_RATES)
     assert lost is not None
     assert (lost.growth, lost.remedy.split(":")[0]) == (math.inf, "assumed_flip is above 0")
-    always = scheme_of(MIXED, {**threshold, "assumed_quality": 0.0, "assumed_flip": 0.5}).lost_reference(0.8, USER)
+    always = scheme_of(MIXED, {**threshold, "assumed_quality": 0.0, "assumed_flip": 0.5}).lost_reference(
+        0.8, LEGITIMATE_RATES
+    )
     assert always is not None
-    assert always.growth == growth_by_phases(MIXED, 0, 0.8, USER)
+    assert always.growth == growth_by_phases(MIXED, 0, 0.8, LEGITIMATE_RATES)
 
 
 def attacked(process: Process, attack: dict[str, Any], **encoding: Any) -> dict[str, Any]:

@@ -91,7 +91,7 @@ def taken_by(scheme: Noise, strategy: str, mu_e: float, **parameters: float) -> 
 
 @DISTRIBUTIONS
 def test_errors_are_the_closed_forms(given: Any) -> None:
-    """User, smart, naive and suspicious: the mean squared error is that of theory in every slot, at 5 standard errors."""
+    """Legitimate, smart, naive and suspicious: the mean squared error is that of theory in every slot, at 5 standard errors."""
     slots, trials, scheme = 15, 20_000, Noise(STABLE, 0.4, given)
     batch, some = Batch(slots, trials), {"use_state": 0.7, "use_innovation": 0.3}
     made = {name: spy(name, given, batch, 0.4) for name in ("naive", "smart")}
@@ -185,12 +185,12 @@ def test_the_published_recursions_are_these() -> None:
     losses, mu = 0.3, 0.4
     scheme = Noise(network, 1.0 - mu, P.tolist())
     a = (1.0 - losses) * (1.0 - mu)
-    user, eve = open_loop, open_loop
+    legitimate, eve = open_loop, open_loop
     for _ in range(3000):
-        user = a * P + (1.0 - a) * (A @ user @ A.T + W)
+        legitimate = a * P + (1.0 - a) * (A @ legitimate @ A.T + W)
         used = (1.0 - mu) * P + mu * (open_loop + P)
         eve = (1.0 - losses) * used + losses * (A @ eve @ A.T + W)
-    np.testing.assert_allclose(limit(network, scheme.outcomes(1.0 - losses)) + P, user, rtol=1e-9)
+    np.testing.assert_allclose(limit(network, scheme.outcomes(1.0 - losses)) + P, legitimate, rtol=1e-9)
     taken = taken_by(scheme, "naive", 1.0 - losses)
     np.testing.assert_allclose(taken.limit + P, eve, rtol=1e-9)
     assert (np.trace(open_loop), np.trace(P)) == pytest.approx((0.0388, 0.0109), abs=5e-5)
@@ -303,7 +303,7 @@ def test_a_power_test_needs_no_test_where_all_packets_are_alike(mu_d: float) -> 
 
 
 def test_full_noise_hides_more_than_quiet_noise() -> None:
-    """Unmasking: the power test and the Bayesian eavesdropper err less if the noise is small; the user errs alike."""
+    """Unmasking: the power test and the Bayesian eavesdropper err less if the noise is small; the estimator errs alike."""
     slots, trials, errors = 60, 2000, {}
     batch = Batch(slots, trials)
     for given in (SMALL, PACKETS):
@@ -365,7 +365,7 @@ def test_the_user_follows_blocks_of_slots_as_single_ones() -> None:
     played = play(scheme, batch, {"legitimate": coins(0.8, 12, 5, 3)})
     assert np.array_equal([shared.nu(k) for k in range(12)], [packet.nu for packet in played.packets])
     assert not shared.chi(3).any()
-    user, z = shared.estimator(), np.array([packet.z for packet in played.packets])
-    found, _ = user.follow(range(12), user.prior(), np.array(played.received["legitimate"]), z)
+    legitimate, z = shared.estimator(), np.array([packet.z for packet in played.packets])
+    found, _ = legitimate.follow(range(12), legitimate.prior(), np.array(played.received["legitimate"]), z)
     assert np.array_equal(found.x_hat, [belief.x_hat for belief in played.beliefs["legitimate"]])
     assert np.array_equal(found.P, [belief.P for belief in played.beliefs["legitimate"]])

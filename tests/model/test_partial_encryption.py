@@ -1,4 +1,4 @@
-"""Partial encryption: its packets, its user, the exact reader of the unencrypted packets, and the theory of that reader."""
+"""Partial encryption: its packets, its estimator, the exact reader of the unencrypted packets, and the theory of that reader."""
 
 from __future__ import annotations
 
@@ -153,14 +153,14 @@ def test_its_error_has_the_covariance_that_it_reports() -> None:
 
 
 def test_one_encrypted_message_is_enough() -> None:
-    """Only slot 0 is encrypted, all links are perfect: the user has no error, and the eavesdropper's is A^k Σ0 A^kᵀ."""
+    """Only slot 0 is encrypted, all links are perfect: the estimator has no error, and the eavesdropper's is A^k Σ0 A^kᵀ."""
     batch = Batch(30, 5)
     one = scheme(UNSTABLE, [0, 1], 0.0)
     everything = np.ones((30, 5))
-    user, other = one.estimator(KEYS, batch), reader_of(UNSTABLE, batch)
+    legitimate, other = one.estimator(KEYS, batch), reader_of(UNSTABLE, batch)
     grown = UNSTABLE.initial_covariance
     for (x, packet, own), (_, _, theirs) in zip(
-        beliefs(user, one, everything, batch), beliefs(other, one, everything, batch), strict=True
+        beliefs(legitimate, one, everything, batch), beliefs(other, one, everything, batch), strict=True
     ):
         np.testing.assert_allclose(own.x_hat, x, rtol=1e-9)
         assert not own.P.any()

@@ -44,7 +44,7 @@ def links_of(mu: float, mu_e: float) -> ScheduledLinks:
     process=st.sampled_from([STABLE, DRIFTING, UNSTABLE]),
 )
 def test_the_best_policy_is_a_threshold(mu: float, mu_e: float, weight: float, price: float, process: Process) -> None:
-    """It sends from some holding time of the user on, the later the longer the eavesdropper's."""
+    """It sends from some holding time of the legitimate estimator on, the later the longer the eavesdropper's."""
     policy = best_policy(process, mu, mu_e, weight, 9, price)
     assert (np.diff(policy.send.astype(int), axis=0) >= 0).all()
     assert policy.thresholds == tuple(1 + int((~policy.send[:, j]).sum()) for j in range(9))
@@ -108,7 +108,7 @@ def test_a_rule_that_ignores_the_eavesdropper_is_scheduled(process: Process, thr
         send = np.broadcast_to(np.arange(1, 6)[:, None] >= threshold, (5, 5))
         found = policy_metrics(process, send, mu, mu_e)
         expected = scheduled_metrics(process, links_of(mu, mu_e), threshold)
-        assert found.user == pytest.approx(expected.user, rel=1e-9, abs=1e-13)
+        assert found.legitimate == pytest.approx(expected.legitimate, rel=1e-9, abs=1e-13)
         assert found.eavesdropper == pytest.approx(expected.eavesdropper, rel=1e-9, abs=1e-13)
         assert found.transmissions == pytest.approx(expected.transmissions, rel=1e-9)
         assert found.transmissions == pytest.approx((1 / mu) / (threshold - 1 + 1 / mu))
@@ -138,7 +138,7 @@ def test_the_metrics_of_a_policy_are_those_of_following_it(weight: float) -> Non
         if k >= 100:
             sums += np.stack([traces[i - 1], traces[j - 1], sent])
     means = sums / (slots - 100)
-    for mean, expected in zip(means, (metrics.user, metrics.eavesdropper, metrics.transmissions), strict=True):
+    for mean, expected in zip(means, (metrics.legitimate, metrics.eavesdropper, metrics.transmissions), strict=True):
         assert abs(mean.mean() - expected) <= SIGMAS * mean.std(ddof=1) / math.sqrt(trials)
 
 
@@ -159,7 +159,7 @@ def test_a_point_of_the_front_is_what_the_scheme_does() -> None:
         for name in ("legitimate", "eve")
     }
     for series, expected in (
-        (errors["legitimate"], metrics.user),
+        (errors["legitimate"], metrics.legitimate),
         (errors["eve"], metrics.eavesdropper),
         (sent, metrics.transmissions),
     ):
@@ -168,15 +168,15 @@ def test_a_point_of_the_front_is_what_the_scheme_does() -> None:
 
 
 def test_the_front_is_a_front() -> None:
-    """Along the weights the user's error falls; no point dominates another; weights with the same policy are one point."""
+    """Along the weights the legitimate error falls; no point dominates another; weights with the same policy are one point."""
     weights = [i / 20 for i in range(21)]
     found = front(MICROGRID, links_of(MU, MU_E), weights, (0.0, 1e-6), 6)
     for price in (0.0, 1e-6):
         ours = [point for point in found.points if point.price == price]
         assert [point.weights for point in ours] == sorted(point.weights for point in ours)
-        users = [point.metrics.user for point in ours]
+        legitimate = [point.metrics.legitimate for point in ours]
         eavesdroppers = [point.metrics.eavesdropper for point in ours]
-        assert users == sorted(users, reverse=True)
+        assert legitimate == sorted(legitimate, reverse=True)
         assert eavesdroppers == sorted(eavesdroppers, reverse=True)
         asked = {weight for weight, one in found.never if one == price}
         asked |= {w for point in ours for w in weights if point.weights[0] <= w <= point.weights[1]}
@@ -188,7 +188,7 @@ def test_the_front_is_a_front() -> None:
 
 
 def test_a_dominated_policy_is_left_out() -> None:
-    """Against an eavesdropper whose error is unbounded, the policy with the least error of the user dominates others."""
+    """Against an eavesdropper whose error is unbounded, the policy with the least error of the estimator dominates others."""
     found = front(UNSTABLE, links_of(0.9, 0.5), [i / 20 for i in range(21)], (0.0, 1e-3), 4)
     assert found.dominated == 1
     assert all(math.isinf(point.metrics.eavesdropper) for point in found.points if point.weights[1] < 0.8)
@@ -210,7 +210,7 @@ def test_knowing_the_eavesdropper_helps() -> None:
 
 @pytest.mark.parametrize("process", [STABLE, DRIFTING, UNSTABLE], ids=["stable", "drifting", "unstable"])
 def test_where_silence_is_as_good_as_a_packet_it_is_silent(process: Process) -> None:
-    """An eavesdropper that hears nothing, and a user whose error does not count: both choices cost the same, but for rounding."""
+    """An eavesdropper that hears nothing, and an error that does not count: both choices cost the same, but for rounding."""
     assert not best_policy(process, 0.3, 0.0, 0.0, 9).send.any()
 
 
@@ -229,7 +229,7 @@ def test_there_may_be_no_weight_at_which_it_sends() -> None:
 
 
 def test_costs_of_unbounded_errors() -> None:
-    """An unbounded error of the user costs infinitely much, one of the eavesdropper alone is worth infinitely much."""
+    """An unbounded error of the estimator costs infinitely much, one of the eavesdropper alone is worth infinitely much."""
     plain, good = PolicyMetrics(1.0, 3.0, 0.5), PolicyMetrics(1.0, math.inf, 0.5)
     bad = PolicyMetrics(math.inf, math.inf, 0.1)
     assert plain.cost(0.25, 2.0) == pytest.approx(0.25 - 2.25 + 1.0)
@@ -238,4 +238,4 @@ def test_costs_of_unbounded_errors() -> None:
     assert good.dominates(plain)
     assert not plain.dominates(good)
     assert not plain.dominates(plain)
-    assert bad.as_dict() == {"user": None, "eavesdropper": None, "transmissions": 0.1}
+    assert bad.as_dict() == {"legitimate": None, "eavesdropper": None, "transmissions": 0.1}

@@ -91,7 +91,7 @@ def test_masked_levels_say_nothing() -> None:
 
 @pytest.mark.parametrize("threshold", [1.0, 1.4, 3.0, 2.75])
 def test_packets_go_by_the_holding_time_and_a_coin(threshold: float) -> None:
-    """Encrypted from ⌈θ⌉ on, never before ⌊θ⌋, and at ⌊θ⌋ with probability 1 − (θ − ⌊θ⌋); the user reads both kinds alike."""
+    """Encrypted from ⌈θ⌉ on, never before ⌊θ⌋, and at ⌊θ⌋ with probability 1 − (θ − ⌊θ⌋); both kinds are read alike."""
     scheme = QuantisedSchedule(UNSTABLE, threshold, 10, 6.0)
     gamma, slots, trials = coins(0.6, 40, 500), 40, 500
     selective = STRATEGIES["selective"](Knowledge(UNSTABLE, 1.0, {}, {}), Batch(slots, trials))
@@ -105,11 +105,11 @@ def test_packets_go_by_the_holding_time_and_a_coin(threshold: float) -> None:
         if threshold % 1.0:
             early += encrypted[held == np.floor(threshold)].tolist()
         steps = np.sqrt(12.0 * np.diag(scheme.quantisation.covariances(UNSTABLE, slots)[k]))[:, None]
-        user, eve = played.beliefs["legitimate"][k], played.beliefs["eve"][k]
-        assert (np.abs(user.x_hat - played.x[k]) <= 0.500001 * steps)[:, gamma[k]].all()
-        assert np.allclose(user.P[:, :, gamma[k]], np.diag(steps[:, 0] ** 2 / 12.0)[:, :, None], rtol=1e-9)
+        legitimate, eve = played.beliefs["legitimate"][k], played.beliefs["eve"][k]
+        assert (np.abs(legitimate.x_hat - played.x[k]) <= 0.500001 * steps)[:, gamma[k]].all()
+        assert np.allclose(legitimate.P[:, :, gamma[k]], np.diag(steps[:, 0] ** 2 / 12.0)[:, :, None], rtol=1e-9)
         clear = gamma[k] & ~encrypted
-        assert np.array_equal(eve.x_hat[:, clear], user.x_hat[:, clear])
+        assert np.array_equal(eve.x_hat[:, clear], legitimate.x_hat[:, clear])
         assert (eve.action[gamma[k] & encrypted] == Action.DISCARDED).all()
         held = np.where(gamma[k], 1, held + 1)
     if early:
@@ -120,16 +120,16 @@ def test_packets_go_by_the_holding_time_and_a_coin(threshold: float) -> None:
 @pytest.mark.parametrize("process", [pytest.param(STABLE, marks=pytest.mark.long), UNSTABLE])
 @pytest.mark.parametrize("threshold", [1.0, 1.3, 2.0, 2.6])
 def test_expectations_are_those_of_all_courses(process: Process, threshold: float) -> None:
-    """E P over every course of links, acknowledgements and coins in four slots, for user and eavesdropper."""
+    """E P over every course of links, acknowledgements and coins in four slots, for legitimate estimator and eavesdropper."""
     slots, error = 4, QuantisationError.of(3, 4.0)
     courses = np.array(list(itertools.product(range(16), repeat=slots))).T
     gamma, gamma_e, link, coin = (courses // 2**bit % 2 == 1 for bit in range(4))
     odds = zip((gamma, gamma_e, link, coin), (MU, MU_E, ARRIVES, 1.0 - threshold % 1.0), strict=True)
     chances = np.prod([np.where(events, p, 1.0 - p) for events, p in odds], axis=0).prod(axis=0)
     R = error.covariances(process, slots)
-    held, P = np.full(chances.shape, 10**6), {name: np.zeros((chances.size, 2, 2)) for name in ("user", "eve")}
+    held, P = np.full(chances.shape, 10**6), {name: np.zeros((chances.size, 2, 2)) for name in ("legitimate", "eve")}
     found = {
-        "user": always_sent(MU).covariances(process, slots, error),
+        "legitimate": always_sent(MU).covariances(process, slots, error),
         "eve": encrypted_schedule(threshold, MU_E, (MU * MU_E * ARRIVES, MU * (1 - MU_E) * ARRIVES)).covariances(
             process, slots, error
         ),
@@ -138,7 +138,7 @@ def test_expectations_are_those_of_all_courses(process: Process, threshold: floa
     for k in range(slots):
         encrypted = (held >= np.ceil(threshold)) | ((held >= np.floor(threshold)) & coin[k])
         encrypted_fractions.append(float(chances @ encrypted))
-        for name, heard in (("user", gamma[k]), ("eve", gamma_e[k] & ~encrypted)):
+        for name, heard in (("legitimate", gamma[k]), ("eve", gamma_e[k] & ~encrypted)):
             grown = process.A @ P[name] @ process.A.T + process.Q if k else process.initial_covariance
             P[name] = np.where(heard[:, None, None], R[k], grown)
             assert np.allclose(np.tensordot(chances, P[name], axes=1), found[name][k], rtol=1e-9)
@@ -159,11 +159,11 @@ def test_limits_and_the_distribution_of_the_chain(threshold: float) -> None:
     whole, part = int(threshold), threshold % 1.0
     of_chain = chain.stationary[-1] + (chain.stationary[whole - 1] * (1.0 - part) if part else 0.0)
     assert encrypted_fraction(threshold, 0.7) == pytest.approx(of_chain)
-    user = always_sent(0.9)
-    assert np.allclose(user.limit(STABLE, error), user.covariances(STABLE, 2000, error)[-1], rtol=1e-9)
-    assert np.isfinite(user.limit(UNSTABLE)).all()
-    assert np.isinf(user.limit(UNSTABLE, error)).all()
-    assert isinstance(user, SensorChain)
+    legitimate = always_sent(0.9)
+    assert np.allclose(legitimate.limit(STABLE, error), legitimate.covariances(STABLE, 2000, error)[-1], rtol=1e-9)
+    assert np.isfinite(legitimate.limit(UNSTABLE)).all()
+    assert np.isinf(legitimate.limit(UNSTABLE, error)).all()
+    assert isinstance(legitimate, SensorChain)
 
 
 @given(st.floats(1e-6, 1.0), st.floats(0.01, 1.0))

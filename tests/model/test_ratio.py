@@ -35,10 +35,10 @@ def limit(process: Process, hears: float, kept: float, steps: int = 40_000) -> f
 
 
 def ratio(process: Process, mu: float, mu_e: float, mu_d: float) -> float:
-    """J_e / J of a smart eavesdropper: a state resets, and the user alone also gets the innovation of a slot that is heard."""
-    user = limit(process, mu * mu_d, mu * (1.0 - mu_d))
+    """J_e / J of a smart eavesdropper: a state resets, and the estimator alone also gets the innovation of a heard slot."""
+    legitimate = limit(process, mu * mu_d, mu * (1.0 - mu_d))
     smart = limit(process, mu_e * mu_d, 0.0)
-    return smart / user
+    return smart / legitimate
 
 
 @pytest.mark.parametrize("mu_e", mostly_long([0.95, 0.9, 0.85], [0.9]))

@@ -30,8 +30,8 @@ EAVESDROPPERS = {
 }
 
 
-def user_at(mu_d: float) -> Outcomes:
-    """The user's outcomes."""
+def legitimate_at(mu_d: float) -> Outcomes:
+    """The legitimate estimator's outcomes."""
     return Outcomes.legitimate(MU, mu_d)
 
 
@@ -40,7 +40,7 @@ def problem_of(
 ) -> ScheduleProblem:
     """The problem that `best_schedule` solves."""
     theirs = SlotRecursion(process, EAVESDROPPERS[eavesdropper].outcomes, slots)
-    return ScheduleProblem(SlotRecursion(process, user_at, slots), theirs, slots, max_trace, weight)
+    return ScheduleProblem(SlotRecursion(process, legitimate_at, slots), theirs, slots, max_trace, weight)
 
 
 def mesh_of(slots: int, levels: int) -> np.ndarray:
@@ -52,19 +52,19 @@ def mesh_of(slots: int, levels: int) -> np.ndarray:
 @pytest.mark.parametrize("eavesdropper", EAVESDROPPERS)
 @pytest.mark.parametrize("process", [UNSTABLE, DRIFTING, STABLE])
 def test_a_constant_schedule_has_the_expectations_of_the_scheme(process: Process, eavesdropper: str) -> None:
-    """With the same μ_d in all slots the traces are those of theory, for user and eavesdropper."""
+    """With the same μ_d in all slots the traces are those of theory, for legitimate estimator and eavesdropper."""
     at = EAVESDROPPERS[eavesdropper].outcomes
     mu_d = np.array([[0.3] * 12, [0.9] * 12])
-    for outcomes_at in (user_at, at):
+    for outcomes_at in (legitimate_at, at):
         found = SlotRecursion(process, outcomes_at, 12).traces(mu_d)
         for row, value in zip(found, (0.3, 0.9), strict=True):
             assert np.allclose(row, theoretical_traces(process, outcomes_at(value), 12), rtol=1e-9)
 
 
-@pytest.mark.parametrize("eavesdropper", ["user", "smart", "naive"])
+@pytest.mark.parametrize("eavesdropper", ["legitimate", "smart", "naive"])
 def test_expectations_are_those_of_all_courses(eavesdropper: str) -> None:
     """E P_k under a schedule that changes is the mean over all losses and packet types, each with its probability."""
-    mu_d, mu = (1.0, 0.2, 0.7, 0.4), MU if eavesdropper == "user" else MU_E
+    mu_d, mu = (1.0, 0.2, 0.7, 0.4), MU if eavesdropper == "legitimate" else MU_E
     A, Q, slots = UNSTABLE.A, UNSTABLE.Q, len(mu_d)
     misled = misled_covariances(UNSTABLE, slots)
     expected = np.zeros(slots)
@@ -78,11 +78,11 @@ def test_expectations_are_those_of_all_courses(eavesdropper: str) -> None:
             elif state:
                 P = np.zeros_like(P)
             else:
-                P = {"user": predicted - Q, "smart": predicted, "naive": misled[k]}[eavesdropper]
+                P = {"legitimate": predicted - Q, "smart": predicted, "naive": misled[k]}[eavesdropper]
             expected[k] += (
                 chance / 4.0 ** (slots - 1 - k) * np.trace(P)
             )  # as often as there are courses of the later slots
-    outcomes_at = user_at if eavesdropper == "user" else EAVESDROPPERS[eavesdropper].outcomes
+    outcomes_at = legitimate_at if eavesdropper == "legitimate" else EAVESDROPPERS[eavesdropper].outcomes
     found = SlotRecursion(UNSTABLE, outcomes_at, slots).traces(np.array([mu_d]))[0]
     assert np.allclose(found, expected, rtol=1e-12)
 
@@ -107,7 +107,7 @@ def test_the_program_finds_the_best_of_the_grid(
     )
     assert found.exact
     assert found.grid.value == pytest.approx(sums.max(), rel=1e-9)
-    assert max(found.grid.user) <= max_trace * (1 + 1e-9)
+    assert max(found.grid.legitimate) <= max_trace * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("eavesdropper", EAVESDROPPERS)
@@ -124,7 +124,7 @@ def test_the_best_schedule_is_as_good_as_brute_force(process: Process, max_trace
     problem = problem_of(process, eavesdropper, 4, max_trace)
     found = best_schedule(process, MU, EAVESDROPPERS[eavesdropper].outcomes, 4, max_trace).best
     assert found.value >= problem.sums(mesh_of(4, 41)).max() * (1 - 1e-6)
-    assert max(found.user) <= max_trace * (1 + 1e-9)
+    assert max(found.legitimate) <= max_trace * (1 + 1e-9)
     assert found.mu_d[0] == 1.0
     assert found.value == pytest.approx(sum(found.eavesdropper))
 
@@ -139,7 +139,7 @@ def evolved(problem: ScheduleProblem) -> float:
 
     def loss(columns: np.ndarray) -> np.ndarray:
         mu_d = np.column_stack([np.ones(columns.shape[1]), columns.T])
-        excess = np.maximum(problem.user.traces(mu_d) / problem.max_trace - 1.0, 0.0).sum(axis=1)
+        excess = np.maximum(problem.legitimate.traces(mu_d) / problem.max_trace - 1.0, 0.0).sum(axis=1)
         losses: np.ndarray = -free.sums(mu_d) * (1.0 - (excess > 1e-9)) + 1e3 * excess
         return losses
 
@@ -175,11 +175,11 @@ def test_an_independent_solver_finds_nothing_better(
 ) -> None:
     """Against misled eavesdroppers, whose sum has many local maxima, over seven slots."""
     one = replace(EAVESDROPPERS[eavesdropper], mu_e=mu_e)
-    user = SlotRecursion(process, lambda mu_d: Outcomes.legitimate(mu, mu_d), 7)
-    problem = ScheduleProblem(user, SlotRecursion(process, one.outcomes, 7), 7, max_trace, 0.0)
+    legitimate = SlotRecursion(process, lambda mu_d: Outcomes.legitimate(mu, mu_d), 7)
+    problem = ScheduleProblem(legitimate, SlotRecursion(process, one.outcomes, 7), 7, max_trace, 0.0)
     found = best_schedule(process, mu, one.outcomes, 7, max_trace).best
     assert found.value >= evolved(problem) * (1 - 1e-5)
-    assert max(found.user) <= max_trace * (1 + 1e-9)
+    assert max(found.legitimate) <= max_trace * (1 + 1e-9)
 
 
 def test_a_single_packet_with_the_state_may_be_best() -> None:
@@ -193,8 +193,8 @@ def test_a_single_packet_with_the_state_may_be_best() -> None:
 def test_changes_of_two_neighbours_find_what_changes_of_one_do_not() -> None:
     """A case in which no single μ_d can be changed for the better at a sum that is a hundredth below brute force."""
     naive = Adversary("naive", 0.9, 1.0, 1.0)
-    user = SlotRecursion(SETTLED, lambda mu_d: Outcomes.legitimate(0.8, mu_d), 5)
-    problem = ScheduleProblem(user, SlotRecursion(SETTLED, naive.outcomes, 5), 5, 0.0015, 0.0)
+    legitimate = SlotRecursion(SETTLED, lambda mu_d: Outcomes.legitimate(0.8, mu_d), 5)
+    problem = ScheduleProblem(legitimate, SlotRecursion(SETTLED, naive.outcomes, 5), 5, 0.0015, 0.0)
     found = best_schedule(SETTLED, 0.8, naive.outcomes, 5, 0.0015).best
     assert found.value >= problem.sums(mesh_of(5, 21)).max()
 
@@ -213,7 +213,7 @@ def test_no_change_of_one_slot_improves_it(eavesdropper: str) -> None:
 
 @pytest.mark.long
 def test_it_is_better_to_recover_than_to_be_kept_at_the_bound() -> None:
-    """Against smart, in a long run: no states until the user's error reaches Ω, then a state, and again none."""
+    """Against smart, in a long run: no states until the legitimate error reaches Ω, then a state, and again none."""
     found = best_schedule(SETTLED, MU, EAVESDROPPERS["smart"].outcomes, 16, 0.005, levels=5, capacity=50)
     assert found.best.mu_d[1:5] == (0.0,) * 4
     kept = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.1720277, *[0.547] * 10]])
@@ -222,7 +222,7 @@ def test_it_is_better_to_recover_than_to_be_kept_at_the_bound() -> None:
     assert found.best.mu_d[6:9] == (1.0, 0.0, 0.0)
     assert found.best.value > 1.7 * found.constant.value
     assert len(set(found.constant.mu_d[1:])) == 1
-    assert max(found.constant.user) <= 0.005 * (1 + 1e-9)
+    assert max(found.constant.legitimate) <= 0.005 * (1 + 1e-9)
     assert not found.exact
 
 
@@ -233,7 +233,7 @@ def test_where_no_states_exceed_the_bound_all_slots_have_as_few_as_keep_it() -> 
     assert not math.isfinite(problem.sum_of(nothing))
     mu_d = schedules._repaired(problem, nothing)
     assert len({*mu_d[1:]}) == 1
-    assert problem.user.traces(mu_d[None]).max() == pytest.approx(0.005, rel=1e-9)
+    assert problem.legitimate.traces(mu_d[None]).max() == pytest.approx(0.005, rel=1e-9)
 
 
 def test_a_design_as_json() -> None:
@@ -264,7 +264,7 @@ def test_the_weight_of_the_user_raises_the_probabilities() -> None:
     assert best_schedule(STABLE, MU, at, 6, weight=1.0).best.mu_d == (1.0,) * 6
     assert best_schedule(STABLE, MU, at, 6).best.mu_d == (1.0,) + (0.0,) * 5
     found = best_schedule(STABLE, MU, at, 6, weight=0.6).best
-    assert found.value == pytest.approx(0.4 * sum(found.eavesdropper) - 0.6 * sum(found.user))
+    assert found.value == pytest.approx(0.4 * sum(found.eavesdropper) - 0.6 * sum(found.legitimate))
 
 
 def test_a_trace_that_no_schedule_keeps_is_refused() -> None:
@@ -272,4 +272,4 @@ def test_a_trace_that_no_schedule_keeps_is_refused() -> None:
     at = EAVESDROPPERS["smart"].outcomes
     with pytest.raises(UsageError, match=r"at or below 0\.1 .* it is 0\.2 in slot 0; ask for"):
         best_schedule(UNSTABLE, MU, at, 6, 0.1)
-    assert best_schedule(UNSTABLE, MU, at, 6, 0.2).best.user[0] == pytest.approx(0.2)
+    assert best_schedule(UNSTABLE, MU, at, 6, 0.2).best.legitimate[0] == pytest.approx(0.2)

@@ -183,19 +183,19 @@ def test_before_the_leak_it_is_half_way_between_the_tracks(process: Process) -> 
 
 @pytest.mark.long
 def test_one_betrayed_state_breaks_twin_tracks() -> None:
-    """With a drifting process its mean error is below 1.5 times the user's after the leak, at five standard errors.
+    """With a drifting process its mean error is below 1.5 times the estimator's after the leak, at five standard errors.
 
-    Behind a link as good as the user's; before the leak it is a thousand times as large.
+    Behind a link as good as the legitimate estimator's; before the leak it is a thousand times as large.
     """
     batch, learns_at = Batch(60, 2000), 20
     gamma = coins(0.9, 60, 2000)
     found = errors(reported(DRIFTING, batch, gamma, learns_at))
     estimator = TwinTrack(DRIFTING).estimator(KEYS, batch)
-    user, belief = [], estimator.prior()
+    followed, belief = [], estimator.prior()
     for slot in slots(DRIFTING, batch, gamma):
         belief = estimator.step(slot.k, belief, Reception(slot.gamma, slot.z))
-        user.append((slot, belief))
-    legitimate = errors(user)
+        followed.append((slot, belief))
+    legitimate = errors(followed)
     assert np.all(found[learns_at] == 0.0)
     excess = (found - 1.5 * legitimate)[learns_at + 1 :].mean(axis=0)
     assert excess.mean() + 5.0 * excess.std() / np.sqrt(2000) < 0.0
@@ -203,7 +203,7 @@ def test_one_betrayed_state_breaks_twin_tracks() -> None:
 
 
 def test_a_leak_beside_the_twins_packet_opens_everything() -> None:
-    """Then the distance is known, and its estimate is the user's, to rounding, also where the process is unstable.
+    """Then the distance is known, and its estimate is the estimator's, to rounding, also where the process is unstable.
 
     Not of the trials whose tracks are close by chance: fewer than 1 % in any slot. Of those that heard no twin in that
     slot, and find it by later packets, 99 % end with an error below 1e-9 of the bound.
@@ -213,12 +213,12 @@ def test_a_leak_beside_the_twins_packet_opens_everything() -> None:
     gamma[learns_at] = True
     pairs = reported(UNSTABLE, batch, gamma, learns_at)
     tracks, estimator = TwinTracks(UNSTABLE, KEYS, batch), TwinTrack(UNSTABLE).estimator(KEYS, batch)
-    on_twin, user = tracks.on_twin(learns_at), estimator.prior()
+    on_twin, legitimate = tracks.on_twin(learns_at), estimator.prior()
     for slot, belief in pairs:
-        user = estimator.step(slot.k, user, Reception(slot.gamma, slot.z))
+        legitimate = estimator.step(slot.k, legitimate, Reception(slot.gamma, slot.z))
         if slot.k > learns_at:
             scale = float(np.abs(slot.x).max())
-            away = np.abs(belief.x_hat - user.x_hat).max(axis=0)
+            away = np.abs(belief.x_hat - legitimate.x_hat).max(axis=0)
             assert (away[on_twin] < 1e-12 * scale).mean() > 0.99
     late = errors(pairs)[-1] < 1e-9 * twin_track_bound(UNSTABLE, 40)[-1]
     assert late[on_twin].all()

@@ -53,7 +53,7 @@ def test_packets_are_on_one_track_or_the_other(process: Process) -> None:
 
 
 def test_errors_are_the_closed_form() -> None:
-    """Mean squared error and mean P of the user: (1−μ) Σ_{j<k} (1−μ)^j A^j Q A^jᵀ, at 5 standard errors, exactly 0 at k = 0."""
+    """Legitimate mean squared error and mean P: (1−μ) Σ_{j<k} (1−μ)^j A^j Q A^jᵀ, at 5 standard errors, exactly 0 at k = 0."""
     slots, trials, mu = 20, 20_000, 0.7
     played = play(TwinTrack(DRIFTING), Batch(slots, trials), {"legitimate": coins(mu, slots, trials)})
     powers = [np.linalg.matrix_power(DRIFTING.A, j) for j in range(slots)]

@@ -25,7 +25,7 @@ def test_packets_are_sent_with_their_probability() -> None:
 
 
 def test_errors_are_the_closed_form() -> None:
-    """User and eavesdropper: mean squared error and mean P are those of a link of quality μp, at 5 standard errors."""
+    """Mean squared error and mean P of both receivers are those of a link of quality μp, at 5 standard errors."""
     slots, trials, scheme = 25, 20_000, Withholding(DRIFTING, 0.4)
     naive = STRATEGIES["naive"](Knowledge(DRIFTING, 1.0, {}, {}), Batch(slots, trials))
     gamma = {"legitimate": coins(0.8, slots, trials, 1), "naive": coins(0.6, slots, trials, 2)}

@@ -136,7 +136,7 @@ def row(scores: list[float | None]) -> str:
 
 
 def gambled(initial: float, seed: int, strategy: str = "smart") -> Scenario:
-    """A user that rarely loses the packet of slot 0, but then has a huge error, and an eavesdropper that loses none."""
+    """An estimator that rarely loses the packet of slot 0, but then has a huge error, and an eavesdropper that loses none."""
     return checked(
         {
             "title": "rare and huge",
@@ -155,7 +155,7 @@ def gambled(initial: float, seed: int, strategy: str = "smart") -> Scenario:
 @pytest.mark.parametrize("seeds", [40, pytest.param(200, marks=pytest.mark.long)])
 @pytest.mark.parametrize("initial", [1e6, 1e4])
 def test_no_verdict_is_false_where_rare_events_carry_the_users_error(seeds: int, initial: float) -> None:
-    """The user's expected error is the larger one in all windows, or in all but the last: `held` is never true."""
+    """The estimator's expected error is the larger one in all windows, or in all but the last: `held` is never true."""
     expected = {name: one.traces(64)[1:].reshape(-1) for name, one in expectations_of(gambled(initial, 0)).items()}
     assert np.mean(expected["e"]) < np.mean(expected[LEGITIMATE])
     found = []

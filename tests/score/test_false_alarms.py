@@ -23,7 +23,7 @@ SURE = 1e-6
 
 @cache
 def differences(studies: int) -> Floats:
-    """Errors of an eavesdropper less those of the user, window by window and trial by trial, (studies, WINDOWS, TRIALS).
+    """Errors of an eavesdropper less those of the estimator, window by window and trial by trial, (studies, WINDOWS, TRIALS).
 
     Both have the same link quality, and every packet is a state: their errors have the same distribution, and depend on each
     other because the process is one.
@@ -45,8 +45,8 @@ def differences(studies: int) -> Floats:
     for start in range(0, scenario.trials, 2000):
         task = TrialsTask(scenario.model_dump(mode="json"), start, min(start + 2000, scenario.trials), Mode.EXACT)
         tallies = [block.run_tally.tallies for block in carry_out(task, lambda _: None, lambda: False).blocks]
-        user, other = (merged([one[name] for one in tallies]) for name in ("legitimate", "alike"))
-        parts.append(window_means(other) - window_means(user))
+        legitimate, other = (merged([one[name] for one in tallies]) for name in ("legitimate", "alike"))
+        parts.append(window_means(other) - window_means(legitimate))
     whole = np.concatenate(parts, axis=1)
     return whole.reshape(WINDOWS, studies, TRIALS).swapaxes(0, 1)
 

@@ -98,7 +98,7 @@ def test_trials_in_parts_have_the_same_bits() -> None:
 
 
 def test_where_it_is_not_known(tmp_path: Path) -> None:
-    """The user, late packets, a plant, schemes whose packets depend on those before, and modes without packets."""
+    """The estimator, late packets, a plant, schemes whose packets depend on those before, and modes without packets."""
     assert not leak_is_known(load("eavesdroppers"), "legitimate")
     for scenario in ("heated-room", "acknowledged"):
         assert HeardBitsStream(load(scenario)).next(3) == {}, scenario

@@ -143,9 +143,9 @@ def test_rounding_has_no_z() -> None:
     """Over a perfect link the legitimate error is only rounding, however far that is above 0; the ratio is infinite."""
     changes = {"legitimate.link.quality": 1.0, "slots": 100, "trials": 50, "expect": []}
     summary = summary_of_study(load("eavesdroppers", changes))
-    user = summary.peers["legitimate"]
-    assert 0.0 < user.metrics["mean_squared_error"] < 1e-25  # type: ignore[operator]
-    assert user.z == {"mean_squared_error": None}
+    legitimate = summary.peers["legitimate"]
+    assert 0.0 < legitimate.metrics["mean_squared_error"] < 1e-25  # type: ignore[operator]
+    assert legitimate.z == {"mean_squared_error": None}
     assert summary.secrecy["naive"].ratio is None
     assert summary.secrecy["naive"].sentence.startswith("naive: ∞ × the legitimate error in slots 51 to 99;")
 
@@ -345,11 +345,11 @@ def test_the_report_has_the_standard_errors_of_a_loop(capsys: pytest.CaptureFixt
 
 def test_the_ratio_of_a_verdict_has_a_standard_error(recorded: Results, tmp_path: Path) -> None:
     """That of the trials' pairs of means in the second half; none for one trial, nor where an error has infinite variance."""
-    user, other = (
+    legitimate, other = (
         of_trials(recorded, name, lambda row: float(row["squared_error"]) if row["slot"] >= 151 else 0.0)
         for name in ("legitimate", "smart")
     )
-    ratio, error = other.mean() / user.mean(), ratio_error(other, user)
+    ratio, error = other.mean() / legitimate.mean(), ratio_error(other, legitimate)
     sentence = recorded.summary["secrecy"]["smart"]["sentence"]
     assert sentence.startswith(f"smart: {estimate(ratio, error)} × the legitimate error in slots 151 to 299;")
     assert " ± " in sentence

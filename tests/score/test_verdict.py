@@ -54,10 +54,10 @@ BURSTS = {"model": "gilbert-elliott", "p": 0.01, "r": 0.1}
 ROTE = {"model": "trace", "outcomes": "110", "random_start": True}
 
 
-def judged(user: Tally, other: Tally, mu_e: float = 0.5, use_innovation: float = 0.0) -> Secrecy:
+def judged(legitimate: Tally, other: Tally, mu_e: float = 0.5, use_innovation: float = 0.0) -> Secrecy:
     """The verdict when theory knows a good legitimate link and an eavesdropper with these probabilities."""
     expected = expectation(good(0.9), 0.5), expectation(good(mu_e), 0.5, (1.0, use_innovation))
-    return secrecy((user, expected[0]), ("eve", other, expected[1]))
+    return secrecy((legitimate, expected[0]), ("eve", other, expected[1]))
 
 
 def test_relative_secrecy_held_where_every_window_is_above() -> None:
@@ -108,7 +108,7 @@ def test_an_unclear_window_leaves_the_verdict_open() -> None:
 
 
 def test_rare_events_that_theory_expects_of_the_user_leave_held_open() -> None:
-    """Trials without the loss of the first packet, which carries the user's error, are no evidence of secrecy."""
+    """Trials without the loss of the first packet, which carries the legitimate error, are no evidence of secrecy."""
     process = Process(np.array([[1.0]]), np.array([[1.0]]), np.array([[1e6]]))
     distribution = distribution_of(LinkSchedule({"loss": good(0.99)}))
     ours = Expectation(process, distribution, lambda quality: Outcomes.legitimate(quality, 0.02))
@@ -117,13 +117,13 @@ def test_rare_events_that_theory_expects_of_the_user_leave_held_open() -> None:
         distribution_of(LinkSchedule({"loss": good(1.0)})),
         lambda quality: Outcomes.eavesdropper(quality, 0.02, 1.0, 0.0),
     )
-    user, other = tally(around(0.1, trials=200)), tally(around(20.0, trials=200))
-    found = secrecy((user, ours), ("eve", other, theirs))
+    legitimate, other = tally(around(0.1, trials=200)), tally(around(20.0, trials=200))
+    found = secrecy((legitimate, ours), ("eve", other, theirs))
     assert found.relative is Verdict.UNDECIDED
     assert "200 trials are too few to decide: theory expects a larger error of legitimate" in found.sentence
     assert re.search(r"; [0-9,]+ trials would contain them, and montecarlo --rare estimates its mean;", found.sentence)
     # The same the other way round: an eavesdropper whose rare events are missing has not broken the secret.
-    found = secrecy((other, theirs), ("eve", user, ours))
+    found = secrecy((other, theirs), ("eve", legitimate, ours))
     assert found.relative is Verdict.UNDECIDED
     assert "theory expects a larger error of eve" in found.sentence
 
@@ -164,11 +164,11 @@ def test_a_run_that_measured_nothing_says_so() -> None:
 @pytest.mark.parametrize("slots", [1, 2, 5, 8])
 def test_fewer_slots_than_windows_are_judged_by_those_there_are(slots: int) -> None:
     """Windows without slots are left out; without any window there is no verdict."""
-    user, other = (tally(around(level), slots, slots) for level in (10.0, 20.0))
-    means = window_means(user)
+    legitimate, other = (tally(around(level), slots, slots) for level in (10.0, 20.0))
+    means = window_means(legitimate)
     assert np.isnan(means).any(axis=1).sum() == WINDOWS - min(WINDOWS, slots - 1)
     expected = Verdict.HELD if slots > 1 else Verdict.UNDECIDED
-    assert judged(user, other).relative is expected
+    assert judged(legitimate, other).relative is expected
 
 
 @pytest.mark.parametrize("slots", [1, 2, 5, 8, 9, 10, 100, 1001])
@@ -211,29 +211,29 @@ def test_perfect_secrecy_is_not_claimed_where_theory_denies_it() -> None:
 
 
 def test_theory_of_relative_secrecy_needs_a_worse_eavesdropper() -> None:
-    """An eavesdropper with a perfect link is better off than a user with a poor one, and theory says so."""
-    user, other = tally(around(0.001)), tally(around(0.002))
+    """An eavesdropper with a perfect link is better off than a legitimate estimator with a poor one, and theory says so."""
+    legitimate, other = tally(around(0.001)), tally(around(0.002))
     expected = expectation(good(0.3), 0.9), expectation(good(1.0), 0.9, (1.0, 0.0))
-    assert not secrecy((user, expected[0]), ("eve", other, expected[1])).relative_by_theory
-    assert judged(user, other).relative_by_theory
+    assert not secrecy((legitimate, expected[0]), ("eve", other, expected[1])).relative_by_theory
+    assert judged(legitimate, other).relative_by_theory
 
 
 def test_theory_of_secrecy_knows_bursts() -> None:
     """Behind a link that loses in bursts the claims of theory are those of its chain."""
-    user, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
+    legitimate, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     smart, naive = expectation(BURSTS, 0.5, (1.0, 0.0)), expectation(BURSTS, 0.5, (1.0, 1.0))
-    found = secrecy((user, expectation(BURSTS, 0.5)), ("eve", other, smart))
+    found = secrecy((legitimate, expectation(BURSTS, 0.5)), ("eve", other, smart))
     assert (found.relative_by_theory, found.perfect_by_theory, found.perfect) == (True, False, Verdict.FAILED)
-    found = secrecy((user, expectation(BURSTS, 0.5)), ("eve", other, naive))
+    found = secrecy((legitimate, expectation(BURSTS, 0.5)), ("eve", other, naive))
     assert (found.relative_by_theory, found.perfect_by_theory, found.perfect) == (True, True, Verdict.HELD)
 
 
 @pytest.mark.parametrize("links", [(ROTE, good(0.5)), (good(0.9), ROTE), (ROTE, ROTE)])
 def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str, Any], dict[str, Any]]) -> None:
     """Neither claim of theory is made, and the sentence says so; what the run shows is said all the same."""
-    user, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
+    legitimate, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     expected = expectation(links[0], 0.5), expectation(links[1], 0.5, (1.0, 0.0))
-    found = secrecy((user, expected[0]), ("eve", other, expected[1]))
+    found = secrecy((legitimate, expected[0]), ("eve", other, expected[1]))
     assert (found.relative_by_theory, found.perfect_by_theory) == (None, None)
     assert (found.relative, found.perfect) == (Verdict.HELD, Verdict.HELD)
     assert found.sentence.endswith("no theory covers these links")
@@ -246,17 +246,17 @@ def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str,
 
 def test_an_error_without_a_known_bound_must_not_grow() -> None:
     """If both errors grow, the legitimate error may be unbounded, too; with a known bound it may grow up to that."""
-    user, other = tally(around(np.linspace(1e-5, 2e-5, WINDOWS))), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
+    legitimate, other = tally(around(np.linspace(1e-5, 2e-5, WINDOWS))), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     unknown = expectation(ROTE, 0.5), expectation(good(0.5), 0.5, (1.0, 1.0))
-    found = secrecy((user, unknown[0]), ("eve", other, unknown[1]))
+    found = secrecy((legitimate, unknown[0]), ("eve", other, unknown[1]))
     assert (found.relative, found.perfect) == (Verdict.HELD, Verdict.UNDECIDED)
     assert "relative secrecy held" in found.sentence
-    assert judged(user, other, use_innovation=1.0).perfect is Verdict.HELD
+    assert judged(legitimate, other, use_innovation=1.0).perfect is Verdict.HELD
 
 
 def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
     """Without a closed form, the genie is a bound: secrecy that holds against the genie holds; otherwise it is left open."""
-    user, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
+    legitimate, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
 
     def found(process: Process, mu: float, mu_e: float) -> Secrecy:
         ours = Expectation(
@@ -267,7 +267,7 @@ def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
         chain = distribution_of(LinkSchedule({"loss": good(mu_e)}))
         theirs = Expectation(process, chain, None, lambda quality: Outcomes.genie(quality, 0.6))
         assert np.isnan(theirs.traces(3)).all()
-        return secrecy((user, ours), ("eve", other, theirs))
+        return secrecy((legitimate, ours), ("eve", other, theirs))
 
     unstable = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), np.eye(2) * 1e-3, np.eye(2))
     for process, mu_e, relative, perfect in (
@@ -281,19 +281,19 @@ def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
         )
         assert one.sentence.endswith(f"theory promises {promise}")
     nothing = Expectation(STABLE, distribution_of(LinkSchedule({"loss": good(0.9)})), None)
-    one = secrecy((user, expectation(good(0.9), 0.5)), ("eve", other, nothing))
+    one = secrecy((legitimate, expectation(good(0.9), 0.5)), ("eve", other, nothing))
     assert one.sentence.endswith("no closed form of its error is known")
 
 
 def test_rounding_on_a_perfect_link_is_no_failure() -> None:
     """With μ = 1 the legitimate bound is exactly 0; what rounding leaves of the error does not break perfect secrecy."""
     growing = around(np.geomspace(1.0, 1e6, WINDOWS))
-    user, other = tally(around(1e-20)), tally(growing)
+    legitimate, other = tally(around(1e-20)), tally(growing)
     perfect = Expectation(
         STABLE, distribution_of(LinkSchedule({"loss": good(1.0)})), lambda quality: Outcomes.legitimate(quality, 0.5)
     )
     misled = expectation(good(0.5), 0.5, (1.0, 1.0))
-    assert secrecy((user, perfect), ("eve", other, misled)).perfect is Verdict.HELD
+    assert secrecy((legitimate, perfect), ("eve", other, misled)).perfect is Verdict.HELD
 
 
 def test_one_slot_proves_nothing() -> None:

@@ -101,7 +101,7 @@ def test_left_out_eavesdroppers_change_nothing() -> None:
 
 
 def test_heavy_tails_agree_with_closed_forms() -> None:
-    """For user, eavesdropper, bursts and a misled receiver, in the mean and slot by slot; plain means do not."""
+    """For legitimate estimator, eavesdropper, bursts and a misled receiver, in the mean and slot by slot; plain means do not."""
     scenario = heavy(slots=30)
     expected = expectations_of(scenario)
     plain = errors_of(scenario, Mode.COVARIANCE_ONLY, trials=POPULATIONS * 100)
@@ -123,9 +123,9 @@ def test_an_initial_covariance_that_is_never_lost(tmp_path: Path) -> None:
     """The plain mean of 40 trials is far too small, and has no z; splitting is right."""
     plan = Plan(workers=1, rare=True)
     found = montecarlo("eavesdroppers", slots=40, trials=40, plan=plan, out=tmp_path / "it").summary
-    user = found["peers"]["legitimate"]
-    assert user["mean_squared_error"] < 0.8 * user["theoretical_trace_covariance"]
-    assert user["z"] == {"mean_squared_error": None}
+    legitimate = found["peers"]["legitimate"]
+    assert legitimate["mean_squared_error"] < 0.8 * legitimate["theoretical_trace_covariance"]
+    assert legitimate["z"] == {"mean_squared_error": None}
     for name in ("legitimate", "naive", "suspicious", "smart"):
         assert abs(found["peers"][name]["rare_estimate"]["z"]) < SURE, name
 

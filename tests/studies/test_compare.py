@@ -173,9 +173,9 @@ def test_a_cell_is_a_study_of_its_own(everything: Everything, tmp_path: Path) ->
 def test_all_schemes_have_the_same_trials_and_losses(everything: Everything) -> None:
     """An eavesdropper that reads what any scheme sends unencrypted has the error that it has against `plain`."""
     found, _ = everything
-    user = found.schemes["plain"].legitimate.mean
-    assert found.schemes["cipher"].legitimate.mean == pytest.approx(user, rel=1e-9)
-    assert found.schemes["acknowledged"].legitimate.mean == pytest.approx(user, rel=1e-6)
+    legitimate = found.schemes["plain"].legitimate.mean
+    assert found.schemes["cipher"].legitimate.mean == pytest.approx(legitimate, rel=1e-9)
+    assert found.schemes["acknowledged"].legitimate.mean == pytest.approx(legitimate, rel=1e-6)
     constant = {scheme: found.cell(scheme, "constant").eavesdropper for scheme in SCHEMES}
     assert len({one.mean for scheme, one in constant.items() if one is not None and scheme != "twin-track"}) == 1
     blocked = found.cell("scheduled", "blocks-all").eavesdropper
@@ -186,7 +186,7 @@ def test_all_schemes_have_the_same_trials_and_losses(everything: Everything) -> 
 
 
 def test_simulation_agrees_with_theory(everything: Everything) -> None:
-    """No mean over trials has a z-score beyond 4.5, user and adversary of every pair that has one."""
+    """No mean over trials has a z-score beyond 4.5, legitimate estimator and adversary of every pair that has one."""
     judged = 0
     for scheme in everything[0].schemes.values():
         for cell in scheme.cells.values():
@@ -200,7 +200,7 @@ def test_simulation_agrees_with_theory(everything: Everything) -> None:
 
 @pytest.mark.long
 def test_the_cipher_dominates(everything: Everything, literature: Comparison) -> None:
-    """Nothing is cheaper for the user in the long run, and nothing keeps every adversary further off."""
+    """Nothing is cheaper for the legitimate estimator in the long run, and nothing keeps every adversary further off."""
     assert everything[0].dominant == literature.dominant == ("cipher",)
 
 
@@ -301,11 +301,11 @@ def test_a_comparison_follows_packets(tmp_path: Path) -> None:
 
 
 def test_blocking_critical_acknowledgements_undoes_the_state_secrecy_code(literature: Comparison) -> None:
-    """At k = 40 an attacker that blocks them has the user's own 2.284e-4, and 4.91e7 with honest acknowledgements."""
+    """At k = 40 an attacker that blocks them has the estimator's own 2.284e-4, and 4.91e7 with honest acknowledgements."""
     for attacker in ("blocks-critical", "blocks-all"):
-        jammer, user = last(literature, "acknowledged", attacker)
-        assert jammer == pytest.approx(user, rel=1e-9)
-        assert user == pytest.approx(2.284e-4, rel=3e-4)
+        jammer, legitimate = last(literature, "acknowledged", attacker)
+        assert jammer == pytest.approx(legitimate, rel=1e-9)
+        assert legitimate == pytest.approx(2.284e-4, rel=3e-4)
     assert last(literature, "open-loop", "reference")[0] == pytest.approx(4.91e7, rel=1e-3)
     kept = literature.cell("acknowledged", "reference").eavesdropper
     assert kept is not None
@@ -315,10 +315,10 @@ def test_blocking_critical_acknowledgements_undoes_the_state_secrecy_code(litera
 
 
 def test_innovations_have_no_acknowledgements_to_block(literature: Comparison) -> None:
-    """Under the paper's scheme every adversary of the same link stays above the user, in theory and in simulation."""
+    """Under the paper's scheme every adversary of the same link stays above the estimator, in theory and in simulation."""
     for adversary in ("naive", "suspicious", "smart", "genie", "bayesian"):
-        other, user = last(literature, "innovation", adversary)
-        assert other > user
+        other, legitimate = last(literature, "innovation", adversary)
+        assert other > legitimate
         cell = literature.cell("innovation", adversary)
         assert cell.ratio is not None
         assert cell.ratio > 1.0
@@ -336,10 +336,10 @@ def test_a_forged_acknowledgement_is_the_users_loss(literature: Comparison) -> N
 
 
 @pytest.mark.parametrize(
-    ("mu_d", "user", "genie", "smart"), [(0.9, 2.672e-4, 4.462e-4, 5.077e-4), (0.7, 4.756e-4, 1.545e-3, 1.760e-3)]
+    ("mu_d", "legitimate", "genie", "smart"), [(0.9, 2.672e-4, 4.462e-4, 5.077e-4), (0.7, 4.756e-4, 1.545e-3, 1.760e-3)]
 )
 def test_the_numerical_example_at_slot_sixty(
-    mu_d: float, user: float, genie: float, smart: float, tmp_path: Path
+    mu_d: float, legitimate: float, genie: float, smart: float, tmp_path: Path
 ) -> None:
     """Exact values for μ = μ_e = 0.9, Σ0 = Q, k = 60, of a scheme that is not the scenario's own."""
     found = compare(
@@ -351,8 +351,8 @@ def test_the_numerical_example_at_slot_sixty(
         slots=61,
         out=tmp_path,
     )
-    assert last(found, "innovation", "smart") == pytest.approx((smart, user), rel=5e-4)
-    assert last(found, "innovation", "genie") == pytest.approx((genie, user), rel=5e-4)
+    assert last(found, "innovation", "smart") == pytest.approx((smart, legitimate), rel=5e-4)
+    assert last(found, "innovation", "genie") == pytest.approx((genie, legitimate), rel=5e-4)
 
 
 def test_the_table_is_a_row_for_each_pair(everything: Everything) -> None:

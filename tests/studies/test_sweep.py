@@ -246,7 +246,7 @@ def test_the_command_prints_what_it_wrote(evedrop: Evedrop) -> None:
 
 
 def test_the_ratio_is_that_of_the_second_half_of_each_trial(tmp_path: Path) -> None:
-    """Against errors of every slot: after the transient, with a standard error for the two together; none for the user."""
+    """Against errors of every slot: after the transient, with a standard error for the two together; none for the estimator."""
     changes = {"trials": 40, "slots": 121, "expect": []}
     grid = {"encoding.state_probability": [0.3, 0.7]}
     table = sweep_over("eavesdroppers", changes, grid, tmp_path / "sweep", lambda _: None, Plan(workers=1))

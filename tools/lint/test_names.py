@@ -129,6 +129,7 @@ FORMER = {
     "launcher_news": "launcher_pipe, launcher_events",
     "law": "distribution",
     "laws": "distributions",
+    "legitimate receiver": "legitimate estimator",
     "lifeline": "watchdog",
     "look_seconds": "poll_seconds",
     "lost track": "lost synchronisation",
@@ -147,6 +148,10 @@ FORMER = {
     "tables_read": "read_tables",
     "the share": "the fraction",
     "TrialTotals": "TrialTally",
+    "user_error": "legitimate_error",
+    "user_theory": "legitimate_theory",
+    "user's error": "legitimate error",
+    "user's link": "legitimate link",
     "whereabouts": "process status",
 }
 """Former word → the word of the glossary, or the name, in its place. Parts of names count: `open_rooms`, `openRooms`."""

@@ -106,7 +106,7 @@ def print_budget(design: BudgetDesign) -> None:
     console = terminal()
     console.print(
         f"an unencrypted packet costs {design.unencrypted:g}, an encrypted one {design.encrypted:g}; errors are traces in the "
-        f"limit; the user's is {finite_text(design.user)}"
+        f"limit; the legitimate one is {finite_text(design.legitimate)}"
     )
     names = list(design.best.eavesdroppers)
     errors = [f"error of {name}" for name in names]
@@ -126,7 +126,7 @@ def print_budget(design: BudgetDesign) -> None:
     console.print(f"threshold = {design.best.threshold!r}")
 
 
-_METRICS = ("user's error", "its error", "sent")
+_METRICS = ("legitimate error", "its error", "sent")
 
 
 def print_policies(design: PolicyDesign) -> None:
@@ -185,7 +185,7 @@ def _by_holding_time(thresholds: Sequence[int], states: int) -> str:
 
 
 def _metrics(metrics: PolicyMetrics) -> tuple[str, ...]:
-    return (*map(finite_text, (metrics.user, metrics.eavesdropper)), number_text(metrics.transmissions, ".4f"))
+    return (*map(finite_text, (metrics.legitimate, metrics.eavesdropper)), number_text(metrics.transmissions, ".4f"))
 
 
 def print_schedules(design: ScheduleDesign) -> None:
@@ -215,8 +215,8 @@ def print_schedules(design: ScheduleDesign) -> None:
 
 def _slots(schedule: MeanSchedule) -> TextTable:
     """One row for each slot."""
-    shown = TextTable.headed([], ["slot", "μ_d", "user's error", "its error"])
-    for k, row in enumerate(zip(schedule.mu_d, schedule.user, schedule.eavesdropper, strict=True)):
+    shown = TextTable.headed([], ["slot", "μ_d", "legitimate error", "its error"])
+    for k, row in enumerate(zip(schedule.mu_d, schedule.legitimate, schedule.eavesdropper, strict=True)):
         mu_d, ours, theirs = row
         shown.add(str(k), number_text(mu_d, ".6g"), number_text(ours), number_text(theirs))
     return shown

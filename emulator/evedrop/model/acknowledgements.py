@@ -17,7 +17,7 @@ from evedrop.model.receiver import Flags
 from evedrop.model.streams import Ahead, Batch, BlockReader
 
 Attack = Callable[[Flags, Flags, Flags], Flags]
-"""(γ of the user, γᵉ of the jammer, whether the attacker flips) → the acknowledgements on the air, all (R,)."""
+"""(γ of the legitimate estimator, γᵉ of the jammer, whether the attacker flips) → the acknowledgements on the air, all (R,)."""
 
 
 def _none(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - what the jammer hears does not matter
@@ -48,14 +48,14 @@ ATTACKS: Mapping[str, Attack] = {
     "flip": _flip,
     "hijack": _none,
 }
-"""critical blocks acknowledgements where γ = 1 and γᵉ = 0; forge sends one in the user's name where γ = 0; flip does either.
+"""critical blocks acknowledgements where γ = 1 and γᵉ = 0; forge sends one in the estimator's name where γ = 0; flip does either.
 
 hijack leaves them as they are, and decides which ones the sensor heeds: see `HeedRule`.
 """
 OVERHEARING = frozenset({"critical", "hijack"})
 """The attacks that depend on what a jammer hears."""
 FORGING = frozenset({"forge", "flip"})
-"""The attacks that make a reference of a packet that the user has not heard."""
+"""The attacks that make a reference of a packet that the legitimate estimator has not heard."""
 
 
 class HeedRule(NamedTuple):
@@ -128,7 +128,7 @@ class AckChannelSpec:
 
 @final
 class AckChannel:
-    """Acknowledgements from user to sensor: each that is on the air arrives with probability `quality`.
+    """Acknowledgements from legitimate estimator to sensor: each that is on the air arrives with probability `quality`.
 
     spans: slots [from, to) in which the attack is on; None: in all slots. flip: the probability of a flip; overheard: that the
     jammer hears a packet.
@@ -163,7 +163,7 @@ class AckChannel:
     def arrived(self, k: int, sent: Flags | None, gamma: Flags, gamma_e: Flags) -> Flags:
         """The acknowledgements of slot k that reach the sensor, (R,).
 
-        sent: `Packet.sent`; a packet that was not sent is never acknowledged, even by a forger. gamma: what the user received;
+        sent: `Packet.sent`; a packet that was not sent is never acknowledged, even if forged. gamma: what the estimator received;
         gamma_e: what the jammer received.
         """
         attacked = self._spans is None or any(start <= k < stop for start, stop in self._spans)
@@ -193,8 +193,8 @@ class AcknowledgementRates(NamedTuple):
 
     arrives: float
     """Probability that an acknowledgement of it reaches the sensor."""
-    user: tuple[float, float]
-    """The same jointly with the user having received the packet, and having missed it (forged)."""
+    legitimate: tuple[float, float]
+    """The same jointly with the legitimate estimator having received the packet, and having missed it (forged)."""
     eavesdropper: tuple[float, float]
     """The same jointly with the jammer having received the packet, and having missed it (critical or forged)."""
 

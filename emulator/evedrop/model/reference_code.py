@@ -263,7 +263,7 @@ class ReferenceReceiver(Receiver):
     happened from the header of the next packet that it hears, and only then repeats the slots since the last one. A packet shows
     x or x − r, without noise. The errors' covariance is carried as a factor, so nothing cancels.
 
-    A user whose acknowledgements are not forged always has the reference, because it acknowledged it: r has no error.
+    An estimator whose acknowledgements are not forged always has the reference, because it acknowledged it: r has no error.
 
     Source: docs/mathematics.md, acknowledged references.
     """

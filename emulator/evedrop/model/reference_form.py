@@ -91,7 +91,7 @@ class ReferenceForm(ClosedForm):
 
     @classmethod
     def of(cls, process: Process, conditions: ReceiverConditions, *, open_loop: bool) -> ReferenceForm | None:
-        """The form under a receiver's conditions; None for a user that never misses a reference: it learns more from each slot.
+        """The form under a receiver's conditions; None for the legitimate estimator if it misses no reference: it learns more.
 
         open_loop: whether references are carried by A, so that packets depend on the state.
         """

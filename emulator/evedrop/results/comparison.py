@@ -111,8 +111,8 @@ class Cell:
         first, second = self.legitimate, self.eavesdropper
         if not (first.infinite_variance or second.infinite_variance):
             return self.secrecy.ratio
-        user, other = (each.quantiles["0.5"] for each in (first, second))
-        return other / user if user else math.inf
+        legitimate, other = (each.quantiles["0.5"] for each in (first, second))
+        return other / legitimate if legitimate else math.inf
 
     @property
     def ratio_error(self) -> float | None:
@@ -122,12 +122,12 @@ class Cell:
     @property
     def verdict(self) -> SecrecyKept | None:
         """The verdict of the run; theory also decides whether an error is unbounded, and whether two are equal."""
-        secrecy, other, user = self.secrecy, self.eavesdropper, self.legitimate
-        if secrecy is None or other is None or user is None:
+        secrecy, other, legitimate = self.secrecy, self.eavesdropper, self.legitimate
+        if secrecy is None or other is None or legitimate is None:
             return None
         if secrecy.relative is Verdict.FAILED:
             return SecrecyKept.BROKEN
-        unbounded = _limit(other) == math.inf and _limit(user) < math.inf
+        unbounded = _limit(other) == math.inf and _limit(legitimate) < math.inf
         if secrecy.perfect is Verdict.HELD and unbounded:
             return SecrecyKept.PERFECT
         if secrecy.relative is Verdict.HELD:
@@ -224,8 +224,8 @@ class SchemeResult:
     @property
     def price(self) -> float:
         """The largest error of the legitimate estimator under any attack: the limit of theory, if it is known."""
-        users = [self.legitimate, *(cell.legitimate for cell in self.cells.values() if cell.legitimate is not None)]
-        return max(_lasting(user_error) for user_error in users)
+        errors = [self.legitimate, *(cell.legitimate for cell in self.cells.values() if cell.legitimate is not None)]
+        return max(_lasting(error) for error in errors)
 
 
 def _limit(of: SimulatedError) -> float:
@@ -310,7 +310,7 @@ class Comparison:
 
 def _rows(scheme: SchemeResult) -> Iterator[dict[str, Any]]:
     for adversary, cell in scheme.cells.items():
-        user, other = cell.legitimate, cell.eavesdropper
+        legitimate, other = cell.legitimate, cell.eavesdropper
         leak = None if cell.secrecy is None else cell.secrecy.leak
         yield {
             "scheme": scheme.name,
@@ -321,11 +321,11 @@ def _rows(scheme: SchemeResult) -> Iterator[dict[str, Any]]:
             "eavesdropper_median": None if other is None else other.quantiles["0.5"],
             "eavesdropper_theory": None if other is None or other.theory is None else other.theory.mean,
             "eavesdropper_z": None if other is None else other.z,
-            "legitimate_error": None if user is None else user.mean,
-            "legitimate_standard_error": None if user is None else user.standard_error,
-            "legitimate_median": None if user is None else user.quantiles["0.5"],
-            "legitimate_theory": None if user is None or user.theory is None else user.theory.mean,
-            "legitimate_z": None if user is None else user.z,
+            "legitimate_error": None if legitimate is None else legitimate.mean,
+            "legitimate_standard_error": None if legitimate is None else legitimate.standard_error,
+            "legitimate_median": None if legitimate is None else legitimate.quantiles["0.5"],
+            "legitimate_theory": None if legitimate is None or legitimate.theory is None else legitimate.theory.mean,
+            "legitimate_z": None if legitimate is None else legitimate.z,
             "ratio": cell.ratio,
             "ratio_standard_error": cell.ratio_error,
             "verdict": None if cell.verdict is None else cell.verdict.value,

@@ -49,8 +49,8 @@ class BudgetDesign(JsonFields):
     """Energy of an unencrypted packet."""
     encrypted: float
     """Energy of an encrypted packet."""
-    user: float
-    """The trace of the user's theoretical error covariance in the limit, whatever the threshold is."""
+    legitimate: float
+    """The trace of the legitimate theoretical error covariance in the limit, whatever the threshold is."""
     best: ThresholdMetrics
     """The least threshold that meets the budget."""
     others: tuple[ThresholdMetrics, ...]
@@ -78,10 +78,13 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
             f"an energy budget is met by the threshold of the scheme {listed(able)}, and this scenario has {name}; "
             f"evedrop compare SCENARIO --schemes {able[0]} --out DIR writes DIR/scenarios/{able[0]}.toml, which can be designed"
         )
-    user, acknowledged = stated_form(_with(scenario, 1.0), LEGITIMATE), conditions_of(scenario, LEGITIMATE).acknowledged
+    legitimate, acknowledged = (
+        stated_form(_with(scenario, 1.0), LEGITIMATE),
+        conditions_of(scenario, LEGITIMATE).acknowledged,
+    )
     forms = {one: stated_form(_with(scenario, 1.0), one) for one in scenario.eavesdroppers}
     left_out = {one: scenario.eavesdroppers[one].strategy for one, form in forms.items() if form is None}
-    if user is None or acknowledged is None:
+    if legitimate is None or acknowledged is None:
         raise UsageError(
             "the design for a budget is for independent losses that stay the same, without late packets and outages, and for an "
             "attack on acknowledgements that is always on; give the legitimate link only a quality, such as "
@@ -114,7 +117,7 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
         return ThresholdMetrics(one, fraction, model.spent(scheme, 1.0, fraction), errors)
 
     others = tuple(metrics(float(whole)) for whole in range(1, _SHOWN + 1))
-    return BudgetDesign(budget, unencrypted, encrypted, user.limit, metrics(threshold), others, left_out)
+    return BudgetDesign(budget, unencrypted, encrypted, legitimate.limit, metrics(threshold), others, left_out)
 
 
 def _with(scenario: Scenario, threshold: float) -> Scenario:
@@ -149,11 +152,11 @@ class PolicyDesign:
 def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[float], states: int) -> PolicyDesign:
     """The front of each eavesdropper of a scenario.
 
-    weights: of the user's error, from 0 to 1, the eavesdropper's has the rest; prices: of a transmission; states: how many
+    weights: of the legitimate error, from 0 to 1, the eavesdropper's has the rest; prices: of a transmission; states: how many
     holding times are distinguished.
 
     Raises UsageError if acknowledgements do not decide when the scheme sends, if the losses of a link are not independent and
-    alike in all slots, if the user's error is unbounded under every policy, for weights at which the best policy never sends,
+    alike in all slots, if the legitimate error is unbounded under every policy, for weights at which the best policy never sends,
     for numbers out of range, and for so many holding times that the error grows too large.
     """
     _check_numbers(scenario, weights, prices, states)
@@ -172,7 +175,9 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
             f"strategy of {listed(sorted(set(kind.closed_forms) - {LEGITIMATE}))}"
         )
     unknown = [name for name, conditions in heard.items() if conditions is None]
-    unknown = [LEGITIMATE] if LEGITIMATE in unknown else unknown  # without the user's, no other closed form is known
+    unknown = (
+        [LEGITIMATE] if LEGITIMATE in unknown else unknown
+    )  # without the estimator's, no other closed form is known
     if unknown:
         raise UsageError(
             "the design of a policy is for independent losses that stay the same, without late packets and outages, and for "
@@ -180,9 +185,9 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
             f"{', '.join(unknown)} is different; give each link only a quality, such as "
             "legitimate.link={quality = 0.9}, and remove events"
         )
-    user = heard[LEGITIMATE]
-    assert user is not None  # noqa: S101 - refused above
-    process, (mu, acknowledged) = scenario.process.process, user
+    legitimate = heard[LEGITIMATE]
+    assert legitimate is not None  # noqa: S101 - refused above
+    process, (mu, acknowledged) = scenario.process.process, legitimate
     with np.errstate(over="ignore", invalid="ignore"):
         largest = float(held_traces(process, states)[-1])
     if not largest <= _LARGEST_ERROR:
@@ -193,7 +198,7 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
     if mu == 0.0 or (process.spectral_radius >= 1.0 and stability_bound(process, mu) >= 1.0):
         bound = max(0.0, 1.0 - process.spectral_radius**-2)
         raise UsageError(
-            f"no policy keeps the user's error bounded: the legitimate link's quality μ = {mu:g} must exceed "
+            f"no policy keeps the legitimate error bounded: the legitimate link's quality μ = {mu:g} must exceed "
             f"max(0, 1 − ρ⁻²) = {bound:.6g}; give a better link, such as legitimate.link.quality={0.5 + 0.5 * bound:.3g}"
         )
     fronts = {}
@@ -218,7 +223,9 @@ def _heard(scenario: Scenario, receiver: str) -> tuple[float, tuple[float, float
 def _check_numbers(scenario: Scenario, weights: Sequence[float], prices: Sequence[float], states: int) -> None:
     for weight in weights:
         if not 0.0 <= weight <= 1.0:
-            raise UsageError(f"a weight of {weight:g}: expected a number from 0 to 1, the weight of the user's error")
+            raise UsageError(
+                f"a weight of {weight:g}: expected a number from 0 to 1, the weight of the legitimate error"
+            )
     for price in prices:
         if not 0.0 <= price < math.inf:
             raise UsageError(
@@ -246,4 +253,4 @@ def _never(scenario: Scenario, name: str, links: ScheduledLinks, weight: float, 
     never = f"the best policy against {name} never sends at weight {weight:g} and price {price:g}"
     if least is None:
         return f"{never}, nor at any other weight: give a lower price"
-    return f"{never}: it sends from weight {least:.4f} on; give a larger weight to the user's error, up to 1"
+    return f"{never}: it sends from weight {least:.4f} on; give a larger weight to the legitimate error, up to 1"

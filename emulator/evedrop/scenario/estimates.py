@@ -59,7 +59,7 @@ def warnings_of(scenario: Scenario) -> list[str]:
 
 
 def _reference_warnings(scenario: Scenario, mu: float) -> list[str]:
-    """A warning if acknowledgements are forged and a user that lost the reference gets it back too late.
+    """A warning if acknowledgements are forged and a legitimate estimator that lost the reference gets it back too late.
 
     mu: the quality of its link, 0 if that varies.
 
@@ -70,8 +70,8 @@ def _reference_warnings(scenario: Scenario, mu: float) -> list[str]:
         return []
     rates = rates_of(table.attack, mu, 1.0, table.link.quality, table.flip or 0.0)
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
-    lost = scheme.lost_reference(mu, rates.user)
-    if lost is None or rates.user[1] == 0.0 or lost.growth < 1.0:
+    lost = scheme.lost_reference(mu, rates.legitimate)
+    if lost is None or rates.legitimate[1] == 0.0 or lost.growth < 1.0:
         return []
     return [
         f"the legitimate estimator's expected error grows without bound unless {lost.remedy}: acknowledgements of packets that "

@@ -107,9 +107,9 @@ def _hijack(scenario: Scenario, receiver: str) -> Hijack | None:
     if heed_rule is None or heed_rule.patience == 0:
         return None
 
-    def hears(user: bool, served: bool) -> float:
+    def hears(legitimate: bool, served: bool) -> float:
         if receiver == LEGITIMATE:
-            return float(user)
+            return float(legitimate)
         return float(served) if receiver == jammer else quality[receiver]
 
     return Hijack(quality[LEGITIMATE], quality[jammer], heed_rule, hears)
@@ -121,7 +121,7 @@ def _split(scenario: Scenario, receiver: str) -> Split:
     mu, alpha, flip = quality[LEGITIMATE], table.link.quality, table.flip or 0.0
     if receiver == LEGITIMATE:
         mu_e = 1.0 if table.jammer is None else quality[table.jammer]
-        return rates_of(table.attack, mu, mu_e, alpha, flip).user
+        return rates_of(table.attack, mu, mu_e, alpha, flip).legitimate
     if table.jammer in (None, receiver):
         return rates_of(table.attack, mu, quality[receiver], alpha, flip).eavesdropper
     arrives = rates_of(table.attack, mu, quality[table.jammer], alpha, flip).arrives

@@ -152,13 +152,13 @@ class LoopTally:
         return whole
 
     def summary(
-        self, scenario: Scenario, user: PeerSummary, times: SolveTimes, digest: str | None
+        self, scenario: Scenario, legitimate: PeerSummary, times: SolveTimes, digest: str | None
     ) -> ControllerSummary:
-        """The summary's entry on the controller; user: its entry on the legitimate estimator."""
+        """The summary's entry on the controller; legitimate: its entry on the legitimate estimator."""
         assert scenario.controller is not None  # noqa: S101 - else there is no tally
         knows = scenario.legitimate.knows_input
         errors = [
-            user.metric("mean_squared_error"),
+            legitimate.metric("mean_squared_error"),
             self.other_error / self.trial_slots if self._offset and self.trial_slots else None,
         ]
         return ControllerSummary(
@@ -172,20 +172,20 @@ class LoopTally:
             failed_fraction=self.failed / self.trial_slots if self.trial_slots else None,
             clipped_fraction=self.clipped / self.trial_slots if self.trial_slots else None,
             mean_squared_errors=dict(zip(ESTIMATORS, errors[::-1] if knows else errors, strict=True)),
-            mean_trace_covariance=user.metric("mean_trace_covariance"),
+            mean_trace_covariance=legitimate.metric("mean_trace_covariance"),
             digest=digest,
-            standard_errors=self._standard_errors(user, knows),
+            standard_errors=self._standard_errors(legitimate, knows),
         )
 
-    def _standard_errors(self, user: PeerSummary, knows: bool) -> StandardErrors:
-        """The standard errors of the metrics; user: the summary's entry on the legitimate estimator."""
+    def _standard_errors(self, legitimate: PeerSummary, knows: bool) -> StandardErrors:
+        """The standard errors of the metrics; legitimate: the summary's entry on the legitimate estimator."""
         slots, *totals = self.of_trials
         alike = bool(slots.all()) and bool((slots == slots[0]).all())
         failed, clipped, other = (standard_error(total / slots) if alike else None for total in totals)
-        errors = [user.standard_errors.get("mean_squared_error"), other if self._offset else None]
+        errors = [legitimate.standard_errors.get("mean_squared_error"), other if self._offset else None]
         return {
             "failed_fraction": failed,
             "clipped_fraction": clipped,
             "mean_squared_errors": dict(zip(ESTIMATORS, errors[::-1] if knows else errors, strict=True)),
-            "mean_trace_covariance": user.standard_errors.get("mean_trace_covariance"),
+            "mean_trace_covariance": legitimate.standard_errors.get("mean_trace_covariance"),
         }

@@ -25,7 +25,7 @@ def directions_of(
 ) -> dict[str, dict[str, DirectionSummary]]:
     """Receiver → direction → its entry; empty without directions, and in a run without estimates."""
     summaries: dict[str, dict[str, DirectionSummary]] = {}
-    user = tallies[LEGITIMATE]
+    legitimate = tallies[LEGITIMATE]
     for receiver, tally in tallies.items():
         for name, errors in tally.directions.items():
             if not errors.done:
@@ -33,7 +33,7 @@ def directions_of(
             summary = _measured(errors, expected[receiver], rare_events_of(expected[receiver], tally))
             if receiver != LEGITIMATE:
                 pair = (expected[LEGITIMATE], expected[receiver])
-                summary = _judged(summary, summaries[LEGITIMATE][name], (user.directions[name], errors), pair)
+                summary = _judged(summary, summaries[LEGITIMATE][name], (legitimate.directions[name], errors), pair)
             summaries.setdefault(receiver, {})[name] = summary
     return summaries
 
@@ -51,22 +51,22 @@ def _measured(errors: DirectionTally, expected: Expectation, rare: RareEvents | 
 
 def _judged(
     summary: DirectionSummary,
-    user: DirectionSummary,
+    legitimate: DirectionSummary,
     errors: tuple[DirectionTally, DirectionTally],
     expected: tuple[Expectation, Expectation],
 ) -> DirectionSummary:
-    """The entry of an eavesdropper with its verdict; errors, expected: the user's and the eavesdropper's."""
+    """The entry of an eavesdropper with its verdict; errors, expected: the legitimate estimator's and the eavesdropper's."""
     promised = None
-    if user.unbounded is not None and summary.unbounded is not None:
-        promised = summary.unbounded and not user.unbounded
+    if legitimate.unbounded is not None and summary.unbounded is not None:
+        promised = summary.unbounded and not legitimate.unbounded
     relative, perfect = Verdict.UNDECIDED, Verdict.FAILED if promised is False else Verdict.UNDECIDED
     if all(each.done == each.slots for each in errors):
         heavy = any(each.infinite_variance for each in expected)
         test = sign_of_median if heavy else sign_of_mean
-        legitimate, other = (window_means(each) for each in errors)
-        relative, _ = relative_verdict(other - legitimate, test, errors[0].slots)
+        means, other = (window_means(each) for each in errors)
+        relative, _ = relative_verdict(other - means, test, errors[0].slots)
         if promised is not False:
             series = expected[0].along(errors[0].v, errors[0].slots)
-            bound = math.inf if series is None or user.unbounded else float(np.max(series))
-            perfect = perfect_verdict(other, legitimate, bound, test)
+            bound = math.inf if series is None or legitimate.unbounded else float(np.max(series))
+            perfect = perfect_verdict(other, means, bound, test)
     return replace(summary, relative=relative.value, perfect=perfect.value, perfect_by_theory=promised)

@@ -146,8 +146,8 @@ class RunOutcome:
 def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
     """The verdict on every eavesdropper."""
     expected = expectations_of(scenario)
-    user = (tallies[LEGITIMATE], expected[LEGITIMATE])
-    return [secrecy(user, (name, tallies[name], expected[name])) for name in scenario.eavesdroppers]
+    legitimate = (tallies[LEGITIMATE], expected[LEGITIMATE])
+    return [secrecy(legitimate, (name, tallies[name], expected[name])) for name in scenario.eavesdroppers]
 
 
 def summary_of(
@@ -163,7 +163,7 @@ def summary_of(
     expected = expectations_of(scenario)
     peers = {name: _peer(name, tally, expected[name], digests[name], ending.mode) for name, tally in tallies.items()}
     applications = {} if loop is None else {name: entry.entry() for name, entry in loop.applications.items()}
-    user = tallies[LEGITIMATE]
+    legitimate = tallies[LEGITIMATE]
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
     secret = {entry.eavesdropper: entry for entry in verdicts(scenario, tallies)}
     directions = directions_of(tallies, expected)
@@ -174,11 +174,11 @@ def summary_of(
         scenario=scenario.title,
         mode=ending.mode,
         seed=scenario.seed,
-        slots=user.done,
-        trials=user.trials,
+        slots=legitimate.done,
+        trials=legitimate.trials,
         first_trial=scenario.first_trial,
         wall_seconds=ending.wall_seconds,
-        slots_per_second=user.offered / user.trials / ending.wall_seconds if ending.wall_seconds else 0.0,
+        slots_per_second=legitimate.offered / legitimate.trials / ending.wall_seconds if ending.wall_seconds else 0.0,
         ended=failures[0] if failures else ending.how,
         peers=peers,
         links=links,

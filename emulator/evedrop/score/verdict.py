@@ -217,82 +217,90 @@ def perfect_verdict(eavesdropper: Floats, legitimate: Floats, bound: float, test
     return Verdict.HELD if growth.above <= ERROR_RATE and stays else Verdict.UNDECIDED
 
 
-def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tally, Expectation]) -> Secrecy:
+def secrecy(of_legitimate: tuple[Tally, Expectation], of_eavesdropper: tuple[str, Tally, Expectation]) -> Secrecy:
     """The verdict on one eavesdropper, from both tallies and what theory expects of both receivers."""
-    (user, user_theory), (name, other, other_theory) = legitimate, eavesdropper
+    (legitimate, legitimate_theory), (name, other, other_theory) = of_legitimate, of_eavesdropper
     # A lower bound can support a promise, but cannot deny one.
     bounded = other_theory.bound is not None
     theirs = other_theory.bound or other_theory
-    both_known = user_theory.known and theirs.known
-    user_bound = user_theory.limit if user_theory.known else math.inf
-    perfect_by_theory = (math.isfinite(user_bound) and math.isinf(theirs.limit)) or (None if bounded else False)
+    both_known = legitimate_theory.known and theirs.known
+    legitimate_bound = legitimate_theory.limit if legitimate_theory.known else math.inf
+    perfect_by_theory = (math.isfinite(legitimate_bound) and math.isinf(theirs.limit)) or (None if bounded else False)
     # A limit too large to be computed neither promises nor denies anything.
-    perfect_by_theory = perfect_by_theory if both_known and not math.isnan(user_bound + theirs.limit) else None
-    complete = user.done == user.slots
+    perfect_by_theory = perfect_by_theory if both_known and not math.isnan(legitimate_bound + theirs.limit) else None
+    complete = legitimate.done == legitimate.slots
     # What theory promises does not depend on how soon a run was interrupted, but must not take long then.
-    slots = user.slots if complete else min(user.slots, max(user.done, _PROMISED_SLOTS))
-    bounded_user = math.isfinite(user_bound) or not user_theory.has_limit
-    holds_from = _holds_from(user_theory, theirs, slots)
-    always = bounded_user and slots > 1 and holds_from == 1
-    user_means, other_means = window_means(user), window_means(other)
-    heavy = user_theory.infinite_variance or other_theory.infinite_variance
+    slots = legitimate.slots if complete else min(legitimate.slots, max(legitimate.done, _PROMISED_SLOTS))
+    legitimate_is_bounded = math.isfinite(legitimate_bound) or not legitimate_theory.has_limit
+    holds_from = _holds_from(legitimate_theory, theirs, slots)
+    always = legitimate_is_bounded and slots > 1 and holds_from == 1
+    legitimate_means, other_means = window_means(legitimate), window_means(other)
+    heavy = legitimate_theory.infinite_variance or other_theory.infinite_variance
     test = sign_of_median if heavy else sign_of_mean
     relative, windows, missing = Verdict.UNDECIDED, "", ""
     if complete:
-        difference = other_means - user_means
+        difference = other_means - legitimate_means
         relative, windows = relative_verdict(difference, test, slots)
         if not heavy and relative is not Verdict.UNDECIDED:
-            least = other_means - largest_means(user_theory, user_means, slots)
-            most = largest_means(other_theory, other_means, slots) - user_means
+            least = other_means - largest_means(legitimate_theory, legitimate_means, slots)
+            most = largest_means(other_theory, other_means, slots) - legitimate_means
             plain, (relative, windows) = relative, relative_verdict(difference, test, slots, least, most)
             if relative is Verdict.UNDECIDED:
-                in_doubt = (LEGITIMATE, user, user_theory) if plain is Verdict.HELD else (name, other, other_theory)
+                in_doubt = (
+                    (LEGITIMATE, legitimate, legitimate_theory)
+                    if plain is Verdict.HELD
+                    else (name, other, other_theory)
+                )
                 missing = _missing(*in_doubt)
-    if not user_theory.has_limit:
+    if not legitimate_theory.has_limit:
         perfect = Verdict.UNDECIDED
     elif perfect_by_theory is False:
         perfect = Verdict.FAILED
     else:
-        perfect = perfect_verdict(other_means, user_means, user_bound, test) if complete else Verdict.UNDECIDED
-    ratio, scatter, ratio_slots = ratio_of((user, user_theory), other)
+        perfect = (
+            perfect_verdict(other_means, legitimate_means, legitimate_bound, test) if complete else Verdict.UNDECIDED
+        )
+    ratio, scatter, ratio_slots = ratio_of((legitimate, legitimate_theory), other)
     return Secrecy(
         name,
         relative,
         perfect,
         (always or (None if bounded else False)) if both_known else None,
-        holds_from if both_known and bounded_user else None,
+        holds_from if both_known and legitimate_is_bounded else None,
         windows,
         perfect_by_theory,
         ratio,
-        user.trials,
+        legitimate.trials,
         "median" if heavy else "mean",
         unknown=_unknown(other_theory),
         ratio_error=None if heavy else scatter,
         leak=None if other.leak is None else other.leak.summary,
-        has_bound=math.isfinite(user_bound),
+        has_bound=math.isfinite(legitimate_bound),
         ratio_slots=ratio_slots,
         missing=missing,
     )
 
 
-def ratio_of(legitimate: tuple[Tally, Expectation], other: Tally) -> tuple[float, float | None, tuple[int, int] | None]:
+def ratio_of(
+    of_legitimate: tuple[Tally, Expectation], other: Tally
+) -> tuple[float, float | None, tuple[int, int] | None]:
     """The ratio of two mean errors, the eavesdropper's over the legitimate one, its standard error, and its slots.
 
     Over the second half of the run, so that the start, in which few packets decide, does not count; over all slots of a run
     that was cut short or is not longer than its first half. inf if the legitimate error is only rounding; NaN without slots.
     """
-    user, theory = legitimate
-    if not user.done:
+    legitimate, theory = of_legitimate
+    if not legitimate.done:
         return math.nan, None, None
-    first = int(window_bounds(user.slots)[WINDOWS // 2])
-    if user.done == other.done == user.slots and first < user.slots:
-        theirs, ours = (tally.window_errors[WINDOWS // 2 : WINDOWS].sum(axis=0) for tally in (other, user))
+    first = int(window_bounds(legitimate.slots)[WINDOWS // 2])
+    if legitimate.done == other.done == legitimate.slots and first < legitimate.slots:
+        theirs, ours = (tally.window_errors[WINDOWS // 2 : WINDOWS].sum(axis=0) for tally in (other, legitimate))
     else:
-        first, (theirs, ours) = 0, (tally.window_errors.sum(axis=0) for tally in (other, user))
+        first, (theirs, ours) = 0, (tally.window_errors.sum(axis=0) for tally in (other, legitimate))
     over, under = float(np.mean(theirs)), float(np.mean(ours))
-    alike = user.alike and other.alike
-    slots = (first, user.done - 1)
-    if not under or theory.is_rounding(under / (slots[1] + 1 - first), user.done):
+    alike = legitimate.alike and other.alike
+    slots = (first, legitimate.done - 1)
+    if not under or theory.is_rounding(under / (slots[1] + 1 - first), legitimate.done):
         return math.inf, None, slots
     return over / under, ratio_error(theirs, ours) if alike else None, slots
 
@@ -350,9 +358,9 @@ def _unknown(theory: Expectation) -> str:
     return "no closed form of its error is known" if theory.outcomes_at is None else Secrecy.unknown
 
 
-def _holds_from(user: Expectation, other: Expectation, slots: int) -> int | None:
+def _holds_from(legitimate: Expectation, other: Expectation, slots: int) -> int | None:
     """The first slot k ≥ 1 from which theory expects the other's error to be larger up to slot slots−1; None without one."""
-    streams, first = (user.stream(), other.stream()), 1
+    streams, first = (legitimate.stream(), other.stream()), 1
     for part in parts_of(range(slots)):
         smaller, larger = (stream.next_traces(len(part)) for stream in streams)
         wrong = np.flatnonzero(~(larger - smaller > 0.0))

@@ -121,7 +121,7 @@ class ExactSimulation:
         answered = self._ack_channel is not None or self._control_loop is not None
         sent: list[Sent] = []
         alarms: list[Flags] = []
-        users: list[FollowedSlots] = []
+        followed: list[FollowedSlots] = []
         inputs = None if self._control_loop is None else self._control_loop.room(len(chunk))
         for slots in [range(k, k + 1) for k in chunk] if answered else [chunk]:
             with self._guard.asking(LEGITIMATE, slots):
@@ -135,15 +135,15 @@ class ExactSimulation:
                 alarms += [] if alarm is None else [alarm]
             if self._control_loop is not None and inputs is not None:
                 if self._control_loop.awaits_estimate:
-                    users.append(self._follow(LEGITIMATE, slots, links[LEGITIMATE], made))
-                x_hat = users[-1].beliefs.x_hat[0] if users else None
+                    followed.append(self._follow(LEGITIMATE, slots, links[LEGITIMATE], made))
+                x_hat = followed[-1].beliefs.x_hat[0] if followed else None
                 self._control_loop.act(slots.start, slots.start - chunk.start, made.true[0], x_hat, inputs)
         whole = Sent.joined(sent)
         with self._guard.asking(LEGITIMATE, chunk):
             self._packets.add_slots(self._roles.scheme.encrypted(whole.packets), whole.packets.sent)
         followed = {
-            name: FollowedSlots.joined(users)
-            if users and name == LEGITIMATE
+            name: FollowedSlots.joined(followed)
+            if followed and name == LEGITIMATE
             else self._follow(name, chunk, link, whole)
             for name, link in links.items()
         }

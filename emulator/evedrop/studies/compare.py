@@ -131,12 +131,12 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
         for group, merger in groups:
             cells |= _cells(group, merger.run_tally.tallies)
         scenario, merger = groups[0][0].scenario, groups[0][1]
-        user = merger.run_tally.tallies[LEGITIMATE]
+        legitimate = merger.run_tally.tallies[LEGITIMATE]
         schemes[scheme] = SchemeResult(
             scheme,
             scenario.encoding.parameters,
             _needs(scenario, merger.packets),
-            _measured(scenario, LEGITIMATE, user, expectations_of(scenario)[LEGITIMATE]),
+            _measured(scenario, LEGITIMATE, legitimate, expectations_of(scenario)[LEGITIMATE]),
             {adversary: cells[adversary] for adversary in matchups.adversaries},
             _leak(scenario),
         )

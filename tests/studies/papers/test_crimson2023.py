@@ -14,13 +14,13 @@ A, Q = np.array([[0.5, 0.1], [0.4, 0.6]]), 0.01 * np.eye(2)
 def test_at_the_threshold_both_err_alike() -> None:
     """By iterating the published recursions; with equal losses any noise puts the eavesdropper behind."""
     P, P_OL, mu = filter_error(), open_loop(), noise_threshold(0.4, 0.25)
-    user = eavesdropper = P_OL
+    legitimate = eavesdropper = P_OL
     for _ in range(500):
         a = 0.6 * (1.0 - mu)
-        user = a * P + (1.0 - a) * (A @ user @ A.T + Q)
+        legitimate = a * P + (1.0 - a) * (A @ legitimate @ A.T + Q)
         used = (1.0 - mu) * P + mu * (P_OL + P)
         eavesdropper = 0.75 * used + 0.25 * (A @ eavesdropper @ A.T + Q)
-    assert np.trace(user) == pytest.approx(np.trace(eavesdropper), rel=1e-9)
+    assert np.trace(legitimate) == pytest.approx(np.trace(eavesdropper), rel=1e-9)
     assert mu == pytest.approx(0.1409, abs=1e-4)
     assert noise_threshold(0.3, 0.3) < 1e-9
 

@@ -81,7 +81,7 @@ def test_where_the_expected_error_of_the_unstable_process_has_a_bound() -> None:
         assert growth(TransmissionPolicy(theta=theta), MU) == pytest.approx(coded**packets * missed)
     assert growth(TransmissionPolicy(theta=0.174), MU) < 1.0 < growth(TransmissionPolicy(theta=0.175), MU)
     unheard = 1.44 * 0.2 * 0.74 / (1 - 1.44 * 0.2 * 0.26)
-    assert growth(TransmissionPolicy(theta=0.0), MU, user=False) == pytest.approx(unheard)
+    assert growth(TransmissionPolicy(theta=0.0), MU, legitimate=False) == pytest.approx(unheard)
 
 
 def test_trials_do_not_depend_on_their_batch() -> None:

@@ -191,7 +191,7 @@ def design_policy(
 ) -> PolicyDesign:
     """When a sensor with acknowledgements should send: the Pareto front against each eavesdropper of a scenario.
 
-    weights: of the user's error, from 0 to 1; the eavesdropper's error has the rest; prices: of a transmission; states: how many
+    weights: of the legitimate error, from 0 to 1; the eavesdropper's has the rest; prices: of a transmission; states: how many
     holding times are distinguished; changes: entries by dotted key.
 
     Raises ScenarioError with every mistake of the scenario, UsageError if it is not one for policies, see

@@ -80,7 +80,7 @@ def _designs(parser: argparse.ArgumentParser) -> None:
         "--min-ratio",
         type=float,
         metavar="R",
-        help="find the cheapest μ_d at which every eavesdropper's error is at least R times the user's in the limit",
+        help="find the cheapest μ_d at which every eavesdropper's error is at least R times the estimator's in the limit",
     )
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument(
@@ -98,7 +98,11 @@ def _designs(parser: argparse.ArgumentParser) -> None:
         help="the threshold from which to encrypt, so that a slot costs an energy of at most E on average",
     )
     parser.add_argument(
-        "--weight", type=float, nargs="+", metavar="β", help="weights of the user's error, 0 to 1 (default 0, 0.05 … 1)"
+        "--weight",
+        type=float,
+        nargs="+",
+        metavar="β",
+        help="weights of the legitimate error, 0 to 1 (default 0, 0.05 … 1)",
     )
     parser.add_argument("--price", type=float, nargs="+", metavar="λ", help="costs of a transmission (default 0)")
     parser.add_argument("--states", type=int, metavar="N", help="holding times that are distinguished (default 10)")

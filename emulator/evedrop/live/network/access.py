@@ -94,16 +94,16 @@ def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, rel
             )
         )
     for name in receivers:
-        user, told = name == LEGITIMATE, loop is not None and loop.knows_input
+        legitimate, told = name == LEGITIMATE, loop is not None and loop.knows_input
         table.append(
             Grant(
                 name,
                 writes=(
                     keys.telemetry(name),
                     keys.progress(name),
-                    *((keys.acknowledged, *estimate) if user else ()),
+                    *((keys.acknowledged, *estimate) if legitimate else ()),
                 ),
-                reads=(keys.downlink(name), keys.control(name), *((keys.input,) if user and told else ())),
+                reads=(keys.downlink(name), keys.control(name), *((keys.input,) if legitimate and told else ())),
                 token=keys.alive(name),
                 checks=(keys.alive(name),),
             )

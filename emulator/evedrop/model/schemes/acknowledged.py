@@ -39,7 +39,7 @@ class AcknowledgedEncoder(Encoder):
             self._reference = product(self._code.at(k), np.where(self._slot == NONE, 0.0, self._reference))
         # Where there is no reference, 0 is subtracted: x − 0 is x.
         z = x - self._reference
-        # The state as the user reads it, to the last bit: the rounding of x would grow with each reference made from another.
+        # The state to the last bit as the estimator reads it: the rounding of x would grow with each reference made from another.
         self._k, self._read = k, z + self._reference
         return Packet(z, np.zeros(x.shape[1], np.bool_), self._slot[None].copy())
 
@@ -52,7 +52,7 @@ class AcknowledgedEncoder(Encoder):
 
 
 class _AcknowledgedReferences(Scheme):
-    """Subtracts a reference that the user has, as its acknowledgements show."""
+    """Subtracts a reference that the legitimate estimator has, as its acknowledgements show."""
 
     best_reader = "reference"
     needs_acknowledgements = True
@@ -90,7 +90,7 @@ def _reference_form(scheme: Acknowledged, conditions: ReceiverConditions) -> Ref
 
 
 class Acknowledged(_AcknowledgedReferences):
-    """Subtracts a reference that the user has; an eavesdropper that missed a reference can never recover it.
+    """Subtracts a reference that the legitimate estimator has; an eavesdropper that missed a reference can never recover it.
 
     The reference is carried so that a packet is independent of the state it is sent for, unless A is singular. There is no
     secret: receivers differ only in which packets they heard, and the sensor knows that of one of them. The scheme therefore
@@ -129,7 +129,7 @@ def _open_loop_form(scheme: OpenLoop, conditions: ReceiverConditions) -> Referen
 
 
 class OpenLoop(_AcknowledgedReferences):
-    """Subtracts a reference that the user has, carried by A; an eavesdropper that missed it follows the stable modes later.
+    """Subtracts a reference that the estimator has, carried by A; an eavesdropper that missed it follows the stable modes later.
 
     Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
     """

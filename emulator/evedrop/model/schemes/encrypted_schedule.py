@@ -174,7 +174,7 @@ class QuantisedScheduleEstimator(Receiver):
 
 
 def _always_read(scheme: QuantisedSchedule, conditions: ReceiverConditions) -> ChainForm | None:
-    """That of the user, which reads every packet."""
+    """That of the legitimate estimator, which reads every packet."""
     received = conditions.received
     if received is None or conditions.acknowledged is None or scheme.threshold > LARGEST_OPERATOR:
         return None

@@ -64,7 +64,7 @@ class RandomCodeEncoder(MixedEncoder):
 class RandomCode(Scheme):
     """With probability α the state, otherwise the state minus a reference, as `acknowledged` sends it.
 
-    A flipped acknowledgement leaves user and sensor with different references; the next state that the user receives, if its
+    A flipped acknowledgement leaves sensor and estimator with different references; the next state that it receives, if its
     acknowledgement is not flipped, synchronises them again.
 
     Source: Lücke, Lu, Quevedo (2022); docs/mathematics.md, flipped acknowledgements.
@@ -86,7 +86,7 @@ class RandomCode(Scheme):
         """A number that is not a probability, or 0."""
         if given.get("plain_probability") == 0:
             why = f"is {as_toml(given['plain_probability'])}, so the state is never sent again once there is a reference: "
-            why += "the first flipped acknowledgement would leave the user behind for good; expected a number above 0, up to 1"
+            why += "one flipped acknowledgement would leave the estimator behind for good; expected a number above 0, up to 1"
             return [("plain_probability", why)]
         return probability_mistakes(given, "plain_probability")
 
@@ -133,7 +133,7 @@ def forged_fraction(mu: float, flip: float) -> float:
 
 @final
 class ThresholdCodeEncoder(MixedEncoder):
-    """Sends the state where b > θ, b the probability that the user has lost the reference, as far as the sensor knows."""
+    """Sends the state where b > θ, b the probability that the estimator has lost the reference, as far as the sensor knows."""
 
     def __init__(self, code: ReferenceCode, n: int, trials: int, threshold: float, forged: float) -> None:
         super().__init__(code, n, trials)
@@ -153,7 +153,7 @@ class ThresholdCodeEncoder(MixedEncoder):
 
 
 class ThresholdCode(Scheme):
-    """The state where the belief that the user has lost the reference exceeds θ, else the state minus the reference.
+    """The state where the belief that the estimator has lost the reference exceeds θ, else the state minus the reference.
 
     The sensor computes its belief from the link's quality and the probability of flips as it is told them.
 
@@ -176,7 +176,7 @@ class ThresholdCode(Scheme):
         mistakes = probability_mistakes(given, "lost_belief", "assumed_quality", "assumed_flip")
         if is_number(given.get("lost_belief"), 1.0, 1.0):
             why = f"is {as_toml(given['lost_belief'])}, which no belief exceeds, so the state is never sent again once there is "
-            why += "a reference: the first flipped acknowledgement would leave the user behind for good; "
+            why += "a reference: one flipped acknowledgement would leave the estimator behind for good; "
             why += "expected a number below 1"
             mistakes.append(("lost_belief", why))
         return mistakes

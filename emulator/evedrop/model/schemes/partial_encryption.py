@@ -129,7 +129,7 @@ class PartialEncryption(Scheme):
         return _WORD_BITS * int(self._hidden.sum())
 
     def outcomes(self, mu: float) -> Outcomes:
-        """Theorem IV.1: neither the noise nor its absence makes a difference to the user."""
+        """Theorem IV.1: neither the noise nor its absence makes a difference to the legitimate estimator."""
         return Outcomes.legitimate(mu, self.state_probability)
 
     def reader_outcomes(self, reader: str, mu_e: float) -> Outcomes | None:

@@ -57,7 +57,7 @@ class Withholding(Scheme):
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A number that is not a probability, or 0."""
         if is_number(given.get("state_probability"), 0.0, 0.0):
-            why = f"is {as_toml(given['state_probability'])}, so nothing is sent after slot 0, and the user knows no more than "
+            why = f"is {as_toml(given['state_probability'])}, so nothing is sent after slot 0, and no receiver knows more than "
             why += "an eavesdropper that hears nothing; expected a number above 0, up to 1"
             return [("state_probability", why)]
         return probability_mistakes(given, "state_probability")

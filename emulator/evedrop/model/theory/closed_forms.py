@@ -39,7 +39,7 @@ from evedrop.model.theory.covariances import (
 )
 
 Hears = Callable[[bool, bool], float]
-"""(whether the user hears a packet, whether the hijacker does) → the probability that a receiver hears it."""
+"""(whether the legitimate estimator hears a packet, whether the hijacker does) → the probability that a receiver hears it."""
 
 
 class ClosedForm(ABC):
@@ -74,7 +74,7 @@ class Hijack:
     """A hijacked sensor that counts the packets its eavesdropper has missed."""
 
     mu: float
-    """Quality of the user's link."""
+    """Quality of the legitimate link."""
     mu_e: float
     """Quality of the link of the eavesdropper that the sensor serves."""
     heed_rule: HeedRule
@@ -97,7 +97,7 @@ class ReceiverConditions:
     """The probabilities that a packet is acknowledged and the receiver heard it, and that it is acknowledged and the receiver did
     not. None: there are no acknowledgements, or their probabilities differ from slot to slot. Else `received` is known."""
     forged: bool = False
-    """Whether an attacker sends acknowledgements in the user's name."""
+    """Whether an attacker sends acknowledgements in the legitimate estimator's name."""
     hijack: Hijack | None = None
     """The hijacked sensor, if it needs more than the last packet to decide which acknowledgements it heeds."""
 
@@ -313,7 +313,7 @@ def hijacked_schedule(threshold: int, mu: float, mu_e: float, heed_rule: HeedRul
     """The chain for a receiver of the scheme `scheduled` whose sensor is hijacked.
 
     A state is a holding time, as for `scheduled`, and how many packets in a row the eavesdropper has missed that the sensor
-    serves: 0 … patience, or more. hears: the probability that the receiver hears a packet, by whether the user and that
+    serves: 0 … patience, or more. hears: the probability that the receiver hears a packet, by whether the estimator and that
     eavesdropper hear it.
 
     Source: docs/mathematics.md, the hijacked sensor.
@@ -326,13 +326,13 @@ def hijacked_schedule(threshold: int, mu: float, mu_e: float, heed_rule: HeedRul
         for s in range(top):
             carried[s * counts + missed, (s + 1) * counts + missed] = 1.0
         before = top * counts + missed
-        for user, served in product((True, False), repeat=2):
+        for legitimate, served in product((True, False), repeat=2):
             now = 0 if served else min(missed + 1, counts - 1)
-            chance = (mu if user else 1.0 - mu) * (mu_e if served else 1.0 - mu_e)
-            heeded = heed_rule.fraction_of(now) if user else 0.0
+            chance = (mu if legitimate else 1.0 - mu) * (mu_e if served else 1.0 - mu_e)
+            heeded = heed_rule.fraction_of(now) if legitimate else 0.0
             for after, odds in ((now, heeded), (top * counts + now, 1.0 - heeded)):
-                reset[before, after] += chance * odds * hears(user, served)
-                carried[before, after] += chance * odds * (1.0 - hears(user, served))
+                reset[before, after] += chance * odds * hears(legitimate, served)
+                carried[before, after] += chance * odds * (1.0 - hears(legitimate, served))
     return SensorChain(start, reset, carried)
 
 

@@ -58,7 +58,7 @@ class Outcomes:
 
     @classmethod
     def eavesdropper(cls, mu_e: float, mu_d: float, use_state: float, use_innovation: float) -> Outcomes:
-        """A user of packets behind a link of quality μ_e, with P(b=1 | ν=0) and P(b=1 | ν=1)."""
+        """A receiver behind a link of quality μ_e that uses packets with P(b=1 | ν=0) and P(b=1 | ν=1)."""
         state = mu_e * mu_d * use_state
         misled = mu_e * (1.0 - mu_d) * use_innovation
         discarded = mu_d * (1.0 - use_state) + (1.0 - mu_d) * (1.0 - use_innovation)

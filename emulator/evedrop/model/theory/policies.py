@@ -25,7 +25,7 @@ _AS_GOOD = 1e-9  # relative difference below which silence is as good as a packe
 
 @dataclass(frozen=True)
 class Policy:
-    """The optimal decision by the holding times 1, 2 … S of user (row) and eavesdropper (column); S stands for longer ones."""
+    """The optimal decision by the holding times 1, 2 … S: legitimate (row), eavesdropper's (column); S stands for longer ones."""
 
     send: NDArray[np.bool_]
     """(S, S)."""
@@ -36,7 +36,7 @@ class Policy:
 
     @property
     def thresholds(self) -> tuple[int, ...]:
-        """For each holding time of the eavesdropper: the least one of the user at which to send; S + 1 if there is none."""
+        """For each holding time of the eavesdropper: the least one of the estimator at which to send; S + 1 if there is none."""
         return tuple(int(silent) + 1 for silent in (~self.send).sum(axis=0))
 
     @property
@@ -62,7 +62,7 @@ def best_policy(process: Process, mu: float, mu_e: float, weight: float, states:
     """Minimise the average of weight · tr P − (1 − weight) · tr Pᵉ + price · [sent] over all rules by two holding times.
 
     Holding times longer than `states` slots count as `states`, which keeps the cost of an unstable process finite. By
-    relative value iteration. For each holding time of the eavesdropper the policy is a threshold on the user's. μ must be
+    relative value iteration. For each holding time of the eavesdropper the policy is a threshold on the estimator's. μ must be
     above 0. Where silence is as good as a packet it is silent.
 
     Source: docs/mathematics.md, the best policy.
@@ -103,7 +103,7 @@ def least_weight(process: Process, mu: float, mu_e: float, price: float, states:
 
 
 def policy_chains(send: NDArray[np.bool_], mu: float, mu_e: float) -> tuple[SensorChain, SensorChain, Floats]:
-    """A policy's chains for user and eavesdropper, and where it sends, (S,), over the states that it reaches.
+    """A policy's chains for legitimate estimator and eavesdropper, and where it sends, (S,), over the states that it reaches.
 
     send: (S, S), by holding times. The first slot's are S and S.
 
@@ -116,18 +116,18 @@ def policy_chains(send: NDArray[np.bool_], mu: float, mu_e: float) -> tuple[Sens
     for i, j in queue:
         heard = ((False, 1.0 - mu), (True, mu)) if send[i, j] else ((False, 1.0),)
         heard_e = ((False, 1.0 - mu_e), (True, mu_e)) if send[i, j] else ((False, 1.0),)
-        for (user, chance), (eve, chance_e) in product(heard, heard_e):
+        for (legitimate, chance), (eve, chance_e) in product(heard, heard_e):
             if chance * chance_e > 0.0:
-                to = (0 if user else min(i + 1, last), 0 if eve else min(j + 1, last))
+                to = (0 if legitimate else min(i + 1, last), 0 if eve else min(j + 1, last))
                 if to not in index_of:
                     index_of[to] = len(index_of)
                     queue.append(to)
-                moves.append((index_of[i, j], index_of[to], chance * chance_e, user, eve))
+                moves.append((index_of[i, j], index_of[to], chance * chance_e, legitimate, eve))
     start = np.zeros(len(index_of))
     start[0] = 1.0
     matrices = np.zeros((4, len(index_of), len(index_of)))
-    for s, r, chance, user, eve in moves:
-        matrices[int(user), s, r] += chance
+    for s, r, chance, legitimate, eve in moves:
+        matrices[int(legitimate), s, r] += chance
         matrices[2 + int(eve), s, r] += chance
     sends = np.array([float(send[state]) for state in index_of])
     return SensorChain(start, matrices[1], matrices[0]), SensorChain(start, matrices[3], matrices[2]), sends
@@ -137,29 +137,29 @@ def policy_chains(send: NDArray[np.bool_], mu: float, mu_e: float) -> tuple[Sens
 class PolicyMetrics(JsonFields):
     """The metrics of one policy in the limit: exact, by the stationary distribution of its chain."""
 
-    user: float
-    """Trace of the user's theoretical error covariance; inf if it is unbounded."""
+    legitimate: float
+    """Trace of the legitimate theoretical error covariance; inf if it is unbounded."""
     eavesdropper: float
     """The eavesdropper's."""
     transmissions: float
     """The fraction of slots in which the sensor sends."""
 
     def dominates(self, other: PolicyMetrics) -> bool:
-        """Whether one of the three metrics is better and none is worse: user and transmissions low, eavesdropper high."""
+        """Whether one of the three metrics is better and none is worse: our error and transmissions low, theirs high."""
         ours, theirs = self.to_lower, other.to_lower
         return all(a <= b for a, b in zip(ours, theirs, strict=True)) and ours != theirs
 
     @property
     def to_lower(self) -> tuple[float, float, float]:
         """What a good policy has low, to ten digits: the rest is rounding."""
-        metrics = (self.user, -self.eavesdropper, self.transmissions)
-        user, eavesdropper, transmissions = (float(f"{one:.10g}") for one in metrics)
-        return user, eavesdropper, transmissions
+        metrics = (self.legitimate, -self.eavesdropper, self.transmissions)
+        legitimate, eavesdropper, transmissions = (float(f"{one:.10g}") for one in metrics)
+        return legitimate, eavesdropper, transmissions
 
     def cost(self, weight: float, price: float) -> float:
-        """Average cost: weight · user − (1 − weight) · eavesdropper + price · transmissions; −inf if only the second is inf."""
+        """Average cost: weight · legitimate − (1 − weight) · eavesdropper + price · transmissions; −inf if only the second is."""
         gained = (1.0 - weight) * self.eavesdropper if weight < 1.0 else 0.0
-        paid = weight * self.user if weight > 0.0 else 0.0
+        paid = weight * self.legitimate if weight > 0.0 else 0.0
         return math.inf if math.isinf(paid) else paid - gained + price * self.transmissions
 
 
@@ -172,7 +172,7 @@ class FrontPoint:
     price: float
     """λ, the cost of a transmission."""
     thresholds: tuple[int, ...]
-    """By the eavesdropper's holding time 1 … S: the least holding time of the user at which to send; S + 1: never."""
+    """By the eavesdropper's holding time 1 … S: the least holding time of the estimator at which to send; S + 1: never."""
     metrics: PolicyMetrics
     scheduled: int
     """The threshold of `scheduled` that costs least at the larger weight, of those in `Front.thresholds`."""
@@ -212,12 +212,12 @@ class Front:
 
 @dataclass(frozen=True)
 class ScheduledLinks:
-    """The links as the policies need them: of the sensor, the user and one eavesdropper."""
+    """The links as the policies need them: of the sensor, the legitimate estimator and one eavesdropper."""
 
     mu: float
     mu_e: float
-    user: tuple[float, float]
-    """Probabilities that a packet is acknowledged and the user heard it, and that it is acknowledged and it did not."""
+    legitimate: tuple[float, float]
+    """Probabilities that a packet is acknowledged and the estimator heard it, and that it is acknowledged and it did not."""
     eavesdropper: tuple[float, float]
     """The same for the eavesdropper."""
 
@@ -229,8 +229,8 @@ def policy_metrics(process: Process, send: NDArray[np.bool_], mu: float, mu_e: f
 
     Source: docs/mathematics.md, the best policy.
     """
-    user, eve, sends = policy_chains(send, mu, mu_e)
-    return _metrics(process, user, eve, sends)
+    legitimate, eve, sends = policy_chains(send, mu, mu_e)
+    return _metrics(process, legitimate, eve, sends)
 
 
 def scheduled_metrics(process: Process, links: ScheduledLinks, threshold: int) -> PolicyMetrics:
@@ -238,14 +238,16 @@ def scheduled_metrics(process: Process, links: ScheduledLinks, threshold: int) -
 
     Source: docs/mathematics.md, schedules by holding time.
     """
-    user = scheduled(threshold, links.mu, links.user)
+    legitimate = scheduled(threshold, links.mu, links.legitimate)
     eve = scheduled(threshold, links.mu_e, links.eavesdropper)
-    return _metrics(process, user, eve, np.arange(threshold) == threshold - 1)
+    return _metrics(process, legitimate, eve, np.arange(threshold) == threshold - 1)
 
 
-def _metrics(process: Process, user: SensorChain, eve: SensorChain, sends: Floats | NDArray[np.bool_]) -> PolicyMetrics:
-    ours, theirs = (float(np.trace(chain.limit(process))) for chain in (user, eve))
-    return PolicyMetrics(ours, theirs, float(user.stationary @ sends))
+def _metrics(
+    process: Process, legitimate: SensorChain, eve: SensorChain, sends: Floats | NDArray[np.bool_]
+) -> PolicyMetrics:
+    ours, theirs = (float(np.trace(chain.limit(process))) for chain in (legitimate, eve))
+    return PolicyMetrics(ours, theirs, float(legitimate.stationary @ sends))
 
 
 def front(
@@ -276,5 +278,5 @@ def front(
 
 
 def _cheapest(metrics: Sequence[PolicyMetrics], weight: float, price: float) -> int:
-    """The threshold, from 1 on, of the least cost; of equal ones the one with the least error of the user."""
-    return min(range(len(metrics)), key=lambda i: (metrics[i].cost(weight, price), metrics[i].user)) + 1
+    """The threshold, from 1 on, of the least cost; of equal ones the one with the least error of the legitimate estimator."""
+    return min(range(len(metrics)), key=lambda i: (metrics[i].cost(weight, price), metrics[i].legitimate)) + 1

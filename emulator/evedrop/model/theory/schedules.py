@@ -78,7 +78,7 @@ def _probabilities(outcomes: Outcomes) -> Floats:
 class ScheduleProblem:
     """What a schedule is to reach: the largest Σ_k (1 − weight) tr E Pᵉ_k − weight tr E P_k with tr E P_k ≤ Ω in each slot."""
 
-    user: SlotRecursion
+    legitimate: SlotRecursion
     eavesdropper: SlotRecursion
     slots: int
     max_trace: float
@@ -87,7 +87,7 @@ class ScheduleProblem:
 
     def sums(self, mu_d: Floats) -> Floats:
         """The sum of each schedule, (S, N) → (S,); −inf for those that violate Ω."""
-        ours, theirs = self.user.traces(mu_d), self.eavesdropper.traces(mu_d)
+        ours, theirs = self.legitimate.traces(mu_d), self.eavesdropper.traces(mu_d)
         total = ((1.0 - self.weight) * theirs - self.weight * ours).sum(axis=1)
         return np.where((ours <= self.max_trace * (1.0 + ROUNDING)).all(axis=1), total, -np.inf)
 
@@ -143,18 +143,18 @@ def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Flo
         return found
 
     def loss(of: Floats) -> float:
-        ours, theirs = (each.traces(schedule(of)[None])[0] for each in (problem.user, problem.eavesdropper))
+        ours, theirs = (each.traces(schedule(of)[None])[0] for each in (problem.legitimate, problem.eavesdropper))
         return float((problem.weight * ours - (1.0 - problem.weight) * theirs).sum()) / scale
 
     def slope(of: Floats) -> Floats:
-        ours, theirs = (derivatives(each, of) for each in (problem.user, problem.eavesdropper))
+        ours, theirs = (derivatives(each, of) for each in (problem.legitimate, problem.eavesdropper))
         found: Floats = (problem.weight * ours - (1.0 - problem.weight) * theirs).sum(axis=0) / scale
         return found
 
     constraint: Any = {
         "type": "ineq",
-        "fun": lambda of: 1.0 - problem.user.traces(schedule(of)[None])[0, 1:] / bound,
-        "jac": lambda of: -derivatives(problem.user, of)[1:] / bound,
+        "fun": lambda of: 1.0 - problem.legitimate.traces(schedule(of)[None])[0, 1:] / bound,
+        "jac": lambda of: -derivatives(problem.legitimate, of)[1:] / bound,
     }
     found = minimize(
         loss,
@@ -171,7 +171,7 @@ def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Flo
 
 
 def _repaired(problem: ScheduleProblem, mu_d: Floats) -> Floats:
-    """The nearest schedule, (N,), on the way from one to states alone that keeps Ω: the user's error falls with each μ_d.
+    """The nearest schedule, (N,), on the way from one to states alone that keeps Ω: the legitimate error falls with each μ_d.
 
     Slots without states keep none, if Ω can be kept so.
     """
@@ -205,7 +205,7 @@ class MeanSchedule(JsonFields):
 
     mu_d: tuple[float, ...]
     """μ_d(k) for k = 0 … N−1; the first is 1."""
-    user: tuple[float, ...]
+    legitimate: tuple[float, ...]
     """tr E P_k."""
     eavesdropper: tuple[float, ...]
     """tr E Pᵉ_k."""
@@ -250,7 +250,7 @@ def best_schedule(
     levels: int = 11,
     capacity: int = 100,
 ) -> BestSchedule:
-    """The μ_d(k) that maximise an eavesdropper's summed error while the user's stays within Ω in every slot.
+    """The μ_d(k) that maximise an eavesdropper's summed error while the legitimate estimator's stays within Ω in every slot.
 
     eavesdropper_at: μ_d → its outcomes; block: slots, from slot 1 on, that share a μ_d; levels: the number of μ_d in the grid;
     capacity: the most candidates that are kept from slot to slot.
@@ -262,9 +262,9 @@ def best_schedule(
 
     Source: docs/mathematics.md, schedules of μ_d.
     """
-    user = SlotRecursion(process, lambda mu_d: Outcomes.legitimate(mu, mu_d), slots)
-    problem = ScheduleProblem(user, SlotRecursion(process, eavesdropper_at, slots), slots, max_trace, weight)
-    least = user.traces(np.ones((1, slots)))[0]
+    legitimate = SlotRecursion(process, lambda mu_d: Outcomes.legitimate(mu, mu_d), slots)
+    problem = ScheduleProblem(legitimate, SlotRecursion(process, eavesdropper_at, slots), slots, max_trace, weight)
+    least = legitimate.traces(np.ones((1, slots)))[0]
     worst = int(np.argmax(least))
     if not least[worst] <= max_trace:
         raise UsageError(
@@ -281,13 +281,13 @@ def best_schedule(
     starts += sorted(schedules, key=problem.sum_of, reverse=True)[:_ASCENDED]
     best = max((_ascended(problem, start, blocks) for start in starts), key=problem.sum_of)
     best = _improved_by_pairs(problem, best, blocks)
-    # Upwards, where the user's error is smaller: digits beyond these depend on the machine.
+    # Upwards, where the legitimate error is smaller: digits beyond these depend on the machine.
     best = np.minimum(np.ceil(best / _DIGIT) * _DIGIT, 1.0).round(7)
     return BestSchedule(_described(problem, best), _described(problem, constant), _described(problem, grid), exact)
 
 
 def _described(problem: ScheduleProblem, mu_d: Floats) -> MeanSchedule:
-    ours, theirs = problem.user.traces(mu_d[None])[0], problem.eavesdropper.traces(mu_d[None])[0]
+    ours, theirs = problem.legitimate.traces(mu_d[None])[0], problem.eavesdropper.traces(mu_d[None])[0]
     value = problem.sum_of(mu_d)
     return MeanSchedule(tuple(mu_d.tolist()), tuple(ours.tolist()), tuple(theirs.tolist()), value)
 
@@ -297,18 +297,18 @@ def _best_of_grid(
 ) -> tuple[Floats, bool]:
     """The best schedule whose μ_d are levels, (N,), and whether the search was exhaustive.
 
-    Forward over the slots, with the candidates that no other one dominates: that has a user's error at most as large in
+    Forward over the slots, with the candidates that no other one dominates: that has a legitimate error at most as large in
     every later slot, an eavesdropper's at least as large, and a sum at least as large so far.
     """
     mu_d = np.ones((1, problem.slots))
-    E, F = problem.user.initial[None], problem.eavesdropper.initial[None]
+    E, F = problem.legitimate.initial[None], problem.eavesdropper.initial[None]
     value, exact = np.zeros(1), True
     for block in blocks:
         count = len(levels)
         mu_d, E, F, value = (np.repeat(array, count, axis=0) for array in (mu_d, E, F, value))
         mu_d[:, block] = np.tile(levels, len(mu_d) // count)[:, None]
         for k in range(block.start, block.stop):
-            E, F = problem.user.next(k, E, mu_d[:, k]), problem.eavesdropper.next(k, F, mu_d[:, k])
+            E, F = problem.legitimate.next(k, E, mu_d[:, k]), problem.eavesdropper.next(k, F, mu_d[:, k])
             ours = np.trace(E, axis1=1, axis2=2)
             value = value + (1.0 - problem.weight) * np.trace(F, axis1=1, axis2=2) - problem.weight * ours
             kept = ours <= problem.max_trace * (1.0 + ROUNDING)
@@ -360,7 +360,7 @@ def _lowest(problem: ScheduleProblem, blocks: list[slice]) -> Floats:
 def _ascended(problem: ScheduleProblem, mu_d: Floats, blocks: list[slice]) -> Floats:
     """A schedule, (N,), that no change of a single block improves, from one that keeps Ω.
 
-    The user's error falls with each μ_d, so those of a block that keep Ω are all from the least one on.
+    The legitimate error falls with each μ_d, so those of a block that keep Ω are all from the least one on.
     """
     mu_d = mu_d.copy()
     best = problem.sum_of(mu_d)

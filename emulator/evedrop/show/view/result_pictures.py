@@ -295,7 +295,7 @@ _SAID = {
     SecrecyKept.UNDECIDED: "too few trials to tell",
     SecrecyKept.BROKEN: "broken",
 }
-_NOTABLE = 1.1  # the factor by which an attack must raise the user's error to be noted
+_NOTABLE = 1.1  # the factor by which an attack must raise the legitimate error to be noted
 _FACTS = ("legitimate\nerror", "ACKs", "bits\na slot", "energy\na slot", "secret bits\na slot (+ once)")
 _FACT_WIDTH = 1.25
 _LEFT = _FACT_WIDTH * len(_FACTS)
@@ -374,8 +374,8 @@ def _cell(axes: Axes, column: int, row: int, scheme: SchemeResult, cell: Cell) -
         return
     axes.add_patch(Rectangle(**box, facecolor=_GROUND[word]))
     axes.text(column + 0.5, row - 0.17, MARKS[word], ha="center", va="center", color=_INK[word], fontsize=11)
-    user = cell.legitimate.typical / scheme.legitimate.typical if scheme.legitimate.typical else math.inf
-    raised = f"  u×{_number(user)}" if user > _NOTABLE else ""
+    legitimate = cell.legitimate.typical / scheme.legitimate.typical if scheme.legitimate.typical else math.inf
+    raised = f"  u×{_number(legitimate)}" if legitimate > _NOTABLE else ""
     size = 7.2 if raised else 8.4
     axes.text(
         column + 0.5,

@@ -51,7 +51,7 @@ def filter_error() -> Floats:
 
 
 def published_error(losses: float, mu: float, taken: Floats | None = None) -> float:
-    """Tr EP by the published recursion; taken: P_n for an eavesdropper that takes noise for the estimate, None for the user."""
+    """Tr EP by the published recursion; taken: P_n for an eavesdropper that takes noise for the estimate, None without one."""
     P, process = filter_error(), Process(_A, _SMALL, _SMALL)
     kept = losses if taken is not None else 1.0 - (1.0 - losses) * (1.0 - mu)
     source = (1.0 - losses) * (1.0 - mu) * P + kept * _SMALL
@@ -60,16 +60,16 @@ def published_error(losses: float, mu: float, taken: Floats | None = None) -> fl
     return float(np.trace(lyapunov(Process(process.A, source, _SMALL), kept)))
 
 
-def noise_threshold(user_losses: float, losses: float) -> float:
-    """The least μ for which the error of an eavesdropper that takes noise for the estimate exceeds the user's, by bisection.
+def noise_threshold(legitimate_losses: float, losses: float) -> float:
+    """The least μ for which the error of an eavesdropper that takes noise for the estimate exceeds the estimator's, by bisection.
 
-    For an eavesdropper with fewer losses than the user; otherwise it is 0.
+    For an eavesdropper with fewer losses than the legitimate estimator; otherwise it is 0.
     """
     taken = open_loop() + filter_error()
     low, high = 0.0, 1.0
     for _ in range(50):
         mu = 0.5 * (low + high)
-        ahead = published_error(losses, mu, taken) <= published_error(user_losses, mu)
+        ahead = published_error(losses, mu, taken) <= published_error(legitimate_losses, mu)
         low, high = (mu, high) if ahead else (low, mu)
     return high
 
@@ -104,9 +104,9 @@ def _example() -> Iterator[PublishedNumber]:
     near, far = noise_threshold(0.4, 0.25), noise_threshold(0.5, 0.3)
     reason = (
         "the threshold on μ depends on both loss probabilities, which we do not know: many pairs give 0.14, such "
-        f"as 0.4 for the user and 0.25 for the eavesdropper ({near:.3f}); with 0.5 and 0.3 it is {far:.3f}, with equal ones 0"
+        f"as legitimate 0.4 and 0.25 for the eavesdropper ({near:.3f}); with 0.5 and 0.3 it is {far:.3f}, with equal ones 0"
     )
-    quantity = "the μ above which the eavesdropper's error exceeds the user's"
+    quantity = "the μ above which the eavesdropper's error exceeds the legitimate estimator's"
     yield PublishedNumber.stated(_SLIDES, quantity, 0.14, "0 to 1", NumberVerdict.NOT_PUBLIC, reason)
 
 
@@ -118,7 +118,10 @@ def _recursions(trials: int, slots: int) -> Iterator[PublishedNumber]:
         "user": published_error(LOSSES, NOISE),
         "naive": published_error(LOSSES, NOISE, open_loop() + filter_error()),
     }
-    for name, quantity in (("user", "tr EP of the user"), ("naive", "tr EPᵉ of an eavesdropper that is unaware")):
+    for name, quantity in (
+        ("user", "tr EP of the legitimate estimator"),
+        ("naive", "tr EPᵉ of an eavesdropper that is unaware"),
+    ):
         mean, error = published[name]
         yield PublishedNumber.compared(
             where, f"{quantity}, by simulation", formulas[name], mean, error, errors=4.0, printed=False
@@ -150,7 +153,7 @@ def mean_errors(noise_covariance: object, trials: int, slots: int) -> dict[str, 
     trajectory, local = Trajectory(truth, keys["process"], batch), LocalFilter(truth, PLANT, keys["measurement"], batch)
     encoder = scheme.encoder(keys, batch)
     knowledge = Knowledge(network, scheme.state_probability, {}, {}, None, scheme.noise_distribution)
-    receivers: dict[str, Receiver] = {"user": scheme.estimator(keys, batch)}
+    receivers: dict[str, Receiver] = {"user": scheme.estimator(keys, batch)}  # the name of its link's stream
     receivers |= {name: STRATEGIES[name](knowledge, batch) for name in ("naive", "power-test", "bayesian")}
     spec = {"model": "bernoulli", "quality": 1.0 - LOSSES}
     links = {

@@ -30,7 +30,7 @@ from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.studies.papers.reproduction import NumberVerdict, Paper, Progress, PublishedNumber
 
 MU, FLIP = 0.8, 0.1
-"""The quality of the user's link and the probability of a flip, in all examples here."""
+"""The quality of the legitimate link and the probability of a flip, in all examples here."""
 STABLE = Process(np.array([[0.9]]), np.array([[1.0]]), np.array([[1.0 / 0.19]]))
 UNSTABLE = Process(
     np.array([[1.2, 0.1], [0.0, 0.5]]), np.array([[0.6, 0.2], [0.2, 0.5]]), np.array([[0.6, 0.2], [0.2, 0.5]])
@@ -74,8 +74,8 @@ class _Published:
     """Their mean traces with one policy."""
 
     policy: TransmissionPolicy
-    user: tuple[float, ...]
-    """One for each quality of the eavesdropper's link, on which the user does not depend."""
+    legitimate: tuple[float, ...]
+    """One for each quality of the eavesdropper's link, on which the legitimate estimator does not depend."""
     eavesdropper: Mapping[float, float]
     """The quality of its link → its mean trace."""
 
@@ -142,11 +142,13 @@ class Luecke2022(Paper):
 
 
 def _estimated(printed: _Published, means: Floats, slots: int) -> Iterator[PublishedNumber]:
-    """The rows of user and eavesdroppers; means: of each trial, (1 + eavesdroppers, R); slots: of all trials together."""
+    """The rows of estimator and eavesdroppers; means: of each trial, (1 + eavesdroppers, R); slots: of all trials together."""
     mean, error = means.mean(axis=1), means.std(axis=1, ddof=1) / math.sqrt(means.shape[1])
     where = "random_policy/" if printed.policy.theta is None else "threshold_policy/"
-    for i, ((mu_e, eavesdropper), user) in enumerate(zip(printed.eavesdropper.items(), printed.user, strict=True)):
-        for name, theirs, row in (("user", user, 0), ("eavesdropper", eavesdropper, i + 1)):
+    for i, ((mu_e, eavesdropper), legitimate) in enumerate(
+        zip(printed.eavesdropper.items(), printed.legitimate, strict=True)
+    ):
+        for name, theirs, row in (("legitimate estimator", legitimate, 0), ("eavesdropper", eavesdropper, i + 1)):
             yield PublishedNumber.compared(
                 where, f"{name}, {printed.policy}, μ_e = {mu_e}", theirs, float(mean[row]), float(error[row]),
                 relative=0.02, errors=4.0, their_error=float(error[row]) * math.sqrt(slots / _THEIR_SLOTS),
@@ -154,11 +156,11 @@ def _estimated(printed: _Published, means: Floats, slots: int) -> Iterator[Publi
 
 
 def _by_quantiles(printed: _Published, runs: Floats) -> Iterator[PublishedNumber]:
-    """The rows of user and eavesdropper where no expectation is finite; runs: the mean of each run, (2, runs)."""
+    """The rows of legitimate estimator and eavesdropper where no expectation is finite; runs: the mean of each run, (2, runs)."""
     ((mu_e, eavesdropper),) = printed.eavesdropper.items()
     for name, theirs, factor, means in (
-        ("user", printed.user[0], growth(printed.policy, MU), runs[0]),
-        ("eavesdropper", eavesdropper, growth(printed.policy, mu_e, user=False), runs[1]),
+        ("legitimate estimator", printed.legitimate[0], growth(printed.policy, MU), runs[0]),
+        ("eavesdropper", eavesdropper, growth(printed.policy, mu_e, legitimate=False), runs[1]),
     ):
         low, middle, high = np.quantile(means, [0.05, 0.5, 0.95])
         reason = (
@@ -167,20 +169,20 @@ def _by_quantiles(printed: _Published, runs: Floats) -> Iterator[PublishedNumber
             f"runs of {_RUN_SLOTS:,} slots go from {low:.3g} to {high:.3g} (5 and 95 %), with the median {middle:.3g}"
         )
         verdict = NumberVerdict.NOT_COMPARABLE
-        if name == "user":
+        if name == "legitimate estimator":
             verdict = NumberVerdict.PROGRAM
             reason += "; they chose the policy so that this error is 2, but its mean settles nowhere"
         who = f"{name}, unstable A, {printed.policy}, μ_e = {mu_e}"
         yield PublishedNumber.stated("solve_optim.py", who, theirs, math.inf, verdict, reason)
 
 
-def growth(policy: TransmissionPolicy, quality: float, user: bool = True) -> float:
+def growth(policy: TransmissionPolicy, quality: float, legitimate: bool = True) -> float:
     """The growth of the expected error of a receiver that lacks the reference, for the unstable process.
 
-    quality: of its link; user: whether it is the one whose acknowledgements are flipped.
+    quality: of its link; legitimate: whether it is the one whose acknowledgements are flipped.
     """
     rates = rates_of("flip", MU, quality, flip=FLIP)
-    reference = policy.scheme(UNSTABLE).lost_reference(quality, rates.user if user else rates.eavesdropper)
+    reference = policy.scheme(UNSTABLE).lost_reference(quality, rates.legitimate if legitimate else rates.eavesdropper)
     assert reference is not None  # noqa: S101 - both schemes have references
     return reference.growth
 
@@ -196,7 +198,7 @@ def mean_traces(
 ) -> Floats:
     """The mean of tr P over the slots of each trial, after a start that is left out: receivers × trials.
 
-    The first receiver is the user. open_loop: L = A. Only covariances are followed, which do not depend on the states, so an
+    The first receiver is the estimator. open_loop: L = A. Only covariances are followed, which do not depend on the states, so an
     unstable process has no horizon. side_by_side: trials that are simulated at once.
     """
     parts = [
