@@ -76,8 +76,8 @@ def run_alone(rows: Callable[[bool], Iterable[Row]]) -> None:
 
 def read_row(line: str) -> Row:
     """The row of a line of JSON."""
-    found: dict[str, Any] = json.loads(line)
-    return Row(**found)
+    entries: dict[str, Any] = json.loads(line)
+    return Row(**entries)
 
 
 def _line(cells: Iterable[str]) -> str:

@@ -104,17 +104,17 @@ def microseconds(endpoint: str, routed: bool, size: int, count: int) -> float:
 
 def main(quick: bool) -> None:
     """Through a router and straight, by TCP and by a Unix socket."""
-    for what, (size, count) in SIZES.items():
-        found: dict[str, list[float]] = {}
+    for name, (size, count) in SIZES.items():
+        times: dict[str, list[float]] = {}
         for _ in range(1 if quick else 5):
             for way, routed in (("through the router", True), ("straight", False)):
                 with tempfile.TemporaryDirectory() as folder:
                     unix = f"unixsock-stream/{Path(folder) / 'socket'}"
                     for protocol, endpoint in (("TCP", f"tcp/127.0.0.1:{free_port()}"), ("a Unix socket", unix)):
                         taken = microseconds(endpoint, routed, size, count // 20 if quick else count)
-                        found.setdefault(f"{way}, {protocol}", []).append(taken)
-        for way, values in found.items():
-            print(f"{what}: {way}: {statistics.median(values):,.0f} µs of the processor a message")
+                        times.setdefault(f"{way}, {protocol}", []).append(taken)
+        for way, values in times.items():
+            print(f"{name}: {way}: {statistics.median(values):,.0f} µs of the processor a message")
 
 
 if __name__ == "__main__":

@@ -141,8 +141,8 @@ def mistakes_in_good(changes: dict[str, Any], without: str = "") -> list[str]:
 
 def digests_of(results: Results | Path) -> dict[str, str]:
     """Receiver → its digest, of results or of the folder that has them."""
-    found = results if isinstance(results, Results) else Results.read(results)
-    return {name: peer["digest"] for name, peer in found.summary["peers"].items()}
+    result = results if isinstance(results, Results) else Results.read(results)
+    return {name: peer["digest"] for name, peer in result.summary["peers"].items()}
 
 
 def part_of(brief: AnyBrief, kind: type[P]) -> P:

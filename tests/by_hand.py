@@ -138,8 +138,10 @@ class ByHand:
 
     def statuses(self, limit: float = LONG) -> dict[str, int]:
         """Process → its exit status, once all have ended."""
-        wait_until(lambda: all(one.poll() is not None for one in self.processes.values()), "the end of all", limit)
-        return {name: one.wait() for name, one in self.processes.items()}
+        wait_until(
+            lambda: all(process.poll() is not None for process in self.processes.values()), "the end of all", limit
+        )
+        return {name: process.wait() for name, process in self.processes.items()}
 
     @property
     def summary(self) -> Mapping[str, Any]:

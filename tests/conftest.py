@@ -71,7 +71,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Iterat
     say_what_was_skipped(terminalreporter)
 
 
-def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], limit: float = LIMIT) -> Any:
+def wait_until(condition: Callable[[], Any], awaited: str | Callable[[], str], limit: float = LIMIT) -> Any:
     """The first true value of a condition; fails the test if it stays false for this number of seconds.
 
     what: the condition in words, or a function that gives them, with what is known by then.
@@ -81,17 +81,17 @@ def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], limi
     deadline = time.monotonic() + limit
     while True:
         began = time.monotonic()
-        if found := condition():
-            return found
+        if result := condition():
+            return result
         looked = time.monotonic()
         if looked > deadline:
-            pytest.fail(f"within {limit:g} s: {what if isinstance(what, str) else what()}")
+            pytest.fail(f"within {limit:g} s: {awaited if isinstance(awaited, str) else awaited()}")
         time.sleep(min(0.1, max(0.01, 4 * (looked - began))))
 
 
 def with_mark(mark: str) -> dict[int, str]:
     """Process id → command line of every living process whose command line or environment has `mark` in it."""
-    found = {}
+    commands = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             command, environment = (folder / "cmdline").read_bytes(), (folder / "environ").read_bytes()
@@ -99,8 +99,8 @@ def with_mark(mark: str) -> dict[int, str]:
         except OSError:
             continue
         if mark.encode() in command + environment and state != "Z" and int(folder.name) != os.getpid():
-            found[int(folder.name)] = command.replace(b"\0", b" ").decode(errors="replace")
-    return found
+            commands[int(folder.name)] = command.replace(b"\0", b" ").decode(errors="replace")
+    return commands
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,8 @@ class Done:
     @property
     def summary(self) -> dict[str, Any]:
         """What --json printed: one object and nothing else."""
-        found: dict[str, Any] = json.loads(self.out)
-        return found
+        summary: dict[str, Any] = json.loads(self.out)
+        return summary
 
 
 def cause_of(ended: str) -> str:
@@ -138,14 +138,14 @@ class Live:
 
     def children(self) -> dict[str, int]:
         """Process name → process id."""
-        found: dict[str, int] = {}
+        children: dict[str, int] = {}
         for pid, command in with_mark(str(self.temporary)).items():
             words = command.split()
             if pid != self.process.pid and words and words[-1].endswith(".json"):
                 name = Path(words[-1]).stem
                 # A process that has just forked, to start another program, is there twice: the first is itself.
-                found[name] = min(pid, found.get(name, pid))
-        return found
+                children[name] = min(pid, children.get(name, pid))
+        return children
 
     def child(self, name: str) -> int:
         """The process id of one process, as soon as it is there."""

@@ -47,10 +47,10 @@ def own_release() -> str:
 def mirror(release: str) -> str:
     """The address from which this machine's apt has the packages of a release. Raises CannotRun."""
     pattern = ("indextargets", "--format", "$(CODENAME) $(COMPONENT) $(REPO_URI)", "Created-By: Packages")
-    lines = tried("apt-get", *pattern, what="apt-get indextargets").splitlines()
+    lines = tried("apt-get", *pattern, subject="apt-get indextargets").splitlines()
     if not lines:
-        tried("apt-get", "update", "-q", what="apt-get update")
-        lines = tried("apt-get", *pattern, what="apt-get indextargets").splitlines()
+        tried("apt-get", "update", "-q", subject="apt-get update")
+        lines = tried("apt-get", *pattern, subject="apt-get indextargets").splitlines()
     for line in lines:
         codename, component, address = line.split(maxsplit=2)
         if (codename, component) == (release, "main"):
@@ -89,7 +89,7 @@ def bootstrap(
     system = folder / "system"
     system.mkdir()
     command = (*IN_NAMESPACES, "sh", "-c", _BOOTSTRAP, "sh", system, release, address, tar, ",".join(packages))
-    tried(*command, what="debootstrap", timeout=seconds, env={**_proxies(), **os.environ})
+    tried(*command, subject="debootstrap", timeout=seconds, env={**_proxies(), **os.environ})
     system.rmdir()  # nothing was ever in it that others than the command saw
 
 
@@ -102,12 +102,12 @@ def python_version(tar: Path) -> str:
 def _proxies() -> dict[str, str]:
     """Apt's proxies as variables of the environment; debootstrap does not ask apt."""
     words = ("http_proxy", "Acquire::http::Proxy", "https_proxy", "Acquire::https::Proxy")
-    lines = tried("apt-config", "shell", *words, what="apt-config").splitlines()
+    lines = tried("apt-config", "shell", *words, subject="apt-config").splitlines()
     return dict(line.split("=", 1) for line in shlex.split(" ".join(lines)))
 
 
-def require_memory(kilobytes: int, what: str) -> None:
+def require_memory(kilobytes: int, subject: str) -> None:
     """Raises CannotRun if less is available."""
     for line in Path("/proc/meminfo").read_text().splitlines():
         if line.startswith("MemAvailable:") and (available := int(line.split()[1])) < kilobytes:
-            raise CannotRun(f"{what} takes {kilobytes} kB of memory here, and {available} kB are available")
+            raise CannotRun(f"{subject} takes {kilobytes} kB of memory here, and {available} kB are available")

@@ -46,7 +46,7 @@ class Checked(HTMLParser):
 
     def values(self, name: str) -> list[str]:
         """The values of an attribute, in order."""
-        return [value for _, found, value in self.attributes if found == name]
+        return [value for _, key, value in self.attributes if key == name]
 
 
 def checked(folder: Path) -> Checked:
@@ -64,7 +64,9 @@ def checked(folder: Path) -> Checked:
     assert len(ids) == len(set(ids))
     assert {link.removeprefix("#") for link in page.values("href")} <= set(ids)
     assert page.tags["img"] == sum(bool(words) for words in page.values("alt"))
-    assert page.tags["svg"] == len([one for one in page.attributes if one == ("svg", "aria-hidden", "true")])
+    assert page.tags["svg"] == len(
+        [attribute for attribute in page.attributes if attribute == ("svg", "aria-hidden", "true")]
+    )
     scrolling = page.tags["table"] + page.tags["svg"]
     assert page.values("role").count("region") == page.values("tabindex").count("0") == scrolling
     assert page.headings[0]

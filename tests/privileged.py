@@ -33,12 +33,12 @@ def skip(error: CannotRun) -> NoReturn:
 
 def say_what_was_skipped(terminal: pytest.TerminalReporter) -> None:
     """Print the banner, once for each folder and reason."""
-    found = set()
+    skipped = set()
     for report in terminal.stats.get("skipped", ()):
         reason = report.longrepr[2].removeprefix("Skipped: ")
         if reason.startswith(_REASON):
-            found.add((report.nodeid.rpartition("/")[0], reason.removeprefix(_REASON)))
-    for folder, reason in sorted(found):
+            skipped.add((report.nodeid.rpartition("/")[0], reason.removeprefix(_REASON)))
+    for folder, reason in sorted(skipped):
         terminal.section(f"{BANNER}: {folder}", sep="!", red=True)
         terminal.write_line(" ".join(reason.split()))
 
@@ -52,14 +52,14 @@ def run(*command: str | Path, **options: Any) -> subprocess.CompletedProcess[str
     return done
 
 
-def tried(*command: str | Path, what: str, **options: Any) -> str:
+def tried(*command: str | Path, subject: str, **options: Any) -> str:
     """What a command says on its standard output. Raises CannotRun if it fails: that is not what we test."""
     try:
         return run(*command, **options).stdout
     except subprocess.TimeoutExpired as error:
-        raise CannotRun(f"{what}: did not end within {error.timeout:g} s") from error
+        raise CannotRun(f"{subject}: did not end within {error.timeout:g} s") from error
     except (AssertionError, OSError) as error:
-        raise CannotRun(f"{what}: {str(error)[-2000:]}") from error
+        raise CannotRun(f"{subject}: {str(error)[-2000:]}") from error
 
 
 def prepare(packages: Mapping[str, str]) -> None:
@@ -69,7 +69,7 @@ def prepare(packages: Mapping[str, str]) -> None:
     with Path(__file__).open() as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the second process finds the commands installed
         _install(sorted({package for command, package in packages.items() if shutil.which(command) is None}))
-    tried("unshare", "--net", "--mount", "--pid", "--fork", "true", what="namespaces cannot be made")
+    tried("unshare", "--net", "--mount", "--pid", "--fork", "true", subject="namespaces cannot be made")
 
 
 def _install(missing: list[str]) -> None:
@@ -79,9 +79,9 @@ def _install(missing: list[str]) -> None:
         raise CannotRun(f"{', '.join(missing)} are not installed, and there is no apt-get")
     # A daemon of the machine's own is neither needed nor ours to start.
     quiet = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "RUNLEVEL": "1"}
-    tried("apt-get", "update", "-q", what="apt-get update", env=quiet)
+    tried("apt-get", "update", "-q", subject="apt-get update", env=quiet)
     names = " ".join(missing)
     install = ("apt-get", "install", "-q", "-y", "--no-install-recommends", "-o", "DPkg::Lock::Timeout=120")
-    tried(*install, "--download-only", *missing, what=f"the download of {names}", env=quiet)
+    tried(*install, "--download-only", *missing, subject=f"the download of {names}", env=quiet)
     # Downloaded packages are installed without a limit: killed in the middle, dpkg would need repair.
-    tried(*install, *missing, what=f"apt-get install {names}", env=quiet, timeout=None)
+    tried(*install, *missing, subject=f"apt-get install {names}", env=quiet, timeout=None)

@@ -151,8 +151,8 @@ class Cable:
 @contextmanager
 def cable(port: int) -> Iterator[Cable]:
     """A cable to a port of this machine."""
-    one = Cable(port)
+    cable = Cable(port)
     try:
-        yield one
+        yield cable
     finally:
-        one.close()
+        cable.close()

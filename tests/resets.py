@@ -18,7 +18,7 @@ def reset_connections(pid: int, port: int) -> int:
 
     Both ends are told at once. Raises PermissionError where a process may not reach into one that it has started.
     """
-    found, process = 0, os.pidfd_open(pid)
+    resets, process = 0, os.pidfd_open(pid)
     try:
         for number in _sockets_of(pid):
             own = _LIBC.syscall(_PIDFD_GETFD, process, number, 0)
@@ -26,19 +26,19 @@ def reset_connections(pid: int, port: int) -> int:
                 raise PermissionError("pidfd_getfd")
             if own < 0:  # closed meanwhile
                 continue
-            with suppress(OSError), closing(socket.socket(fileno=own)) as one:
-                if one.family == socket.AF_INET and one.getsockname()[1] == port:
-                    one.getpeername()  # that which listens has no peer, and stays
-                    found += _LIBC.connect(one.fileno(), _UNSPECIFIED, len(_UNSPECIFIED)) == 0
+            with suppress(OSError), closing(socket.socket(fileno=own)) as connection:
+                if connection.family == socket.AF_INET and connection.getsockname()[1] == port:
+                    connection.getpeername()  # that which listens has no peer, and stays
+                    resets += _LIBC.connect(connection.fileno(), _UNSPECIFIED, len(_UNSPECIFIED)) == 0
     finally:
         os.close(process)
-    return found
+    return resets
 
 
 def _sockets_of(pid: int) -> list[int]:
-    found = []
+    sockets = []
     for path in Path(f"/proc/{pid}/fd").iterdir():
         with suppress(OSError):
             if os.readlink(path).startswith("socket:"):
-                found.append(int(path.name))
-    return found
+                sockets.append(int(path.name))
+    return sockets

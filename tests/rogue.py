@@ -41,5 +41,5 @@ def with_rogue(evedrop: Evedrop, name: str, does: str) -> dict[str, str]:
     """The environment in which the process of that name does something else than it should."""
     (evedrop.folder / "sitecustomize.py").write_text(BEGIN.format(name=name))
     (evedrop.folder / "rogue.py").write_text(ROGUE + does + "\n")
-    found = os.environ.get("PYTHONPATH", "")
-    return {**evedrop.environment, "PYTHONPATH": f"{evedrop.folder}{os.pathsep}{found}".rstrip(os.pathsep)}
+    path = os.environ.get("PYTHONPATH", "")
+    return {**evedrop.environment, "PYTHONPATH": f"{evedrop.folder}{os.pathsep}{path}".rstrip(os.pathsep)}

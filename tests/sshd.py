@@ -61,19 +61,19 @@ class Sshd:
 
 def descendants(pid: int) -> list[int]:
     """The ids of the children of a process, and of theirs; parents first."""
-    found = []
+    pids = []
     with suppress(OSError):
         for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-            found += [int(child), *descendants(int(child))]
-    return found
+            pids += [int(child), *descendants(int(child))]
+    return pids
 
 
 def program() -> str:
     """The path of sshd. Raises CannotRun."""
-    found = shutil.which("sshd", path=f"{os.environ['PATH']}:/usr/sbin:/usr/local/sbin")
-    if found is None or shutil.which("ssh") is None or shutil.which("ssh-keygen") is None:
+    path = shutil.which("sshd", path=f"{os.environ['PATH']}:/usr/sbin:/usr/local/sbin")
+    if path is None or shutil.which("ssh") is None or shutil.which("ssh-keygen") is None:
         raise CannotRun("sshd or ssh is not installed (Debian's openssh-server)")
-    return found
+    return path
 
 
 @contextmanager
@@ -124,10 +124,12 @@ def sshd(folder: Path, address: str = "127.0.0.1", enter: tuple[str, ...] = (), 
             )
         server = Sshd(folder, process, address, port)
         try:
-            said = folder / "sshd.log"
-            wait_until(lambda: b"listening" in said.read_bytes() or process.poll() is not None, "an sshd that listens")
+            log_file = folder / "sshd.log"
+            wait_until(
+                lambda: b"listening" in log_file.read_bytes() or process.poll() is not None, "an sshd that listens"
+            )
             if process.poll() is not None:
-                raise CannotRun(f"sshd does not start: {said.read_text().strip()[-500:]}")
+                raise CannotRun(f"sshd does not start: {log_file.read_text().strip()[-500:]}")
             yield server
         finally:
             for pid in (process.pid, *server.sessions()):

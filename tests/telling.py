@@ -94,7 +94,9 @@ def program_with_path() -> NoReturn:
 
     Debian and Ubuntu ship a `sitecustomize` that this process has imported long ago; the one in PYTHONPATH comes before it.
     """
-    folders = [one for one in os.environ.get("PYTHONPATH", "").split(os.pathsep) if one and one not in sys.path]
+    folders = [
+        folder for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep) if folder and folder not in sys.path
+    ]
     if folders:
         sys.path[:0] = folders
         importlib.invalidate_caches()

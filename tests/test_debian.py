@@ -85,11 +85,11 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Started
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
     with unharmed(tmp_path):
-        one = StartedDebootstrap(tmp_path)
-        for name, value in one.environment.items():
+        debootstrap = StartedDebootstrap(tmp_path)
+        for name, value in debootstrap.environment.items():
             monkeypatch.setenv(name, value)
-        yield one
-        one.close()
+        yield debootstrap
+        debootstrap.close()
 
 
 @contextmanager
@@ -191,8 +191,8 @@ def test_a_folder_with_a_mount_in_it_is_not_removed(started: StartedDebootstrap,
     folder, kept = tmp_path / "temporary", tmp_path / "kept"
     for made in (folder / "a place", folder / "other", kept):
         made.mkdir(parents=True)
-    what = ("-t", "tmpfs", "tmpfs") if kind == "another file system" else ("--bind", kept)
-    script = (sys.executable, "-c", REMOVES, folder, kept, *what)
+    mount = ("-t", "tmpfs", "tmpfs") if kind == "another file system" else ("--bind", kept)
+    script = (sys.executable, "-c", REMOVES, folder, kept, *mount)
     run(*IN_A_NAMESPACE, *script, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)})
     assert not folder.exists()
     assert [path.name for path in kept.iterdir()] == ([] if kind == "another file system" else ["treasure"])

@@ -165,8 +165,8 @@ def test_the_command_line_loads_nothing_to_print_help() -> None:
 
 def test_the_pytest_plugin_loads_nothing_but_pytest() -> None:
     """The plugin is loaded in every project whose environment contains Evedrop."""
-    found = loaded_by("pytest", "evedrop.cli.pytest_plugin")
-    more = found["evedrop.cli.pytest_plugin"] - found["pytest"]
+    loaded = loaded_by("pytest", "evedrop.cli.pytest_plugin")
+    more = loaded["evedrop.cli.pytest_plugin"] - loaded["pytest"]
     assert packages(more) == set()
     assert {name for name in more if name.startswith("evedrop.")} == {"evedrop.cli", "evedrop.cli.pytest_plugin"}
 

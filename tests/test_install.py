@@ -126,17 +126,17 @@ def test_a_line_comes_while_pip_is_silent(
     python.chmod(0o755)
     monkeypatch.setattr(install, "SECONDS", 0.01)
     monkeypatch.setattr(sys, "executable", str(python))
-    said = []
+    messages = []
 
     def say(text: str) -> None:
-        said.append(text)
+        messages.append(text)
         if "118 MB" in text:
             printed.write_text("yes\n")
             monkeypatch.setattr(install, "SECONDS", 100.0)
 
     monkeypatch.setattr(install, "_say", say)
     assert install._pip(install.Progress({"big"})) == 0
-    assert said[-1] == "1 of 1 packages here, 118 MB; the last begun is big, 118 MB"
+    assert messages[-1] == "1 of 1 packages here, 118 MB; the last begun is big, 118 MB"
     assert capsys.readouterr().out == ""
 
 

@@ -81,11 +81,11 @@ def test_a_package_with_one_of_each_runs(evedrop: Evedrop, environment: dict[str
     live, memory = (Results.read(evedrop.folder / name).summary for name in ("live", "memory"))
     assert digests_of(evedrop.folder / "live") == digests_of(evedrop.folder / "memory")
     assert live["peers"]["smart"]["largest_error"] == memory["peers"]["smart"]["largest_error"] > 0.0
-    assert [one["held"] for one in live["expectations"]] == [True]
-    assert [one["event"] for one in live["events"]] == ["dim legitimate", "legitimate is bright again"]
+    assert [expectation["held"] for expectation in live["expectations"]] == [True]
+    assert [event["event"] for event in live["events"]] == ["dim legitimate", "legitimate is bright again"]
     page = (evedrop.folder / "live" / "report.html").read_text(encoding="utf-8")
     told = {"flipped", "chaser", "shifts", "steady", "smart.largest_error above 0: held", "<td>dim legitimate</td>"}
-    assert {one for one in told if one in page} == told
+    assert {word for word in told if word in page} == told
     assert len(rows(evedrop.folder / "live" / "recording.rrd", "ratio/smart", "Scalars:scalars")) == 60
     assert "say hello" in evedrop.process("--help", env=environment).out
 

@@ -23,6 +23,6 @@ def test_what_cannot_be_tested_is_said_loudly(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, env={**os.environ, **where}, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
     assert " passed" not in done.stdout
-    *said, _ = done.stdout.splitlines()[-2 * len(FOLDERS) - 1 :]
-    assert [banner.strip("!") for banner in said[::2]] == [f" {BANNER}: {folder} " for folder in FOLDERS]
-    assert all("it takes Linux and root" in reason or "there is no apt-get" in reason for reason in said[1::2])
+    *lines, _ = done.stdout.splitlines()[-2 * len(FOLDERS) - 1 :]
+    assert [banner.strip("!") for banner in lines[::2]] == [f" {BANNER}: {folder} " for folder in FOLDERS]
+    assert all("it takes Linux and root" in reason or "there is no apt-get" in reason for reason in lines[1::2])

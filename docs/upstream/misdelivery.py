@@ -67,10 +67,12 @@ def reset(port: int) -> None:
         with suppress(OSError):
             if not os.readlink(f"/proc/self/fd/{number}").startswith("socket:"):
                 continue
-        with suppress(OSError), closing(socket.socket(fileno=os.dup(int(number)))) as one:
-            if one.family == socket.AF_INET and one.getsockname()[1] == port:
-                one.getpeername()  # that which listens has no peer, and stays
-                LIBC.connect(one.fileno(), bytes(16), 16)  # to an address of family AF_UNSPEC: resets the connection
+        with suppress(OSError), closing(socket.socket(fileno=os.dup(int(number)))) as connection:
+            if connection.family == socket.AF_INET and connection.getsockname()[1] == port:
+                connection.getpeername()  # that which listens has no peer, and stays
+                LIBC.connect(
+                    connection.fileno(), bytes(16), 16
+                )  # to an address of family AF_UNSPEC: resets the connection
 
 
 def client(name: str, port: int, seconds: float, reopen: bool) -> None:
@@ -142,13 +144,15 @@ def main() -> None:
             reset(port)
             cuts += 1
             time.sleep(rng.choice(GAPS))
-    found = [json.loads(one.communicate()[0].splitlines()[-1]) for one in clients]
+    counts = [json.loads(client.communicate()[0].splitlines()[-1]) for client in clients]
     print(
         f"{cuts} cuts, seed {options.seed}, clients that {'open a new session' if options.reopen else 'Zenoh reconnects'}"
     )
-    print(f"from router to clients: {sum(one['wrong'] for one in found)} of {sum(one['got'] for one in found)} wrong")
     print(
-        f"from clients to router: {count.wrong} of {count.got} wrong; sessions: {sum(one['openings'] for one in found)}"
+        f"from router to clients: {sum(count_['wrong'] for count_ in counts)} of {sum(count_['got'] for count_ in counts)} wrong"
+    )
+    print(
+        f"from clients to router: {count.wrong} of {count.got} wrong; sessions: {sum(count_['openings'] for count_ in counts)}"
     )
     sys.stdout.flush()
     os._exit(0)

@@ -57,7 +57,9 @@ class ScenarioError(UsageError):
     def numbered(self, line_of: Callable[[str], int | None]) -> ScenarioError:
         """The same with the line of each mistake's entry; line_of: dotted path → line, None if the file has no such entry."""
         lines = [(mistake, line_of(mistake.partition(":")[0])) for mistake in self._all]
-        return ScenarioError(self.source, [one if line is None else f"{one} (line {line})" for one, line in lines])
+        return ScenarioError(
+            self.source, [mistake if line is None else f"{mistake} (line {line})" for mistake, line in lines]
+        )
 
 
 class TraceError(UsageError):
@@ -66,10 +68,10 @@ class TraceError(UsageError):
     The message itself is for the command line: `typed` is `what` with options in place of entries, where the two differ.
     """
 
-    def __init__(self, path: str, entry: str, what: str, typed: str | None = None) -> None:
+    def __init__(self, path: str, entry: str, reason: str, typed: str | None = None) -> None:
         self.entry = entry
-        self.what = what
-        super().__init__(f"{path}: {what if typed is None else typed}")
+        self.what = reason
+        super().__init__(f"{path}: {reason if typed is None else typed}")
 
 
 class DisturbanceError(UsageError):
@@ -96,10 +98,10 @@ class RunError(EvedropError):
 class MalformedMessage(RunError):
     """A message that breaks the protocol of docs/protocol.md; `at_fault` names its sender, the only writer of its key."""
 
-    def __init__(self, key: str, found: str, expected: str, payload: bytes, sender: str = "") -> None:
+    def __init__(self, key: str, actual: str, expected: str, payload: bytes, sender: str = "") -> None:
         shown = payload[:48].hex(" ") + (" …" if len(payload) > 48 else "")
         super().__init__(
-            f"malformed message on {key}: {found}; expected {expected}. "
+            f"malformed message on {key}: {actual}; expected {expected}. "
             f"Its {len(payload)} bytes: {shown}. Check that {sender or 'its sender'} speaks docs/protocol.md"
         )
         self.key = key
@@ -109,9 +111,9 @@ class MalformedMessage(RunError):
 class Gap(RunError):
     """A slot that is missing, doubled or out of order: the transport lost what the link did not."""
 
-    def __init__(self, key: str, expected: int, found: int, sender: str = "") -> None:
+    def __init__(self, key: str, expected: int, actual: int, sender: str = "") -> None:
         super().__init__(
-            f"gap on {key}: slot {found} arrived where slot {expected} was due. No link loses whole messages, "
+            f"gap on {key}: slot {actual} arrived where slot {expected} was due. No link loses whole messages, "
             f"so a process or the transport did; look at the logs of {sender or 'the sender'} and of the router"
         )
         self.key = key
@@ -132,28 +134,28 @@ class Refusal(RunError):
 class Contradiction(RunError):
     """A process contradicts its own earlier messages, or another process's messages about the same slots."""
 
-    def __init__(self, process: str, what: str, against: str | None = None) -> None:
+    def __init__(self, process: str, contradiction: str, against: str | None = None) -> None:
         """against: the other process; None if the process contradicts itself."""
         self.at_fault = (process,) if against is None else (process, against)
         look = f"logs/{process}.log" if against is None else f"logs/{process}.log and logs/{against}.log"
-        super().__init__(f"{process} contradicts {against or 'itself'}: {what}; look at {look}")
+        super().__init__(f"{process} contradicts {against or 'itself'}: {contradiction}; look at {look}")
 
 
 class Silence(RunError):
     """Processes that are on the network and do nothing, while all others wait for them."""
 
-    def __init__(self, processes: tuple[str, ...], what: str) -> None:
+    def __init__(self, processes: tuple[str, ...], failure: str) -> None:
         self.at_fault = processes
-        super().__init__(f"{' and '.join(processes)}: {what}")
+        super().__init__(f"{' and '.join(processes)}: {failure}")
 
 
 class MissingProcesses(RunError):
     """Processes that did not appear on the network: `missing`."""
 
-    def __init__(self, process: str, missing: tuple[str, ...], what: str) -> None:
+    def __init__(self, process: str, missing: tuple[str, ...], when: str) -> None:
         """process: that waited for them; what: the rest of the sentence."""
         self.missing = missing
-        super().__init__(f"{process}: {', '.join(missing)} did not appear {what}")
+        super().__init__(f"{process}: {', '.join(missing)} did not appear {when}")
 
 
 class Interrupted(EvedropError):
@@ -161,8 +163,8 @@ class Interrupted(EvedropError):
 
     exit_status = 130
 
-    def __init__(self, said: str = "interrupted") -> None:
-        super().__init__(said)
+    def __init__(self, message: str = "interrupted") -> None:
+        super().__init__(message)
 
     @classmethod
     def with_results(cls, folder: object) -> Interrupted:
@@ -177,12 +179,12 @@ class NoAnswer(Exception):
 class UnknownName(KeyError):
     """A name that results do not have; the message says which they have."""
 
-    def __init__(self, what: str, name: object, known: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: object, choices: Iterable[str]) -> None:
         """what: the kind of thing, such as "receiver"."""
-        names = [*known]
-        super().__init__(what, name, names)  # what a copy is made from in another process
+        names = [*choices]
+        super().__init__(kind, name, names)  # what a copy is made from in another process
         expected = f"expected one of {', '.join(names)}" if names else "these results have none"
-        self._said = f"there is no {what} {name!r}; {expected}"
+        self._said = f"there is no {kind} {name!r}; {expected}"
 
     def __str__(self) -> str:
         return self._said

@@ -32,13 +32,13 @@ def taken_port() -> Iterator[int]:
         yield int(listener.getsockname()[1])
 
 
-def refused(done: Done, said: str) -> None:
+def refused(done: Done, message: str) -> None:
     """Check a command that was refused: exit 2 and one line."""
     assert done.status == 2
     assert done.out == ""
     (line,) = done.err.splitlines()
     assert line.startswith("evedrop: ")
-    assert said in line
+    assert message in line
 
 
 def test_a_run_prints_its_results_and_passes(evedrop: Evedrop) -> None:
@@ -170,8 +170,8 @@ def test_two_runs_at_once_do_not_meet(evedrop: Evedrop) -> None:
     for seed, live in zip((1, 2), runs, strict=True):
         alone = evedrop("montecarlo", "eavesdroppers", "--slots", "600", "--trials", "1", "--seed", str(seed), "--json",
                         "--out", f"alone{seed}")  # fmt: skip
-        found = {name: peer["digest"] for name, peer in live.results.summary["peers"].items()}
-        assert found == {name: peer["digest"] for name, peer in alone.summary["peers"].items()}
+        digests = {name: peer["digest"] for name, peer in live.results.summary["peers"].items()}
+        assert digests == {name: peer["digest"] for name, peer in alone.summary["peers"].items()}
 
 
 def test_a_secret_of_its_own_changes_the_schedule_alone(evedrop: Evedrop) -> None:
@@ -211,9 +211,9 @@ def test_a_scenario_names_a_secret_in_its_own_folder(evedrop: Evedrop) -> None:
     assert stored["secret_file"] == str(inner / "secret.bin")
     again = Evedrop(elsewhere)("montecarlo", "../a", "--trials", "1", "--json", "--out", "again").summary
     changed = evedrop(*base, "b", "--set", "secret_file=elsewhere/secret.bin").summary
-    found = [{peer["digest"] for peer in one["peers"].values()} for one in (first, again, changed)]
-    assert found[0] == found[1]
-    assert found[0].isdisjoint(found[2])
+    digests = [{peer["digest"] for peer in summary["peers"].values()} for summary in (first, again, changed)]
+    assert digests[0] == digests[1]
+    assert digests[0].isdisjoint(digests[2])
 
 
 def test_diff_says_where_and_tells_by_its_status(evedrop: Evedrop) -> None:

@@ -41,8 +41,8 @@ def test_a_package_that_is_broken_breaks_no_help(evedrop: Evedrop) -> None:
 
 def test_every_command_is_in_the_module_that_the_registry_says() -> None:
     """And every module has commands only that the registry lists."""
-    found: dict[str, str] = {}
+    modules: dict[str, str] = {}
     for name in dict.fromkeys(MODULES.values()):
         for command in import_module(f"evedrop.cli.commands.{name}").COMMANDS:
-            found[command.group or command.name] = name
-    assert found == dict(MODULES)
+            modules[command.group or command.name] = name
+    assert modules == dict(MODULES)

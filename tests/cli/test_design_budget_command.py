@@ -20,10 +20,10 @@ PAGE = Path(__file__).parents[2] / "docs" / "schemes" / "quantised-schedule.md"
 @pytest.fixture
 def scenario(tmp_path: Path) -> Path:
     """The scenario of the scheme's page."""
-    found = re.search(r"```toml\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert found is not None
+    match = re.search(r"```toml\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert match is not None
     path = tmp_path / "quantised.toml"
-    path.write_text(found[1])
+    path.write_text(match[1])
     return path
 
 
@@ -52,7 +52,7 @@ def test_errors_are_those_of_runs(scenario: Path, tmp_path: Path) -> None:
     for name, limit in (("legitimate", design.legitimate), ("listener", design.best.eavesdroppers["listener"])):
         error = peers[name]["standard_errors"]["mean_squared_error"]
         assert abs(peers[name]["mean_squared_error"] - limit) < 5.0 * error + 0.01 * limit  # the first slots differ
-    energies = [one.energy for one in design.others]
+    energies = [other.energy for other in design.others]
     assert energies == sorted(energies, reverse=True)
 
 
@@ -64,9 +64,9 @@ def test_the_table_has_the_threshold(evedrop: Evedrop, scenario: Path, budget: f
     (marked,) = [line for line in done.out.splitlines() if "the budget's" in line]
     assert float(marked.split()[0]) == pytest.approx(threshold, abs=1e-6)
     assert done.out.splitlines()[-1].startswith("threshold = ")
-    found = json.loads(evedrop("design", str(scenario), "--budget", str(budget), "--json").out)
-    assert found["best"]["threshold"] == pytest.approx(threshold)
-    assert set(found) == {"budget", "unencrypted", "encrypted", "legitimate", "best", "others"}
+    designed_ = json.loads(evedrop("design", str(scenario), "--budget", str(budget), "--json").out)
+    assert designed_["best"]["threshold"] == pytest.approx(threshold)
+    assert set(designed_) == {"budget", "unencrypted", "encrypted", "legitimate", "best", "others"}
 
 
 def test_what_has_no_limit_is_unbounded(evedrop: Evedrop, scenario: Path) -> None:
@@ -76,10 +76,10 @@ def test_what_has_no_limit_is_unbounded(evedrop: Evedrop, scenario: Path) -> Non
     done = evedrop(*words)
     assert "the legitimate one is ∞" in done.out
     assert "left out: spy (naive)" in done.out
-    found = json.loads(evedrop(*words, "--json").out)
-    assert found["legitimate"] is None
-    assert found["best"]["eavesdroppers"] == {"listener": None}
-    assert found["left_out"] == {"spy": "naive"}
+    designed_ = json.loads(evedrop(*words, "--json").out)
+    assert designed_["legitimate"] is None
+    assert designed_["best"]["eavesdroppers"] == {"listener": None}
+    assert designed_["left_out"] == {"spy": "naive"}
 
 
 @pytest.mark.parametrize(

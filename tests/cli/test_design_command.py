@@ -18,8 +18,8 @@ def designed(evedrop: Evedrop, scenario: str, *more: str) -> dict[str, Any]:
     done = evedrop("design", scenario, "--json", *more)
     assert (done.status, done.err) == (0, "")
     assert done.out.count("\n") == 1
-    found: dict[str, Any] = json.loads(done.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
-    return found
+    designed: dict[str, Any] = json.loads(done.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+    return designed
 
 
 def changes(**entries: object) -> list[str]:
@@ -29,27 +29,27 @@ def changes(**entries: object) -> list[str]:
 
 def test_the_numerical_illustration(evedrop: Evedrop) -> None:
     """Exactly the promised keys; bounds to 1e-6; intervals and optima for each μ_e to 1e-4."""
-    found = designed(evedrop, "numerical")
-    assert list(found) == ["rho", "legitimate", "eavesdroppers"]
-    assert set(found["legitimate"]) == {"bound", "trace"}
+    result = designed(evedrop, "numerical")
+    assert list(result) == ["rho", "legitimate", "eavesdroppers"]
+    assert set(result["legitimate"]) == {"bound", "trace"}
     keys = {"bound", "perfect", "relative", "best_difference", "best_ratio", "ratio", "largest_ratio", "trace"}
-    assert {frozenset(one) for one in found["eavesdroppers"].values()} == {frozenset(keys)}
-    assert found["rho"] == pytest.approx(1.387799, abs=1e-6)
-    assert found["legitimate"]["bound"] == pytest.approx(LOW, abs=1e-6)
+    assert {frozenset(eavesdropper) for eavesdropper in result["eavesdroppers"].values()} == {frozenset(keys)}
+    assert result["rho"] == pytest.approx(1.387799, abs=1e-6)
+    assert result["legitimate"]["bound"] == pytest.approx(LOW, abs=1e-6)
     for name, bound, relative, difference, ratio in (
         ("smart", 0.565630, (LOW, 1.0), None, None),
         ("equal", 0.534206, (LOW, 1.0), None, None),
         ("better", 0.506090, (0.54153, 0.93882), 0.55709, 0.6297),
         ("much-better", 0.485642, (0.54790, 0.89331), 0.57447, 0.6445),
     ):
-        one = found["eavesdroppers"][name]
-        assert one["bound"] == pytest.approx(bound, abs=1e-6)
-        (interval,) = one["relative"]
+        eavesdropper = result["eavesdroppers"][name]
+        assert eavesdropper["bound"] == pytest.approx(bound, abs=1e-6)
+        (interval,) = eavesdropper["relative"]
         assert interval == pytest.approx(relative, abs=1e-4)
-        assert one["best_difference"] == (difference and pytest.approx(difference, abs=1e-4))
-        assert one["best_ratio"] == (ratio and pytest.approx(ratio, abs=1e-4))
-        assert one["perfect"] == (pytest.approx([LOW, 0.565630], abs=1e-6) if name == "smart" else None)
-    assert found["eavesdroppers"]["smart"]["trace"] is None
+        assert eavesdropper["best_difference"] == (difference and pytest.approx(difference, abs=1e-4))
+        assert eavesdropper["best_ratio"] == (ratio and pytest.approx(ratio, abs=1e-4))
+        assert eavesdropper["perfect"] == (pytest.approx([LOW, 0.565630], abs=1e-6) if name == "smart" else None)
+    assert result["eavesdroppers"]["smart"]["trace"] is None
 
 
 @pytest.mark.parametrize(
@@ -72,9 +72,9 @@ def test_the_numerical_illustration(evedrop: Evedrop) -> None:
 )
 def test_edges(evedrop: Evedrop, entries: dict[str, Any], legitimate: dict[str, Any], smart: dict[str, Any]) -> None:
     """μ = 1, μ_e = 0, ρ = 1, and a link for which no μ_d is admissible: strict JSON with null for what is unbounded."""
-    found = designed(evedrop, "numerical", *changes(**entries))
-    assert found["legitimate"] == {**found["legitimate"], **legitimate}
-    against = found["eavesdroppers"]["smart"]
+    result = designed(evedrop, "numerical", *changes(**entries))
+    assert result["legitimate"] == {**result["legitimate"], **legitimate}
+    against = result["eavesdroppers"]["smart"]
     assert against == {**against, **smart}
 
 
@@ -147,13 +147,13 @@ def test_who_has_no_closed_form_is_left_out_and_said(evedrop: Evedrop) -> None:
         eavesdroppers__deaf='{strategy = "constant", link = {quality = 0.9}}',
         eavesdroppers__pool='{strategy = "colluding", links = [{quality = 0.5}, {quality = 0.8}], reads_as = "smart"}',
     )
-    found = designed(evedrop, "numerical", *extra)
-    assert found["left_out"] == {"clever": "bayesian"}
-    equal, genie, pool = (found["eavesdroppers"][name] for name in ("equal", "genie", "pool"))
+    result = designed(evedrop, "numerical", *extra)
+    assert result["left_out"] == {"clever": "bayesian"}
+    equal, genie, pool = (result["eavesdroppers"][name] for name in ("equal", "genie", "pool"))
     assert pool == {key: pytest.approx(value) if key != "relative" else pool[key] for key, value in equal.items()}
     assert genie["bound"] == equal["bound"]
-    assert found["legitimate"]["trace"] < genie["trace"] < equal["trace"]
-    assert found["eavesdroppers"]["deaf"]["bound"] is None
+    assert result["legitimate"]["trace"] < genie["trace"] < equal["trace"]
+    assert result["eavesdroppers"]["deaf"]["bound"] is None
     (line,) = [line for line in evedrop("design", "numerical", *extra).out.splitlines() if "left out" in line]
     assert line.startswith(
         "left out: clever (bayesian): no closed form of its error is known; a guarantee against a genie holds against every "
@@ -192,9 +192,9 @@ def test_a_scheme_that_needs_acknowledgements_is_refused(evedrop: Evedrop, schem
 def test_sending_every_state_is_a_choice(evedrop: Evedrop) -> None:
     """The scheme plain is μ_d = 1: its trace is that of sending every state, and the range is the same."""
     naive = changes(encoding='{scheme = "plain"}', eavesdroppers='{eve = {strategy = "naive", link = {quality = 0.9}}}')
-    found = designed(evedrop, "numerical", *naive)
-    assert found["legitimate"]["trace"] == pytest.approx(0.000228372, rel=1e-5)
-    assert found["legitimate"]["bound"] == pytest.approx(LOW, abs=1e-6)
+    result = designed(evedrop, "numerical", *naive)
+    assert result["legitimate"]["trace"] == pytest.approx(0.000228372, rel=1e-5)
+    assert result["legitimate"]["bound"] == pytest.approx(LOW, abs=1e-6)
 
 
 def test_figures_that_cannot_be_written_are_refused(evedrop: Evedrop) -> None:
@@ -207,12 +207,12 @@ def test_figures_that_cannot_be_written_are_refused(evedrop: Evedrop) -> None:
 
 def test_the_choice_of_a_ratio(evedrop: Evedrop) -> None:
     """`--min-ratio R`: in words, as JSON, and the line it prints gives a scenario that has the ratio."""
-    found = designed(evedrop, "numerical", "--min-ratio", "2")
-    choice = found["choice"]
+    result = designed(evedrop, "numerical", "--min-ratio", "2")
+    choice = result["choice"]
     assert min(ratio for ratio in choice["ratios"].values() if ratio is not None) == pytest.approx(2.0, rel=1e-9)
     assert choice["cost"] > 1.0
     again = designed(evedrop, "numerical", *changes(encoding__state_probability=choice["mu_d"]))
-    ratios = {name: one["ratio"] for name, one in again["eavesdroppers"].items()}
+    ratios = {name: eavesdropper["ratio"] for name, eavesdropper in again["eavesdroppers"].items()}
     assert ratios == {name: value and pytest.approx(value) for name, value in choice["ratios"].items()}
     done = evedrop("design", "numerical", "--min-ratio", "2")
     assert f"state_probability = {choice['mu_d']!r}" in done.out.splitlines()
@@ -266,8 +266,8 @@ def test_what_is_refused_can_be_measured(evedrop: Evedrop, scenario: str, entrie
     done = evedrop(
         "design", scenario, *([] if scenario != "numerical" else ["--min-ratio", "1.5"]), *changes(**entries)
     )
-    said = done.err.splitlines()[-1] if done.err else done.out.splitlines()[-1]
-    command = said[said.rindex("evedrop ") :].removesuffix(" measures this one")
+    line = done.err.splitlines()[-1] if done.err else done.out.splitlines()[-1]
+    command = line[line.rindex("evedrop ") :].removesuffix(" measures this one")
     words = shlex.split(command)
     assert words[1] in {"sweep", "montecarlo"}
     assert evedrop(*words[1:], "--trials", "2", "--slots", "4", "--set", "expect=[]", "--out", "measured").status == 0

@@ -45,28 +45,28 @@ def fronts(evedrop: Evedrop, *words: str) -> dict[str, Any]:
     done = evedrop("design", *words, "--policy", "--json")
     assert (done.status, done.err) == (0, "")
     assert done.out.count("\n") == 1
-    found: dict[str, Any] = json.loads(done.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
-    return found
+    fronts: dict[str, Any] = json.loads(done.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+    return fronts
 
 
 def test_json(evedrop: Evedrop, scenario: str) -> None:
     """Exactly the promised keys; `scheduled` by its closed form; null for unbounded; the strategy without theory is named."""
-    found = fronts(evedrop, scenario, "--weight", "0.6", "0.9", "1", "--price", "0", "1e-3", "--states", "6")
-    assert list(found) == ["mu", "states", "eavesdroppers", "left_out"]
-    assert (found["mu"], found["states"], found["left_out"]) == (0.9, 6, {"deaf": "constant"})
-    assert list(found["eavesdroppers"]) == ["near", "far"]
-    for one in found["eavesdroppers"].values():
-        assert list(one) == ["scheduled", "policies", "never", "dominated"]
-        assert [row["threshold"] for row in one["scheduled"]] == [1, 2, 3, 4, 5, 6]
-        assert one["scheduled"][2]["transmissions"] == pytest.approx((1 / 0.81) / (2 + 1 / 0.81))
-        for row in one["policies"]:
+    result = fronts(evedrop, scenario, "--weight", "0.6", "0.9", "1", "--price", "0", "1e-3", "--states", "6")
+    assert list(result) == ["mu", "states", "eavesdroppers", "left_out"]
+    assert (result["mu"], result["states"], result["left_out"]) == (0.9, 6, {"deaf": "constant"})
+    assert list(result["eavesdroppers"]) == ["near", "far"]
+    for eavesdropper in result["eavesdroppers"].values():
+        assert list(eavesdropper) == ["scheduled", "policies", "never", "dominated"]
+        assert [row["threshold"] for row in eavesdropper["scheduled"]] == [1, 2, 3, 4, 5, 6]
+        assert eavesdropper["scheduled"][2]["transmissions"] == pytest.approx((1 / 0.81) / (2 + 1 / 0.81))
+        for row in eavesdropper["policies"]:
             assert list(row) == [
                 "weights", "price", "thresholds", "legitimate", "eavesdropper", "transmissions", "scheduled",
             ]  # fmt: skip
             assert len(row["thresholds"]) == 6
-        assert one["policies"][-1]["weights"][1] == 1.0
-    assert found["eavesdroppers"]["far"]["scheduled"][5]["eavesdropper"] is None
-    assert found["eavesdroppers"]["far"]["scheduled"][0]["legitimate"] == pytest.approx(2.2837e-4, rel=1e-4)
+        assert eavesdropper["policies"][-1]["weights"][1] == 1.0
+    assert result["eavesdroppers"]["far"]["scheduled"][5]["eavesdropper"] is None
+    assert result["eavesdroppers"]["far"]["scheduled"][0]["legitimate"] == pytest.approx(2.2837e-4, rel=1e-4)
 
 
 def test_for_people(evedrop: Evedrop, scenario: str) -> None:
@@ -88,14 +88,14 @@ def test_for_people(evedrop: Evedrop, scenario: str) -> None:
 
 def test_in_python(scenario: str) -> None:
     """The same from Python, whose default weights are all twentieths."""
-    found = design_policy(scenario, states=4, changes={"eavesdroppers.far.link.quality": 0.3})
-    points = found.fronts["far"].points
+    result = design_policy(scenario, states=4, changes={"eavesdroppers.far.link.quality": 0.3})
+    points = result.fronts["far"].points
     assert points[-1].thresholds == (1, 1, 1, 1)
-    assert {weight for weight, _ in found.fronts["far"].never} < {i / 20 for i in range(21)}
+    assert {weight for weight, _ in result.fronts["far"].never} < {i / 20 for i in range(21)}
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--weight", "1.5"), "a weight of 1.5: expected a number from 0 to 1"),
         (("--weight", "nan"), "a weight of nan: expected"),
@@ -123,11 +123,11 @@ def test_in_python(scenario: str) -> None:
         ),
     ],
 )
-def test_refusals(evedrop: Evedrop, scenario: str, words: tuple[str, ...], said: str) -> None:
+def test_refusals(evedrop: Evedrop, scenario: str, words: tuple[str, ...], message: str) -> None:
     """A design that does not exist is refused, with the bound and the remedy."""
     done = evedrop("design", scenario, "--policy", *words)
     assert (done.status, done.out) == (2, "")
-    assert said in done.err
+    assert message in done.err
 
 
 def test_options_of_policies_alone_are_refused(evedrop: Evedrop) -> None:

@@ -26,10 +26,10 @@ def test_json(evedrop: Evedrop) -> None:
     """Exactly the promised keys; the legitimate error within Ω in every slot; what has no closed form is named."""
     done = evedrop("design", "numerical", *SHORT, "--set", MIXED, "--json")
     assert (done.status, done.err) == (0, "")
-    found = json.loads(done.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
-    assert list(found) == ["eavesdroppers", "left_out"]
-    assert found["left_out"] == {"wise": "bayesian"}
-    smart = found["eavesdroppers"]["smart"]
+    schedules = json.loads(done.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+    assert list(schedules) == ["eavesdroppers", "left_out"]
+    assert schedules["left_out"] == {"wise": "bayesian"}
+    smart = schedules["eavesdroppers"]["smart"]
     assert list(smart) == ["best", "constant", "grid", "exact"]
     best = smart["best"]
     assert list(best) == ["mu_d", "legitimate", "eavesdropper", "value"]
@@ -60,10 +60,10 @@ def test_for_people(evedrop: Evedrop) -> None:
 
 def test_in_python() -> None:
     """The same from Python; blocks and a weight without Ω."""
-    found = design_schedule(
+    result = design_schedule(
         "numerical", 9, weight=0.5, block=4, changes={"process.initial_covariance": [[1, 0], [0, 1]]}
     )
-    best = found.schedules["smart"].best
+    best = result.schedules["smart"].best
     assert best.mu_d[1] == best.mu_d[4]
     assert best.mu_d[5] == best.mu_d[8]
     expected = SlotRecursion(UNSTABLE, lambda mu_d: Outcomes.legitimate(0.9, mu_d), 9)
@@ -71,7 +71,7 @@ def test_in_python() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--schedule", "1", "--max-trace", "1"), "a schedule of 1 slot: expected a whole number from 2 to 100"),
         (("--schedule", "101", "--max-trace", "1"), "a schedule of 101 slots: expected"),
@@ -91,9 +91,9 @@ def test_in_python() -> None:
         ((*SHORT, "--set", 'eavesdroppers={wise={strategy="bayesian",link={quality=0.85}}}'), "add one, such as"),
     ],
 )  # fmt: skip
-def test_refusals(evedrop: Evedrop, words: tuple[str, ...], said: str) -> None:
+def test_refusals(evedrop: Evedrop, words: tuple[str, ...], message: str) -> None:
     """A design that does not exist is refused, with the bound and the remedy."""
     words = words if "--set" in words else (*words, "--set", SMART)
     done = evedrop("design", "numerical", *words)
     assert (done.status, done.out) == (2, "")
-    assert said in done.err
+    assert message in done.err

@@ -25,7 +25,7 @@ def commands() -> list[Command]:
     from evedrop.cli.commands import MODULES
 
     names = list(dict.fromkeys(MODULES.values()))
-    return [one for name in names for one in import_module(f"evedrop.cli.commands.{name}").COMMANDS]
+    return [command for name in names for command in import_module(f"evedrop.cli.commands.{name}").COMMANDS]
 
 
 def parsed(command: Command) -> argparse.Namespace:
@@ -37,14 +37,14 @@ def parsed(command: Command) -> argparse.Namespace:
     return options
 
 
-@pytest.mark.parametrize("command", commands(), ids=lambda one: one.name)
+@pytest.mark.parametrize("command", commands(), ids=lambda command: command.name)
 def test_every_command_has_a_section_and_an_example_that_is_understood(command: Command) -> None:
     """The example names the command, and the parser takes all of it."""
     assert command.section in SECTIONS
     assert parsed(command).command is command.run
 
 
-@pytest.mark.parametrize("command", commands(), ids=lambda one: one.name)
+@pytest.mark.parametrize("command", commands(), ids=lambda command: command.name)
 def test_the_page_of_a_command_exists(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
     """The help names a page that `evedrop docs` prints."""
     if command.page:
@@ -56,22 +56,22 @@ def test_help_lists_all_commands_in_sections(capsys: pytest.CaptureFixture[str])
     """In the order of the sections, each command once."""
     assert list(parser_of().sections) == SECTIONS
     assert main(["--help"]) == 0
-    said = capsys.readouterr().out
-    assert [line.rstrip(":") for line in said.splitlines() if line.endswith(":")] == SECTIONS
+    output = capsys.readouterr().out
+    assert [line.rstrip(":") for line in output.splitlines() if line.endswith(":")] == SECTIONS
 
 
 @pytest.mark.parametrize("columns", [40, 80])
 def test_help_fits_a_narrow_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """No line is wider than the terminal: neither of the help of all commands, nor of one of them."""
     monkeypatch.setenv("COLUMNS", str(columns))
-    for parser in [parser_of(), *(parsed(one).parser for one in commands())]:
+    for parser in [parser_of(), *(parsed(command).parser for command in commands())]:
         assert max(map(len, parser.format_help().splitlines())) <= columns, parser.prog
 
 
 def test_a_usage_is_broken_the_same_with_every_python(monkeypatch: pytest.MonkeyPatch) -> None:
     """At spaces, with the sign of repetition beside its word."""
     monkeypatch.setenv("COLUMNS", "42")
-    (link,) = (one for one in commands() if one.name == "link")
+    (link,) = (command for command in commands() if command.name == "link")
     usage = parsed(link).parser.format_help().partition("\n\n")[0]
     indent = " " * len("usage: evedrop link ")
     expected = ["usage: evedrop link [options] RUN NAME", f"{indent}KEY=VALUE", f"{indent}[KEY=VALUE ...]"]
@@ -88,7 +88,7 @@ def test_an_example_that_is_broken_stays_the_same_command(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         (["rn", "vehicle"], "unknown command rn; did you mean run?"),
         (["links", "fitt", "x.csv"], "unknown command fitt; did you mean fit?"),
@@ -101,18 +101,18 @@ def test_an_example_that_is_broken_stays_the_same_command(monkeypatch: pytest.Mo
         (["docs", "lnks"], "there is no page lnks; did you mean links?"),
     ],
 )
-def test_a_mistyped_word_gets_a_hint(given: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mistyped_word_gets_a_hint(given: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     """And no option is taken by its first letters."""
     assert main(given) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("rate", ["0.9", "61", "nan", "fast"])
 def test_a_number_out_of_range_is_refused_with_its_range(rate: str, capsys: pytest.CaptureFixture[str]) -> None:
     """By the parser, before anything is loaded."""
     assert main(["view", "run", "--video", "run.mp4", "--fps", rate]) == 2
-    said = f"argument --fps: {rate} is not a number of frames per second from 1 to 60"
-    assert said in capsys.readouterr().err
+    message = f"argument --fps: {rate} is not a number of frames per second from 1 to 60"
+    assert message in capsys.readouterr().err
     assert parser_of("view").parse_whole(["view", "run", "--fps", "60"]).fps == 60.0
 
 
@@ -123,24 +123,24 @@ def test_a_word_that_resembles_no_other_gets_no_hint(capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize(
-    ("given", "said"), [([], "COMMAND"), (["--version", "rn"], "evedrop "), (["links", "--help", "fitt"], "links")]
+    ("given", "message"), [([], "COMMAND"), (["--version", "rn"], "evedrop "), (["links", "--help", "fitt"], "links")]
 )
 def test_argparse_finds_what_comes_before_a_command(
-    given: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    given: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An option in its place is carried out, and a command that is missing is named."""
     assert main(given) == (0 if "--version" in given or "--help" in given else 2)
     told = capsys.readouterr()
-    assert said in told.out + told.err
+    assert message in told.out + told.err
     assert "unknown command" not in told.err
 
 
 def test_docs_lists_every_page(capsys: pytest.CaptureFixture[str]) -> None:
     """With its title."""
     assert main(["docs"]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     pages = (Path(__file__).parents[2] / "docs").rglob("*.md")
-    assert {line.split()[0].rpartition("/")[2] for line in said.splitlines()} == {page.stem for page in pages}
+    assert {line.split()[0].rpartition("/")[2] for line in output.splitlines()} == {page.stem for page in pages}
 
 
 def test_new_copies_a_built_in_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -114,15 +114,15 @@ def nobody() -> Iterator[io.TextIOWrapper]:
 @pytest.mark.parametrize("name", mostly_long(COMMANDS, USUAL))
 def test_the_output_changes_neither_status_nor_files(name: str, inputs: Path, tmp_path: Path) -> None:
     """Whether all of it is read, none of it, or in an encoding that has no Greek letters."""
-    ordinary, unread, narrow = (copied(inputs, tmp_path / one) for one in ("ordinary", "unread", "narrow"))
+    ordinary, unread, narrow = (copied(inputs, tmp_path / name) for name in ("ordinary", "unread", "narrow"))
     done = ordinary(*COMMANDS[name])
     with nobody() as output:
         alone = unread.process(*COMMANDS[name], stdout=output)
     with (
         contextlib.chdir(narrow.folder),
-        (tmp_path / "said").open("w", encoding="ascii") as said,
-        contextlib.redirect_stdout(said),
-        contextlib.redirect_stderr(said),
+        (tmp_path / "said").open("w", encoding="ascii") as file,
+        contextlib.redirect_stdout(file),
+        contextlib.redirect_stderr(file),
     ):
         from evedrop.cli.main import main
 

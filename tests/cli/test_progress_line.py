@@ -90,9 +90,9 @@ def test_the_errors_never_hide_how_far_a_run_is(
         line.on_event(RunProgress(10, 43.0, "slots/s", ERRORS))
         line.on_event(RunProgress(2999, 43.0, "slots/s", ERRORS))
     written = Text.from_ansi(terminal.getvalue()).plain.splitlines()
-    assert all(cell_len(one) <= columns for one in written)
-    assert not any(one.strip() in {"left", "slots"} for one in written), "nothing goes on in a second line"
-    last = [one for one in written if "2999/3000" in one][-1]
+    assert all(cell_len(line) <= columns for line in written)
+    assert not any(line.strip() in {"left", "slots"} for line in written), "nothing goes on in a second line"
+    last = [line for line in written if "2999/3000" in line][-1]
     assert shown in last
     assert " left" in last
     assert ("smart" not in last) is cut
@@ -108,6 +108,6 @@ def test_a_held_run_on_a_narrow_terminal_says_that_it_is_held(monkeypatch: pytes
     with ProgressLine(400, "slots") as line:
         line.on_event(RunProgress(100, 43.0, "slots/s", ERRORS))
         line.on_event(Held(120))
-    last = [one for one in Text.from_ansi(terminal.getvalue()).plain.splitlines() if "held before" in one][-1]
+    last = [line for line in Text.from_ansi(terminal.getvalue()).plain.splitlines() if "held before" in line][-1]
     assert "held before slot 120 120/400 slots" in last
     assert "left" not in last

@@ -67,7 +67,9 @@ def names() -> set[str]:
     """Every command of the registry, as it is typed."""
     modules = [import_module(f"evedrop.cli.commands.{name}") for name in dict.fromkeys(MODULES.values())]
     return {
-        one.name if one.group is None else f"{one.group} {one.name}" for module in modules for one in module.COMMANDS
+        command.name if command.group is None else f"{command.group} {command.name}"
+        for module in modules
+        for command in module.COMMANDS
     }
 
 
@@ -151,10 +153,10 @@ def test_a_run_in_progress_is_only_looked_at(evedrop: Evedrop) -> None:
 
 def test_a_view_says_what_it_does_not_know(evedrop: Evedrop, mark: Path) -> None:
     """The words are those of the folder; the quality of a link whose loss model is not built in is left out."""
-    found = recorded(evedrop.folder / "run")
-    assert not found.complete
-    assert (found.words["legitimate"], found.words["smart"], found.words["naive"]) == ("evil:S", "evil:E", "naive")
-    assert found.unknown_links
+    result = recorded(evedrop.folder / "run")
+    assert not result.complete
+    assert (result.words["legitimate"], result.words["smart"], result.words["naive"]) == ("evil:S", "evil:E", "naive")
+    assert result.unknown_links
     replay(evedrop.folder / "run")
     assert load_results(evedrop.folder / "run").plot() is not None
     assert not mark.exists()

@@ -82,8 +82,10 @@ def test_every_command_that_prints_a_table_writes_it() -> None:
         for module in dict.fromkeys(MODULES.values())
         for command in import_module(f"evedrop.cli.commands.{module}").COMMANDS
     ]
-    printing = {one.name for module, one in commands if prints_tables(f"commands.{module}", one.run.__name__)}
-    assert {one.name for _, one in commands if tables in one.options} == printing - {*ROLES}
+    printing = {
+        command.name for module, command in commands if prints_tables(f"commands.{module}", command.run.__name__)
+    }
+    assert {command.name for _, command in commands if tables in command.options} == printing - {*ROLES}
     assert printing - {*ROLES} == COMMANDS.keys() | OF_OTHERS
 
 
@@ -105,7 +107,7 @@ def test_tables_are_written(name: str, evedrop: Evedrop) -> None:
     text = (evedrop.folder / "a.tex").read_text(encoding="utf-8")
     assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == len(files)
     body = "".join(line for line in text.splitlines(keepends=True) if not line.startswith("%"))
-    assert body.isascii(), {one for one in body if not one.isascii()}
+    assert body.isascii(), {character for character in body if not character.isascii()}
     for line in body.splitlines():
         plain = re.sub(r"\\[$_%&#{}]", "", line)
         assert plain.count("$") % 2 == 0, line
@@ -199,8 +201,8 @@ def test_python_writes_them_too(tmp_path: Path) -> None:
     """`to_csv` and `to_latex` of results."""
     run = montecarlo("eavesdroppers", trials=4, slots=20, expect=[])
     swept = sweep("eavesdroppers", {"slots": [10, 20]}, trials=4, expect=[])
-    for i, one in enumerate((run, swept)):
-        (path,) = one.to_csv(tmp_path / f"{i}.csv")
+    for i, results in enumerate((run, swept)):
+        (path,) = results.to_csv(tmp_path / f"{i}.csv")
         rows = list(itertools.islice(csv.reader(path.read_text(encoding="utf-8").splitlines()), 3))
         assert len(rows) == 3
-        assert r"\begin{tabular}" in one.to_latex(tmp_path / f"{i}.tex").read_text()
+        assert r"\begin{tabular}" in results.to_latex(tmp_path / f"{i}.tex").read_text()

@@ -63,7 +63,7 @@ def _image(daemon: Docker, folder: Path, times: dict[str, float]) -> None:
     )
     try:
         daemon("import", str(_debian(folder)), BASE)
-        said, _ = fetching.communicate(timeout=_FETCH_SECONDS)
+        errors, _ = fetching.communicate(timeout=_FETCH_SECONDS)
     except subprocess.TimeoutExpired as error:
         raise CannotRun(
             f"the packages of tools/constraints/project.txt were not fetched within {_FETCH_SECONDS:g} s of the base image"
@@ -72,7 +72,7 @@ def _image(daemon: Docker, folder: Path, times: dict[str, float]) -> None:
         fetching.kill()
         fetching.wait()
     if fetching.returncode:
-        raise CannotRun(f"the packages of tools/constraints/project.txt cannot be fetched: {said[-2000:]}")
+        raise CannotRun(f"the packages of tools/constraints/project.txt cannot be fetched: {errors[-2000:]}")
     times["base image and packages"], begun = time.monotonic() - begun, time.monotonic()
     environment = {**os.environ, "DOCKER_HOST": daemon.address, "EVEDROP_BASE": BASE, "DOCKER_BUILDKIT": "0"}
     run("docker-compose", "build", cwd=copy, env=environment)
@@ -98,5 +98,5 @@ def project(tmp_path: Path, docker: Docker) -> Iterator[Callable[..., Project]]:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     """How long the preparations took."""
-    for what, seconds in config.stash.get(_TIMES, {}).items():
-        terminalreporter.write_line(f"{what}: {seconds:.0f} s")
+    for name, seconds in config.stash.get(_TIMES, {}).items():
+        terminalreporter.write_line(f"{name}: {seconds:.0f} s")

@@ -100,8 +100,8 @@ class Docker:
 
     def inspected(self, kind: str, name: str) -> dict[str, Any]:
         """What `docker inspect` says of one thing."""
-        found: list[dict[str, Any]] = json.loads(self(kind, "inspect", name))
-        return found[0]
+        objects: list[dict[str, Any]] = json.loads(self(kind, "inspect", name))
+        return objects[0]
 
     def entering(self, mounts: bool = False) -> tuple[str, ...]:
         """The words that start a command on the daemon's host: in its network; with its mounts too, though without a /proc."""

@@ -58,22 +58,22 @@ class Project:
         try:
             return run(*command, **options)
         except AssertionError as error:
-            said = subprocess.run(
+            completed = subprocess.run(
                 ("docker-compose", "logs", "--no-color"), capture_output=True, text=True, check=False, **options
             )
-            raise AssertionError(f"{error}\n{said.stdout}") from error
+            raise AssertionError(f"{error}\n{completed.stdout}") from error
 
     def container(self, service: str) -> str:
         """The id of a service's container."""
         project = f"label=com.docker.compose.project={self.environment['COMPOSE_PROJECT_NAME']}"
-        found = self.docker("ps", "-aq", "-f", project, "-f", f"label=com.docker.compose.service={service}")
-        assert found, f"no container of {service}"
-        return found
+        identity = self.docker("ps", "-aq", "-f", project, "-f", f"label=com.docker.compose.service={service}")
+        assert identity, f"no container of {service}"
+        return identity
 
     def state(self, service: str) -> dict[str, Any]:
         """What Docker knows of a service's container."""
-        found: dict[str, Any] = self.docker.inspected("container", self.container(service))["State"]
-        return found
+        state: dict[str, Any] = self.docker.inspected("container", self.container(service))["State"]
+        return state
 
     def ended(self, service: str) -> int:
         """The status with which a service ends, once it has."""
@@ -97,9 +97,9 @@ class Project:
     def listening(self) -> set[str]:
         """The ports of the machine that are listened on; all of them on loopback."""
         table = self.docker.inside("cat", "/proc/net/tcp").splitlines()[1:]
-        found = [line.split()[1].split(":") for line in table if line.split()[3] == "0A"]
-        assert {address for address, _ in found} <= {"0100007F"}
-        return {str(int(port, 16)) for _, port in found}
+        sockets = [line.split()[1].split(":") for line in table if line.split()[3] == "0A"]
+        assert {address for address, _ in sockets} <= {"0100007F"}
+        return {str(int(port, 16)) for _, port in sockets}
 
     def shown(self) -> None:
         """Wait until the view's page answers, at its address on loopback, and check that nothing else listens."""
@@ -126,12 +126,12 @@ def projects(folder: Path, docker: Docker) -> Iterator[Callable[..., Project]]:
     made: list[Project] = []
 
     def make(**variables: str) -> Project:
-        one = Project.of(folder, docker, **variables)
-        made.append(one)
-        return one
+        project = Project.of(folder, docker, **variables)
+        made.append(project)
+        return project
 
     try:
         yield make
     finally:
-        for one in made:
-            one.down()
+        for project in made:
+            project.down()

@@ -56,14 +56,14 @@ def test_the_recipe_for_a_script_gives_table_and_status(project: Make) -> None:
     """Word by word as docs/containers.md has it: all that the recorder says, the table too, and the status of the run."""
     tested = project(EVEDROP_OPTIONS=f"{SHORT} --set expect=[{{metric='smart.mean_squared_error',below=0}}]")
     tested.compose("up", "--detach")
-    said = tested.compose("logs", "--follow", "recorder").stdout
+    output = tested.compose("logs", "--follow", "recorder").stdout
     identity = tested.compose("ps", "--all", "--quiet", "recorder").stdout.strip()
     assert tested.docker("wait", identity) == "1"
     complete(tested, 600)
-    ended = said.index('"ended"')
+    ended = output.index('"ended"')
     digest = tested.results().summary["peers"]["smart"]["digest"]
     for words in ("1 of 1 expectations FAILED", digest[:12], "relative secrecy", "results: /runs/two-eavesdroppers-"):
-        assert said.index(words) > ended
+        assert output.index(words) > ended
 
 
 def test_a_scenario_of_ones_own(project: Make) -> None:
@@ -105,34 +105,34 @@ WRONG = {
 
 def test_of_a_scenario_that_does_not_fit_nothing_is_started(project: Make) -> None:
     """One line says why; so does one for a user that does not exist."""
-    one = project()
-    shutil.copy("scenarios/cut.toml", one.folder / "one.toml")
+    own = project()
+    shutil.copy("scenarios/cut.toml", own.folder / "one.toml")
     two = Path("scenarios/two-eavesdroppers.toml").read_text(encoding="utf-8")
-    (one.folder / "two.toml").write_text(f"{two}\n[network]\nrouters = 2\n", encoding="utf-8")
+    (own.folder / "two.toml").write_text(f"{two}\n[network]\nrouters = 2\n", encoding="utf-8")
     for scenario, reason in WRONG.items():
-        one.environment["EVEDROP_SCENARIO"] = scenario
-        done = one.compose("up", may_fail=True)
+        own.environment["EVEDROP_SCENARIO"] = scenario
+        done = own.compose("up", may_fail=True)
         assert done.returncode != 0
-        assert one.state("briefs")["ExitCode"] == 2
-        (line,) = one.said("briefs").splitlines()[-1:]
+        assert own.state("briefs")["ExitCode"] == 2
+        (line,) = own.said("briefs").splitlines()[-1:]
         assert line.startswith(f"evedrop: {reason}")
-    one.environment["EVEDROP_USER"] = "somebody"
-    one.compose("up", may_fail=True)
-    assert "evedrop: EVEDROP_USER is somebody, and must be numbers" in one.said("briefs")
-    assert not any((one.folder / "runs").iterdir())
-    assert one.docker("ps", "--quiet") == ""
+    own.environment["EVEDROP_USER"] = "somebody"
+    own.compose("up", may_fail=True)
+    assert "evedrop: EVEDROP_USER is somebody, and must be numbers" in own.said("briefs")
+    assert not any((own.folder / "runs").iterdir())
+    assert own.docker("ps", "--quiet") == ""
 
 
 def test_a_killed_container_ends_the_run_and_the_next_one_goes_well(project: Make) -> None:
     """It is named, what was measured is on disk, everybody leaves; and another `up` makes a whole run."""
-    one = project(EVEDROP_OPTIONS=ENDLESS)
-    one.compose("up", "--detach")
-    one.running()
-    one.docker("kill", one.container("smart"))
-    assert one.ended("recorder") == 3
-    assert "smart cut off from the network for 2 s" in one.said("recorder")
-    assert one.results().slots.num_rows > 0
-    assert {service: one.ended(service) for service in ROLES} == {**dict.fromkeys(ROLES, 3), "smart": 137}
+    own = project(EVEDROP_OPTIONS=ENDLESS)
+    own.compose("up", "--detach")
+    own.running()
+    own.docker("kill", own.container("smart"))
+    assert own.ended("recorder") == 3
+    assert "smart cut off from the network for 2 s" in own.said("recorder")
+    assert own.results().slots.num_rows > 0
+    assert {service: own.ended(service) for service in ROLES} == {**dict.fromkeys(ROLES, 3), "smart": 137}
     again = project(EVEDROP_OPTIONS=SHORT)
     again.compose("up")
     complete(again, 600)
@@ -140,16 +140,16 @@ def test_a_killed_container_ends_the_run_and_the_next_one_goes_well(project: Mak
 
 def test_a_router_started_again_and_a_network_that_was_away_change_nothing(project: Make) -> None:
     """Kill and start the router's container, take an eavesdropper's off its network and put it back: the same digests."""
-    one = project(EVEDROP_OPTIONS=LONG)
-    one.compose("up", "--detach")
-    one.running()
-    one.docker("kill", one.container("router"))
-    one.docker("start", one.container("router"))
-    one.running(one.progress())
-    smart, network = one.container("smart"), f"{one.environment['COMPOSE_PROJECT_NAME']}_to-smart"
-    one.docker("network", "disconnect", network, smart)
-    health = ("docker", "-H", one.docker.address, "exec", smart, "evedrop", "health", "/brief/brief.json")
+    own = project(EVEDROP_OPTIONS=LONG)
+    own.compose("up", "--detach")
+    own.running()
+    own.docker("kill", own.container("router"))
+    own.docker("start", own.container("router"))
+    own.running(own.progress())
+    smart, network = own.container("smart"), f"{own.environment['COMPOSE_PROJECT_NAME']}_to-smart"
+    own.docker("network", "disconnect", network, smart)
+    health = ("docker", "-H", own.docker.address, "exec", smart, "evedrop", "health", "/brief/brief.json")
     wait_until(lambda: subprocess.run(health, capture_output=True, check=False).returncode, "an eavesdropper cut off")
-    one.docker("network", "connect", network, smart)
-    assert one.ended("recorder") == 0, one.said("recorder")
-    complete(one, 3000)
+    own.docker("network", "connect", network, smart)
+    assert own.ended("recorder") == 0, own.said("recorder")
+    complete(own, 3000)

@@ -92,18 +92,18 @@ def services_of(folder: Path) -> dict[str, Any]:
     """The services of a docker-compose.yml, read as docker-compose does."""
     yaml = YAML(typ="safe")
     yaml.version = (1, 1)
-    found: dict[str, Any] = yaml.load(folder / "docker-compose.yml")
-    return found
+    services: dict[str, Any] = yaml.load(folder / "docker-compose.yml")
+    return services
 
 
 def test_every_process_has_a_service_a_brief_and_a_network(own: Path) -> None:
     """Each service reaches only its router and has only its own brief; names are strings, and the scenario is the one given."""
-    found = services_of(own)
-    services = found["services"]
-    mounts = [one.split(":") for one in services["briefs"]["volumes"][2:]]
+    result = services_of(own)
+    services = result["services"]
+    mounts = [volume.split(":") for volume in services["briefs"]["volumes"][2:]]
     by_process = {path.rpartition("/")[2]: name for name, path in mounts}
     assert set(by_process) == {"router", "relay", "sensor", "legitimate", "controller", "recorder", *NAMES}
-    assert set(by_process.values()) == set(found["volumes"])
+    assert set(by_process.values()) == set(result["volumes"])
     for process, name in by_process.items():
         volumes = services[name]["volumes"]
         assert volumes[0] == f"{name}:/brief:ro"
@@ -116,7 +116,7 @@ def test_every_process_has_a_service_a_brief_and_a_network(own: Path) -> None:
     for name, service in services.items():
         for network in service.get("networks", ()):
             networks.setdefault(network, set()).add(name)
-    assert set(networks) == set(found["networks"])
+    assert set(networks) == set(result["networks"])
     for process, name in by_process.items():
         hub = "router" if process in {"sensor", "relay"} else "relay"
         if process != "router":
@@ -137,7 +137,7 @@ def test_docker_compose_accepts_the_files(own: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("two-eavesdroppers", "--listen", "tls/a:1"), "--listen belongs to briefs"),
         (("two-eavesdroppers", "--wait", "5"), "--wait belongs to briefs"),
@@ -146,7 +146,7 @@ def test_docker_compose_accepts_the_files(own: Path) -> None:
         (("file/two.toml", "--slots", "7"), "file/two.toml is the scenario itself"),
     ],
 )
-def test_what_containers_cannot_run_is_refused(words: tuple[str, ...], said: str, evedrop: Evedrop) -> None:
+def test_what_containers_cannot_run_is_refused(words: tuple[str, ...], message: str, evedrop: Evedrop) -> None:
     """The message is one sentence, and no file is written."""
     folder = evedrop.folder / "file"
     folder.mkdir()
@@ -154,7 +154,7 @@ def test_what_containers_cannot_run_is_refused(words: tuple[str, ...], said: str
     (evedrop.folder / "secret").write_bytes(bytes(32))
     done = evedrop("brief", *words, "--compose", "file", "--overwrite")
     assert done.status == 2
-    assert done.err.startswith(f"evedrop: {said}"), done.err
+    assert done.err.startswith(f"evedrop: {message}"), done.err
     assert [path.name for path in folder.iterdir()] == ["two.toml"]
 
 
@@ -162,7 +162,7 @@ SHIPPED = load("two-eavesdroppers")
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"modules": "/srv/here"}, r"^modules = /srv/here: .*evedrop brief SCENARIO --out DIR"),
         (
@@ -171,9 +171,9 @@ SHIPPED = load("two-eavesdroppers")
         ),
     ],
 )
-def test_what_the_image_lacks_is_refused(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_what_the_image_lacks_is_refused(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
     """Classes of the user, and a program that gives the states; no folder is made."""
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(UsageError, match=message):
         write_compose(SHIPPED.model_copy(update=changes), "two-eavesdroppers", False, tmp_path / "made", False)
     assert not (tmp_path / "made").exists()
 

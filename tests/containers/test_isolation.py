@@ -55,12 +55,12 @@ print(json.dumps(found))
 def going(tmp_path_factory: pytest.TempPathFactory, docker: Docker) -> Iterator[Project]:
     """A run that does not end by itself; taken down in the middle, it leaves what was measured."""
     with projects(tmp_path_factory.mktemp("going"), docker) as make:
-        one = make(EVEDROP_OPTIONS=ENDLESS, EVEDROP_MEMORY=str(MEMORY))
-        one.compose("up", "--detach")
-        one.running()
-        yield one
-    assert one.results().summary["ended"] == "interrupted"
-    assert one.results().slots.num_rows > 0
+        project = make(EVEDROP_OPTIONS=ENDLESS, EVEDROP_MEMORY=str(MEMORY))
+        project.compose("up", "--detach")
+        project.running()
+        yield project
+    assert project.results().summary["ended"] == "interrupted"
+    assert project.results().slots.num_rows > 0
 
 
 def addresses(going: Project, service: str) -> dict[str, str]:
@@ -77,7 +77,9 @@ def is_healthy(project: Project, service: str) -> bool:
 def test_who_can_reach_what(going: Project) -> None:
     """Every role reaches only the router, has only its own brief, and has no rights; all become healthy."""
     everybody = {service: addresses(going, service) for service in ROLES}
-    others = [f"{host}:{port}" for found in everybody.values() for host in found.values() for port in (7447, 17450)]
+    others = [
+        f"{host}:{port}" for addresses in everybody.values() for host in addresses.values() for port in (7447, 17450)
+    ]
 
     def look(service: str) -> str:
         # Of an unknown name Docker asks who is not to be reached from here, and that takes as long as is waited.
@@ -87,15 +89,15 @@ def test_who_can_reach_what(going: Project) -> None:
     with ThreadPoolExecutor() as looking:
         seen = dict(zip(ROLES[1:], looking.map(look, ROLES[1:]), strict=True))
     for service in ROLES[1:]:
-        found = json.loads(seen[service])
-        assert found["names"] == sorted({"router", service}, key=ROLES.index)
+        view = json.loads(seen[service])
+        assert view["names"] == sorted({"router", service}, key=ROLES.index)
         own = {f"{everybody['router'][f'to-{service}']}:7447"}
         if service == "recorder":
             own |= {f"{host}:17450" for host in everybody[service].values()}
-        assert set(found["reached"]) == own
-        assert found["files"] == ["/brief/brief.json"]
-        assert found["briefs"] == [service]
-        assert found["rights"] == ["1000", "0" * 16]
+        assert set(view["reached"]) == own
+        assert view["files"] == ["/brief/brief.json"]
+        assert view["briefs"] == [service]
+        assert view["rights"] == ["1000", "0" * 16]
     for service in ROLES:
         wait_until(partial(is_healthy, going, service), f"a healthy {service}")
 
@@ -137,9 +139,9 @@ def test_no_way_leads_out(going: Project) -> None:
     """No process of the run reaches the host at any address, or resolves a name through it; only the view's forwarder does."""
     docker, project = going.docker, going.environment["COMPOSE_PROJECT_NAME"]
     networks = docker("network", "ls", "-q", "--filter", f"label=com.docker.compose.project={project}").split()
-    gateways = {docker.inspected("network", one)["IPAM"]["Config"][0]["Gateway"] for one in networks}
-    found = json.loads(docker.inside("ip", "-json", "-4", "address"))
-    hosts = {one["local"] for link in found for one in link["addr_info"] if one["local"] != "127.0.0.1"}
+    gateways = {docker.inspected("network", network)["IPAM"]["Config"][0]["Gateway"] for network in networks}
+    links = json.loads(docker.inside("ip", "-json", "-4", "address"))
+    hosts = {address["local"] for link in links for address in link["addr_info"] if address["local"] != "127.0.0.1"}
     assert gateways > hosts, "only what forwards the view is on a network that the host is in"
     begun = [*docker.entering(), sys.executable, "-c", SERVICES]
     with subprocess.Popen(begun, stdout=subprocess.PIPE, text=True) as services:
@@ -149,8 +151,8 @@ def test_no_way_leads_out(going: Project) -> None:
 
             def reached(service: str) -> set[str]:
                 quick = ("exec", "-e", "RES_OPTIONS=timeout:1 attempts:1", going.container(service))
-                said = docker(*quick, "python", "-c", REACHES, port, service, *sorted(hosts | gateways))
-                return set(said.split())
+                answers = docker(*quick, "python", "-c", REACHES, port, service, *sorted(hosts | gateways))
+                return set(answers.split())
 
             with ThreadPoolExecutor() as looking:
                 by_service = dict(zip(ROLES, looking.map(reached, ROLES), strict=True))

@@ -42,8 +42,8 @@ class Block:
     @property
     def file(self) -> str | None:
         """The name of the file that it contains, by the comment above it or its own first line."""
-        found = re.match(r"# ([\w./-]+\.(?:py|toml))\n", self.text)
-        return self._note("file") or (found[1] if found else None)
+        match = re.match(r"# ([\w./-]+\.(?:py|toml))\n", self.text)
+        return self._note("file") or (match[1] if match else None)
 
     @property
     def not_run(self) -> str | None:
@@ -68,9 +68,9 @@ class Block:
     def commands(self) -> Iterator[tuple[str, str]]:
         """Each command with its output."""
         for part in re.split(r"^\$ ", self.text, flags=re.MULTILINE)[1:]:
-            found = re.match(r"((?:.*\\\n)*.*\n)", part)
-            assert found is not None
-            yield found[1].rstrip("\n"), part[found.end() :]
+            match = re.match(r"((?:.*\\\n)*.*\n)", part)
+            assert match is not None
+            yield match[1].rstrip("\n"), part[match.end() :]
 
     def _note(self, kind: str) -> str | None:
         name, _, value = self.note.partition(": ")
@@ -79,8 +79,8 @@ class Block:
 
 def blocks(page: Path) -> list[Block]:
     """The fences of a page."""
-    found = _FENCE.finditer(page.read_text(encoding="utf-8"))
-    return [Block(one["note"] or "", one["language"], one["text"], one.start("text")) for one in found]
+    matches = _FENCE.finditer(page.read_text(encoding="utf-8"))
+    return [Block(match["note"] or "", match["language"], match["text"], match.start("text")) for match in matches]
 
 
 def matches(printed: str, shown: str) -> bool:
@@ -159,10 +159,10 @@ def rewrite(page: Path) -> list[Carried]:
     shift = 0
     with tempfile.TemporaryDirectory() as folder:
         for block, done in carry_out(page, Path(folder)):
-            wrong += [one for one in done if not one.is_right]
+            wrong += [carried for carried in done if not carried.is_right]
             new = "".join(
-                f"$ {one.command}\n{one.shown if one.is_right or not one.shown else _trimmed(one.printed)}"
-                for one in done
+                f"$ {carried.command}\n{carried.shown if carried.is_right or not carried.shown else _trimmed(carried.printed)}"
+                for carried in done
             )
             begins = block.begins + shift
             text = text[:begins] + new + text[begins + len(block.text) :]

@@ -19,8 +19,8 @@ PROMISES = re.compile(r"(?<!not a )one-time pads?|(?<!not against )unlimited mea
 
 def test_no_text_promises_more_than_a_stream_cipher() -> None:
     """In pages, scenarios and docstrings."""
-    found = {path.name: PROMISES.findall(" ".join(path.read_text(encoding="utf-8").split())) for path in FILES}
-    assert {name: words for name, words in found.items() if words} == {}
+    findalls = {path.name: PROMISES.findall(" ".join(path.read_text(encoding="utf-8").split())) for path in FILES}
+    assert {name: words for name, words in findalls.items() if words} == {}
 
 
 def test_the_page_of_the_cipher_says_what_it_is() -> None:

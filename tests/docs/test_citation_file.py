@@ -20,28 +20,32 @@ WITHOUT_A_PAPER = {"plain", "cipher", "twin-track"}
 
 def test_every_reference_can_be_found() -> None:
     """It has a title, a year, authors, and says what it is cited for."""
-    for one in FILE["references"]:
-        assert {"title", "year", "authors", "notes"} <= set(one), one
-        assert all({"given-names", "family-names"} <= set(author) for author in one["authors"])
+    for reference in FILE["references"]:
+        assert {"title", "year", "authors", "notes"} <= set(reference), reference
+        assert all({"given-names", "family-names"} <= set(author) for author in reference["authors"])
 
 
 def test_every_scheme_has_its_paper() -> None:
     """In the notes of a reference, or in the message."""
-    said = " ".join(
+    notes = " ".join(
         [FILE["message"].replace("partial encryption", "partial-encryption")]
-        + [one["notes"] for one in FILE["references"]]
+        + [reference["notes"] for reference in FILE["references"]]
     )
-    assert {name for name in SCHEMES if re.search(rf"\b{name}\b", said)} == set(SCHEMES) - WITHOUT_A_PAPER
+    assert {name for name in SCHEMES if re.search(rf"\b{name}\b", notes)} == set(SCHEMES) - WITHOUT_A_PAPER
 
 
 def test_every_recomputed_paper_is_there() -> None:
     """By its number at arXiv, or by its DOI."""
-    there = {one.get("doi") for one in FILE["references"]}
-    there |= {key["value"].removeprefix("arXiv:") for one in FILE["references"] for key in one.get("identifiers", ())}
+    there = {reference.get("doi") for reference in FILE["references"]}
+    there |= {
+        key["value"].removeprefix("arXiv:")
+        for reference in FILE["references"]
+        for key in reference.get("identifiers", ())
+    }
     for paper in PAPERS.values():
         wanted = set(re.findall(r"arXiv (\d{4}\.\d{5})|doi (10\.[\w./]+)", paper.published))
         assert wanted
-        assert {one or other for one, other in wanted} <= there, paper.published
+        assert {doi or other for doi, other in wanted} <= there, paper.published
 
 
 def test_what_is_not_released_is_not_said_to_be_stable() -> None:

@@ -25,8 +25,8 @@ def test_the_rows_and_columns_are_those_of_the_command() -> None:
     matchups = matchups_of(load(options.scenario, changes_of(options)))
     some = matchups.groups[0].scenario
     with Image.open(DOCS / "compare.png") as picture:
-        said = {name: picture.info[name] for name in ("Rows", "Columns", "Size")}
-    assert said == {
+        infos = {name: picture.info[name] for name in ("Rows", "Columns", "Size")}
+    assert infos == {
         "Rows": ",".join(matchups.schemes),
         "Columns": ",".join(matchups.adversaries),
         "Size": f"{some.slots} slots, {some.trials} trials, seed {some.seed}",

@@ -37,13 +37,15 @@ NOT_RUN = {
 @pytest.mark.parametrize("name", RUN)
 def test_the_commands_of_a_page_print_what_it_shows(name: str, tmp_path: Path) -> None:
     """In order, in one folder. `python -m tests.docs.consoles PAGE` writes what they print into the page."""
-    wrong = [str(one) for _, done in carry_out(PAGES[name], tmp_path) for one in done if not one.is_right]
+    wrong = [str(command) for _, done in carry_out(PAGES[name], tmp_path) for command in done if not command.is_right]
     assert not wrong, "\n".join(wrong)
 
 
 def test_no_further_block_of_commands_is_left_out() -> None:
     """The blocks that are not run are counted."""
-    left_out = {name: sum(one.has_commands and not one.is_run for one in blocks(path)) for name, path in PAGES.items()}
+    left_out = {
+        name: sum(block.has_commands and not block.is_run for block in blocks(path)) for name, path in PAGES.items()
+    }
     assert {name: count for name, count in left_out.items() if count} == NOT_RUN
 
 
@@ -82,5 +84,5 @@ def test_a_page_that_is_wrong_is_found(tmp_path: Path) -> None:
         "<!-- exit status: 3 -->\n```console\n$ true\n$ exit 3\n```\n"
         "<!-- not run: it never ends -->\n```console\n$ sleep 1000\n```\n"
     )
-    done = [[one.is_right for one in commands] for _, commands in carry_out(page, tmp_path)]
+    done = [[command.is_right for command in commands] for _, commands in carry_out(page, tmp_path)]
     assert done == [[True, False, False], [True, True]]

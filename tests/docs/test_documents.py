@@ -19,8 +19,8 @@ def commands(page: str) -> list[list[str]]:
     """The `evedrop` commands in a page's code blocks, and those of pytest."""
     text = (DOCS / page).read_text(encoding="utf-8")
     lines = [line.strip().removeprefix("$ ") for line in text.splitlines()]
-    found = [line.partition("  #")[0] for line in lines if line.startswith(("evedrop ", "python -m pytest "))]
-    return [shlex.split(line) for line in found if " -m pytest " not in line or "test_errata.py" in line]
+    texts = [line.partition("  #")[0] for line in lines if line.startswith(("evedrop ", "python -m pytest "))]
+    return [shlex.split(line) for line in texts if " -m pytest " not in line or "test_errata.py" in line]
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -50,12 +50,12 @@ _PIP = {"--force-reinstall"}
 
 def test_every_option_that_the_code_names_is_one() -> None:
     """A message that advises an option names one that a command has."""
-    known = cli.parser_of().options() | _PIP
+    options = cli.parser_of().options() | _PIP
     sources = [path.relative_to(DOCS.parent).as_posix() for path in sorted((DOCS.parent / "emulator").rglob("*.py"))]
     assert set(sources) > OTHER_OPTIONS
     for source in set(sources) - OTHER_OPTIONS:
         text = (DOCS.parent / source).read_text(encoding="utf-8")
-        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) <= known, source
+        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) <= options, source
 
 
 @pytest.mark.parametrize("page", PAGES)

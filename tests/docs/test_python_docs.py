@@ -28,10 +28,10 @@ def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         if kind == "python":
             exec(compile(code, "docs/python.md", "exec"), names)  # noqa: S102 - the page's own code
             continue
-        call, *_, said = re.split(r"^Traceback .*:$\n", code.removeprefix(">>> "), maxsplit=1, flags=re.MULTILINE)
+        call, *_, message = re.split(r"^Traceback .*:$\n", code.removeprefix(">>> "), maxsplit=1, flags=re.MULTILINE)
         with pytest.raises(Exception, match="mistakes") as caught:
             exec(call, names)  # noqa: S102 - the same
-        assert "".join(traceback.format_exception_only(caught.value)) == said
+        assert "".join(traceback.format_exception_only(caught.value)) == message
 
 
 def test_the_table_has_every_function() -> None:
@@ -50,5 +50,5 @@ def test_the_commands_without_a_function_are_listed() -> None:
         for command in importlib.import_module(f"evedrop.cli.commands.{module}").COMMANDS
         if command.section in {"run", "study"}
     }
-    (said,) = re.findall(r"have no\s+function: (.*?);", PAGE, re.DOTALL)
-    assert set(re.findall(r"`([\w ]+)`", said)) == {name for name in commands if name not in evedrop.__all__}
+    (listing,) = re.findall(r"have no\s+function: (.*?);", PAGE, re.DOTALL)
+    assert set(re.findall(r"`([\w ]+)`", listing)) == {name for name in commands if name not in evedrop.__all__}

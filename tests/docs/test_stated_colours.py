@@ -33,9 +33,9 @@ def test_the_readme_names_the_colours_of_the_vehicle_s_receivers() -> None:
     """In the words below its picture."""
     receivers = load("vehicle").receivers
     assert receivers == ("legitimate", "naive", "suspicious", "smart")
-    said = re.findall(r"The legitimate estimator \((\w+)\).*?naive eavesdropper \((\w+)\)", text("README.md"))
+    colours = re.findall(r"The legitimate estimator \((\w+)\).*?naive eavesdropper \((\w+)\)", text("README.md"))
     more = re.findall(r"the suspicious one \((\w+)\).*?the smart one \((\w+)\)", text("README.md"))
-    assert [*said[0], *more[0]] == [name_of(colour) for colour in RECEIVERS[:4]]
+    assert [*colours[0], *more[0]] == [name_of(colour) for colour in RECEIVERS[:4]]
 
 
 def test_the_page_of_the_view_names_the_first_colours() -> None:

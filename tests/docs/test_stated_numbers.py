@@ -37,8 +37,8 @@ def git(*words: str) -> str:
 
 def test_the_reserved_names_are_all_there() -> None:
     """Those that an eavesdropper cannot have."""
-    (said,) = re.findall(r"((?:`[a-z]+`(?:, | and )?)+) are reserved\.", page("scenario.md"))
-    assert sorted(re.findall(r"`([a-z]+)`", said)) == sorted(RESERVED)
+    (listing,) = re.findall(r"((?:`[a-z]+`(?:, | and )?)+) are reserved\.", page("scenario.md"))
+    assert sorted(re.findall(r"`([a-z]+)`", listing)) == sorted(RESERVED)
 
 
 def test_how_many_mistakes_are_reported() -> None:

@@ -23,8 +23,8 @@ def test_the_scenario_of_the_page_passes(tmp_path: Path) -> None:
     """As it stands, in memory."""
     (text,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     (tmp_path / "page.toml").write_text(text, encoding="utf-8")
-    found = carry_out(str(tmp_path / "page.toml"), Manner(in_memory=True, out=tmp_path / "out"))
-    assert (found.outcome, found.reasons) == (Outcome.PASSED, ())
+    result = carry_out(str(tmp_path / "page.toml"), Manner(in_memory=True, out=tmp_path / "out"))
+    assert (result.outcome, result.reasons) == (Outcome.PASSED, ())
 
 
 def test_the_ci_jobs_test_and_keep_the_report() -> None:

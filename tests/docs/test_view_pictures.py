@@ -42,9 +42,9 @@ def run_of(scenario: str, folder: Path) -> Path:
 def quoted(page: Path, picture: str) -> list[str]:
     """The words of the command with which a page says that one of its pictures is made."""
     text = page.read_text(encoding="utf-8")
-    found = re.search(r"`evedrop (view RUN --picture FILE\.png[^`]*)`", text[text.index(f"{picture})") :])
-    assert found is not None
-    return shlex.split(found[1])
+    match = re.search(r"`evedrop (view RUN --picture FILE\.png[^`]*)`", text[text.index(f"{picture})") :])
+    assert match is not None
+    return shlex.split(match[1])
 
 
 def drawn(words: list[str], run: Path, picture: Path) -> Path:
@@ -62,9 +62,9 @@ def coarse(picture: Path) -> npt.NDArray[np.float64]:
     return means
 
 
-def difference(one: Path, other: Path) -> float:
+def difference(picture: Path, other: Path) -> float:
     """The mean absolute difference of two pictures' squares. Fails if the pictures have different sizes."""
-    first, second = coarse(one), coarse(other)
+    first, second = coarse(picture), coarse(other)
     assert first.shape == second.shape
     return float(np.abs(first - second).mean())
 
@@ -92,7 +92,7 @@ def test_the_picture_of_a_day_is_what_its_command_draws(tmp_path: Path) -> None:
 def test_a_picture_is_described_alike_wherever_it_is_shown() -> None:
     """The words for those who do not see it."""
     pages = [ROOT / "README.md", *DOCS.rglob("*.md")]
-    said = {
+    descriptions = {
         text for page in pages for text in re.findall(r"!\[([^]]+)\]\([\w/.]*live_view\.png\)", page.read_text("utf-8"))
     }
-    assert len(said) == 1
+    assert len(descriptions) == 1

@@ -36,10 +36,12 @@ def listed(names: list[str]) -> str:
     return quoted[0] if len(quoted) == 1 else f"{', '.join(quoted[:-1])} and {quoted[-1]}"
 
 
-def strategies(names: list[str], said: str) -> str:
+def strategies(names: list[str], message: str) -> str:
     """A sentence about strategies."""
     several = len(names) > 1
-    return f"The {'strategies' if several else 'strategy'} {listed(names)} {'are' if several else 'is'} granted {said}."
+    return (
+        f"The {'strategies' if several else 'strategy'} {listed(names)} {'are' if several else 'is'} granted {message}."
+    )
 
 
 @pytest.mark.parametrize("page", ["README.md", "SECURITY.md"])
@@ -79,11 +81,11 @@ def test_the_protocol_lists_the_keys_of_each_strategy() -> None:
     """The row of the eavesdropper in the table of roles of docs/protocol.md."""
     page = (ROOT / "docs" / "protocol.md").read_text(encoding="utf-8")
     (row,) = re.findall(r"^\| `eavesdropper` \| (smart[^|]*) \|", page, re.MULTILINE)
-    said: dict[str, set[str]] = {}
+    granted: dict[str, set[str]] = {}
     for part in row.split("; "):
         names, _, keys = part.partition(": ")
         for name in re.split(r", | and ", names):
             if name in STRATEGIES.names and keys.startswith("`"):
-                said[name] = set(re.findall(r"`(\w+)`", keys))
+                granted[name] = set(re.findall(r"`(\w+)`", keys))
     asked = {name: set(cls.streams(given)) for name, (cls, given) in built_in().items()}
-    assert said == {name: streams for name, streams in asked.items() if streams}
+    assert granted == {name: streams for name, streams in asked.items() if streams}

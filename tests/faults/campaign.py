@@ -99,15 +99,15 @@ class Campaign:
         self,
         case: AnyCase,
         hits: tuple[Fault | WireFault | StudyFault, ...],
-        found: list[str],
+        misses: list[str],
         outcome: str,
         seconds: float,
     ) -> Verdict:
         """What became of a case, whose folder is kept if something promised did not hold."""
         ours.reap()
-        if not found:
+        if not misses:
             shutil.rmtree(self.folder / str(case.seed))
-        return Verdict(case, hits, OUTCOMES[-1] if found else outcome, tuple(found), seconds)
+        return Verdict(case, hits, OUTCOMES[-1] if misses else outcome, tuple(misses), seconds)
 
     def _studied(self) -> Undisturbed:
         if self._study is None:
@@ -273,10 +273,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             say(f"{case.seed:6d}  {case}")
         return 0
     verdicts: list[Verdict] = []
-    with campaign(options.keep) as one:
+    with campaign(options.keep) as running:
         try:
             for case in cases:
-                verdicts.append(one.carry_out(case))
+                verdicts.append(running.carry_out(case))
                 say(str(verdicts[-1]))
                 for miss in verdicts[-1].misses:
                     say(f"        {miss}")
@@ -291,7 +291,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     say(f"{sum(len(verdict.hits) for verdict in verdicts)} faults in {len(verdicts)} runs, {len(missed)} with a miss")
     for verdict in missed:
         say(
-            f"    make test-faults SEED={verdict.case.seed}    what is left of it: {one.folder / str(verdict.case.seed)}"
+            f"    make test-faults SEED={verdict.case.seed}    what is left of it: {running.folder / str(verdict.case.seed)}"
         )
     skipped = [verdict for verdict in verdicts if verdict.lack is not None]
     for lack in sorted({str(verdict.lack) for verdict in skipped}):

@@ -188,11 +188,11 @@ class Disturbed:
             return servers[:1] if name == FORK_SERVERS[0] else servers[1:2]
         firsts = self.firsts
         return [
-            one.pid
-            for one in ours.descendants()
-            if one.brief is not None
-            and one.brief.stem == name
-            and self._first_at(one.brief.parent) == (firsts[shard] if shard < len(firsts) else None)
+            descendant.pid
+            for descendant in ours.descendants()
+            if descendant.brief is not None
+            and descendant.brief.stem == name
+            and self._first_at(descendant.brief.parent) == (firsts[shard] if shard < len(firsts) else None)
         ]
 
     def _first_at(self, private: Path) -> int | None:

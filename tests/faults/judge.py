@@ -114,19 +114,21 @@ def misses(
 ) -> list[str]:
     """The broken promises, now that the launcher has ended; hits: the faults that hit something, and when."""
     left = ours.none_left(before, _LEAVE_SECONDS, *run.temporaries.values())
-    found = [f"process {one.pid} is left: {' '.join(one.words)}; {ours.doing(one.pid)}" for one in left]
+    misses = [
+        f"process {process.pid} is left: {' '.join(process.words)}; {ours.doing(process.pid)}" for process in left
+    ]
     ours.end_all(left)
     status = status_of(run)
-    found += _of_status(status, run, hits, longest_outage, int(reference.summary["slots"]))
-    found += _of_what_is_said(run, any(map(_of_limits, hits)))
+    misses += _of_status(status, run, hits, longest_outage, int(reference.summary["slots"]))
+    misses += _of_what_is_said(run, any(map(_of_limits, hits)))
     for host, folder in run.temporaries.items():
         if not _may_leave_files(status, [*hits], host):
-            found += [f"{path} is left" for path in sorted(folder.iterdir())]
-    found += _of_ports(run)
+            misses += [f"{path} is left" for path in sorted(folder.iterdir())]
+    misses += _of_ports(run)
     if not any(fault.kind in ("remove", "break the disk") for fault in hits):
-        found += _of_results(status, run, hits, reference)
-        found += _of_files(status, run, any(_of_disk(fault) or _of_limits(fault) for fault in hits))
-    return found
+        misses += _of_results(status, run, hits, reference)
+        misses += _of_files(status, run, any(_of_disk(fault) or _of_limits(fault) for fault in hits))
+    return misses
 
 
 def _may_leave_files(status: int, hits: Sequence[Fault], host: str) -> bool:
@@ -232,8 +234,8 @@ def _of_files(status: int, run: Run, lacking: bool) -> Iterator[str]:
 
 def _folders(run: Run) -> list[Path]:
     """Where results are, or were moved to: those of each shard where they could not be made one."""
-    found = [folder for folder in (run.out, run.renamed) if folder.is_dir()]
-    return [one for folder in found for one in (sorted((folder / "shards").glob("*")) or [folder])]
+    folders = [folder for folder in (run.out, run.renamed) if folder.is_dir()]
+    return [shard for folder in folders for shard in (sorted((folder / "shards").glob("*")) or [folder])]
 
 
 def _of_results(status: int, run: Run, hits: Mapping[Fault, float], reference: Reference) -> Iterator[str]:

@@ -133,12 +133,12 @@ _T = TypeVar("_T")
 
 def _awaited(look: Callable[[], list[_T]], run: Disturbed) -> list[_T]:
     """The first non-empty answer, within some seconds."""
-    found: list[_T] = []
+    targets: list[_T] = []
     for _ in range(int(_APPEARS_SECONDS / 0.02)):
-        found = look()
-        if found or run.over.wait(0.02):
+        targets = look()
+        if targets or run.over.wait(0.02):
             break
-    return found
+    return targets
 
 
 def _process(fault: Fault, run: Disturbed) -> list[int]:
@@ -185,14 +185,14 @@ def _stop(fault: Fault, run: Disturbed) -> bool:
 
 
 def _stop_and_kill(fault: Fault, run: Disturbed) -> bool:
-    found = _process(fault, run)
+    pids = _process(fault, run)
     for number in (signal.SIGSTOP, signal.SIGKILL):
-        for pid in found:
+        for pid in pids:
             with suppress(ProcessLookupError):
                 os.kill(pid, number)
         if number == signal.SIGSTOP:
             run.over.wait(fault.seconds)
-    return bool(found)
+    return bool(pids)
 
 
 def _limited(fault: Fault, run: Disturbed) -> bool:

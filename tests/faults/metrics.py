@@ -43,8 +43,8 @@ def _differences(place: str, value: Any, wanted: Any) -> Iterator[str]:
         for name in sorted({*wanted, *value}):
             yield from _differences(f"{place}.{name}", value.get(name), wanted.get(name))
     elif isinstance(wanted, list) and isinstance(value, list) and len(wanted) == len(value):
-        for number, (one, other) in enumerate(zip(value, wanted, strict=True)):
-            yield from _differences(f"{place}.{number}", one, other)
+        for number, (item, other) in enumerate(zip(value, wanted, strict=True)):
+            yield from _differences(f"{place}.{number}", item, other)
     elif not same(value, wanted):
         yield f"{place} is {value}, and in memory {wanted}"
 
@@ -86,11 +86,11 @@ def unlike_rows(summary: Mapping[str, Any], tables: Mapping[str, pa.Table], shar
         return
     latecomers = {name: account["late"] for name, account in links.items()}
     for name, peer in summary["peers"].items():
-        found, late = means[name], latecomers[name]
+        mean, late = means[name], latecomers[name]
         for metric in _MEANS:
             # A late packet counts as received, and perhaps as used, when it arrives; rows of slots have none of them.
-            least = found[metric] / found["trials"]
-            most = least + (late / found["trials"] if metric in _FRACTIONS else 0.0)
+            least = mean[metric] / mean["trials"]
+            most = least + (late / mean["trials"] if metric in _FRACTIONS else 0.0)
             if not (same(peer[metric], least) or same(peer[metric], most) or least < peer[metric] < most):
                 yield f"{metric} of {name} is {peer[metric]}, and by the rows of slots {least}"
     for name, link in summary["links"].items():

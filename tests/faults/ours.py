@@ -97,12 +97,12 @@ def _look() -> frozenset[int]:
             state, parent = (folder / "stat").read_text().rpartition(")")[2].split()[:2]
             if state not in "ZX":
                 children.setdefault(int(parent), []).append(int(folder.name))
-    found, waiting = set[int](), list(children.get(os.getpid(), []))
+    pids, waiting = set[int](), list(children.get(os.getpid(), []))
     while waiting:
         pid = waiting.pop()
-        found.add(pid)
+        pids.add(pid)
         waiting += children.get(pid, [])
-    return frozenset(found)
+    return frozenset(pids)
 
 
 def marked(*temporaries: Path) -> Iterator[Process]:
@@ -178,12 +178,12 @@ def _stacks(pid: int) -> str:
 
 def end_all(processes: list[Process]) -> None:
     """End what a failed case has left."""
-    for one in processes:
+    for process in processes:
         with suppress(OSError):
-            os.kill(one.pid, signal.SIGKILL)
-    for one in processes:
+            os.kill(process.pid, signal.SIGKILL)
+    for process in processes:
         with suppress(OSError):
-            os.waitpid(one.pid, 0)
+            os.waitpid(process.pid, 0)
 
 
 def reap() -> None:

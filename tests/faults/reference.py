@@ -47,13 +47,13 @@ class Reference:
 
         whole: the slots that all shards have done, whose rows must be of all trials; None for the whole run.
         """
-        known, found = self.tables.get(name), 0
-        if known is None:
+        expected, wrong = self.tables.get(name), 0
+        if expected is None:
             return
         seen = set[tuple[Any, ...]]()
         for row in table.to_pylist():
             key = _key(name, row)
-            wanted = known.get(key)
+            wanted = expected.get(key)
             why = (
                 "twice"
                 if key in seen
@@ -65,11 +65,11 @@ class Reference:
             )
             seen.add(key)
             if why is not None:
-                found += 1
-                if found <= _SHOWN:
+                wrong += 1
+                if wrong <= _SHOWN:
                     yield f"{name} {key}: {why}"
-        if found > _SHOWN:
-            yield f"{name}: {found} wrong rows in all"
+        if wrong > _SHOWN:
+            yield f"{name}: {wrong} wrong rows in all"
 
 
 def in_memory(scenario: Scenario, folder: Path) -> Reference:

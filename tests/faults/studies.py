@@ -122,13 +122,13 @@ def carried_out(case: StudyCase, folder: Path, before: frozenset[int], usual: Un
     results = Results.read(folder / "out")
     yield from unlike_memory({**results.summary, "expectations": None}, {**usual.results.summary, "expectations": None})
     for name in _TABLES:
-        found, wanted = getattr(results, name), getattr(usual.results, name)
+        actual, wanted = getattr(results, name), getattr(usual.results, name)
         if (
-            not found.equals(wanted)
-            and found.to_pylist() != wanted.to_pylist()
-            and repr(found.to_pylist()) != repr(wanted.to_pylist())
+            not actual.equals(wanted)
+            and actual.to_pylist() != wanted.to_pylist()
+            and repr(actual.to_pylist()) != repr(wanted.to_pylist())
         ):
-            yield f"the table of {name} is not that of an undisturbed study: {len(found)} rows, wanted {len(wanted)}"
+            yield f"the table of {name} is not that of an undisturbed study: {len(actual)} rows, wanted {len(wanted)}"
     if (folder / "out" / "kept").exists():
         yield "the kept trials are left in the folder of a complete study"
     yield from failed_looks(folder / "out", usual.results.folder)

@@ -74,11 +74,11 @@ STATUSES: dict[str, tuple[int, str, list[Fault], str]] = {
 }
 
 
-@pytest.mark.parametrize("what", STATUSES)
-def test_the_judge_sees(what: str, ended: Ended, reference: Reference) -> None:
+@pytest.mark.parametrize("case", STATUSES)
+def test_the_judge_sees(case: str, ended: Ended, reference: Reference) -> None:
     """What a launcher must not do or say."""
-    ended.launcher.returncode, said, hits, expected = STATUSES[what]
-    (ended.folder / "stderr").write_text(said)
+    ended.launcher.returncode, stderr, hits, expected = STATUSES[case]
+    (ended.folder / "stderr").write_text(stderr)
     misses = ended.misses(reference, *hits)
     assert [line for line in misses if expected in line], misses
 
@@ -126,11 +126,11 @@ def test_the_judge_has_nothing_to_say_of_early_ends_that_are_whole(early: Ended,
 
 
 @pytest.mark.parametrize(
-    "what", mostly_long(LACKING, ["one slot of the journal", "the last row of the trials", "one slot of the slots"])
+    "case", mostly_long(LACKING, ["one slot of the journal", "the last row of the trials", "one slot of the slots"])
 )
-def test_missing_rows_of_a_run_that_ended_early_are_seen(what: str, early: Ended, reference: Reference) -> None:
+def test_missing_rows_of_a_run_that_ended_early_are_seen(case: str, early: Ended, reference: Reference) -> None:
     """All tables are counted up to the slot of the summary."""
-    name, change = LACKING[what]
+    name, change = LACKING[case]
     early.change(name, change)
     misses = early.misses(reference, KILL)
     assert [line for line in misses if line.startswith(f"{name} lacks")], misses

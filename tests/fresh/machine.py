@@ -116,10 +116,10 @@ class Outcome:
 
     def mistakes(self, commands: tuple[str, ...]) -> list[str]:
         """All that is not as README promises, in words."""
-        found = [f"`{command}` did not end" for command in commands if command not in self.ended]
-        found += [f"`{command}` ended with {status}" for command, (status, _) in self.ended.items() if status]
-        found += [line for line in self.said if re.match(r"(FAILED|ERROR) \S+\.py\b", line)]
-        return found + [f"left behind: {what}" for what in self.left]
+        mistakes = [f"`{command}` did not end" for command in commands if command not in self.ended]
+        mistakes += [f"`{command}` ended with {status}" for command, (status, _) in self.ended.items() if status]
+        mistakes += [line for line in self.said if re.match(r"(FAILED|ERROR) \S+\.py\b", line)]
+        return mistakes + [f"left behind: {path}" for path in self.left]
 
 
 # Root on one of each kind, and an ordinary user on the other.
@@ -168,25 +168,25 @@ def outcome(
     given.mkdir()
     what_pip_is_told(given)
     bundle = ("bundle", "create", "--quiet", given / "evedrop.bundle", "HEAD")
-    tried("git", "-c", f"safe.directory={ROOT}", *bundle, what="git bundle", cwd=ROOT)
+    tried("git", "-c", f"safe.directory={ROOT}", *bundle, subject="git bundle", cwd=ROOT)
     bounding = ",".join(("-all", *(f"+{name}" for name in _CAPABILITIES)))
     words = (system, tar, given, machine.user, bounding, *commands)
-    said = _said([*IN_NAMESPACES, "--ipc", "--uts", "sh", "-c", _RUN, "sh", *map(str, words)], write, seconds)
+    printed = _said([*IN_NAMESPACES, "--ipc", "--uts", "sh", "-c", _RUN, "sh", *map(str, words)], write, seconds)
     result = given / "result"
     lines = [line.split("\t") for line in result.read_text().splitlines()] if result.exists() else []
     if not lines:
-        raise CannotRun(f"{machine.name} cannot be set up: {' '.join(said[-20:])}")
+        raise CannotRun(f"{machine.name} cannot be set up: {' '.join(printed[-20:])}")
     return Outcome(
         ended={line[3]: (int(line[1]), int(line[2])) for line in lines if line[0] == "ended"},
         left=tuple(line[1] for line in lines if line[0] == "left"),
-        said=tuple(said),
+        said=tuple(printed),
         used_kilobytes=max((int(line[1]) for line in lines if line[0] == "used"), default=0),
     )
 
 
 def _said(command: list[str], write: Callable[[str], object], seconds: float) -> list[str]:
     """The lines that a command says; it is killed after some seconds."""
-    said: list[str] = []
+    lines: list[str] = []
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
     ) as process:
@@ -195,12 +195,12 @@ def _said(command: list[str], write: Callable[[str], object], seconds: float) ->
         try:
             assert process.stdout is not None
             for line in process.stdout:
-                said.append(line.rstrip("\n"))
+                lines.append(line.rstrip("\n"))
                 write(line)
         finally:
             limit.cancel()
             process.kill()
-    return said
+    return lines
 
 
 def what_pip_is_told(folder: Path) -> None:

@@ -33,9 +33,9 @@ def test_every_machine_has_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     for commits in range(6, 10):
         monkeypatch.setattr(machine, "run", lambda *_, n=commits, **__: subprocess.CompletedProcess([], 0, f"{n}\n"))
         turns += chosen("in-turn")
-    assert sorted(one.name for one in turns) == sorted(MACHINES)
+    assert sorted(turn.name for turn in turns) == sorted(MACHINES)
     assert chosen("all") == list(MACHINES.values())
-    assert [one.name for one in chosen("debian12-cc")] == ["debian12-cc"]
+    assert [machine.name for machine in chosen("debian12-cc")] == ["debian12-cc"]
     with pytest.raises(ValueError, match="no fresh machine 'debian11'; expected one of debian12, "):
         chosen("debian11")
 
@@ -105,7 +105,7 @@ def test_pip_is_told_there_what_it_is_told_here(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.parametrize("user", ["root", "newcomer"])
 def test_a_machine_is_bare_and_what_stays_there_is_told(user: str) -> None:
     """It has nothing of this environment, no power over this machine, and its own /dev/shm and /tmp; what stays is named."""
-    name = next(name for name, one in MACHINES.items() if one.user == user and "gcc" not in one.packages)
+    name = next(name for name, machine in MACHINES.items() if machine.user == user and "gcc" not in machine.packages)
     look = "env; pwd; ls -A /dev/shm /tmp; command -v gcc cc; mount -t tmpfs tmpfs /mnt; git log -1"
     leave = "sleep 1000 & touch /tmp/mine /dev/shm/ours /dev/shm/12.zenoh /tmp/pytest-of-nobody; sleep 0.1"
     with temporary_folder("evedrop-fresh-") as folder:
@@ -145,12 +145,12 @@ def test_killed_tests_leave_no_machine() -> None:
 
 def _of_machines(folder: Path) -> list[str]:
     """The processes whose root is in a folder."""
-    found = []
+    names = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             root = os.readlink(entry / "root")
         except OSError:
             continue
         if root.startswith(str(folder)):
-            found.append(entry.name)
-    return found
+            names.append(entry.name)
+    return names

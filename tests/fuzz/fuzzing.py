@@ -87,16 +87,16 @@ def broken_by(reader: Reader, data: bytes, folder: Path) -> Failure | None:
 def campaign(name: str, seed: int, count: int, first: int = 0) -> list[Failure]:
     """The failures of a reader among this number of changed examples, from the one with the number `first` on."""
     reader = READERS[name]
-    found: list[Failure] = []
+    failures: list[Failure] = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as place:
         for number in range(first, first + count):
             mutator = Mutator(f"{name}/{seed}/{number}", reader.words())
             failure = broken_by(reader, reader.changed(mutator, number), Path(place) / "of-one")
             if failure is not None:
-                found.append(failure)
-                if len(found) == _MOST_FAILURES:
+                failures.append(failure)
+                if len(failures) == _MOST_FAILURES:
                     break
-    return found
+    return failures
 
 
 def keep(name: str, failure: Failure) -> Path:

@@ -38,24 +38,24 @@ class Mutator:
 
     def raw(self, data: bytes) -> bytes:
         """Bytes with some of them changed, cut out, doubled or put in."""
-        found = bytearray(data)
+        mutated = bytearray(data)
         for _ in range(self.random.randint(1, _MOST_CHANGES)):
-            at = self.random.randrange(len(found) + 1)
+            at = self.random.randrange(len(mutated) + 1)
             length = self.random.choice((1, 1, 2, 4, 8, 64))
             match self.random.randrange(6):
-                case 0 if at < len(found):
-                    found[at] ^= 1 << self.random.randrange(8)
-                case 1 if at < len(found):
-                    found[at] = self.random.choice((0, 1, 0x7F, 0x80, 0x90, 0xC0, 0xD9, 0xDD, 0xDF, 0xFF))
+                case 0 if at < len(mutated):
+                    mutated[at] ^= 1 << self.random.randrange(8)
+                case 1 if at < len(mutated):
+                    mutated[at] = self.random.choice((0, 1, 0x7F, 0x80, 0x90, 0xC0, 0xD9, 0xDD, 0xDF, 0xFF))
                 case 2:
-                    del found[at : at + length]
+                    del mutated[at : at + length]
                 case 3:
-                    found[at:at] = found[at : at + length]
+                    mutated[at:at] = mutated[at : at + length]
                 case 4:
-                    found[at:at] = self.random.randbytes(length)
+                    mutated[at:at] = self.random.randbytes(length)
                 case _:
-                    del found[at : None if self.random.random() < 0.2 else at + 1]
-        return bytes(found)
+                    del mutated[at : None if self.random.random() < 0.2 else at + 1]
+        return bytes(mutated)
 
     def tree(self, value: Any) -> Any:
         """Tables and lists with some entries of another type or value, taken out, doubled, or named otherwise."""
@@ -83,7 +83,7 @@ class Mutator:
         name = self.random.choice(list(value))
         match self.random.randrange(12):
             case 0:
-                return {one: inner for one, inner in value.items() if one != name}
+                return {key: inner for key, inner in value.items() if key != name}
             case 1:
                 return {**value, self.random.choice(self._texts): value[name]}
             case 2:
@@ -133,11 +133,11 @@ class Mutator:
 
 def words_of(trees: list[Any]) -> tuple[str, ...]:
     """Every name and text in tables, each once: what a change is most likely to be understood by."""
-    found: dict[str, None] = {}
+    words: dict[str, None] = {}
 
     def collect(value: Any) -> None:
         if isinstance(value, str) and len(value) < 60:
-            found[value] = None
+            words[value] = None
         elif isinstance(value, Mapping):
             for name, inner in value.items():
                 collect(name)
@@ -147,4 +147,4 @@ def words_of(trees: list[Any]) -> tuple[str, ...]:
                 collect(inner)
 
     collect(trees)
-    return tuple(found)
+    return tuple(words)

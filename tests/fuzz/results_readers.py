@@ -60,9 +60,9 @@ def _cut_short() -> dict[str, bytes]:
                     ones = SlotSums(*(np.ones(1) for _ in fields(SlotSums)))
                     writer.slot_rows(first, receiver, ones, np.zeros(1))
                 writer.write_rows(f"slot {first + 1}")
-            found = _files_in(folder)
+            files = _files_in(folder)
             raise _Killed
-        return found
+        return files
 
 
 class _Killed(Exception):
@@ -113,12 +113,12 @@ def _look_at(place: Path) -> None:
 
 @cache
 def _briefs() -> list[bytes]:
-    found = []
+    briefs = []
     for name in ("eavesdroppers", "acknowledged", "microgrid", "restart"):
         scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": []})
         for brief in briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False)).values():
-            found.append(json.dumps({**json.loads(brief.text), "run": "r00000000", "password": "p"}).encode())
-    return found
+            briefs.append(json.dumps({**json.loads(brief.text), "run": "r00000000", "password": "p"}).encode())
+    return briefs
 
 
 def _brief(data: bytes, folder: Path) -> None:
@@ -152,9 +152,9 @@ def _killed_wire() -> dict[str, bytes]:
             journal.change("scan", {"loss": {"model": "bernoulli", "quality": 0.5}}, {("scan/0", "put"): 4})
             if start == 0:
                 journal.close()
-        found = {str(path.relative_to(name)): path.read_bytes() for path in Path(name).rglob("*") if path.is_file()}
+        files = {str(path.relative_to(name)): path.read_bytes() for path in Path(name).rglob("*") if path.is_file()}
         journal.close()
-    return found
+    return files
 
 
 def _in_wire(file: str) -> Callable[[bytes, Path], None]:

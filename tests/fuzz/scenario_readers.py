@@ -35,23 +35,23 @@ _DOCUMENTS = Path(__file__).parents[2] / "docs"
 @cache
 def _scenarios() -> list[bytes]:
     """The shipped ones, as they are and short, those of the documents, and ones with a bit of everything."""
-    found = [path.read_bytes() for path in sorted(_EXAMPLES.glob("_*.toml"))] * 4
+    scenarios = [path.read_bytes() for path in sorted(_EXAMPLES.glob("_*.toml"))] * 4
     for path in shipped().values():
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
         tables["slots"] = min(tables["slots"], 40)
         tables.pop("expect", None)
-        found.append(tomli_w.dumps(tables).encode())
+        scenarios.append(tomli_w.dumps(tables).encode())
     for page in sorted(_DOCUMENTS.glob("*.md")):
         blocks = re.findall(r"^```toml\n(.*?)^```$", page.read_text(encoding="utf-8"), re.S | re.M)
-        found += [
+        scenarios += [
             block.encode() for block in blocks if "[process]" in block and ":" not in block.partition("[encoding]")[2]
         ]
-    return [*found, *(path.read_bytes() for path in shipped().values())]
+    return [*scenarios, *(path.read_bytes() for path in shipped().values())]
 
 
 @cache
 def _scenario_words() -> tuple[str, ...]:
-    return words_of([tomllib.loads(one.decode()) for one in _scenarios()])
+    return words_of([tomllib.loads(scenario.decode()) for scenario in _scenarios()])
 
 
 def read_scenario(data: bytes, folder: Path) -> list[str]:

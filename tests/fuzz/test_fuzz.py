@@ -120,11 +120,11 @@ def changed(tables: Any, path: tuple[Any, ...], value: Any) -> Any:
         return value
     name, rest = path[0], path[1:]
     if isinstance(tables, dict) and name in tables:
-        inner = {one: found for one, found in tables.items() if one != name or rest or value is not None}
+        inner = {key: entry for key, entry in tables.items() if key != name or rest or value is not None}
         return {**inner, name: changed(tables[name], rest, value)} if rest or value is not None else inner
     if isinstance(tables, list) and isinstance(name, int) and name < len(tables):
-        found = [changed(tables[name], rest, value)] if rest or value is not None else []
-        return [*tables[:name], *found, *tables[name + 1 :]]
+        items = [changed(tables[name], rest, value)] if rest or value is not None else []
+        return [*tables[:name], *items, *tables[name + 1 :]]
     return tables
 
 
@@ -134,12 +134,12 @@ def checked(change: tuple[str, list[tuple[tuple[Any, ...], Any]]]) -> None:
     tables = SCENARIOS[name]
     for path, value in changes:
         tables = changed(tables, path, value)
-    said = ""
+    message = ""
     try:
         warnings_of(parse(tomli_w.dumps(tables), name))
     except UsageError as error:
-        said = str(error)
-    assert "\x1b" not in said
+        message = str(error)
+    assert "\x1b" not in message
 
 
 @seed(1)

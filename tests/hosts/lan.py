@@ -40,8 +40,8 @@ def take_away_leftovers() -> None:
     """Namespaces of tests that were killed."""
     for line in _ip("netns", "list").splitlines():
         name = line.split()[0]
-        found = _NAME.match(name)
-        if found and not Path(f"/proc/{found[1]}").exists():
+        match = _NAME.match(name)
+        if match and not Path(f"/proc/{match[1]}").exists():
             with suppress(OSError):  # others, at the same time, take it away as well
                 _take_away(name)
 
@@ -114,9 +114,9 @@ class Lan:
 @contextmanager
 def lan(*hosts: str) -> Iterator[Lan]:
     """A network with these hosts, which is gone when the block ends."""
-    one = Lan(hosts)
+    lan = Lan(hosts)
     try:
-        one.build()
-        yield one
+        lan.build()
+        yield lan
     finally:
-        one.take_away()
+        lan.take_away()

@@ -109,8 +109,8 @@ def test_hosts_of_their_own_change_nothing_and_show_nothing(tmp_path: Path) -> N
         evedrop = (sys.executable, "-m", "evedrop")
         network.run("recorder", *evedrop, "pause", str(run.folder / "run"))  # however long the scan takes
         router = network.addresses["router"]
-        found = network.run("eve", sys.executable, "-c", SCAN, "65535", router)
-        assert found.split() == [router, str(PORT)]
+        output = network.run("eve", sys.executable, "-c", SCAN, "65535", router)
+        assert output.split() == [router, str(PORT)]
         others = [network.addresses[host] for host in HOSTS if host != "router"]
         assert network.run("eve", sys.executable, "-c", SCAN, str(PORT), *others) == ""
         for host in HOSTS:  # what listens at all, of any protocol, is what was scanned for
@@ -207,11 +207,11 @@ except OSError:
 
 def test_two_networks_do_not_meet(tmp_path: Path) -> None:
     """Hosts of two networks have the same addresses and do not reach each other; both are gone in the end."""
-    with lan("a", "b") as one, lan("a") as other:
-        assert one.addresses["a"] == other.addresses["a"]
-        assert one.namespace("a") != other.namespace("a")
-        assert one.run("a", sys.executable, "-c", KNOCK, one.addresses["b"]) == "refused\n"
-        assert other.run("a", sys.executable, "-c", KNOCK, one.addresses["b"]) == "not there\n"
-        names = {one.namespace("a"), one.namespace("b"), other.namespace("a")}
+    with lan("a", "b") as first, lan("a") as other:
+        assert first.addresses["a"] == other.addresses["a"]
+        assert first.namespace("a") != other.namespace("a")
+        assert first.run("a", sys.executable, "-c", KNOCK, first.addresses["b"]) == "refused\n"
+        assert other.run("a", sys.executable, "-c", KNOCK, first.addresses["b"]) == "not there\n"
+        names = {first.namespace("a"), first.namespace("b"), other.namespace("a")}
         assert names <= {path.name for path in Path("/run/netns").iterdir()}
     assert not names & {path.name for path in Path("/run/netns").iterdir()}

@@ -48,9 +48,9 @@ def launched(folder: Path, scenario: Scenario) -> Iterator[tuple[Lan, subprocess
             text += [f'command = ["sh", {json.dumps(str(script))}]', "port = 2222"]
         # One client for both: the keys of alpha's server let it into beta, too.
         (folder / "beta" / "user.pub").write_text((folder / "alpha" / "user.pub").read_text())
-        known = [(folder / host / "known_hosts").read_text() for host in PLACES]
+        host_keys = [(folder / host / "known_hosts").read_text() for host in PLACES]
         client = (folder / "alpha" / "client").read_text()
-        (folder / "known_hosts").write_text("".join(known))
+        (folder / "known_hosts").write_text("".join(host_keys))
         (folder / "client").write_text(client.replace(f"{folder}/alpha/known_hosts", f"{folder}/known_hosts"))
         text[0] = f'ssh_config = "{folder}/client"'
         (folder / "hosts.toml").write_text("\n".join(text))
@@ -101,8 +101,8 @@ def test_over_ssh_hosts_give_the_same_run(tmp_path: Path) -> None:
         network.unplug("beta")
         time.sleep(8.0)  # how long it is out is what is tested
         network.plug("beta")
-        _, said = launcher.communicate(timeout=120.0)
-        assert launcher.returncode == 0, said
+        _, errors = launcher.communicate(timeout=120.0)
+        assert launcher.returncode == 0, errors
         summary = Results.read(tmp_path / "run").summary
         as_if_undisturbed(summary, scenario, tmp_path / "memory")
         assert [outage["process"] for outage in summary["outages"]] == ["eve"]
@@ -115,8 +115,8 @@ def test_a_host_that_stays_away_is_named(tmp_path: Path) -> None:
     with launched(tmp_path, scenario) as (network, launcher):
         under_way(tmp_path, launcher)
         network.unplug("beta")
-        _, said = launcher.communicate(timeout=120.0)
-        assert launcher.returncode == 3, said
-        assert "host beta" in said
+        _, errors = launcher.communicate(timeout=120.0)
+        assert launcher.returncode == 3, errors
+        assert "host beta" in errors
         place = tmp_path / "alpha" / "temporary"
         wait_until(partial(_is_free, place), "no process left on alpha", 60.0)

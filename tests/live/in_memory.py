@@ -38,12 +38,12 @@ class Stage:
 
     def all(self, key: str) -> list[bytes]:
         """All messages that were put on a key; the others are dropped."""
-        found = []
+        payloads = []
         while not self.put.empty():
             where, payload = self.put.get()
             if where == key:
-                found.append(payload)
-        return found
+                payloads.append(payload)
+        return payloads
 
 
 class FakeSubscription:
@@ -58,10 +58,10 @@ class FakeSubscription:
 
     def take(self, most: int) -> list[bytes]:
         """The next message, and those after it."""
-        found = [self.recv()]
-        while len(found) < most and not self._queue.empty():
-            found.append(self.recv())
-        return found
+        payloads = [self.recv()]
+        while len(payloads) < most and not self._queue.empty():
+            payloads.append(self.recv())
+        return payloads
 
     def __iter__(self) -> Iterator[bytes]:
         while not self._queue.empty():

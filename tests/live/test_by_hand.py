@@ -114,9 +114,9 @@ def test_by_hand_the_recorder_prints_and_ends_as_run_does(below: float, evedrop:
     ended = {name: live.end() for name, live in running.items()}
     assert ended["recorder"].status == launched.status, ended["recorder"].err
     assert {done.status for name, done in ended.items() if name != "recorder"} == {0}
-    found, expected = closing(ended["recorder"]), comparable(launched.out.replace("launched", "results").splitlines())
-    assert found == expected
-    assert any("relative secrecy" in line for line in found)
+    actual, expected = closing(ended["recorder"]), comparable(launched.out.replace("launched", "results").splitlines())
+    assert actual == expected
+    assert any("relative secrecy" in line for line in actual)
 
 
 @pytest.mark.long
@@ -265,9 +265,11 @@ def test_a_host_that_is_not_known_is_said(name: str, evedrop: Evedrop) -> None:
 def test_a_certificate_of_another_process_is_said(evedrop: Evedrop) -> None:
     """Briefs whose identities were exchanged: both say so before they try anything."""
     briefs = written(evedrop, "--listen", "tls/127.0.0.1:7447")
-    found = {name: json.loads((evedrop.folder / briefs[name]).read_text()) for name in ("smart", "naive")}
+    contents = {name: json.loads((evedrop.folder / briefs[name]).read_text()) for name in ("smart", "naive")}
     for name, other in (("smart", "naive"), ("naive", "smart")):
-        (evedrop.folder / briefs[name]).write_text(json.dumps({**found[name], "identity": found[other]["identity"]}))
+        (evedrop.folder / briefs[name]).write_text(
+            json.dumps({**contents[name], "identity": contents[other]["identity"]})
+        )
         told(begun(evedrop, name, briefs[name]).end(), 2, f"briefs/{name}.json: ", f"is that of {other}, not of {name}")
 
 
@@ -282,10 +284,10 @@ def test_who_does_not_come_is_named(evedrop: Evedrop) -> None:
     assert done.err == "evedrop: smart did not appear within 15 s; start it, or look at its log\n"
     assert closing(done)[0] == "smart did not appear within 15 s; start it, or look at its log; the results so far:"
     assert Results.read(evedrop.folder / "results").summary["ended"].startswith("smart did not appear")
-    said = {name: live.end() for name, live in lives.items() if name != "recorder"}
-    assert {name: one.status for name, one in said.items()} == dict.fromkeys(said, 3)
-    for name, one in said.items():
-        assert one.err.startswith(f"evedrop: {name}: the recorder gave the run up: smart did not appear")
+    ends = {name: live.end() for name, live in lives.items() if name != "recorder"}
+    assert {name: end.status for name, end in ends.items()} == dict.fromkeys(ends, 3)
+    for name, end in ends.items():
+        assert end.err.startswith(f"evedrop: {name}: the recorder gave the run up: smart did not appear")
 
 
 @pytest.mark.long

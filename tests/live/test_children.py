@@ -92,26 +92,26 @@ class Bench:
         """The recorder writes these lines and ends: what the launcher shows of them."""
         self.starter.lines = b"".join(lines)
         self.children.start(self.briefs["recorder"])
-        found: list[ProgressEvent] = []
+        events: list[ProgressEvent] = []
 
         def ended() -> bool:
             match self.children.next_event(0.1):
                 case ProcessExit("recorder"):
                     return True
                 case ProgressEvent() as event:
-                    found.append(event)
+                    events.append(event)
             return False
 
         wait_until(ended, "the recorder's end")
-        return found
+        return events
 
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
     """Children of a run that is not there."""
-    one = Bench(tmp_path)
-    with closing(one.held), one.children:
-        yield one
+    bench = Bench(tmp_path)
+    with closing(bench.held), bench.children:
+        yield bench
 
 
 def test_a_signal_that_comes_when_the_run_is_complete_changes_nothing(bench: Bench) -> None:
@@ -188,10 +188,10 @@ def test_the_sender_of_a_malformed_message_is_named(bench: Bench, key: str, send
         bench.children.start(bench.briefs[name])
     error = MalformedMessage(f"evedrop/r1/{key}", "3", "4", b"")
     bench.leaves("naive", LastWord.about(error))
-    said = f"{sender} broke the protocol: malformed message on evedrop/r1/{key}"
-    assert bench.children.failure_report(ProcessExit("naive", 3), RunEnded(3, "naive left")).startswith(said)
+    message = f"{sender} broke the protocol: malformed message on evedrop/r1/{key}"
+    assert bench.children.failure_report(ProcessExit("naive", 3), RunEnded(3, "naive left")).startswith(message)
     ending = RunEnded(3, str(error), broken_by=protocol_breaker(error))
-    assert bench.children.failure_report(None, ending).startswith(said)
+    assert bench.children.failure_report(None, ending).startswith(message)
 
 
 def test_a_router_that_all_have_lost_is_at_fault(bench: Bench) -> None:
@@ -257,8 +257,8 @@ def test_no_news_deletes_the_brief_of_a_process_that_may_not_have_read_it(bench:
 )
 def test_news_are_read_as_they_were_written(event: ProgressEvent) -> None:
     """Whatever their entries."""
-    found = read_event(event.line)
-    assert (type(found), found.line) == (type(event), event.line)
+    result = read_event(event.line)
+    assert (type(result), result.line) == (type(event), event.line)
 
 
 MALFORMED = {

@@ -64,20 +64,20 @@ def test_a_run_begins_when_all_are_there() -> None:
 
 
 @pytest.mark.parametrize(
-    ("unread", "said"),
+    ("unread", "message"),
     [
         (("smart",), "smart did not appear within 30 s; start it, or look at its log"),
         (("sensor", "smart"), "sensor, smart did not appear within 30 s; start them, or look at their logs"),
         ((), "sensor, smart did not appear within 30 s; start them, or look at their logs"),
     ],
 )
-def test_who_does_not_appear_is_named_after_the_patience(unread: tuple[str, ...], said: str) -> None:
+def test_who_does_not_appear_is_named_after_the_patience(unread: tuple[str, ...], message: str) -> None:
     """And not before; but not a process that is waiting for another one, unless all that are missing do."""
     network = Told("sensor", "smart")
     network.unread = {network.keys.control(name) for name in unread}
-    with pytest.raises(RunError) as found:
+    with pytest.raises(RunError) as raised:
         conducted(network).assemble()
-    assert str(found.value) == said
+    assert str(raised.value) == message
     assert 30.0 < network.clock.now - 1000.0 < 30.2
     assert not network.opened
 

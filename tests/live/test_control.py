@@ -82,8 +82,8 @@ class Steered:
 
     def status(self) -> dict[str, Any]:
         """How it is doing."""
-        found: dict[str, Any] = json.loads(self("status", "--json"))
-        return found
+        status: dict[str, Any] = json.loads(self("status", "--json"))
+        return status
 
     def end(self) -> Done:
         """The file is removed at the end of the run."""
@@ -113,8 +113,8 @@ def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> No
     run = steered(slots=500, pace=0.002, events=KILLED + DELAYED)
     assert run("step", "70") == "slots 0 to 69 passed; held before slot 70"  # the receiver is down
     with stepping(evedrop, run.live.folder, 150):
-        said = [run("link", "legitimate", "quality=0.6"), run("link", "smart", "cut"), run("pause")]
-    said += [
+        answers = [run("link", "legitimate", "quality=0.6"), run("link", "smart", "cut"), run("pause")]
+    answers += [
         run(
             "link",
             "legitimate",
@@ -125,11 +125,11 @@ def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> No
             "delay.value=2",
         )
     ]
-    said += [run("step", "7"), run("link", "smart", "heal"), run("link", "legitimate", "cut"), run("step", "1")]
-    said += [run("link", "legitimate", "heal"), run("resume")]
-    assert said[0].endswith("on: link legitimate: quality = 0.6")
-    assert said[4].startswith("slots ")
-    assert slot_of(said[4]) == slot_of(said[2]) + 7 == slot_of(said[3]) + 7
+    answers += [run("step", "7"), run("link", "smart", "heal"), run("link", "legitimate", "cut"), run("step", "1")]
+    answers += [run("link", "legitimate", "heal"), run("resume")]
+    assert answers[0].endswith("on: link legitimate: quality = 0.6")
+    assert answers[4].startswith("slots ")
+    assert slot_of(answers[4]) == slot_of(answers[2]) + 7 == slot_of(answers[3]) + 7
     assert run.end().status == 0
     once = digests_of(run.live.folder)
     assert None not in once.values()
@@ -139,10 +139,10 @@ def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> No
         assert evedrop(*command, "--out", str(again)).status == 0
         assert digests_of(again) == once
         assert evedrop("diff", folder, str(again)).status == 0
-        events = [(one["slot"], one["event"]) for one in load_results(run.live.folder).summary["events"]]
-        repeated = [(one["slot"], one["event"]) for one in load_results(again).summary["events"]]
+        events = [(event["slot"], event["event"]) for event in load_results(run.live.folder).summary["events"]]
+        repeated = [(event["slot"], event["event"]) for event in load_results(again).summary["events"]]
         theirs = ("pause the run", "resume the run", *(f"step {n} slots" for n in (70, 150, 7)), "step 1 slot")
-        assert sorted(repeated) == sorted(one for one in events if one[1] not in theirs)
+        assert sorted(repeated) == sorted(event for event in events if event[1] not in theirs)
     run.live.nothing_left()
 
 
@@ -151,10 +151,10 @@ def test_a_paused_run_stands_still(steered: Start, evedrop: Evedrop) -> None:
     run = steered(pace=0.002)
     with stepping(evedrop, run.live.folder, 300):
         at = slot_of(run("pause"))
-    found = run.status()
-    assert (found["slot"], found["state"], found["slots"]) == (at, "paused", 400)
-    assert found["processes"] == dict.fromkeys(("router", "sensor", "legitimate", "smart"), True)
-    assert found["links"]["smart"]["offered"] == 3 * at
+    status = run.status()
+    assert (status["slot"], status["state"], status["slots"]) == (at, "paused", 400)
+    assert status["processes"] == dict.fromkeys(("router", "sensor", "legitimate", "smart"), True)
+    assert status["links"]["smart"]["offered"] == 3 * at
     assert run("pause") == f"held already, before slot {at}"
     assert run("link", "smart", "quality=0.5") == f"from slot {at} on: link smart: quality = 0.5"
     assert run("step", "4") == f"slots {at} to {at + 3} passed; held before slot {at + 4}"
@@ -164,7 +164,7 @@ def test_a_paused_run_stands_still(steered: Start, evedrop: Evedrop) -> None:
     assert run("resume") == f"the run goes on with slot {at + 4}"
     summary = run.end().summary
     assert summary["ended"] == "complete"
-    assert [(one["slot"] - at, one["event"], one["by"]) for one in summary["events"]] == [
+    assert [(event["slot"] - at, event["event"], event["by"]) for event in summary["events"]] == [
         (-at, "pause the run", "operator"),
         (-at, "step 300 slots", "operator"),
         *([(0, "pause the run", "operator")] if at < 300 else []),  # the step may be over before the operator says so
@@ -194,7 +194,7 @@ def test_mistakes_are_told_and_change_nothing(steered: Start) -> None:
     assert run.try_to("step", "0").status == 2
     assert (run.live.folder / "scenario.toml").read_text() == before
     run("resume")
-    assert [one["event"] for one in run.end().summary["events"]] == ["pause the run", "resume the run"]
+    assert [event["event"] for event in run.end().summary["events"]] == ["pause the run", "resume the run"]
 
 
 @pytest.mark.long
@@ -227,7 +227,7 @@ def test_an_interrupted_pause_leaves_nothing(number: signal.Signals, steered: St
     assert not run.control.exists()
     summary = run.live.results.summary
     assert (summary["slots"], summary["ended"]) == (at, "interrupted")
-    assert [one["event"] for one in summary["events"]] == ["pause the run", "step 40 slots", "cut smart"]
+    assert [event["event"] for event in summary["events"]] == ["pause the run", "step 40 slots", "cut smart"]
 
 
 @pytest.mark.parametrize("name", mostly_long(["sensor", "recorder", "router"], ["router"]))

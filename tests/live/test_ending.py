@@ -87,19 +87,19 @@ def network() -> Network:
 def ended(network: Network, patience: float = 30.0) -> tuple[Conductor, float]:
     """The conductor of a run that has told its end, and the seconds that this took."""
     clock = TestClock()
-    one = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True, clock=clock)  # type: ignore[arg-type]
-    one.assemble()
+    conductor = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True, clock=clock)  # type: ignore[arg-type]
+    conductor.assemble()
     began = clock.now
-    one.end(patience)
-    return one, clock.now - began
+    conductor.end(patience)
+    return conductor, clock.now - began
 
 
 def test_everybody_is_told_once(network: Network) -> None:
     """A process that confirms the end is not told again, and reports how many messages it dropped."""
     network.does["smart"] = lambda _: network.ends("smart", 3)
-    one, _ = ended(network)
+    conductor, _ = ended(network)
     assert network.told == dict.fromkeys(NAMES, 1)
-    assert one.misdelivered == {"router": 0, "sensor": 0, "legitimate": 0, "smart": 3}
+    assert conductor.misdelivered == {"router": 0, "sensor": 0, "legitimate": 0, "smart": 3}
 
 
 def test_a_process_that_loses_its_connection_just_then_is_told_again(network: Network) -> None:
@@ -120,9 +120,9 @@ def test_a_process_that_loses_its_connection_just_then_is_told_again(network: Ne
 def test_a_process_that_vanishes_without_a_word_is_not_waited_for_long(network: Network) -> None:
     """Its last message may have been lost: after a while it has left."""
     network.does["smart"] = lambda _: network.watches["smart"](False)
-    one, seconds = ended(network)
+    conductor, seconds = ended(network)
     assert network.told["smart"] == 1
-    assert "smart" not in one.misdelivered
+    assert "smart" not in conductor.misdelivered
     assert 3.0 <= seconds < 4.0
 
 
@@ -133,14 +133,14 @@ def test_a_process_that_was_never_told_is_waited_for(network: Network) -> None:
         network.ends("sensor")
         network.watches["smart"](True)
 
-    one = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True, clock=TestClock())  # type: ignore[arg-type]
-    one.assemble()
+    conductor = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True, clock=TestClock())  # type: ignore[arg-type]
+    conductor.assemble()
     network.watches["smart"](False)
     network.does["sensor"] = gone
-    assert one.next_message() is None
-    one.end(30.0)
+    assert conductor.next_message() is None
+    conductor.end(30.0)
     assert network.told["smart"] == 1
-    assert "smart" in one.misdelivered
+    assert "smart" in conductor.misdelivered
 
 
 @pytest.mark.parametrize("name", ["router", "relay"])

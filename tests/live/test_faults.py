@@ -45,9 +45,9 @@ def test_a_killed_process_is_named_and_the_results_are_kept(evedrop: Evedrop) ->
     live = evedrop.live("eavesdroppers", *ENDLESS)
     live.running()
     live.kill("smart")
-    said = ended_by_fault(live)
-    assert "smart was ended by signal 9" in said
-    assert "logs/smart.log" in said
+    ending = ended_by_fault(live)
+    assert "smart was ended by signal 9" in ending
+    assert "logs/smart.log" in ending
     tables_whole(live)
 
 
@@ -70,23 +70,23 @@ ROGUES = {
 """What is wrong → the process at fault, how, and the expected message: for each pair of a sender and a process that notices."""
 
 
-@pytest.mark.parametrize("what", mostly_long(ROGUES, ["NaN estimate", "skipped slot", "journal without a link"]))
-def test_a_process_that_breaks_the_protocol_is_named(evedrop: Evedrop, what: str) -> None:
+@pytest.mark.parametrize("case", mostly_long(ROGUES, ["NaN estimate", "skipped slot", "journal without a link"]))
+def test_a_process_that_breaks_the_protocol_is_named(evedrop: Evedrop, case: str) -> None:
     """Whichever process notices it, the sender is named, with the mistake and the last lines of its log."""
-    name, does, said = ROGUES[what]
+    name, does, message = ROGUES[case]
     rogue = with_rogue(evedrop, name, does)
     live = evedrop.live("eavesdroppers", *ENDLESS, "--set", "longest_outage=1", env=rogue)
     done = live.end()
     assert done.status == 3
     assert done.err.startswith(f"evedrop: {name} broke the protocol: ")
-    assert said in done.err.splitlines()[0]
+    assert message in done.err.splitlines()[0]
     assert f"logs/{name}.log" in done.err
     live.nothing_left()
     tables_whole(live)
 
 
 @pytest.mark.parametrize(
-    ("does", "said"),
+    ("does", "message"),
     [
         ("def fail(self):\n    raise RuntimeError('no such luck')\nReport.pack = fail", "no such luck"),
         ("import os\nReport.pack = lambda self: os._exit(0)", "smart left before the run ended"),
@@ -94,13 +94,13 @@ def test_a_process_that_breaks_the_protocol_is_named(evedrop: Evedrop, what: str
     ],
     ids=["exception", "leaves early", "does not start"],
 )
-def test_a_process_that_fails_is_named(evedrop: Evedrop, does: str, said: str) -> None:
+def test_a_process_that_fails_is_named(evedrop: Evedrop, does: str, message: str) -> None:
     """An exception, an early leave and a failed start all end the run, with the log."""
     live = evedrop.live("eavesdroppers", *ENDLESS, env=with_rogue(evedrop, "smart", does))
     done = live.end()
     assert done.status == 3
     assert done.err.startswith("evedrop: smart ")
-    assert said in done.err
+    assert message in done.err
     live.nothing_left()
 
 
@@ -237,11 +237,11 @@ def test_a_private_folder_is_removed_with_its_launcher_or_by_the_next(tmp_path: 
         assert process.stdout is not None
         return process, Path(process.stdout.readline().strip())
 
-    first, one = begun()
-    assert one.stat().st_mode & 0o777 == 0o700
+    first, folder = begun()
+    assert folder.stat().st_mode & 0o777 == 0o700
     first.kill()
     first.communicate()
-    wait_until(lambda: not one.exists(), "no folder of a killed launcher")
+    wait_until(lambda: not folder.exists(), "no folder of a killed launcher")
     second, two = begun()
     for guard in (pid for pid, command in with_mark(str(two)).items() if pid != second.pid):
         os.kill(guard, signal.SIGKILL)
@@ -250,7 +250,7 @@ def test_a_private_folder_is_removed_with_its_launcher_or_by_the_next(tmp_path: 
     assert two.exists()
     third, three = begun()
     fourth, four = begun()
-    assert {one.exists(), two.exists()} == {False}
+    assert {folder.exists(), two.exists()} == {False}
     assert {three.exists(), four.exists()} == {True}
     for process in (third, fourth):
         process.communicate()
@@ -307,8 +307,8 @@ def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop, name: str) 
     done = live.end()
     assert done.status == 3
     # Zenoh only notices that a process is lost while it can send to it: a full socket leaves this to the recorder.
-    said = r"( stopped responding: hung, suspended or cut off|: alive, and silent for \d+ s while the run waits)"
-    assert re.match(f"evedrop: {name}{said}", done.err), done.err
+    message = r"( stopped responding: hung, suspended or cut off|: alive, and silent for \d+ s while the run waits)"
+    assert re.match(f"evedrop: {name}{message}", done.err), done.err
     live.nothing_left()
     tables_whole(live)
 

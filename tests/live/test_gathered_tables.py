@@ -44,15 +44,15 @@ def slots_of(seed: int) -> Slots:
 def part_of(whole: Slots, rows: slice, trials: slice, recorded: int) -> Slots:
     """Some slots of some of its trials, the first `recorded` trials in full."""
     receivers = {}
-    for name, one in whole.receivers.items():
-        trace = np.einsum("kiir->kr", one.P)[rows, trials]
-        delivered = one.delivered[rows, trials]
-        lost = {**{reason: counts[rows] for reason, counts in one.lost.items()}}
+    for name, receiver in whole.receivers.items():
+        trace = np.einsum("kiir->kr", receiver.P)[rows, trials]
+        delivered = receiver.delivered[rows, trials]
+        lost = {**{reason: counts[rows] for reason, counts in receiver.lost.items()}}
         lost["lost"] = np.count_nonzero(~delivered, axis=1).astype(np.uint32)
         receivers[name] = ReceiverSlots(
-            one.x_hat[rows, :, trials],
-            one.action[rows, trials],
-            one.P[rows, :, :, trials][..., :recorded],
+            receiver.x_hat[rows, :, trials],
+            receiver.action[rows, trials],
+            receiver.P[rows, :, :, trials][..., :recorded],
             np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1),
             delivered,
             lost,
@@ -68,9 +68,9 @@ def write(folder: Path, whole: Slots, trials: slice, recorded: int, ends: Sequen
     with ResultsWriter(folder, NAMES, N) as writer:
         for first, end in zip([0, *ends], ends, strict=False):
             part = part_of(whole, slice(first, end), trials, recorded)
-            errors = {name: squared_errors(part.x, one.x_hat) for name, one in part.receivers.items()}
-            for name, one in part.receivers.items():
-                sums = slot_sums(errors[name], one.action, one.trace)
+            errors = {name: squared_errors(part.x, receiver.x_hat) for name, receiver in part.receivers.items()}
+            for name, receiver in part.receivers.items():
+                sums = slot_sums(errors[name], receiver.action, receiver.trace)
                 writer.slot_rows(first, name, sums, np.arange(first, end) / 7.0)
             writer.trial_rows(part, errors, 100 + trials.start)
             writer.journal_rows(part)
@@ -88,9 +88,9 @@ def gathered(
         "trials": Recorded(NAMES, range(100, 100 + RECORDED), 6 + 2 * N + N * N),
         "journal": Journals(NAMES, sizes),
     }
-    for name, one in made.items():
-        one.slots_at_once = at_once
-        one.write([shard / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")
+    for name, writer in made.items():
+        writer.slots_at_once = at_once
+        writer.write([shard / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")
         yield name, pq.read_table(folder / f"{name}.parquet")
 
 
@@ -105,15 +105,15 @@ def sorted_rows(table: pa.Table) -> pa.Table:
     return plain.sort_by([(key, "ascending") for key in keys])
 
 
-def same(found: pa.Table, wanted: pa.Table) -> None:
+def same(table: pa.Table, wanted: pa.Table) -> None:
     """Check that two tables have the same rows, numbers of statistics within rounding."""
-    assert found.schema == wanted.schema
-    found, wanted = sorted_rows(found), sorted_rows(wanted)
+    assert table.schema == wanted.schema
+    table, wanted = sorted_rows(table), sorted_rows(wanted)
     for name in wanted.column_names:
         if name in ("mean_squared_error", "mean_trace_covariance", "standard_error"):
-            np.testing.assert_allclose(found[name].to_numpy(), wanted[name].to_numpy(), rtol=1e-12, err_msg=name)
+            np.testing.assert_allclose(table[name].to_numpy(), wanted[name].to_numpy(), rtol=1e-12, err_msg=name)
         else:
-            assert found[name].to_pylist() == wanted[name].to_pylist(), name
+            assert table[name].to_pylist() == wanted[name].to_pylist(), name
 
 
 ends = st.lists(st.integers(1, SLOTS - 1), max_size=6, unique=True).map(lambda some: [*sorted(some), SLOTS])
@@ -150,8 +150,8 @@ def check_two_shards(cut: int, first: list[int], second: list[int], at_once: int
         write(folder / "1", whole, slice(0, cut), min(cut, RECORDED), first)
         write(folder / "2", whole, slice(cut, TRIALS), max(1, RECORDED - cut), second)
         shards, sizes = [folder / "1", folder / "2"], [cut, TRIALS - cut]
-        for table, found in gathered(folder / "run", shards, sizes, at_once):
-            same(found, pq.read_table(folder / "whole" / f"{table}.parquet"))
+        for table, actual in gathered(folder / "run", shards, sizes, at_once):
+            same(actual, pq.read_table(folder / "whole" / f"{table}.parquet"))
 
 
 @pytest.mark.parametrize("missing", [[], [13]], ids=["killed", "cut short"])
@@ -160,14 +160,14 @@ def test_a_shard_that_came_to_less_leaves_the_others_as_they_are(tmp_path: Path,
     whole = slots_of(1)
     write(tmp_path / "1", whole, slice(0, 4), 4, [SLOTS])
     write(tmp_path / "2", whole, slice(4, TRIALS), 1, missing)
-    found = dict(gathered(tmp_path / "run", [tmp_path / "1", tmp_path / "2"], [4, TRIALS - 4], 9))
+    tables = dict(gathered(tmp_path / "run", [tmp_path / "1", tmp_path / "2"], [4, TRIALS - 4], 9))
     here = missing[0] if missing else 0
-    for row in found["slots"].to_pylist():
+    for row in tables["slots"].to_pylist():
         assert row["trials"] == (TRIALS if row["slot"] < here else 4)
-    for row in found["journal"].to_pylist():
+    for row in tables["journal"].to_pylist():
         flags = whole.receivers[row["link"]].delivered[row["slot"]].copy()
         flags[slice(TRIALS if row["slot"] < here else 4, None)] = False
         assert row["offered"] == (TRIALS if row["slot"] < here else 4)
         assert row["delivered_mask"] == np.packbits(flags, bitorder="little").tobytes()
-    trials = found["trials"].to_pylist()
+    trials = tables["trials"].to_pylist()
     assert len(trials) == len(NAMES) * (4 * SLOTS + here)

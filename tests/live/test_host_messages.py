@@ -78,6 +78,6 @@ def test_other_lines_are_no_messages(line: bytes, read: Callable[[bytes], HostMe
 )
 def test_a_malformed_order_names_the_entry(change: dict[str, Any], mistake: str) -> None:
     """An answer is not an order either."""
-    found = {**json.loads(line_of(START)), **change}
+    order = {**json.loads(line_of(START)), **change}
     with pytest.raises(ValueError, match=mistake):
-        order_in(json.dumps(found).encode())
+        order_in(json.dumps(order).encode())

@@ -45,8 +45,8 @@ PLACES = {"alpha": ("router", "sensor", "legitimate", "smart"), "beta": ("naive"
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sshd]:
     """An sshd for all tests of this module."""
     try:
-        with sshd(tmp_path_factory.mktemp("sshd")) as one:
-            yield one
+        with sshd(tmp_path_factory.mktemp("sshd")) as server:
+            yield server
     except CannotRun as error:
         skip(error)
 
@@ -117,20 +117,20 @@ def test_ctrl_c_ends_everything_on_all_hosts(evedrop: Evedrop, server: Sshd) -> 
     assert live.results.slots.num_rows > 0
 
 
-def struck(evedrop: Evedrop, what: str, number: signal.Signals) -> None:
+def struck(evedrop: Evedrop, case: str, number: signal.Signals) -> None:
     """Send a signal to the program on the host beta, its fork server, or the ssh that is connected with it."""
-    mark = evedrop.folder / "beta.sh" if what == "ssh" else temporary(evedrop, "beta")
-    word = "evedrop.fork_server" if what == "fork server" else "host"
+    mark = evedrop.folder / "beta.sh" if case == "ssh" else temporary(evedrop, "beta")
+    word = "evedrop.fork_server" if case == "fork server" else "host"
     (pid,) = (pid for pid, command in with_mark(str(mark)).items() if word in command.split())
     os.kill(pid, number)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("what", ["evedrop host", "ssh"])
-def test_ctrl_c_ends_a_run_whose_connection_hangs(what: str, evedrop: Evedrop, server: Sshd) -> None:
+@pytest.mark.parametrize("case", ["evedrop host", "ssh"])
+def test_ctrl_c_ends_a_run_whose_connection_hangs(case: str, evedrop: Evedrop, server: Sshd) -> None:
     """The host reports no end; once the connection is closed, the system continues it, and it ends its processes."""
     live = running(evedrop, server, direct=True)
-    struck(evedrop, what, signal.SIGSTOP)
+    struck(evedrop, case, signal.SIGSTOP)
     live.process.send_signal(signal.SIGINT)
     done = live.end()
     assert done.status == 130, done.err
@@ -139,11 +139,11 @@ def test_ctrl_c_ends_a_run_whose_connection_hangs(what: str, evedrop: Evedrop, s
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("what", ["evedrop host", "ssh"])
-def test_a_killed_launcher_leaves_nothing_where_a_connection_hangs(what: str, evedrop: Evedrop, server: Sshd) -> None:
+@pytest.mark.parametrize("case", ["evedrop host", "ssh"])
+def test_a_killed_launcher_leaves_nothing_where_a_connection_hangs(case: str, evedrop: Evedrop, server: Sshd) -> None:
     """The system ends ssh with the launcher; it would wait for a suspended host, or is suspended itself."""
     live = running(evedrop, server, direct=True)
-    struck(evedrop, what, signal.SIGSTOP)
+    struck(evedrop, case, signal.SIGSTOP)
     live.process.kill()
     live.process.wait()
     nothing_left(evedrop)
@@ -190,14 +190,14 @@ ENDS = {
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("what", mostly_long(ENDS, ["evedrop host"]))
-def test_a_host_whose_program_ends_is_named(what: str, evedrop: Evedrop, server: Sshd) -> None:
+@pytest.mark.parametrize("case", mostly_long(ENDS, ["evedrop host"]))
+def test_a_host_whose_program_ends_is_named(case: str, evedrop: Evedrop, server: Sshd) -> None:
     """And no process there is said to have been ended by a signal."""
     live = running(evedrop, server, direct=True)
-    struck(evedrop, what, ENDS[what][0])
+    struck(evedrop, case, ENDS[case][0])
     done = live.end()
     assert done.status == 3
-    assert done.err.startswith(f"evedrop: naive was lost: {ENDS[what][1]}"), done.err
+    assert done.err.startswith(f"evedrop: naive was lost: {ENDS[case][1]}"), done.err
     nothing_left(evedrop)
 
 
@@ -228,7 +228,7 @@ def other_version(evedrop: Evedrop, server: Sshd) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("made", "said"),
+    ("made", "message"),
     [
         (nobody_listens, "Connection refused"),
         (no_such_key, "Permission denied"),
@@ -237,13 +237,13 @@ def other_version(evedrop: Evedrop, server: Sshd) -> Path:
     ],
 )
 def test_a_host_that_cannot_be_used_is_named(
-    made: Callable[[Evedrop, Sshd], Path], said: str, evedrop: Evedrop, server: Sshd
+    made: Callable[[Evedrop, Sshd], Path], message: str, evedrop: Evedrop, server: Sshd
 ) -> None:
     """One line with its name and the reason, exit status 2; nothing is started, and there are no results."""
     done = evedrop("run", "restart", "--hosts", str(made(evedrop, server)), "--view", "off", "--out", "run")
     assert done.status == 2
     assert done.err.startswith("evedrop: host alpha: ")
-    assert said in done.err
+    assert message in done.err
     assert done.err.count("\n") == 1
     nothing_left(evedrop)
     assert not (evedrop.folder / "run").exists()

@@ -65,6 +65,6 @@ def test_a_live_run_with_numpy_has_the_digests_of_memory_with_c(evedrop: Evedrop
     for process in ("sensor", "legitimate", "naive", "recorder"):
         log = (evedrop.folder / "live" / "logs" / f"{process}.log").read_text()
         assert f"the kernels are numpy, as {KERNELS_VARIABLE} says" in log, process
-    found = digests_of(evedrop.folder / "live")
-    assert set(found) == {"legitimate", "naive", "suspicious"}
-    assert found == digests_of(evedrop.folder / "memory")
+    digests = digests_of(evedrop.folder / "live")
+    assert set(digests) == {"legitimate", "naive", "suspicious"}
+    assert digests == digests_of(evedrop.folder / "memory")

@@ -27,5 +27,5 @@ def test_a_burst_passes_on_everything_in_order() -> None:
 @pytest.mark.parametrize("role", ["router", "relay", "sensor", "controller"])
 def test_nobody_who_passes_messages_on_does_it_on_the_thread_that_receives(role: str) -> None:
     """A router or relay that waited for a full queue on its only thread would wait for itself, until it is given up."""
-    found: dict[str, Any] = lock_step_environment(role)
-    assert ("tx: (worker_threads: 1)" in found["ZENOH_RUNTIME"]) == (role in {"router", "relay"})
+    result: dict[str, Any] = lock_step_environment(role)
+    assert ("tx: (worker_threads: 1)" in result["ZENOH_RUNTIME"]) == (role in {"router", "relay"})

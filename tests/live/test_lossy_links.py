@@ -141,9 +141,9 @@ def test_design_is_for_independent_losses(every_model: Path, evedrop: Evedrop) -
     with pytest.raises(UsageError, match=r"such as eavesdroppers\.distance\.link="):
         design(every_model, changes={"legitimate.link": quality})
     links = {f"eavesdroppers.{name}.link": quality for name in lossy()["eavesdroppers"]}
-    found = design(every_model, changes={"legitimate.link": quality, **links})
+    result = design(every_model, changes={"legitimate.link": quality, **links})
     # A scenario that is checked already takes the same changes.
-    assert design(load(every_model), changes={"legitimate.link": quality, **links}).trace == found.trace
+    assert design(load(every_model), changes={"legitimate.link": quality, **links}).trace == result.trace
 
 
 def test_bursts_that_last_too_long_are_a_warning() -> None:

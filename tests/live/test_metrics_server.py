@@ -36,9 +36,9 @@ def scraped(page: str) -> Samples:
     with urlopen(page) as answer:  # noqa: S310 - our own page
         families = [*text_string_to_metric_families(answer.read().decode())]
     return {
-        (one.name, *(one.labels[label] for label in sorted(one.labels))): one.value
+        (sample.name, *(sample.labels[label] for label in sorted(sample.labels))): sample.value
         for family in families
-        for one in family.samples
+        for sample in family.samples
     }
 
 
@@ -56,11 +56,11 @@ def test_a_scrape_has_the_metrics_of_the_run(tmp_path: Path) -> None:
     with metrics_served(ANY_PORT, metrics) as page:
         run(scenario, out=tmp_path / "run", view="off", on_event=on_event)
         last = scraped(page)
-    slots = [one["evedrop_slots_total",] for one in seen]
+    slots = [samples["evedrop_slots_total",] for samples in seen]
     assert slots == sorted(slots)
     assert 0 < slots[0] <= last["evedrop_slots_total",] == last["evedrop_slots_planned",] == scenario.slots
     assert last["evedrop_running",] == 1
-    assert all(one["evedrop_slots_per_second",] > 0 for one in seen)
+    assert all(samples["evedrop_slots_per_second",] > 0 for samples in seen)
     summary = Results.read(tmp_path / "run").summary
     for name, metrics in summary["peers"].items():
         for metric in ("mean_squared_error", "mean_trace_covariance", "received_fraction", "used_fraction"):
@@ -84,10 +84,10 @@ def test_a_lost_connection_is_counted(tmp_path: Path) -> None:
     events = [Started(), *[ConnectionOutage("smart", slot, slot + 1, 0.5) for slot in (3, 9)]]
     with metrics_served(ANY_PORT, metrics) as page:
         assert scraped(page)["evedrop_running",] == 0
-        for one in events:
-            metrics.on_event(one)
-        found = scraped(page)
-    assert (found["evedrop_running",], found["evedrop_lost_connections_total", "smart"]) == (1, 2)
+        for event in events:
+            metrics.on_event(event)
+        result = scraped(page)
+    assert (result["evedrop_running",], result["evedrop_lost_connections_total", "smart"]) == (1, 2)
     assert told == events
 
 
@@ -103,7 +103,7 @@ def crowded(folder: Path, patience: float) -> Iterator[tuple[str, list[socket.so
 def test_programs_that_only_connect_keep_nobody_out_for_long(tmp_path: Path) -> None:
     """Each connection is closed, and then the metrics can be read."""
     with crowded(tmp_path, 0.5) as (page, idle):
-        assert [one.recv(1) for one in idle] == [b""] * len(idle)
+        assert [connection.recv(1) for connection in idle] == [b""] * len(idle)
         assert scraped(page)["evedrop_running",] == 0
 
 
@@ -111,8 +111,8 @@ def test_places_are_limited(tmp_path: Path) -> None:
     """The last that connects is turned away at once; a place that somebody leaves is free again."""
     with crowded(tmp_path, 10 * LIMIT) as (page, idle):
         assert idle[-1].recv(1) == b""
-        for one in idle:
-            one.close()
+        for connection in idle:
+            connection.close()
 
         def answered() -> bool:
             with contextlib.suppress(OSError):
@@ -141,12 +141,12 @@ def test_metrics_are_those_of_the_folder_and_alarms_of_the_watermark(tmp_path: P
     with metrics_served(ANY_PORT, metrics) as page:
         assert ("evedrop_mean_squared_error", "legitimate") not in scraped(page)
         metrics.on_event(FolderMoved(str(tmp_path / "after")))
-        found = scraped(page)
+        result = scraped(page)
     summary = Results.read(tmp_path / "after").summary
-    assert found["evedrop_mean_squared_error", "legitimate"] == summary["peers"]["legitimate"]["mean_squared_error"]
+    assert result["evedrop_mean_squared_error", "legitimate"] == summary["peers"]["legitimate"]["mean_squared_error"]
     for metric in ("false_alarm_fraction", "detected_fraction"):
-        assert found[f"evedrop_{metric}",] == summary["integrity"][metric]
-    assert ("evedrop_watermark_fraction",) not in found  # only those that the application names
+        assert result[f"evedrop_{metric}",] == summary["integrity"][metric]
+    assert ("evedrop_watermark_fraction",) not in result  # only those that the application names
 
 
 def test_an_ipv6_address_has_brackets(tmp_path: Path) -> None:

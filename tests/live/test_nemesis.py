@@ -79,10 +79,10 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", WRONG)
-def test_mistakes_are_told_with_their_path(what: str, golden: Golden) -> None:
+@pytest.mark.parametrize("case", WRONG)
+def test_mistakes_are_told_with_their_path(case: str, golden: Golden) -> None:
     """What was found, what was expected; several at once."""
-    nemesis, places = WRONG[what]
+    nemesis, places = WRONG[case]
     mistakes = mistakes_of(right, nemesis)
     assert sorted(places_of(mistakes)) == sorted(places)
     golden("check", mistakes)
@@ -123,10 +123,10 @@ def test_faults_come_as_often_and_last_as_long_as_is_said() -> None:
     spans = happening(scenario, "eve")
     lengths = [(to or NEVER) - start for start, to, _ in spans[:-1]]
     gaps = [after[0] - (before[1] or NEVER) for before, after in pairwise(spans)]
-    for found, mean in ((lengths, 12.0), (gaps, 30.0)):
+    for durations, mean in ((lengths, 12.0), (gaps, 30.0)):
         standard_deviation = (mean * (mean - 1.0)) ** 0.5
-        assert abs(sum(found) / len(found) - mean) < 5.0 * standard_deviation / len(found) ** 0.5
-        assert min(found) == 1
+        assert abs(sum(durations) / len(durations) - mean) < 5.0 * standard_deviation / len(durations) ** 0.5
+        assert min(durations) == 1
     kills = sum(kind == "kill" for _, _, kind in spans)
     assert abs(kills - len(spans) / 2) < 2.5 * len(spans) ** 0.5
 

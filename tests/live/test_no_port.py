@@ -65,13 +65,13 @@ def listening_ports(pids: Iterator[int] | list[int]) -> list[str]:
         for descriptor in Path(f"/proc/{pid}/fd").iterdir():
             with contextlib.suppress(OSError):  # closed meanwhile
                 inodes.add(os.readlink(descriptor))
-    found = []
+    listening_ports = []
     for table in ("tcp", "tcp6"):
         for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
             words = line.split()
             if words[3] == "0A" and f"socket:[{words[9]}]" in inodes:
-                found.append(words[1])
-    return found
+                listening_ports.append(words[1])
+    return listening_ports
 
 
 def router_of(live: Live, where: str = "control.json") -> str:
@@ -331,13 +331,13 @@ def test_malformed_sockets_are_refused(text: str) -> None:
 def test_a_port_without_certificates_is_said_to_be_exposed(evedrop: Evedrop) -> None:
     """`brief` and `run` say who can do what, and what to give instead; with certificates they say nothing."""
     port = free_port()
-    said = (
+    message = (
         f"evedrop: warning: tcp/127.0.0.1:{port} is not encrypted, and a user of this machine who listens there before"
     )
     for words in (("brief",), ("run", "--slots", "50", "--view", "off")):
         name, *rest = words
         done = evedrop(name, "eavesdroppers", *rest, "--out", name, "--listen", f"tcp/127.0.0.1:{port}")
-        assert said in done.err
+        assert message in done.err
         assert f"give tls/127.0.0.1:{port}" in done.err
     assert evedrop("brief", "eavesdroppers", "--out", "safe").err == ""
     assert json.loads((evedrop.folder / "safe" / "sensor.json").read_text())["router"].startswith("tls/127.0.0.1:")

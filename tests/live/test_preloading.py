@@ -159,8 +159,8 @@ def test_without_its_server_a_process_is_ended(own_bench: Bench, tmp_path: Path)
 
 def is_kept(starter: Starter) -> bool:
     """Whether a run that begins now has this starter."""
-    with process_starter() as found:
-        return found is starter
+    with process_starter() as kept:
+        return kept is starter
 
 
 def test_where_nothing_can_be_forked_interpreters_are_started(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,10 +72,10 @@ def has_ended(process: StartedProcess, status: int) -> bool:
 
 
 @long
-@pytest.mark.parametrize("what", RUNS)
-def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp_path: Path) -> None:
+@pytest.mark.parametrize("case", RUNS)
+def test_a_killed_router_costs_nothing_but_time(case: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Killed twice in a run and started again by the launcher: digests and links are those in memory, and it is listed."""
-    path, scenario = scenario_in(tmp_path, **RUNS[what])
+    path, scenario = scenario_in(tmp_path, **RUNS[case])
     live = evedrop.live(str(path), "--json", "--paused")
     for times in (1, 2):
         with stepping(evedrop, live.folder, 100):
@@ -90,8 +90,8 @@ def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp
     live.nothing_left()
     as_if_undisturbed(done.summary, scenario, tmp_path / "memory")
     outages = done.summary["outages"]
-    assert [one["process"] for one in outages] == ["router"] * 2
-    assert all(one["seconds"] > 0.0 and 0 < one["slot"] <= one["until"] for one in outages)
+    assert [outage["process"] for outage in outages] == ["router"] * 2
+    assert all(outage["seconds"] > 0.0 and 0 < outage["slot"] <= outage["until"] for outage in outages)
 
 
 @pytest.mark.parametrize("name", [pytest.param("router", marks=long), "relay"])
@@ -110,7 +110,7 @@ def test_either_of_two_linked_routers_may_be_killed(name: str, evedrop: Evedrop,
     assert done.status == 0, done.err
     live.nothing_left()
     as_if_undisturbed(done.summary, scenario, tmp_path / "memory")
-    assert [one["process"] for one in done.summary["outages"]] == [name]
+    assert [outage["process"] for outage in done.summary["outages"]] == [name]
 
 
 @long
@@ -129,7 +129,7 @@ def test_a_relay_gives_up_an_attempt_that_is_not_answered(evedrop: Evedrop, tmp_
         assert evedrop("resume", str(run.results)).status == 0
         assert set(run.statuses().values()) == {0}, run.log("recorder").read_text()
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
-        assert [one["process"] for one in run.summary["outages"]] == ["router"]
+        assert [outage["process"] for outage in run.summary["outages"]] == ["router"]
 
 
 @pytest.mark.long
@@ -150,7 +150,7 @@ def test_what_an_operator_changed_survives_the_router(evedrop: Evedrop, tmp_path
     assert evedrop("resume", folder).status == 0
     done = live.end()
     assert done.status == 0, done.err
-    assert [one["process"] for one in done.summary["outages"]] == ["router"]
+    assert [outage["process"] for outage in done.summary["outages"]] == ["router"]
     as_if_undisturbed(done.summary, load(live.folder / "scenario.toml"), tmp_path / "memory")
 
 
@@ -159,11 +159,11 @@ def test_a_router_that_dies_too_often_is_named(evedrop: Evedrop, tmp_path: Path)
     """The fourth time it is not started again: the run ends with status 3, with what was measured, and nothing is left."""
     path, _ = scenario_in(tmp_path, slots=1_000_000)
     live = evedrop.live(str(path))
-    found: set[int | None] = {None}
+    pids: set[int | None] = {None}
     for _ in range(4):
         live.running(more_than=live.done())
-        wait_until(lambda: live.children().get("router") not in found, "another router")
-        found.add(live.child("router"))
+        wait_until(lambda: live.children().get("router") not in pids, "another router")
+        pids.add(live.child("router"))
         live.kill("router")
     done = live.end()
     assert done.status == 3
@@ -229,7 +229,7 @@ def is_taken_up(
         assert evedrop("resume", str(run.results)).status == 0
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, folder / "memory")
-        assert [one["process"] for one in run.summary["outages"]] == [name]
+        assert [outage["process"] for outage in run.summary["outages"]] == [name]
 
 
 @long

@@ -65,13 +65,13 @@ class Conducted:
 
 def test_losses_that_overlap_are_one_outage() -> None:
     """One entry for each process that was cut off, from its first loss to when slots are joined again; then another."""
-    conducted, said = Conducted(), list[ProgressEvent]()
+    conducted, events = Conducted(), list[ProgressEvent]()
     recovery = Recovery(
         conducted,  # type: ignore[arg-type]
         conducted,  # type: ignore[arg-type]
         Flow(32, 8, 30.0),
         0.0,
-        said.append,
+        events.append,
     )
     recovery.poll(10)
     for lost in (
@@ -84,16 +84,16 @@ def test_losses_that_overlap_are_one_outage() -> None:
         conducted.lost = {}
         recovery.poll(10)
     assert conducted.rounds == [10, 10, 10]
-    assert said == []
+    assert events == []
     recovery.poll(11)
     conducted.lose("router", "sensor", "smart")
     recovery.poll(12)
     conducted.lost, conducted.another_router = {}, True
     recovery.poll(12)
     recovery.poll(13)
-    found = [(one.process, one.slot, one.until) for one in recovery.outages]
-    assert found == [("smart", 10, 11), ("sensor", 10, 11), ("router", 12, 13)]
-    assert said == recovery.outages
+    outages = [(outage.process, outage.slot, outage.until) for outage in recovery.outages]
+    assert outages == [("smart", 10, 11), ("sensor", 10, 11), ("router", 12, 13)]
+    assert events == recovery.outages
 
 
 @pytest.mark.parametrize(("complete", "until"), [(True, 20), (False, None)])
@@ -108,7 +108,7 @@ def test_an_outage_that_is_open_at_the_end_lasts_to_the_last_slot_of_a_complete_
     recovery.poll(10)
     recovery.poll(20)
     recovery.give_up(20, complete)
-    assert [(one.process, one.slot, one.until) for one in recovery.outages] == [("smart", 10, until)]
+    assert [(outage.process, outage.slot, outage.until) for outage in recovery.outages] == [("smart", 10, until)]
 
 
 def recovery_of(conducted: Conducted, clock: TestClock, longest_outage: float, pace: float = 0.0) -> Recovery:

@@ -9,7 +9,7 @@ from evedrop.live.launch.ports import RouterEndpoint, router_endpoint
 
 
 @pytest.mark.parametrize(
-    ("listen", "connect", "said"),
+    ("listen", "connect", "message"),
     [
         (
             "tcp/0.0.0.0:7447",
@@ -31,9 +31,11 @@ from evedrop.live.launch.ports import RouterEndpoint, router_endpoint
         ("tls/0.0.0.0:7447", "router.lan", "--connect router.lan is not an endpoint"),
     ],
 )
-def test_addresses_at_which_no_router_can_be_reached_are_refused(listen: str, connect: str | None, said: str) -> None:
+def test_addresses_at_which_no_router_can_be_reached_are_refused(
+    listen: str, connect: str | None, message: str
+) -> None:
     """Each with the option and what to give instead."""
-    with pytest.raises(UsageError, match=said) as caught:
+    with pytest.raises(UsageError, match=message) as caught:
         router_endpoint(listen, connect)
     assert "\n" not in str(caught.value)
 
@@ -50,8 +52,8 @@ def test_addresses_at_which_no_router_can_be_reached_are_refused(listen: str, co
 )
 def test_a_router_is_known_by_its_names(listen: str, connect: str | None, names: tuple[str, ...]) -> None:
     """What is connected to, then what is listened on; unencrypted on loopback alone, unless the user says otherwise."""
-    found = router_endpoint(listen, connect)
-    assert found.names == names
-    assert (str(found.listen), str(found.connect)) == (listen, connect or listen)
-    assert found.secure == listen.startswith("tls/")
+    result = router_endpoint(listen, connect)
+    assert result.names == names
+    assert (str(result.listen), str(result.connect)) == (listen, connect or listen)
+    assert result.secure == listen.startswith("tls/")
     assert isinstance(router_endpoint("tcp/0.0.0.0:7447", "tcp/a:7447", insecure=True), RouterEndpoint)

@@ -66,29 +66,29 @@ def test_means_agree_with_theory(tmp_path: Path) -> None:
         process={**process_table(UNSTABLE), "initial_covariance": [[1e-3, 0.0], [0.0, 1e-3]]},
         eavesdroppers={name: tables_of()["eavesdroppers"][name] for name in ("smart", "genie", "suspicious")},
     )
-    found = montecarlo(checked(tables, "it"), out=tmp_path / "it", trials=2000)
-    for name, peer in found.summary["peers"].items():
+    result = montecarlo(checked(tables, "it"), out=tmp_path / "it", trials=2000)
+    for name, peer in result.summary["peers"].items():
         assert abs(peer["z"]["mean_squared_error"]) < 4.5, name
-    verdict = found.summary["secrecy"]["suspicious"]
+    verdict = result.summary["secrecy"]["suspicious"]
     assert (verdict["relative_by_theory"], verdict["perfect_by_theory"]) == (True, None)
     assert verdict["perfect"] == Verdict.UNDECIDED.value
 
 
 def test_what_needs_a_constant_probability_says_nothing() -> None:
     """There is no limit and no statement on tails; the genie bounds the readers whose error has no closed form."""
-    found = expectations_of(checked(tables_of(), "it"))
-    for name, one in found.items():
-        assert math.isnan(one.limit)
-        assert not one.infinite_variance
-        assert (one.streaks(len(MU_D)) is not None) == one.known
-        assert one.known == (name not in ("bayesian", "likelihood"))
-    bound = found["bayesian"].bound
+    expectations = expectations_of(checked(tables_of(), "it"))
+    for name, expectation in expectations.items():
+        assert math.isnan(expectation.limit)
+        assert not expectation.infinite_variance
+        assert (expectation.streaks(len(MU_D)) is not None) == expectation.known
+        assert expectation.known == (name not in ("bayesian", "likelihood"))
+    bound = expectations["bayesian"].bound
     assert bound is not None
-    assert np.array_equal(bound.traces(8), found["genie"].traces(8))
+    assert np.array_equal(bound.traces(8), expectations["genie"].traces(8))
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"slots": 9}, "has 8 numbers; expected one number for each of the 9 slots, or a single number for all"),
         ({"encoding": {"scheme": "innovation", "state_probability": []}}, "is an empty list"),
@@ -96,9 +96,9 @@ def test_what_needs_a_constant_probability_says_nothing() -> None:
         ({"encoding": {"scheme": "withholding", "state_probability": [0.5] * 8}}, "expected a number from 0 to 1"),
     ],
 )
-def test_refusals(changes: dict[str, Any], said: str) -> None:
+def test_refusals(changes: dict[str, Any], message: str) -> None:
     """A list of the wrong length or with wrong numbers is refused, and a scheme that takes none."""
-    with pytest.raises(ScenarioError, match=re.escape(said)):
+    with pytest.raises(ScenarioError, match=re.escape(message)):
         checked(tables_of(**changes), "it")
 
 

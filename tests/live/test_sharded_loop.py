@@ -72,31 +72,31 @@ def test_what_is_kept_by_trial_is_the_same_to_the_bit(ran: Ran, other: int) -> N
     assert inputs_of(ran(2)).num_rows == SLOTS * RECORDED
     for name in ("trials", "digests"):
         assert in_order(getattr(ran(2), name)) == in_order(getattr(ran(other), name))
-    found, wanted = ran(2).summary, ran(other).summary
+    summary, wanted = ran(2).summary, ran(other).summary
     assert digests_of(ran(2)) == digests_of(ran(other))
-    assert found["controller"]["digest"] == wanted["controller"]["digest"] is not None
-    assert found["household"] == wanted["household"]
-    assert 0 < found["household"]["active_windows"] < found["household"]["windows"] == 29
+    assert summary["controller"]["digest"] == wanted["controller"]["digest"] is not None
+    assert summary["household"] == wanted["household"]
+    assert 0 < summary["household"]["active_windows"] < summary["household"]["windows"] == 29
 
 
 @pytest.mark.parametrize("other", [0, 1])
 def test_the_rest_of_the_summary_agrees(ran: Ran, other: int) -> None:
     """Within rounding, of the same keys; against memory but for its mode."""
-    found, wanted = (copy.deepcopy(dict(ran(one).summary)) for one in (2, other))
-    for summary in (found, wanted):
-        summary["controller"] = {name: one for name, one in summary["controller"].items() if name not in TIMED}
+    actual, wanted = (copy.deepcopy(dict(ran(shards).summary)) for shards in (2, other))
+    for summary in (actual, wanted):
+        summary["controller"] = {name: value for name, value in summary["controller"].items() if name not in TIMED}
         summary["mode"] = "any"
-        for one in (summary["controller"], *summary["peers"].values()):
-            assert one["standard_errors"]["mean_trace_covariance"] > 0.0
-    close(found, wanted, "summary")
-    assert found["filter"]["mean_squared_error"] > 0.0
-    assert found["controller"]["mean_squared_errors"]["knowing_input"] > 0.0
+        for peer in (summary["controller"], *summary["peers"].values()):
+            assert peer["standard_errors"]["mean_trace_covariance"] > 0.0
+    close(actual, wanted, "summary")
+    assert actual["filter"]["mean_squared_error"] > 0.0
+    assert actual["controller"]["mean_squared_errors"]["knowing_input"] > 0.0
 
 
 def test_decisions_are_those_of_all_shards(ran: Ran) -> None:
     """Each shard has a controller, which decides for its trials at once."""
-    one, two = (ran(shards).summary["controller"] for shards in (1, 2))
-    assert (one["decisions"], two["decisions"]) == (30, 60)
+    first, two = (ran(shards).summary["controller"] for shards in (1, 2))
+    assert (first["decisions"], two["decisions"]) == (30, 60)
     assert two["longest_solve_seconds"] >= two["mean_solve_seconds"] > 0.0
 
 
@@ -126,7 +126,7 @@ def test_a_loop_that_is_cut_short_is_made_one(evedrop: Evedrop, name: str) -> No
     """Inputs, and the metrics of controller and house, as far as each shard came, or as its recorder had written them."""
     words = ("--trials", "5", "--set", "shards=2", "--set", "expect=[]", "--set", f"record_trials={RECORDED}")
     live = evedrop.live("microgrid", *words)
-    wait_until(lambda: all(last_round(live.folder / "shards" / one).slots > 100 for one in "12"), "slots on disk")
+    wait_until(lambda: all(last_round(live.folder / "shards" / shard).slots > 100 for shard in "12"), "slots on disk")
     os.kill(child(live, 2, name), signal.SIGKILL)
     done = live.end()
     assert done.status == 3

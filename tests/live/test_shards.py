@@ -109,32 +109,32 @@ def test_the_summary_is_that_of_all_trials(ran: Ran, shards: int) -> None:
     """Metrics, accounts, quantiles, events, verdicts and expectations are those of the whole run."""
     close(dict(ran(shards).summary), dict(ran(1).summary), "summary")
     recorded = {2: 4, 3: 5}[shards]  # each shard records its first trial at least
-    assert {one["recomputed_trials"] for one in ran(shards).summary["verification"].values()} == {recorded}
+    assert {verified["recomputed_trials"] for verified in ran(shards).summary["verification"].values()} == {recorded}
 
 
-def close(found: Any, wanted: Any, where: str) -> None:
+def close(value: Any, wanted: Any, where: str) -> None:
     """Check that two parts of summaries are the same, numbers within rounding; but for times, folders, what was verified."""
     if isinstance(wanted, Mapping):
-        assert found.keys() == wanted.keys(), where
+        assert value.keys() == wanted.keys(), where
         for name in wanted.keys() - {"wall_seconds", "slots_per_second", "replay", "verification"}:
-            close(found[name], wanted[name], f"{where}.{name}")
+            close(value[name], wanted[name], f"{where}.{name}")
     elif isinstance(wanted, list):
-        assert len(found) == len(wanted), where
-        for i, (one, other) in enumerate(zip(found, wanted, strict=True)):
-            close(one, other, f"{where}.{i}")
+        assert len(value) == len(wanted), where
+        for i, (item, other) in enumerate(zip(value, wanted, strict=True)):
+            close(item, other, f"{where}.{i}")
     elif isinstance(wanted, float):
-        assert found == pytest.approx(wanted, rel=1e-12), where
+        assert value == pytest.approx(wanted, rel=1e-12), where
     else:
-        assert found == wanted, where
+        assert value == wanted, where
 
 
 @pytest.mark.long
 def test_every_shard_may_have_two_routers(ran: Ran, tmp_path: Path) -> None:
     """At places of its own; the trials are the same."""
-    found = run("eavesdroppers", out=tmp_path / "run", shards=2, network={"routers": 2}, **EVENTFUL)
-    assert in_order(found.digests) == in_order(ran(1).digests)
+    linked = run("eavesdroppers", out=tmp_path / "run", shards=2, network={"routers": 2}, **EVENTFUL)
+    assert in_order(linked.digests) == in_order(ran(1).digests)
     for number in (1, 2):
-        assert (found.folder / "logs" / f"shard-{number}" / "relay.log").is_file()
+        assert (linked.folder / "logs" / f"shard-{number}" / "relay.log").is_file()
 
 
 @pytest.mark.parametrize("shards", mostly_long([1, 2, 3], [1, 2]))
@@ -171,8 +171,8 @@ def test_progress_is_that_of_the_slowest() -> None:
     """Nothing is told before all have begun, and never more than all have done."""
     told: list[ProgressEvent] = []
     shards = shards_of(load("eavesdroppers", {"trials": 3, "shards": 2, "slots": 90}), Path("run"))
-    one = OneProgress(shards, told.append)
-    first, second = (one.of(shard) for shard in shards)
+    progress = OneProgress(shards, told.append)
+    first, second = (progress.of(shard) for shard in shards)
     first(Started())
     first(RunProgress(50, 9.0, "slots/s", {"smart": 1.0}))
     assert told == []
@@ -188,8 +188,8 @@ def test_a_shard_that_was_ended_early_has_done_no_more_than_it_said() -> None:
     """Its end adds the last slots to what it has told only if the run was complete."""
     told: list[ProgressEvent] = []
     shards = shards_of(load("eavesdroppers", {"trials": 3, "shards": 2, "slots": 90}), Path("run"))
-    one = OneProgress(shards, told.append)
-    first, second = (one.of(shard) for shard in shards)
+    progress = OneProgress(shards, told.append)
+    first, second = (progress.of(shard) for shard in shards)
     for on_event in (first, second):
         on_event(Started())
         on_event(RunProgress(20, 4.0, "slots/s", {"smart": 4.0}))
@@ -207,13 +207,13 @@ def test_a_real_time_run_keeps_its_pace_and_an_expectation_that_fails_is_its_sta
     )
     assert done.status == 1, done.err
     assert done.summary["wall_seconds"] >= 59 * 0.02
-    assert [one["held"] for one in done.summary["expectations"]] == [False]
+    assert [expectation["held"] for expectation in done.summary["expectations"]] == [False]
 
 
 def child(live: Live, shard: int, name: str) -> int:
     """The process id of one process of one shard, which its log tells, as soon as it is there."""
 
-    def found() -> int | None:
+    def child_pid() -> int | None:
         for pid in with_mark(str(live.temporary)):
             try:
                 log = os.readlink(f"/proc/{pid}/fd/2")
@@ -223,7 +223,7 @@ def child(live: Live, shard: int, name: str) -> int:
                 return pid
         return None
 
-    pid: int = wait_until(found, f"a process {name} of shard {shard}")
+    pid: int = wait_until(child_pid, f"a process {name} of shard {shard}")
     return pid
 
 
@@ -341,7 +341,7 @@ def test_a_run_in_shards_tells_how_it_does_and_is_not_steered(evedrop: Evedrop) 
 def test_what_shards_cannot_do_is_refused(evedrop: Evedrop) -> None:
     """Briefs and a fixed endpoint are of one router; more shards than trials leave one without work."""
     sharded = ("--trials", "4", "--set", "shards=2")
-    for words, said in (
+    for words, message in (
         (("brief", "eavesdroppers", *sharded, "--out", "briefs", "--results", "there"), "give --set shards=1"),
         (("run", "eavesdroppers", *sharded, "--view", "off", "--listen", "tcp/127.0.0.1:17461"), "give shards=1"),
         (("run", "eavesdroppers", *sharded, "--view", "off", "--relay", "tcp/127.0.0.1:17461"), "give shards=1"),
@@ -350,7 +350,7 @@ def test_what_shards_cannot_do_is_refused(evedrop: Evedrop) -> None:
     ):
         done = evedrop(*words)
         assert done.status == 2, done
-        assert said in done.err
+        assert message in done.err
     assert not (evedrop.folder / "runs").exists()
     assert not (evedrop.folder / "briefs").exists()
 

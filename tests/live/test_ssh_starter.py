@@ -43,10 +43,10 @@ def connect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connect:
     """Begin a connection; the script says these lines, keeps all that it is told, and ends with its standard input."""
     monkeypatch.setenv("PATH", str(tmp_path / "bin"), prepend=":")
 
-    def begin(*said: str, beat_seconds: float = 30.0, **table: Any) -> SshHost:
+    def begin(*lines: str, beat_seconds: float = 30.0, **table: Any) -> SshHost:
         (tmp_path / "bin").mkdir()
         (tmp_path / "told").touch()
-        (tmp_path / "said").write_text("".join(f"{line}\n" for line in said))
+        (tmp_path / "said").write_text("".join(f"{line}\n" for line in lines))
         script = tmp_path / "bin" / "ssh"
         script.write_text(f"#!/bin/sh\ncat '{tmp_path}/said'\nexec cat 3>&1 >'{tmp_path}/told'\n")
         script.chmod(0o700)
@@ -76,7 +76,7 @@ def test_a_host_gets_the_brief_and_what_differs_from_its_own_environment(connect
     assert not path.exists()
     assert process.poll() is None
     host.close(time.monotonic() + LIMIT)
-    (order,) = (one for one in told(tmp_path) if isinstance(one, StartProcess))
+    (order,) = (order for order in told(tmp_path) if isinstance(order, StartProcess))
     assert order.brief.text == brief.text.replace("/srv/here", "/srv/classes")
     assert (order.number, order.environment) == (7, {"OMP_NUM_THREADS": "one"})
     assert process.wait(LIMIT) == CONNECTION_LOST
@@ -91,7 +91,7 @@ def test_a_brief_without_classes_gets_no_folder_of_classes(connect: Connect, tmp
     with (tmp_path / "eve.log").open("wb") as file:
         host.start(7, path, file, {})
     host.close(time.monotonic() + LIMIT)
-    (order,) = (one for one in told(tmp_path) if isinstance(one, StartProcess))
+    (order,) = (order for order in told(tmp_path) if isinstance(order, StartProcess))
     assert order.brief.part == brief_of_eve().part
 
 

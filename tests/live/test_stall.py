@@ -109,10 +109,10 @@ RUNS = {
 """What happens → the slots by report, the answers, and which processes are silent."""
 
 
-@pytest.mark.parametrize("what", RUNS)
-def test_who_is_silent(what: str) -> None:
+@pytest.mark.parametrize("case", RUNS)
+def test_who_is_silent(case: str) -> None:
     """The process at the end of the chain of waiting processes, whichever others are idle."""
-    places, answers, silent = RUNS[what]
+    places, answers, silent = RUNS[case]
     if "controller" in answers:
         places = {**places, "controller": 64}
     assert silent_of(places, answers, ["controller"]) == silent
@@ -156,10 +156,10 @@ def test_a_silent_process_is_named_after_the_patience_and_not_before() -> None:
     run.wait(0.25, done=50)
     run.wait(19.0)
     assert run.asked > 3
-    said = r"eve: alive, and silent for 2\d s while the run waits for slot 50 \(eve is at slot 55"
-    with pytest.raises(Silence, match=said) as found:
+    message = r"eve: alive, and silent for 2\d s while the run waits for slot 50 \(eve is at slot 55"
+    with pytest.raises(Silence, match=message) as raised:
         run.wait(10.0)
-    assert found.value.at_fault == ("eve",)
+    assert raised.value.at_fault == ("eve",)
 
 
 @pytest.mark.parametrize("how", ["held", "missing", "asleep", "joined"])

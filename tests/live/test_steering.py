@@ -55,8 +55,8 @@ class RecordingConductor:
 
     def told(self) -> list[Sent]:
         """All since the last time."""
-        found, self.sent = self.sent, []
-        return found
+        sent, self.sent = self.sent, []
+        return sent
 
 
 class Run:
@@ -114,7 +114,7 @@ def test_a_change_is_made_between_two_slots() -> None:
     assert run.holds(17) == [("router", change), *go(17)]
     assert asked.answers == [Answer(17, "from slot 17 on: link legitimate: quality = 0.2")]
     assert run.events == [(17, "link legitimate: quality = 0.2", "operator")]
-    assert [one.model_dump(exclude_none=True)["event"] for one in run.kept] == [[{"at": 17, **SET}]]
+    assert [message.model_dump(exclude_none=True)["event"] for message in run.kept] == [[{"at": 17, **SET}]]
 
 
 def test_what_the_scenario_changes_later_is_told_again() -> None:
@@ -132,7 +132,7 @@ def test_two_operators_are_served_in_the_order_they_came() -> None:
     run = Run()
     first, second, third = (run.asks("link", event=event) for event in (SET, {"cut": "smart"}, {"cut": "smart"}))
     assert run.conductor.told() == [("sensor", Hold())]
-    assert [one.do for _, one in run.holds(8)] == ["change", "change", "go", "go"]
+    assert [sent.do for _, sent in run.holds(8)] == ["change", "change", "go", "go"]
     assert first.answers[0].slot == second.answers[0].slot == 8
     assert third.answers[0].refused == ("cut: smart is cut already, from slot 8 on; expected a heal before",)
 
@@ -158,9 +158,9 @@ def test_mistakes_change_nothing(event: dict[str, Any], mistakes: list[str]) -> 
     run = Run({"at": 40, "cut": "legitimate"})
     asked = run.asks("link", event=event)
     assert run.holds(5) == go(5)
-    found = asked.answers[0].refused
-    assert len(found) == len(mistakes)
-    for line, wanted in zip(found, mistakes, strict=True):
+    refused = asked.answers[0].refused
+    assert len(refused) == len(mistakes)
+    for line, wanted in zip(refused, mistakes, strict=True):
         assert line.startswith(wanted)
     assert (run.events, run.kept) == ([], [])
 
@@ -180,7 +180,7 @@ def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
     run.steering.done(1)
     run.conductor.away.add("smart")
     run.steering.carry_on(30)
-    assert [one.do for _, one in run.conductor.told()] == ["change", "go", "go"]
+    assert [sent.do for _, sent in run.conductor.told()] == ["change", "go", "go"]
     assert asked.answers[0].slot == 30
     assert [event[1] for event in run.events] == ["kill smart", "link legitimate: quality = 0.2"]
 
@@ -189,7 +189,7 @@ def test_a_wish_to_hold_that_meets_one_of_the_scenario_is_done_there() -> None:
     """The hold that was asked for and the scenario's are one; the scenario's event comes first, and nothing is held twice."""
     run = Run({"at": 30, "cut": "smart"})
     asked = run.asks("link", event={"heal": "smart"})
-    assert [one.do for _, one in run.holds(30)] == ["change", "go", "go"]
+    assert [sent.do for _, sent in run.holds(30)] == ["change", "go", "go"]
     assert asked.answers[0].slot == 30
     assert [event[1] for event in run.events] == ["cut smart", "heal smart"]
 
@@ -203,7 +203,7 @@ def test_a_pause_lasts_until_it_is_ended() -> None:
     second = run.asks("pause")
     changed = run.asks("link", event=SET)
     run.steering.carry_on(12)
-    assert [one.do for _, one in run.conductor.told()] == ["change"]
+    assert [sent.do for _, sent in run.conductor.told()] == ["change"]
     assert second.answers == [Answer(12, "held already, before slot 12")]
     assert changed.answers[0].slot == 12
     resumed = run.asks("resume")
@@ -247,7 +247,7 @@ def test_a_step_lets_slots_pass_and_holds_again() -> None:
     assert run.conductor.told() == go(12, until=17)
     assert run.holds(14) == go(14, until=17)
     changed = run.asks("link", event=SET)
-    assert [one.do for _, one in run.holds(15)] == ["change", "go", "go"]
+    assert [sent.do for _, sent in run.holds(15)] == ["change", "go", "go"]
     assert changed.answers[0].slot == 15
     assert stepped.answers == []
     assert run.holds(17) == []

@@ -30,7 +30,7 @@ def suspend(live: Live, which: str) -> list[int]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("which", "number"), [*((one, signal.SIGINT) for one in WHICH), ("both", signal.SIGTERM)])
+@pytest.mark.parametrize(("which", "number"), [*((name, signal.SIGINT) for name in WHICH), ("both", signal.SIGTERM)])
 def test_a_signal_ends_a_run_whose_fork_servers_are_suspended(
     evedrop: Evedrop, which: str, number: signal.Signals
 ) -> None:

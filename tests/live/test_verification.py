@@ -38,20 +38,20 @@ def reports(batch: int, recorded: int = RECORDED, trials: int = TRIALS) -> list[
     """The reports of a receiver that ends them at the ends of batches and of blocks."""
     log, made, first = BlockDigests(trials, SLOTS, CUTS), [], 0
     sums, ended = BlockSums(trials, SLOTS, CUTS), dict[int, np.ndarray]()
-    found = beliefs(trials=trials)
-    for k, belief in enumerate(found):
+    followed = beliefs(trials=trials)
+    for k, belief in enumerate(followed):
         digests = log.add(range(k, k + 1), one_slot(belief))
         ended |= sums.add(range(k, k + 1), np.trace(belief.P)[None])
         if (k + 1) % batch and k + 1 < SLOTS and not digests:
             continue
-        rows = found[first : k + 1]
-        traces = np.array([np.trace(one.P) for one in rows])
+        rows = followed[first : k + 1]
+        traces = np.array([np.trace(row.P) for row in rows])
         made.append(
             Report(
                 first,
-                np.array([one.x_hat for one in rows]),
-                np.array([one.action for one in rows]),
-                np.ascontiguousarray(np.array([one.P for one in rows])[..., :recorded]),
+                np.array([row.x_hat for row in rows]),
+                np.array([row.action for row in rows]),
+                np.ascontiguousarray(np.array([row.P for row in rows])[..., :recorded]),
                 np.stack([traces.sum(axis=1), (traces**2).sum(axis=1)], axis=1),
                 None,
                 digests,
@@ -111,19 +111,19 @@ LIES = {
 """What was changed → the reports, and the expected message."""
 
 
-@pytest.mark.parametrize("what", LIES)
-def test_a_receiver_that_contradicts_itself_is_found_out(what: str) -> None:
+@pytest.mark.parametrize("case", LIES)
+def test_a_receiver_that_contradicts_itself_is_found_out(case: str) -> None:
     """One bit of one recorded trial is enough, and so are sums that no trials have."""
-    given, said = LIES[what]
-    with pytest.raises(Contradiction, match=f"eve contradicts itself: .*{said}") as found:
+    given, message = LIES[case]
+    with pytest.raises(Contradiction, match=f"eve contradicts itself: .*{message}") as raised:
         verified(given)
-    assert found.value.at_fault == ("eve",)
+    assert raised.value.at_fault == ("eve",)
 
 
 def test_what_is_not_recorded_rests_on_its_own_word() -> None:
     """The digest of a trial that is not recorded cannot be computed: this is what `own_word` in the summary says."""
     verified(
-        changed(2, digests=lambda blocks: {k: at((3, 0), lambda byte: byte ^ 1)(one) for k, one in blocks.items()})
+        changed(2, digests=lambda blocks: {k: at((3, 0), lambda byte: byte ^ 1)(block) for k, block in blocks.items()})
     )
 
 
@@ -150,25 +150,25 @@ def test_any_sums_are_judged(first: float, second: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("column", "place", "said"),
+    ("column", "place", "message"),
     [("x_hat", (1, 3), "its x_hat of trial 13 is"), ("P", (0, 0, 1), "its P of trial 11 is"), ("P", (0, 0, 3), None)],
 )
-def test_a_receiver_leaves_with_what_it_reported(column: str, place: tuple[int, ...], said: str | None) -> None:
+def test_a_receiver_leaves_with_what_it_reported(column: str, place: tuple[int, ...], message: str | None) -> None:
     """Its last word before an outage, from which it is carried on, is what its report of the slot before says.
 
     The covariance of a trial that is not recorded is not in the report.
     """
-    verifier, found = Verifier({"eve": Blocks(SLOTS, CUTS)}, RECORDED, 10), beliefs()
-    last = found[299]
+    verifier, followed = Verifier({"eve": Blocks(SLOTS, CUTS)}, RECORDED, 10), beliefs()
+    last = followed[299]
     other = at(place, lambda x: x + 1.0)(getattr(last, column))
     verifier.left("eve", 300, last._replace(x_hat=other) if column == "x_hat" else last._replace(P=other))
     *before, of_last = [report for report in reports(100) if report.first < 300]
     for report in before:
         verifier.report("eve", report)
-    if said is None:
+    if message is None:
         verifier.report("eve", of_last)
         return
-    with pytest.raises(Contradiction, match=f"before slot 300, with which it goes away, {said}"):
+    with pytest.raises(Contradiction, match=f"before slot 300, with which it goes away, {message}"):
         verifier.report("eve", of_last)
 
 
@@ -214,11 +214,11 @@ def test_slots_in_which_all_say_the_same_pass() -> None:
     Verifier({}, 1, 10).joined(slots_of(sent=silent, unsent=np.ones(2, np.uint32)))
 
 
-@pytest.mark.parametrize("what", CLAIMS)
-def test_who_contradicts_the_journal_is_found_out(what: str) -> None:
+@pytest.mark.parametrize("case", CLAIMS)
+def test_who_contradicts_the_journal_is_found_out(case: str) -> None:
     """In one trial of one slot, recorded or not: the process, the slot, the trial and both values are named."""
-    changes, said = CLAIMS[what]
-    with pytest.raises(Contradiction, match=said):
+    changes, message = CLAIMS[case]
+    with pytest.raises(Contradiction, match=message):
         Verifier({}, 1, 10).joined(slots_of(**changes))
 
 
@@ -238,14 +238,14 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 """What is wrong with a report → its columns, and the expected message."""
 
 
-@pytest.mark.parametrize("what", WRONG)
-def test_a_report_that_no_run_has_is_refused(what: str) -> None:
+@pytest.mark.parametrize("case", WRONG)
+def test_a_report_that_no_run_has_is_refused(case: str) -> None:
     """Blocks, slots, shapes and counts are held to what the run has."""
-    changes, said = WRONG[what]
+    changes, message = WRONG[case]
     raw = replace(reports(100)[0], **changes).pack()
-    with pytest.raises(MalformedMessage, match=f"telemetry/eve: {said}") as found:
+    with pytest.raises(MalformedMessage, match=f"telemetry/eve: {message}") as raised:
         read_report(Reader("evedrop/r/telemetry/eve", raw), 0, EXTENT, Blocks(SLOTS, CUTS))
-    assert found.value.at_fault == ("eve",)
+    assert raised.value.at_fault == ("eve",)
 
 
 def test_digests_that_are_due_are_missed() -> None:
@@ -276,31 +276,31 @@ JOURNALS: dict[str, tuple[dict[str, Any], str]] = {
 """What is wrong with a journal → the columns of its link, and the expected message."""
 
 
-@pytest.mark.parametrize("what", JOURNALS)
-def test_a_journal_that_does_not_add_up_is_refused(what: str) -> None:
+@pytest.mark.parametrize("case", JOURNALS)
+def test_a_journal_that_does_not_add_up_is_refused(case: str) -> None:
     """Every packet has one fate; a journal in which one has none, or two, is malformed."""
-    changes, said = JOURNALS[what]
+    changes, message = JOURNALS[case]
     no_loss = dict.fromkeys(REASONS, np.zeros(1, np.uint32))
     bursts, delays = np.zeros(COUNTED_BURSTS, np.uint32), np.array([4, 0], np.uint32)
     link = replace(Account(np.ones((1, 4), bool), no_loss, None, bursts, delays), **changes)
     raw = Journal(7, 1, {"eve": link}).pack()
-    with pytest.raises(MalformedMessage, match=said) as found:
+    with pytest.raises(MalformedMessage, match=message) as raised:
         read_journal(Reader("evedrop/r/journal", raw), 7, {"eve": 0}, EXTENT)
-    assert found.value.at_fault == ("router",)
+    assert raised.value.at_fault == ("router",)
 
 
 @pytest.mark.parametrize(
-    ("trial", "said"),
+    ("trial", "message"),
     [
         (1, r"sum of tr P over slots 0 to 255 of trial 11 is .*, and what it reported of these slots gives"),
         (3, r"sum of tr P over slots 0 to 255 of all trials is .*, and what it reported of these slots gives"),
     ],
 )
-def test_wrong_sums_over_blocks(trial: int, said: str) -> None:
+def test_wrong_sums_over_blocks(trial: int, message: str) -> None:
     """Of a recorded trial, and of another one, by the sum over all trials; both values are named."""
 
     def more(sums: dict[int, Any]) -> dict[int, Any]:
-        return {block: np.where(np.arange(TRIALS) == trial, 1.5 * one, one) for block, one in sums.items()}
+        return {block: np.where(np.arange(TRIALS) == trial, 1.5 * values, values) for block, values in sums.items()}
 
-    with pytest.raises(Contradiction, match=said):
+    with pytest.raises(Contradiction, match=message):
         verified(changed(2, trace_sums=more))

@@ -62,7 +62,7 @@ def carried(process: Process, t: int, k: int, scheme: type[Scheme] = Acknowledge
 def _first_sigmas(A: bytes, Q: bytes, initial: bytes, slots: int) -> list[Matrix]:
     """The state's covariances in the first slots; the matrices are given as their doubles."""
     n = math.isqrt(len(A) // 8)
-    of_process = [exact(np.frombuffer(one).reshape(n, n)) for one in (A, Q, initial)]
+    of_process = [exact(np.frombuffer(matrix).reshape(n, n)) for matrix in (A, Q, initial)]
     return list(itertools.islice(state_covariances(of_process[0], of_process[1], of_process[2], 200), slots))
 
 

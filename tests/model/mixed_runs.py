@@ -33,10 +33,10 @@ def covariances(
     slots, trials = plain.shape
     encoder = GivenEncoder(ReferenceCode(process, open_loop), process.n, plain)
     receiver = ReferenceReceiver(process, trials, open_loop)
-    belief, nothing, found = receiver.prior(), np.zeros((process.n, trials)), []
+    belief, nothing, covariances = receiver.prior(), np.zeros((process.n, trials)), []
     for k in range(slots):
         packet = encoder.encode(k, nothing, nothing)
         belief = receiver.step(k, belief, Reception(heard[k], nothing, packet.header))
         encoder.acknowledged(k, acks[k])
-        found.append(belief.P)
-    return np.array(found)
+        covariances.append(belief.P)
+    return np.array(covariances)

@@ -53,7 +53,7 @@ def combined(*terms: tuple[Fraction | int, Matrix]) -> Matrix:
 def inverted(M: Matrix) -> Matrix:
     """M⁻¹."""
     n = len(M)
-    rows = [[*row, *one] for row, one in zip(M, identity(n), strict=True)]
+    rows = [[*row, *unit] for row, unit in zip(M, identity(n), strict=True)]
     for c in range(n):
         pivot = next(i for i in range(c, n) if rows[i][c])
         rows[c], rows[pivot] = rows[pivot], rows[c]
@@ -66,13 +66,13 @@ def inverted(M: Matrix) -> Matrix:
 
 def determinant(M: Matrix) -> Fraction:
     """Det M of a matrix whose leading minors are not 0, as those of a covariance."""
-    rows, found = [list(row) for row in M], Fraction(1)
+    rows, product = [list(row) for row in M], Fraction(1)
     for c, row in enumerate(rows):
-        found *= row[c]
+        product *= row[c]
         for other in rows[c + 1 :]:
             factor = other[c] / row[c]
             other[c:] = [a - factor * b for a, b in zip(other[c:], row[c:], strict=True)]
-    return found
+    return product
 
 
 def trace(M: Matrix) -> Fraction:
@@ -116,16 +116,16 @@ def expectations(A: Matrix, Q: Matrix, initial: Matrix, odds: Callable[[str], Fr
     sigmas = state_covariances(A, Q, initial)
     before = next(sigmas)
     E = combined((odds("initial"), initial))
-    found = [E]
+    expected = [E]
     kept = odds("predicted") + odds("decoded") + odds("leaked")
     for sigma in sigmas:
-        if len(found) == slots:
-            return found
+        if len(expected) == slots:
+            return expected
         terms = [(kept, congruent(A, E)), (odds("predicted"), Q), (2 * odds("misled"), congruent(A, before))]
         if odds("leaked"):
             terms.append((odds("leaked"), remaining(Q, sigma)))
         E = rounded(combined(*terms))
-        found.append(E)
+        expected.append(E)
         before = sigma
     raise AssertionError  # the states go on
 
@@ -142,25 +142,25 @@ def behind_a_chain(
     """Tr E P_k of a receiver behind a link that follows a Markov chain, by its states; odds: of every state."""
     sigmas = state_covariances(A, Q, initial)
     before = next(sigmas)
-    parts = [combined((one("initial") * p, initial)) for one, p in zip(odds, distribution, strict=True)]
-    found = [sum((trace(part) for part in parts), Fraction(0))]
-    while len(found) < slots:
+    parts = [combined((chance("initial") * p, initial)) for chance, p in zip(odds, distribution, strict=True)]
+    traces = [sum((trace(part) for part in parts), Fraction(0))]
+    while len(traces) < slots:
         sigma = next(sigmas)
         after = []
-        for s, (one, p) in enumerate(zip(odds, distribution, strict=True)):
+        for s, (chance, p) in enumerate(zip(odds, distribution, strict=True)):
             mixed = combined(*((transitions[r][s], part) for r, part in enumerate(parts)))
-            kept = one("predicted") + one("decoded") + one("leaked")
+            kept = chance("predicted") + chance("decoded") + chance("leaked")
             terms = [
                 (kept, congruent(A, mixed)),
-                (p * one("predicted"), Q),
-                (2 * p * one("misled"), congruent(A, before)),
+                (p * chance("predicted"), Q),
+                (2 * p * chance("misled"), congruent(A, before)),
             ]
-            if one("leaked"):
-                terms.append((p * one("leaked"), remaining(Q, sigma)))
+            if chance("leaked"):
+                terms.append((p * chance("leaked"), remaining(Q, sigma)))
             after.append(rounded(combined(*terms)))
         parts, before = after, sigma
-        found.append(sum((trace(part) for part in parts), Fraction(0)))
-    return found
+        traces.append(sum((trace(part) for part in parts), Fraction(0)))
+    return traces
 
 
 def fixed_point(A: Matrix, kept: Fraction, source: Matrix) -> Matrix:

@@ -30,7 +30,7 @@ PROCESSES = {
 
 def sigmas(process: Process, slots: int) -> list[Matrix]:
     """Σ_k exactly."""
-    found = [exact(process.initial_covariance)]
+    sigmas = [exact(process.initial_covariance)]
     for _ in range(slots - 1):
-        found.append(combined((1, congruent(exact(process.A), found[-1])), (1, exact(process.Q))))
-    return found
+        sigmas.append(combined((1, congruent(exact(process.A), sigmas[-1])), (1, exact(process.Q))))
+    return sigmas

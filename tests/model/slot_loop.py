@@ -44,11 +44,13 @@ class Played:
 
     def squared_error(self, name: str) -> np.ndarray:
         """|x − x̂|², (slots, R)."""
-        return np.array([((x - one.x_hat) ** 2).sum(0) for x, one in zip(self.x, self.beliefs[name], strict=True)])
+        return np.array(
+            [((x - belief.x_hat) ** 2).sum(0) for x, belief in zip(self.x, self.beliefs[name], strict=True)]
+        )
 
     def trace(self, name: str) -> np.ndarray:
         """Tr P reported, (slots, R)."""
-        return np.array([np.trace(one.P) for one in self.beliefs[name]])
+        return np.array([np.trace(belief.P) for belief in self.beliefs[name]])
 
 
 def play(

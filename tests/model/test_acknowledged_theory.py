@@ -64,10 +64,10 @@ def test_the_floor_is_below_the_exact_expectation(process: Process, back: float)
 
 def test_the_floor_follows_many_slots() -> None:
     """Of hundreds of critical slots some stand for others: the bound falls by little, and reaches the error of not listening."""
-    found = reference_floor(STABLE, 0.9, (0.81, 0.09), 400)
+    result = reference_floor(STABLE, 0.9, (0.81, 0.09), 400)
     sigma = list(itertools.islice(exact_sigmas(STABLE), 400))[-1]
-    assert found[-1] == pytest.approx(np.trace(sigma), rel=1e-6)
-    assert found[-1] <= np.trace(sigma) * (1 + 1e-12)
+    assert result[-1] == pytest.approx(np.trace(sigma), rel=1e-6)
+    assert result[-1] <= np.trace(sigma) * (1 + 1e-12)
     seldom = reference_floor(STABLE, 0.9, (0.9, 1e-3), 400)
     assert 0.2 * np.trace(sigma) < seldom[-1] < (1.0 - 0.999**400) * np.trace(sigma) + 0.1 * np.trace(sigma)
     assert np.isinf(reference_floor(MIXED, 0.9, (0.81, 0.09), 3000)[-1])
@@ -79,8 +79,8 @@ def test_the_floor_follows_many_slots() -> None:
 def test_the_papers_example(initial: np.ndarray, honest: float) -> None:
     """Slot 40, μ = μ_e = 0.9: lost for good with honest acknowledgements; as good as legitimate where the critical ones fail."""
     process = Process(UNSTABLE.A, UNSTABLE.Q, initial)
-    found = reference_covariances(process, 0.9, (0.81, 0.09), 41)
-    assert np.trace(found[40]) == pytest.approx(honest, rel=2e-3)
+    result = reference_covariances(process, 0.9, (0.81, 0.09), 41)
+    assert np.trace(result[40]) == pytest.approx(honest, rel=2e-3)
     legitimate = np.trace(theoretical_covariances(process, Acknowledged(process).outcomes(0.9), 41)[40])
     assert legitimate == pytest.approx(2.284e-4, rel=2e-4)
     for acknowledged in ((0.0, 0.0), (0.81, 0.0)):

@@ -49,14 +49,14 @@ def test_rates_are_those_of_the_arrivals(attack: str) -> None:
     gamma, gamma_e = coins(mu, slots, trials, 1), coins(mu_e, slots, trials, 2)
     arrived = np.array([channel.arrived(k, None, gamma[k], gamma_e[k]) for k in range(slots)])
     rates = rates_of(attack, mu, mu_e, quality, 0.2)
-    for found, rate in (
+    for flags, rate in (
         (arrived, rates.arrives),
         (arrived & gamma, rates.legitimate[0]),
         (arrived & ~gamma, rates.legitimate[1]),
         (arrived & gamma_e, rates.eavesdropper[0]),
         (arrived & ~gamma_e, rates.eavesdropper[1]),
     ):
-        assert binomtest(int(found.sum()), found.size, rate).pvalue > 1e-6
+        assert binomtest(int(flags.sum()), flags.size, rate).pvalue > 1e-6
 
 
 def test_what_was_not_sent_is_not_acknowledged() -> None:
@@ -88,8 +88,8 @@ def test_attacks_on_state_secrecy_codes_cost_what_theory_says(attack: str) -> No
     rates = rates_of(attack, mu, mu_e, quality)
     for name, quality, acknowledged in (("legitimate", mu, rates.legitimate), ("eve", mu_e, rates.eavesdropper)):
         expected = np.trace(reference_covariances(UNSTABLE, quality, acknowledged, slots), axis1=1, axis2=2)
-        for found in (played.trace(name), played.squared_error(name)):
-            assert (np.abs(found.mean(1) - expected) < 5.0 * found.std(1) / np.sqrt(trials) + 1e-18).all()
+        for errors in (played.trace(name), played.squared_error(name)):
+            assert (np.abs(errors.mean(1) - expected) < 5.0 * errors.std(1) / np.sqrt(trials) + 1e-18).all()
 
 
 def simulated(chart: Chart, rate: float, trials: int, packets: int) -> np.ndarray:
@@ -114,8 +114,8 @@ def test_run_lengths_are_exact(normal: float, attacked: float) -> None:
     assert chart.run_length(normal) >= 200.0
     for rate in (normal, attacked):
         expected = chart.run_length(rate)
-        found = simulated(chart, rate, 3000, int(40 * min(expected, 500)))
-        assert abs(found.mean() - expected) < 5.0 * found.std() / np.sqrt(3000) + 1e-9
+        result = simulated(chart, rate, 3000, int(40 * min(expected, 500)))
+        assert abs(result.mean() - expected) < 5.0 * result.std() / np.sqrt(3000) + 1e-9
 
 
 @pytest.mark.parametrize("misses", [1, 2, 5, 9])

@@ -32,9 +32,9 @@ def errors(slot: Slot, x_hat: Floats) -> Floats:
 def test_the_constant_one_knows_what_is_public() -> None:
     """x̂ = 0 and P = Σ_k whatever it hears, and theory says tr Σ_k; for μ_d < 1/2 it beats naive in the end."""
     batch = Batch(60, 50)
-    one = READERS["constant"](Knowledge(MARGINAL, 0.3, {}, {}), batch)
+    reader = READERS["constant"](Knowledge(MARGINAL, 0.3, {}, {}), batch)
     sigma = state_covariances(MARGINAL, 60)
-    for slot, beliefs in followed({"constant": one}, slots(MARGINAL, 0.3, 0.9, batch)):
+    for slot, beliefs in followed({"constant": reader}, slots(MARGINAL, 0.3, 0.9, batch)):
         assert not beliefs["constant"].x_hat.any()
         assert np.allclose(beliefs["constant"].P, sigma[slot.k][:, :, None], rtol=1e-12)
     outcomes = STRATEGIES["constant"].outcomes({}, 0.3)
@@ -76,9 +76,9 @@ def test_a_hard_test_locks_on_to_false_tracks(process: Process, mu_d: float, mu_
 def test_pooled_fates_are_those_of_any() -> None:
     """Delivered if one link delivers, else lost for the reason of the first; what is pooled is not changed."""
     fates = [np.array(rows, np.uint8).reshape(2, 4) for rows in ([0, 1, 1, 0, 1, 1, 0, 0], [1, 0, 1, 0, 1, 0, 1, 1])]
-    before = [one.copy() for one in fates]
+    before = [fate.copy() for fate in fates]
     assert pooled(fates).tolist() == [[0, 0, 1, 0], [1, 0, 0, 0]]
-    assert all(np.array_equal(one, kept) for one, kept in zip(fates, before, strict=True))
+    assert all(np.array_equal(fate, kept) for fate, kept in zip(fates, before, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -88,15 +88,15 @@ def test_pooled_links_deliver_what_any_delivers(links: tuple[dict[str, Any], ...
     """Fates are those of the links one by one on their own random numbers, and as many as quality and chain say."""
     batch, key = Batch(400, 200), keys(1)["link"]
     spec = {"model": "pooled", "links": list(links)}
-    found = link_of(spec, key, batch).fates(range(400)).codes
-    models = [loss_of(one) for one in links]
+    codes = link_of(spec, key, batch).fates(range(400)).codes
+    models = [loss_of(link) for link in links]
     width = sum(model.uniforms_per_slot for model in models)
     drawn = np.ascontiguousarray(uniforms(Stream(key, range(200), width).words(range(400))).transpose(0, 2, 1))
     delivered, start = np.zeros((400, 200), bool), 0
     for model in models:
         delivered |= model.fates(0, drawn[:, start : start + model.uniforms_per_slot]) == Fate.DELIVERED
         start += model.uniforms_per_slot
-    assert np.array_equal(found == Fate.DELIVERED, delivered)
+    assert np.array_equal(codes == Fate.DELIVERED, delivered)
     pool = loss_of(spec)
     assert pool.quality == pytest.approx(1.0 - np.prod([1.0 - model.quality for model in models]))
     assert pool.chain is not None
@@ -116,25 +116,25 @@ def test_one_betrayed_state_barely_hurts_the_innovation_scheme() -> None:
     batch, parameters = Batch(81, 1000), {"reads_as": "bayesian", "learns_at": 20}
     knowledge = Knowledge(MARGINAL, 0.3, parameters, {})
     informed, other = STRATEGIES["replay-informed"](knowledge, batch), READERS["bayesian"](knowledge, batch)
-    one, two = informed.prior(), other.prior()
+    first, two = informed.prior(), other.prior()
     for slot in slots(MARGINAL, 0.3, 0.9, batch):
         truth = slot.x if slot.k == 20 else None
-        one = informed.step(slot.k, one, Reception(slot.gamma, slot.z, truth=truth))
+        first = informed.step(slot.k, first, Reception(slot.gamma, slot.z, truth=truth))
         two = other.step(slot.k, two, Reception(slot.gamma, slot.z))
         if slot.k == 20:
-            assert not errors(slot, one.x_hat).any()
-            assert not one.P.any()
+            assert not errors(slot, first.x_hat).any()
+            assert not first.P.any()
             assert errors(slot, two.x_hat).mean() > 1e-3
-    assert np.median(errors(slot, one.x_hat) / errors(slot, two.x_hat)) == pytest.approx(1.0, rel=1e-3)
+    assert np.median(errors(slot, first.x_hat) / errors(slot, two.x_hat)) == pytest.approx(1.0, rel=1e-3)
 
 
 def test_a_state_that_was_not_betrayed_is_missed() -> None:
     """Told by its slot, so that a network that forgets to hand it over does not go unnoticed."""
-    one = STRATEGIES["replay-informed"](
+    reader = STRATEGIES["replay-informed"](
         Knowledge(MARGINAL, 0.3, {"reads_as": "constant", "learns_at": 0}, {}), Batch(2, 1)
     )
     with pytest.raises(ValueError, match="slot 0: the state was to be betrayed"):
-        one.step(0, one.prior(), Reception(np.ones(1, bool), np.zeros((2, 1))))
+        reader.step(0, reader.prior(), Reception(np.ones(1, bool), np.zeros((2, 1))))
 
 
 @pytest.mark.parametrize("reads_as", ["bayesian", "likelihood"])
@@ -150,18 +150,18 @@ def test_one_betrayed_state_breaks_twin_tracks(reads_as: str) -> None:
         "informed": STRATEGIES["replay-informed"](Knowledge(process, 0.5, parameters, {}), batch),
         "other": READERS[reads_as](Knowledge(process, 0.5, {}, {}), batch),
     }
-    beliefs = {name: one.prior() for name, one in receivers.items()}
+    beliefs = {name: receiver.prior() for name, receiver in receivers.items()}
     apart: Floats = np.zeros((2, 400))
-    found = dict.fromkeys(receivers, 0.0)
+    errors = dict.fromkeys(receivers, 0.0)
     for k in range(60):
         x = trajectory.advance()
         if k == 0:
             apart = random.standard_normal((2, 400)) - x
         z = np.where(random.random(400) < 0.5, x, x + apart)
-        for name, one in receivers.items():
+        for name, receiver in receivers.items():
             truth = x if name == "informed" and k == learns_at else None
-            beliefs[name] = one.step(k, beliefs[name], Reception(np.ones(400, bool), z, truth=truth))
+            beliefs[name] = receiver.step(k, beliefs[name], Reception(np.ones(400, bool), z, truth=truth))
             if k > learns_at:
-                found[name] += float(((x - beliefs[name].x_hat) ** 2).sum()) / (49 * 400)
-    assert found["other"] > 0.9
-    assert found["informed"] < 0.01
+                errors[name] += float(((x - beliefs[name].x_hat) ** 2).sum()) / (49 * 400)
+    assert errors["other"] > 0.9
+    assert errors["informed"] < 0.01

@@ -92,11 +92,11 @@ def test_it_is_the_posterior_over_all_type_words(
     A *= radius / np.abs(np.linalg.eigvals(A)).max()
     Q, start = ((f @ f.T + 0.2 * np.eye(n)) for f in random.standard_normal((2, n, n)))
     process = Process(A, Q, start)
-    one = Bayesian(Knowledge(process, mu_d, {}, {}), Batch(len(gamma), 1))
-    belief, z = one.prior(), []
+    bayesian = Bayesian(Knowledge(process, mu_d, {}, {}), Batch(len(gamma), 1))
+    belief, z = bayesian.prior(), []
     for slot in slots(process, mu_d, 1.0, Batch(len(gamma), 1, seed % 1000)):
         z.append(slot.z[:, 0])
-        belief = one.step(slot.k, belief, Reception(np.array(gamma[slot.k : slot.k + 1]), slot.z))
+        belief = bayesian.step(slot.k, belief, Reception(np.array(gamma[slot.k : slot.k + 1]), slot.z))
         mean, P, state = enumerated(process, mu_d, np.array(z), gamma[: slot.k + 1])
         scale = 1.0 + np.abs(P).max()
         assert np.allclose(belief.x_hat[:, 0], mean, rtol=1e-8, atol=1e-8 * np.sqrt(scale))
@@ -207,11 +207,11 @@ def test_it_may_come_late_and_stays_itself() -> None:
     Weights and P are in order, and the error is what it must be, 4.67e-5 within a fifth.
     """
     process, late, batch = MICROGRID, 28_600, Batch(30_000, 20)
-    one = Bayesian(Knowledge(process, 0.5, {}, {}), batch)
-    belief, errors = one.prior(late), []
+    bayesian = Bayesian(Knowledge(process, 0.5, {}, {}), batch)
+    belief, errors = bayesian.prior(late), []
     for slot in slots(process, 0.5, 0.6, batch):
         if slot.k >= late:
-            belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z))
+            belief = bayesian.step(slot.k, belief, Reception(slot.gamma, slot.z))
             errors.append(((slot.x - belief.x_hat) ** 2).sum(axis=0).mean())
     assert np.all(np.abs(belief.memory[0].sum(axis=0) - 1.0) < 1e-14)
     assert np.all(np.linalg.eigvalsh(np.moveaxis(belief.P, 2, 0)) >= 0.0)
@@ -232,10 +232,10 @@ def test_a_day_of_the_microgrid(mu_d: float, mean: float) -> None:
 def test_unstable_covariances_survive_where_cholesky_fails() -> None:
     """Deaf until slot 80 of the numerical example, where Σ_k cannot be factored any more: then one packet, and it is right."""
     batch = Batch(86, 300)
-    one, belief = made("bayesian", EXAMPLE, 0.9, batch), None
-    belief = one.prior()
+    receiver, belief = made("bayesian", EXAMPLE, 0.9, batch), None
+    belief = receiver.prior()
     for slot in slots(EXAMPLE, 0.9, 1.0, batch):
-        belief = one.step(slot.k, belief, Reception(np.full(300, slot.k >= 80), slot.z))
+        belief = receiver.step(slot.k, belief, Reception(np.full(300, slot.k >= 80), slot.z))
         if slot.k == 79:
             assert np.linalg.cond(belief.P[:, :, 0]) > 1e16
     error = ((slot.x - belief.x_hat) ** 2).sum(axis=0)

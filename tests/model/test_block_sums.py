@@ -17,17 +17,17 @@ STARTS = [0, 256, 300, 310, 512]
 def test_parts_do_not_change_the_sums(lengths: list[int], trials: int) -> None:
     """Slot by slot from 0, to the bit, for a single trial as well; a block that has not ended is not among them."""
     numbers = np.random.default_rng(3).lognormal(sigma=8.0, size=(SLOTS - 50, trials))
-    sums, found, k = BlockSums(trials, SLOTS, CUTS), dict[int, np.ndarray](), 0
+    sums, complete, k = BlockSums(trials, SLOTS, CUTS), dict[int, np.ndarray](), 0
     for length in [*lengths, SLOTS]:
         stop = min(k + length, len(numbers))
-        found |= sums.add(range(k, stop), numbers[k:stop])
+        complete |= sums.add(range(k, stop), numbers[k:stop])
         k = stop
-    assert list(found) == STARTS[:-1]
+    assert list(complete) == STARTS[:-1]
     for start, end in zip(STARTS, [*STARTS[1:], len(numbers)], strict=True):
         expected = np.zeros(trials)
         for row in numbers[start:end]:
             expected = expected + row
-        assert np.array_equal(found.get(start, sums.unfinished), expected)
+        assert np.array_equal(complete.get(start, sums.unfinished), expected)
 
 
 def test_another_process_continues_with_a_block() -> None:

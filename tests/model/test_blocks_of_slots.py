@@ -97,13 +97,13 @@ def test_blocks_and_single_slots_give_the_same_bits(name: str, process: Process)
             assert np.array_equal(z[row], once.packets[k].z)
             assert np.array_equal(nu[row], once.packets[k].nu)
         for who, receiver in receivers.items():
-            found, beliefs[who] = receiver.follow(slots, beliefs[who], gamma[who][slots.start : slots.stop], z)
-            digests[who].update(logs[who].add(slots, found))
+            block, beliefs[who] = receiver.follow(slots, beliefs[who], gamma[who][slots.start : slots.stop], z)
+            digests[who].update(logs[who].add(slots, block))
             for row, k in enumerate(slots):
                 expected = once.beliefs[who][k]
-                assert np.array_equal(found.x_hat[row], expected.x_hat), (who, k)
-                assert np.array_equal(found.P[row], expected.P), (who, k)
-                assert np.array_equal(found.action[row], expected.action), (who, k)
+                assert np.array_equal(block.x_hat[row], expected.x_hat), (who, k)
+                assert np.array_equal(block.P[row], expected.P), (who, k)
+                assert np.array_equal(block.action[row], expected.action), (who, k)
             assert np.array_equal(beliefs[who].P, once.beliefs[who][slots[-1]].P)
     for who in receivers:
         log = BlockDigests(BATCH.trials, BATCH.slots)
@@ -123,9 +123,9 @@ def test_a_secret_that_both_sides_share_is_drawn_once() -> None:
     for slots in blocks():
         z = encoder.encode_block(slots, *trajectory.advance_block(len(slots))).z
         heard = gamma[slots.start : slots.stop]
-        one, two = (receiver.follow(slots, receiver.prior(), heard, z)[0] for receiver in (estimator, other))
-        assert np.array_equal(one.x_hat, two.x_hat)
-        assert np.array_equal(one.P, two.P)
+        first, two = (receiver.follow(slots, receiver.prior(), heard, z)[0] for receiver in (estimator, other))
+        assert np.array_equal(first.x_hat, two.x_hat)
+        assert np.array_equal(first.P, two.P)
 
 
 def test_a_subclass_that_changes_a_slot_changes_blocks_too() -> None:
@@ -133,9 +133,9 @@ def test_a_subclass_that_changes_a_slot_changes_blocks_too() -> None:
     secret = SharedSecret(MARGINAL, 0.4, keys_of(("schedule", "noise")), BATCH)
     late, slots = Late(MARGINAL, BATCH.trials, secret), range(BATCH.slots)
     gamma, z = coins(0.7, BATCH.slots, BATCH.trials), np.ones((BATCH.slots, MARGINAL.n, BATCH.trials))
-    found, _ = late.follow(slots, late.prior(), gamma, z)
-    assert not found.action[:4].any()
-    assert found.action[4:].any()
+    beliefs, _ = late.follow(slots, late.prior(), gamma, z)
+    assert not beliefs.action[:4].any()
+    assert beliefs.action[4:].any()
 
 
 class Always(PacketUser):
@@ -168,8 +168,8 @@ class Deaf:
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """As if nothing had arrived."""
-        found: Belief = super().step(k, belief, heard._replace(gamma=np.zeros_like(heard.gamma)))  # type: ignore[misc]
-        return found
+        after: Belief = super().step(k, belief, heard._replace(gamma=np.zeros_like(heard.gamma)))  # type: ignore[misc]
+        return after
 
 
 class Picky:
@@ -193,8 +193,8 @@ class Quick(Naive):
 
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
         """The state from every packet."""
-        found = update.beliefs(self.process, slots.start, belief, gamma.astype(np.uint8), z)
-        return found, found.last
+        beliefs = update.beliefs(self.process, slots.start, belief, gamma.astype(np.uint8), z)
+        return beliefs, beliefs.last
 
 
 class PickyQuick(Quick):
@@ -218,13 +218,13 @@ def test_blocks_are_of_the_class_that_slots_are_of(kind: type[Naive]) -> None:
     """The blocks of a class equal its slots, no matter what it overrides and where it inherits from."""
     receiver, slots = kind(Knowledge(MARGINAL, 0.4, {}, {}), BATCH), range(BATCH.slots)
     gamma, z = coins(0.7, BATCH.slots, BATCH.trials), np.ones((BATCH.slots, MARGINAL.n, BATCH.trials))
-    found, _ = receiver.follow(slots, receiver.prior(), gamma, z)
+    beliefs, _ = receiver.follow(slots, receiver.prior(), gamma, z)
     belief = receiver.prior()
     for k in slots:
         belief = receiver.step(k, belief, Reception(gamma[k], z[k]))
-        assert np.array_equal(found.action[k], belief.action), k
-        assert np.array_equal(found.x_hat[k], belief.x_hat), k
-    assert kind in {Quick, Half} or not (found.action == int(Action.STATE)).any()
+        assert np.array_equal(beliefs.action[k], belief.action), k
+        assert np.array_equal(beliefs.x_hat[k], belief.x_hat), k
+    assert kind in {Quick, Half} or not (beliefs.action == int(Action.STATE)).any()
 
 
 class Loud:

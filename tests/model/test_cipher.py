@@ -24,15 +24,15 @@ KEY = stream_key(ROOT, "mask")
 def masked_in_words(process: Process, k: int, x: np.ndarray, trial: int) -> list[float]:
     """The formula of docs/mathematics.md for one state, in Python's integers."""
     words = Stream(KEY, range(trial, trial + 1), process.n).words(range(k, k + 1))[0, 0].tolist()
-    found = []
+    masked = []
     for i, word in enumerate(words):
         standard_deviation = float(np.sqrt(state_covariances(process, k + 1)[k, i, i]))
         H = 2.0**-200
         while 16.0 * standard_deviation >= H:
             H *= 2.0
         point = round(float(x[i]) * 2.0**52 / H)
-        found.append((((point + 2**52 + (word >> 11)) % 2**53) - 2**52) * H / 2.0**52)
-    return found
+        masked.append((((point + 2**52 + (word >> 11)) % 2**53) - 2**52) * H / 2.0**52)
+    return masked
 
 
 @pytest.mark.parametrize("process", [STABLE, UNSTABLE, DRIFTING])
@@ -87,8 +87,8 @@ def test_errors_are_the_closed_form() -> None:
     slots, trials = 25, 20_000
     played = play(Cipher(DRIFTING), Batch(slots, trials), {"legitimate": coins(0.7, slots, trials)})
     expected = np.trace(theoretical_covariances(DRIFTING, Cipher(DRIFTING).outcomes(0.7), slots), axis1=1, axis2=2)
-    for found in (played.squared_error("legitimate"), played.trace("legitimate")):
-        assert (np.abs(found.mean(1) - expected) < 5.0 * found.std(1) / np.sqrt(trials)).all()
+    for errors in (played.squared_error("legitimate"), played.trace("legitimate")):
+        assert (np.abs(errors.mean(1) - expected) < 5.0 * errors.std(1) / np.sqrt(trials)).all()
 
 
 def test_taking_a_masked_packet_for_the_state_is_finite_nonsense() -> None:
@@ -98,12 +98,12 @@ def test_taking_a_masked_packet_for_the_state_is_finite_nonsense() -> None:
     gamma = {"legitimate": coins(0.7, slots, trials), "naive": np.ones((slots, trials), bool)}
     played = play(Cipher(STABLE), Batch(slots, trials), gamma, {"naive": naive})
     mask, sigma = Mask(STABLE, KEY, Batch(slots, 1)), state_covariances(STABLE, slots)
-    found = played.squared_error("naive")
-    assert np.isfinite(found).all()
+    squared_error = played.squared_error("naive")
+    assert np.isfinite(squared_error).all()
     for k in range(slots):
         H = mask.steps(k) * 2.0**52
         expected = np.trace(sigma[k]) + (H * H).sum() / 3.0
-        assert abs(found[k].mean() - expected) < 5.0 * found[k].std() / np.sqrt(trials)
+        assert abs(squared_error[k].mean() - expected) < 5.0 * squared_error[k].std() / np.sqrt(trials)
         assert expected > 80.0 * np.trace(sigma[k])
 
 

@@ -70,11 +70,11 @@ def sensor(scheme: str, plant: Plant | None = None) -> SensorCore:
     return SensorCore(kind.encoder(keys, BATCH), states, local)
 
 
-def same(one: Any, other: Any) -> bool:
+def same(value: Any, other: Any) -> bool:
     """Whether two arrays, or the lack of them, are the same to the bit."""
-    if one is None or other is None:
-        return one is other
-    return bool(one.tobytes() == other.tobytes())
+    if value is None or other is None:
+        return value is other
+    return bool(value.tobytes() == other.tobytes())
 
 
 @pytest.mark.parametrize(("scheme", "driven"), SENSORS)
@@ -92,10 +92,10 @@ def test_what_is_sent_does_not_depend_on_blocks(scheme: str, driven: bool) -> No
         made.append(Sent.joined(parts))
     if driven:  # the inputs came at another slot
         made = made[1:]
-    for one in made[1:]:
-        assert same(one.true, made[0].true)
-        assert same(one.x, made[0].x)
-        assert all(same(*pair) for pair in zip(one.packets, made[0].packets, strict=True))
+    for sent in made[1:]:
+        assert same(sent.true, made[0].true)
+        assert same(sent.x, made[0].x)
+        assert all(same(*pair) for pair in zip(sent.packets, made[0].packets, strict=True))
     rows = made[0].rows(slice(3, 5))
     assert same(rows.x, made[0].x[3:5])
     assert same(rows.packets.at(1).z, made[0].packets.at(4).z)
@@ -111,7 +111,7 @@ def test_arrivals_and_beliefs_do_not_depend_on_blocks(window: int) -> None:
     """With losses, delays and second copies; late packets are counted alike."""
     schedule = LinkSchedule(LINK, window)
     sent = sensor("innovation").send(range(BATCH.slots))
-    found: list[FollowedSlots] = []
+    followed: list[FollowedSlots] = []
     for edges in EDGES:
         core, receiver = link(schedule), ReceiverCore(estimator(), window)
         parts = []
@@ -121,13 +121,13 @@ def test_arrivals_and_beliefs_do_not_depend_on_blocks(window: int) -> None:
                 part = range(max(slots.start, batch.start), min(slots.stop, batch.stop))
                 if part:
                     parts.append(receiver.take_slots(part, core.arrivals(part, sent.packets.z[part.start : part.stop])))
-        found.append(FollowedSlots.joined(parts))
-    assert (found[0].late is None) is (window == 0)
-    for one in found[1:]:
-        assert all(same(*pair) for pair in zip(one.beliefs, found[0].beliefs, strict=True))
-        assert same(one.late, found[0].late)
-    assert window == 0 or (found[0].late is not None and found[0].late.any())
-    beliefs = found[0].beliefs
+        followed.append(FollowedSlots.joined(parts))
+    assert (followed[0].late is None) is (window == 0)
+    for divided in followed[1:]:
+        assert all(same(*pair) for pair in zip(divided.beliefs, followed[0].beliefs, strict=True))
+        assert same(divided.late, followed[0].late)
+    assert window == 0 or (followed[0].late is not None and followed[0].late.any())
+    beliefs = followed[0].beliefs
     some = beliefs.rows(slice(3, 5))
     assert same(some.x_hat, beliefs.x_hat[3:5])
     assert same(some.P, beliefs.P[3:5])
@@ -166,10 +166,10 @@ def test_a_link_that_only_loses_packets_passes_the_others_on() -> None:
     heard, sent = core.in_time.copy(), np.array([[True, False] * 2] * 4)
     for k in range(4):
         core.silence(range(k, k + 1), sent[k : k + 1])
-    found = core.arrivals(range(4), z)
-    assert found.plain
-    assert found.z is z
-    assert same(found.gamma, heard & sent)
+    arrivals = core.arrivals(range(4), z)
+    assert arrivals.plain
+    assert arrivals.z is z
+    assert same(arrivals.gamma, heard & sent)
     assert heard.any()
     assert not heard.all()
 

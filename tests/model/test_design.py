@@ -51,10 +51,10 @@ def test_numerical_illustration(
     mu_e: float, bound: float, relative: tuple[float, float], difference: float | None, ratio: float | None
 ) -> None:
     """The four eavesdroppers of the numerical illustration, to 1e-4 and the bounds to 1e-6."""
-    found = design(UNSTABLE, 0.9, 0.6, [smart(mu_e)], slots=80)
-    against = found.eavesdroppers["smart"]
-    assert found.rho == pytest.approx(1.387799, abs=1e-6)
-    assert found.bound == pytest.approx(LOW, abs=1e-6)
+    result = design(UNSTABLE, 0.9, 0.6, [smart(mu_e)], slots=80)
+    against = result.eavesdroppers["smart"]
+    assert result.rho == pytest.approx(1.387799, abs=1e-6)
+    assert result.bound == pytest.approx(LOW, abs=1e-6)
     assert against.bound == pytest.approx(bound, abs=1e-6)
     assert len(against.relative) == 1
     assert against.relative[0] == pytest.approx(relative, abs=1e-4)
@@ -70,11 +70,11 @@ def test_optima_are_no_worse_than_any_other_choice() -> None:
         grid = np.linspace(LOW + 1e-4, 1.0, 2000)
         ours = np.array([J(UNSTABLE, 0.9, mu_d) for mu_d in grid])
         theirs = np.array([limit_trace(UNSTABLE, smart(mu_e).outcomes(mu_d)) for mu_d in grid])
-        for found, gains in (
+        for best, gains in (
             (best_difference(UNSTABLE, 0.9, smart(mu_e)), theirs - ours),
             (best_ratio(UNSTABLE, 0.9, smart(mu_e)), theirs / ours),
         ):
-            assert found == pytest.approx(grid[gains.argmax()], abs=2 * (grid[1] - grid[0]))
+            assert best == pytest.approx(grid[gains.argmax()], abs=2 * (grid[1] - grid[0]))
 
 
 qualities = st.floats(0.3, 1.0)
@@ -122,12 +122,12 @@ def test_perfect_secrecy_is_where_one_is_bounded_and_the_other_not(growth: float
 def test_a_misled_receiver_is_kept_out_perfectly() -> None:
     """Naive and suspicious are unbounded on the whole admissible range; a suspicious one never misled is as smart."""
     for adversary in (NAIVE, Adversary("suspicious", 0.95, 0.8, 0.3)):
-        found = design(UNSTABLE, 0.9, 0.6, [adversary], slots=80).eavesdroppers[adversary.name]
-        assert found.perfect == pytest.approx((LOW, 1.0), abs=1e-6)
-        (interval,) = found.relative
+        eavesdropper = design(UNSTABLE, 0.9, 0.6, [adversary], slots=80).eavesdroppers[adversary.name]
+        assert eavesdropper.perfect == pytest.approx((LOW, 1.0), abs=1e-6)
+        (interval,) = eavesdropper.relative
         assert interval == pytest.approx((LOW, 1.0), abs=1e-6)
-        assert found.best_difference is None
-        assert math.isinf(found.trace)
+        assert eavesdropper.best_difference is None
+        assert math.isinf(eavesdropper.trace)
     careful = Adversary("suspicious", 0.95, 0.9, 0.0)
     assert adversary_bound(UNSTABLE, careful) == pytest.approx(stability_bound(UNSTABLE, 0.95 * 0.9))
     assert math.isinf(adversary_bound(UNSTABLE, Adversary("weak", 0.4, 1.0, 1.0)))
@@ -138,9 +138,9 @@ def test_secrecy_in_every_slot_can_fail_early() -> None:
     for mu_e, last in ((0.95, 86), (0.99, 58)):
         best = best_difference(UNSTABLE, 0.9, smart(mu_e))
         assert best is not None
-        found = design(UNSTABLE, 0.9, best, [smart(mu_e)], slots=400).eavesdroppers["smart"]
-        assert found.violated == ((1, last),)
-        assert found.relative_from == last + 1
+        result = design(UNSTABLE, 0.9, best, [smart(mu_e)], slots=400).eavesdroppers["smart"]
+        assert result.violated == ((1, last),)
+        assert result.relative_from == last + 1
     equal = design(UNSTABLE, 0.9, 0.6, [smart(0.9)], slots=400).eavesdroppers["smart"]
     assert equal.violated == ()
     assert equal.relative_from == 1
@@ -173,33 +173,33 @@ def test_trace_that_cannot_be_kept_is_refused() -> None:
 
 def test_lossless_link() -> None:
     """With μ = 1 nothing costs: J ≡ 0, μ_d_min is the stability bound, everybody else is kept out relatively."""
-    found = design(UNSTABLE, 1.0, 0.6, [smart(0.9), NAIVE], slots=80, max_trace=1e-6)
-    assert found.trace == found.plain_trace == 0.0
-    assert found.cost == 1.0
-    assert found.minimum == found.bound == pytest.approx(0.480785, abs=1e-6)
-    against = found.eavesdroppers["smart"]
+    result = design(UNSTABLE, 1.0, 0.6, [smart(0.9), NAIVE], slots=80, max_trace=1e-6)
+    assert result.trace == result.plain_trace == 0.0
+    assert result.cost == 1.0
+    assert result.minimum == result.bound == pytest.approx(0.480785, abs=1e-6)
+    against = result.eavesdroppers["smart"]
     (interval,) = against.relative
-    assert interval == pytest.approx((found.bound, 1.0))
+    assert interval == pytest.approx((result.bound, 1.0))
     assert against.best_ratio is None
 
 
 def test_deaf_eavesdropper() -> None:
     """With μ_e = 0 no μ_d bounds its error, even of a marginally stable process."""
     for process in (UNSTABLE, MICROGRID):
-        found = design(process, 0.9, 0.6, [smart(0.0)], slots=80)
-        against = found.eavesdroppers["smart"]
+        result = design(process, 0.9, 0.6, [smart(0.0)], slots=80)
+        against = result.eavesdroppers["smart"]
         assert math.isinf(against.bound)
-        assert against.perfect == (found.bound, 1.0)
+        assert against.perfect == (result.bound, 1.0)
         assert against.as_dict()["bound"] is None
 
 
 def test_marginally_stable_process() -> None:
     """For ρ = 1 every μ_d > 0 is admissible, secrecy from smart is never perfect, and the ends have closed forms."""
-    found = design(MICROGRID, 0.6, 0.5, [smart(0.6)], slots=80)
-    assert found.admissible == (0.0, 1.0)
-    assert found.eavesdroppers["smart"].perfect is None
-    assert found.eavesdroppers["smart"].relative == ((0.0, 1.0),)
-    assert found.cost == pytest.approx(2.0)
+    result = design(MICROGRID, 0.6, 0.5, [smart(0.6)], slots=80)
+    assert result.admissible == (0.0, 1.0)
+    assert result.eavesdroppers["smart"].perfect is None
+    assert result.eavesdroppers["smart"].relative == ((0.0, 1.0),)
+    assert result.cost == pytest.approx(2.0)
     (interval,) = relative_secrecy(MICROGRID, 0.6, smart(0.9))
     assert interval == pytest.approx((0.0, 1 / 0.9 - (1 / 0.6 - 1)), abs=1e-9)
 
@@ -212,21 +212,21 @@ def test_rounded_eigenvalues_count_as_marginal(angle: float) -> None:
     turn = np.array([[c, -s], [s, c]])
     for A in (turn, turn @ np.array([[1.0, 0.1], [0.0, 1.0]]) @ turn.T):
         process = Process(A, np.eye(2), np.eye(2))
-        found = design(process, 0.9, 0.5, [smart(0.5), smart(0.0), NAIVE], slots=80)
-        assert found.bound == 0.0
-        assert found.eavesdroppers["naive"].trace == math.inf
+        result = design(process, 0.9, 0.5, [smart(0.5), smart(0.0), NAIVE], slots=80)
+        assert result.bound == 0.0
+        assert result.eavesdroppers["naive"].trace == math.inf
         assert perfect_secrecy(process, 0.9, smart(0.5)) is None
-        assert math.isinf(found.eavesdroppers["smart"].trace)
+        assert math.isinf(result.eavesdroppers["smart"].trace)
 
 
 def test_no_admissible_choice_is_said() -> None:
     """Below μ = 1 − ρ⁻² the design has no admissible μ_d, says why, and does not crash."""
-    found = design(UNSTABLE, 0.4, 0.6, [smart(0.9), smart(0.3)], slots=80)
-    assert found.admissible is None
-    assert found.remark is not None
-    assert "no μ_d is admissible" in found.remark
-    assert "0.480785" in found.remark
-    against = found.eavesdroppers["smart"]
+    result = design(UNSTABLE, 0.4, 0.6, [smart(0.9), smart(0.3)], slots=80)
+    assert result.admissible is None
+    assert result.remark is not None
+    assert "no μ_d is admissible" in result.remark
+    assert "0.480785" in result.remark
+    against = result.eavesdroppers["smart"]
     assert (against.perfect, against.relative, against.best_difference, against.best_ratio) == (None, (), None, None)
     assert math.isnan(against.difference)
     assert design(UNSTABLE, 0.9, 0.6, [], slots=80).remark is None
@@ -234,8 +234,8 @@ def test_no_admissible_choice_is_said() -> None:
 
 def test_dictionary_is_strict_json() -> None:
     """The JSON has exactly the promised keys, and null, never Infinity, for what is unbounded."""
-    found = design(UNSTABLE, 0.9, 0.5, [smart(0.85), NAIVE], slots=80)
-    data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    result = design(UNSTABLE, 0.9, 0.5, [smart(0.85), NAIVE], slots=80)
+    data = json.loads(json.dumps(result.as_dict(), allow_nan=False))
     assert set(data) == {"rho", "legitimate", "eavesdroppers"}
     assert set(data["legitimate"]) == {"bound", "trace"}
     assert data["legitimate"]["trace"] is None
@@ -268,10 +268,10 @@ def test_a_genie_is_designed_for_by_its_leak() -> None:
 
 def test_eavesdroppers_without_a_closed_form_are_named() -> None:
     """They cannot be designed for; what is known of a genie holds for them."""
-    found = design(UNSTABLE, 0.9, 0.6, [], slots=80)
-    assert found.omission is None
-    assert "left_out" not in found.as_dict()
-    other = replace(found, left_out={"eve": "bayesian", "mallory": "likelihood"})
+    result = design(UNSTABLE, 0.9, 0.6, [], slots=80)
+    assert result.omission is None
+    assert "left_out" not in result.as_dict()
+    other = replace(result, left_out={"eve": "bayesian", "mallory": "likelihood"})
     assert other.omission == (
         "left out: eve (bayesian), mallory (likelihood): no closed form of its error is known; a guarantee against a genie "
         "holds against every eavesdropper"

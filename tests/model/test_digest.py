@@ -51,12 +51,12 @@ def defined(beliefs: list[Belief], r: int) -> list[bytes]:
 def logged(beliefs: list[Belief], trials: int) -> dict[int, np.ndarray]:
     """Block, by its first slot → digests (R, 16), by the program, slot by slot."""
     log = BlockDigests(trials, len(beliefs))
-    found = {}
+    blocks = {}
     for k, belief in enumerate(beliefs):
         digests = log.add(range(k, k + 1), one_slot(belief))
         assert list(digests) == ([k // 256 * 256] if k % 256 == 255 or k == len(beliefs) - 1 else [])
-        found.update(digests)
-    return found
+        blocks.update(digests)
+    return blocks
 
 
 @settings(max_examples=examples(25), deadline=None)
@@ -64,14 +64,14 @@ def logged(beliefs: list[Belief], trials: int) -> dict[int, np.ndarray]:
 def test_digests_are_as_defined(slots: int, n: int, trials: int, seed: int) -> None:
     """Every block of every trial, and the receiver's digest ordered by trial, then block."""
     beliefs = random_beliefs(slots, n, trials, seed)
-    found = logged(beliefs, trials)
+    blocks = logged(beliefs, trials)
     expected = [defined(beliefs, r) for r in range(trials)]
-    assert {block: [bytes(row) for row in rows] for block, rows in found.items()} == {
-        256 * block: [one[block] for one in expected] for block in range(-(-slots // 256))
+    assert {block: [bytes(row) for row in rows] for block, rows in blocks.items()} == {
+        256 * block: [digests[block] for digests in expected] for block in range(-(-slots // 256))
     }
     whole = RunDigest()
-    whole.add(found)
-    assert whole.hexadecimal == sha256(b"".join(b"".join(one) for one in expected)).hexdigest()
+    whole.add(blocks)
+    assert whole.hexadecimal == sha256(b"".join(b"".join(digests) for digests in expected)).hexdigest()
 
 
 @pytest.mark.parametrize(("n", "trials"), [(2, 1), (2, 24), (2, 25), (2, 130), (20, 7), (20, 8), (20, 17)])
@@ -85,31 +85,31 @@ def test_digests_of_many_trials(n: int, trials: int) -> None:
 def test_trials_may_come_in_parts() -> None:
     """A run's digest does not depend on how many trials were computed at once, only on their order."""
     beliefs = random_beliefs(300, 2, 6, 9)
-    found = logged(beliefs, 6)
+    blocks = logged(beliefs, 6)
     whole, parts, swapped = RunDigest(), RunDigest(), RunDigest()
-    whole.add(found)
+    whole.add(blocks)
     for digest, order in ((parts, (slice(0, 2), slice(2, 6))), (swapped, (slice(2, 6), slice(0, 2)))):
         for part in order:
-            digest.add({block: rows[part] for block, rows in reversed(found.items())})
+            digest.add({block: rows[part] for block, rows in reversed(blocks.items())})
     assert parts.hexadecimal == whole.hexadecimal
     assert swapped.hexadecimal != whole.hexadecimal
 
 
 @settings(deadline=None)
 @given(st.integers(0, 2**31), st.sampled_from(["x_hat", "P", "gamma"]), st.data())
-def test_any_bit_counts(seed: int, what: str, data: st.DataObject) -> None:
+def test_any_bit_counts(seed: int, case: str, data: st.DataObject) -> None:
     """One changed bit of one trial in one slot changes that trial's digest and no other's."""
     beliefs = random_beliefs(5, 2, 3, seed)
     before = logged(beliefs, 3)[0]
     k, r = data.draw(st.integers(0, 4)), data.draw(st.integers(0, 2))
     x_hat, P, action, _ = beliefs[k]
-    if what == "gamma":
+    if case == "gamma":
         action[r] = 0 if action[r] else 1
     else:
-        changed = x_hat[1] if what == "x_hat" else P[0, 1]
+        changed = x_hat[1] if case == "x_hat" else P[0, 1]
         changed[r] = np.nextafter(changed[r], np.inf)
     after = logged(beliefs, 3)[0]
-    assert [not np.array_equal(one, other) for one, other in zip(before, after, strict=True)] == [
+    assert [not np.array_equal(digest, other) for digest, other in zip(before, after, strict=True)] == [
         i == r for i in range(3)
     ]
 
@@ -136,21 +136,21 @@ def test_a_block_may_be_digested_in_parts(cuts: list[int], trials: int, seed: in
     parts = PartialDigests(trials)
     bounds = [0, *sorted(set(cuts)), 40]
     for first, end in itertools.pairwise(bounds):
-        x_hat, P, action = (np.array([one[i] for one in beliefs[first:end]]) for i in range(3))
+        x_hat, P, action = (np.array([belief[i] for belief in beliefs[first:end]]) for i in range(3))
         parts.add(x_hat, P, action)
     whole = PartialDigests(trials)
-    whole.add(*(np.array([one[i] for one in beliefs]) for i in range(3)))
-    found = whole.finished()
-    assert np.array_equal(parts.finished(), found)
-    assert bytes(found[-1]) == defined(beliefs, trials - 1)[0]
+    whole.add(*(np.array([belief[i] for belief in beliefs]) for i in range(3)))
+    finished = whole.finished()
+    assert np.array_equal(parts.finished(), finished)
+    assert bytes(finished[-1]) == defined(beliefs, trials - 1)[0]
 
 
 def test_what_is_held_is_a_copy() -> None:
     """The caller may overwrite the arrays that it has added."""
     beliefs = random_beliefs(40, 2, 3, 6)
     parts, place = PartialDigests(3), Beliefs(np.empty((1, 2, 3)), np.empty((1, 2, 2, 3)), np.empty((1, 3), np.uint8))
-    for one in beliefs:
-        place.x_hat[0], place.P[0], place.action[0] = one.x_hat, one.P, one.action
+    for belief in beliefs:
+        place.x_hat[0], place.P[0], place.action[0] = belief.x_hat, belief.P, belief.action
         parts.add(*place)
     assert np.array_equal(parts.finished(), logged(beliefs, 3)[0])
 
@@ -182,7 +182,7 @@ def test_parts_of_a_block_have_its_digests(bounds: tuple[int, ...]) -> None:
     beliefs = random_beliefs(bounds[-1], 2, 3, 5)
     parts = PartialDigests(3)
     for first, end in itertools.pairwise(bounds):
-        parts.add(*(np.array([one[i] for one in beliefs[first:end]]) for i in range(3)))
+        parts.add(*(np.array([belief[i] for belief in beliefs[first:end]]) for i in range(3)))
     assert [bytes(row) for row in parts.finished()] == [defined(beliefs, r)[0] for r in range(3)]
 
 
@@ -191,12 +191,12 @@ def test_digests_of_inputs_are_as_defined(slots: int) -> None:
     """For each slot whether the decision failed, one byte, and the inputs as little-endian float64."""
     rng = np.random.default_rng(2)
     u, failed = rng.standard_normal((slots, 2, 3)), rng.random((slots, 3)) < 0.5
-    log, found = InputLog(2, 3, slots), {}
+    log, blocks = InputLog(2, 3, slots), {}
     for k in range(slots):
         if (digests := log.add(k, u[k], failed[k])) is not None:
-            found[digests[0]] = [bytes(row) for row in digests[1]]
-    assert list(found) == list(range(0, slots, BLOCK_SLOTS))
-    for start, rows in found.items():
+            blocks[digests[0]] = [bytes(row) for row in digests[1]]
+    assert list(blocks) == list(range(0, slots, BLOCK_SLOTS))
+    for start, rows in blocks.items():
         block = range(start, min(start + BLOCK_SLOTS, slots))
         for r, row in enumerate(rows):
             record = b"".join(struct.pack("<Bdd", int(failed[k, r]), *u[k, :, r]) for k in block)

@@ -32,9 +32,9 @@ MIXED = Process(TURNED @ np.diag([1.3, 1.1, 1.0, 0.6]) @ TURNED.T, np.eye(4), np
 )
 def test_an_error_grows_where_it_is_kept_longer_than_it_shrinks(outcomes: Outcomes, grows: list[bool]) -> None:
     """By eigenvectors, against the recursion over 3000 slots; a direction between them touches both."""
-    found = growth(MIXED, outcomes)
-    assert [found.along(v) for v in TURNED.T] == grows
-    assert found.along(TURNED[:, 3] + TURNED[:, 0]) is grows[0]
+    result = growth(MIXED, outcomes)
+    assert [result.along(v) for v in TURNED.T] == grows
+    assert result.along(TURNED[:, 3] + TURNED[:, 0]) is grows[0]
     # Along the axes, where no rounding of a direction that grows gets into another.
     late = theoretical_covariances(replace(MIXED, A=np.diag([1.3, 1.1, 1.0, 0.6])), outcomes, 900)[[300, 899]]
     for i, expected in enumerate(grows):
@@ -45,14 +45,14 @@ def test_an_error_grows_where_it_is_kept_longer_than_it_shrinks(outcomes: Outcom
 def test_a_direction_is_not_an_eigenvector() -> None:
     """A triangular A: the second state drives the first, so an error of the second direction alone stays bounded."""
     process = Process(np.array([[1.2, 1.0], [0.0, 0.5]]), np.eye(2), np.eye(2))
-    found = growth(process, NOBODY)
-    assert found.along(np.array([1.0, 0.0])) is True
-    assert found.along(np.array([0.0, 1.0])) is False
+    result = growth(process, NOBODY)
+    assert result.along(np.array([1.0, 0.0])) is True
+    assert result.along(np.array([0.0, 1.0])) is False
     turned = Process(process.A.T, np.eye(2), np.eye(2))
-    found = growth(turned, NOBODY)
-    assert [found.along(v) for v in np.eye(2)] == [True, True]  # the first state drives the second
+    result = growth(turned, NOBODY)
+    assert [result.along(v) for v in np.eye(2)] == [True, True]  # the first state drives the second
     # The left eigenvector of 0.5 is orthogonal to the right one of 1.2.
-    assert found.along(np.array([-1.0, 0.7])) is False
+    assert result.along(np.array([-1.0, 0.7])) is False
 
 
 def test_what_is_not_observed_grows() -> None:

@@ -62,12 +62,12 @@ def parts(belief: Belief) -> list[NDArray[Any]]:
 
 def beliefs(name: str, batch: Batch, gamma: np.ndarray, z: np.ndarray) -> list[Belief]:
     """After every slot."""
-    one = receiver(name, batch)
-    belief, found = one.prior(), []
+    reader = receiver(name, batch)
+    belief, followed = reader.prior(), []
     for k in range(batch.slots):
-        belief = one.step(k, belief, heard(name, k, gamma[k], z[k]))
-        found.append(Belief(belief.x_hat.copy(), belief.P.copy(), belief.action.copy()))
-    return found
+        belief = reader.step(k, belief, heard(name, k, gamma[k], z[k]))
+        followed.append(Belief(belief.x_hat.copy(), belief.P.copy(), belief.action.copy()))
+    return followed
 
 
 def heard(name: str, k: int, gamma: np.ndarray, z: np.ndarray) -> Reception:
@@ -102,7 +102,7 @@ def test_estimate_and_reported_covariance_are_the_papers(name: str, seed: int, f
     """Used: (z, 0); lost or discarded: (A x̂, A P Aᵀ + Q); before slot 0: (0, Σ0), not predicted."""
     slots, A, Q = 12, PROCESS.A, PROCESS.Q
     gamma, z = events(slots, 2, seed)
-    found = beliefs(name, Batch(slots, 2, first), gamma, z)
+    followed = beliefs(name, Batch(slots, 2, first), gamma, z)
     for r in range(2):
         x_hat, P = np.zeros(2), PROCESS.initial_covariance
         for k in range(slots):
@@ -113,9 +113,9 @@ def test_estimate_and_reported_covariance_are_the_papers(name: str, seed: int, f
                 action = Action.STATE if uses(name, k, first + r) else Action.DISCARDED
             if action == Action.STATE:
                 x_hat, P = z[k, :, r], np.zeros((2, 2))
-            assert found[k].action[r] == action
-            assert np.allclose(found[k].x_hat[:, r], x_hat, rtol=1e-12, atol=1e-13)
-            assert np.allclose(found[k].P[:, :, r], P, rtol=1e-12, atol=1e-15)
+            assert followed[k].action[r] == action
+            assert np.allclose(followed[k].x_hat[:, r], x_hat, rtol=1e-12, atol=1e-13)
+            assert np.allclose(followed[k].P[:, :, r], P, rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.parametrize("name", mostly_long(PARAMETERS, {*PARAMETERS} - TESTED_ELSEWHERE))
@@ -128,10 +128,10 @@ def test_a_trial_alone_is_the_same_trial(name: str) -> None:
     for first, count in ((77, 1), (44 + trials, 6)):
         part = slice(first - 50, first - 50 + count)
         alone = beliefs(name, Batch(slots, count, first), gamma[:, part].copy(), z[:, :, part].copy())
-        for one, other in zip(alone, among, strict=True):
-            assert one.x_hat.tobytes() == other.x_hat[:, part].tobytes()
-            assert one.P.tobytes() == other.P[:, :, part].tobytes()
-            assert np.array_equal(one.action, other.action[part])
+        for own, other in zip(alone, among, strict=True):
+            assert own.x_hat.tobytes() == other.x_hat[:, part].tobytes()
+            assert own.P.tobytes() == other.P[:, :, part].tobytes()
+            assert np.array_equal(own.action, other.action[part])
 
 
 @pytest.mark.parametrize("name", mostly_long(PARAMETERS, {*PARAMETERS} - {"learning-em"}))
@@ -139,24 +139,24 @@ def test_what_is_lost_does_not_matter(name: str) -> None:
     """Of a packet that was lost not a bit enters the belief, not even NaN."""
     gamma, z = events(40, 30)
     poisoned = np.where(gamma[:, None, :], z, np.nan)
-    for one, other in zip(
+    for belief, other in zip(
         beliefs(name, Batch(40, 30), gamma, z), beliefs(name, Batch(40, 30), gamma, poisoned), strict=True
     ):
-        assert all(left.tobytes() == right.tobytes() for left, right in zip(parts(one), parts(other), strict=True))
+        assert all(left.tobytes() == right.tobytes() for left, right in zip(parts(belief), parts(other), strict=True))
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_a_slot_can_be_computed_again(name: str) -> None:
     """Same belief in, same bits out, also after later slots; and what went in is not changed by it."""
     gamma, z = events(30, 20)
-    one, kept = receiver(name, Batch(30, 20)), []
-    belief = one.prior()
+    reader, kept = receiver(name, Batch(30, 20)), []
+    belief = reader.prior()
     for k in range(30):
         kept.append((belief, [part.tobytes() for part in (*parts(belief), *belief.memory)]))
-        belief = one.step(k, belief, heard(name, k, gamma[k], z[k]))
+        belief = reader.step(k, belief, heard(name, k, gamma[k], z[k]))
     kept.append((belief, [part.tobytes() for part in (*parts(belief), *belief.memory)]))
     for k in (29, 11, 12, 0, 7, 1):
-        again = one.step(k, kept[k][0], heard(name, k, gamma[k], z[k]))
+        again = reader.step(k, kept[k][0], heard(name, k, gamma[k], z[k]))
         assert [part.tobytes() for part in (*parts(again), *again.memory)] == kept[k + 1][1]
     for belief, before in kept:
         assert [part.tobytes() for part in (*parts(belief), *belief.memory)] == before
@@ -166,11 +166,11 @@ def test_a_slot_can_be_computed_again(name: str) -> None:
 def test_what_it_remembers_has_the_trials_last(name: str) -> None:
     """Of any shape, so that a network can hand a batch's memory on, or a part of it."""
     gamma, z = events(12, 20)
-    one = receiver(name, Batch(12, 20))
-    belief = one.prior()
+    reader = receiver(name, Batch(12, 20))
+    belief = reader.prior()
     for k in range(12):
         assert all(part.shape[-1] == 20 for part in belief.memory)
-        belief = one.step(k, belief, heard(name, k, gamma[k], z[k]))
+        belief = reader.step(k, belief, heard(name, k, gamma[k], z[k]))
     assert np.array_equal(belief.action == Action.LOST, ~gamma[11])
 
 
@@ -193,7 +193,7 @@ def test_it_needs_what_it_names_and_no_more(name: str) -> None:
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_who_looks_at_packets_says_so(name: str) -> None:
     """The action of a taker is known from γ; that of a reader is not, and asking for it is an error."""
-    one, gamma = receiver(name, Batch(2, 3)), np.ones(3, bool)
+    reader, gamma = receiver(name, Batch(2, 3)), np.ones(3, bool)
     follows = STRATEGIES[name].follows_gamma(PARAMETERS[name])
     assert follows == (name in {*TAKERS, "colluding"})
     if name in {
@@ -209,9 +209,11 @@ def test_who_looks_at_packets_says_so(name: str) -> None:
         "replay-informed",
     }:
         with pytest.raises(NotImplementedError, match="γ alone does not tell its action"):
-            one.act(0, gamma)
+            reader.act(0, gamma)
     else:
-        assert np.array_equal(one.act(0, gamma), one.step(0, one.prior(), Reception(gamma, np.zeros((2, 3)))).action)
+        assert np.array_equal(
+            reader.act(0, gamma), reader.step(0, reader.prior(), Reception(gamma, np.zeros((2, 3)))).action
+        )
 
 
 def test_a_delegate_is_its_reader() -> None:
@@ -219,7 +221,9 @@ def test_a_delegate_is_its_reader() -> None:
     gamma, z = events(12, 9)
     for name, twin in (("colluding", "smart"), ("replay-informed", "bayesian")):
         pairs = list(zip(beliefs(name, Batch(12, 9), gamma, z), beliefs(twin, Batch(12, 9), gamma, z), strict=True))
-        same = [all(np.array_equal(a, b) for a, b in zip(parts(one), parts(two), strict=True)) for one, two in pairs]
+        same = [
+            all(np.array_equal(a, b) for a, b in zip(parts(first), parts(two), strict=True)) for first, two in pairs
+        ]
         assert same[:LEARNS_AT] == [True] * LEARNS_AT
         assert same[LEARNS_AT] == (name == "colluding")
     assert set(STRATEGIES) == {*READERS, "colluding", "replay-informed"}
@@ -230,12 +234,12 @@ def test_use_probabilities_are_what_it_does(name: str) -> None:
     """P(b = 1 given ν) of theory is how often it uses states and innovations: binomial, at 1e-6 confidence."""
     slots, trials = 60, 2000
     batch = Batch(slots, trials)
-    one = receiver(name, batch)
-    belief = one.prior()
+    reader = receiver(name, batch)
+    belief = reader.prior()
     nu = uniforms(Stream(KEYS["schedule"], range(trials), 1).words(range(slots)))[:, :, 0] >= MU_D
     used = np.empty((slots, trials), bool)
     for k in range(slots):
-        belief = one.step(k, belief, Reception(np.ones(trials, bool), np.zeros((2, trials))))
+        belief = reader.step(k, belief, Reception(np.ones(trials, bool), np.zeros((2, trials))))
         used[k] = belief.action == Action.STATE
     taker = STRATEGIES[name]
     assert issubclass(taker, PacketTaker)
@@ -255,10 +259,10 @@ def test_certain_suspicion_is_smart_or_naive() -> None:
     """With μ_b = 1 the suspicious one is smart at μ̄_b = 0 and naive at μ̄_b = 1, to the bit."""
     gamma, z = events(50, 20)
     for use_innovation, twin in ((0.0, "smart"), (1.0, "naive")):
-        one = receiver("suspicious", Batch(50, 20), use_state=1.0, use_innovation=use_innovation)
-        belief = one.prior()
+        reader = receiver("suspicious", Batch(50, 20), use_state=1.0, use_innovation=use_innovation)
+        belief = reader.prior()
         for k, expected in enumerate(beliefs(twin, Batch(50, 20), gamma, z)):
-            belief = one.step(k, belief, Reception(gamma[k], z[k]))
+            belief = reader.step(k, belief, Reception(gamma[k], z[k]))
             assert all(np.array_equal(left, right) for left, right in zip(parts(belief), parts(expected), strict=True))
 
 
@@ -272,5 +276,5 @@ def test_a_betrayed_state_is_asked_for_by_its_slot() -> None:
 
 def test_closed_forms_of_readers_are_known_or_not() -> None:
     """A taker has one by definition, the genie by its leak; a delegate has its reader's."""
-    known = {name for name in STRATEGIES if STRATEGIES[name].outcomes(PARAMETERS[name], MU_D) is not None}
-    assert known == {*TAKERS, "genie", "colluding"}
+    names = {name for name in STRATEGIES if STRATEGIES[name].outcomes(PARAMETERS[name], MU_D) is not None}
+    assert names == {*TAKERS, "genie", "colluding"}

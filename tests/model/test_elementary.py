@@ -21,8 +21,8 @@ ENTRIES = st.floats(-10, 10, allow_subnormal=False).map(lambda v: round(v, 6))
 @given(st.lists(POSITIVE, min_size=1, max_size=50))
 def test_log_is_within_one_unit_in_the_last_place(x: list[float]) -> None:
     """The logarithm is math.log's to one unit in the last place."""
-    for found, expected in zip(log(np.array(x)).tolist(), map(math.log, x), strict=True):
-        assert abs(found - expected) <= math.ulp(expected)
+    for actual, expected in zip(log(np.array(x)).tolist(), map(math.log, x), strict=True):
+        assert abs(actual - expected) <= math.ulp(expected)
 
 
 def test_log_at_landmarks() -> None:
@@ -41,8 +41,8 @@ def test_log_at_landmarks() -> None:
 @given(st.lists(st.floats(-745.0, 709.7), min_size=1, max_size=50))
 def test_exp_is_within_one_unit_in_the_last_place(x: list[float]) -> None:
     """The exponential is math.exp's to one unit in the last place, subnormal results too."""
-    for found, expected in zip(exp(np.array(x)).tolist(), map(math.exp, x), strict=True):
-        assert abs(found - expected) <= math.ulp(expected)
+    for actual, expected in zip(exp(np.array(x)).tolist(), map(math.exp, x), strict=True):
+        assert abs(actual - expected) <= math.ulp(expected)
 
 
 def test_exp_at_landmarks() -> None:
@@ -58,17 +58,17 @@ def test_exp_at_landmarks() -> None:
 @given(st.lists(PROBABILITIES, min_size=1, max_size=50))
 def test_quantile_is_scipys(u: list[float]) -> None:
     """The normal quantile agrees with scipy's to 1e-14, relatively."""
-    found, expected = normal_quantile(np.array(u)), ndtri(np.array(u))
-    assert np.allclose(found, expected, rtol=1e-14, atol=1e-15)
+    result, expected = normal_quantile(np.array(u)), ndtri(np.array(u))
+    assert np.allclose(result, expected, rtol=1e-14, atol=1e-15)
 
 
 def test_quantile_in_every_region() -> None:
     """A fine grid through centre, tails and far tails: 1e-14 of scipy, rising, and odd about one half."""
     u = np.concatenate([np.linspace(1e-6, 0.5, 100_000), 2.0 ** -np.arange(2, 54.0)])
-    found = normal_quantile(u)
-    assert np.allclose(found, ndtri(u), rtol=1e-14, atol=1e-15)
+    result = normal_quantile(u)
+    assert np.allclose(result, ndtri(u), rtol=1e-14, atol=1e-15)
     order = np.argsort(u)
-    assert np.all(np.diff(found[order]) >= 0)
+    assert np.all(np.diff(result[order]) >= 0)
     dyadic = np.arange(1, 2**12) / 2**13
     assert np.array_equal(normal_quantile(1.0 - dyadic), -normal_quantile(dyadic))
 

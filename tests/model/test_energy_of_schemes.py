@@ -30,22 +30,22 @@ def test_every_scheme_says_which_packets_it_encrypts() -> None:
     for name in SCHEMES:
         scheme = scheme_of(PROCESS, {"scheme": name, **SCHEMES[name].parameters})
         played = play(scheme, Batch(20, 30), {"legitimate": gamma})
-        found = scheme.encrypted(PacketBlock.of(played.packets))
-        assert found.shape == (20, 30)
+        encrypted = scheme.encrypted(PacketBlock.of(played.packets))
+        assert encrypted.shape == (20, 30)
         if name == "cipher":
-            assert found.all()
+            assert encrypted.all()
         elif name == "encrypted-schedule":
-            assert found[0].all()
-            assert not found.all()
-            assert np.array_equal(found[1:], ~gamma[:-1])  # θ = 2: where the packet before was lost
+            assert encrypted[0].all()
+            assert not encrypted.all()
+            assert np.array_equal(encrypted[1:], ~gamma[:-1])  # θ = 2: where the packet before was lost
         elif name == "quantised-schedule":
-            assert found[0].all()
-            assert found[1:][~gamma[:-1]].all()  # θ = 1.5: there, and where a coin says so
-            assert 0.4 < found[1:][gamma[:-1]].mean() < 0.6
+            assert encrypted[0].all()
+            assert encrypted[1:][~gamma[:-1]].all()  # θ = 1.5: there, and where a coin says so
+            assert 0.4 < encrypted[1:][gamma[:-1]].mean() < 0.6
         elif name == "partial-encryption":
-            assert np.array_equal(found, ~np.array([packet.nu for packet in played.packets]))
+            assert np.array_equal(encrypted, ~np.array([packet.nu for packet in played.packets]))
         else:
-            assert not found.any()
+            assert not encrypted.any()
 
 
 def test_packets_that_are_not_sent_are_not_counted() -> None:

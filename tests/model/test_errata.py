@@ -230,5 +230,5 @@ def test_item_8_every_slot_fails_early(mu_e: float, last: int) -> None:
     smart = Adversary("smart", mu_e, 1.0, 0.0)
     best = best_difference(EXAMPLE, MU, smart)
     assert best is not None
-    found = design(EXAMPLE, MU, best, [smart], slots=1000).eavesdroppers["smart"]
-    assert found.violated == ((1, last),)
+    result = design(EXAMPLE, MU, best, [smart], slots=1000).eavesdroppers["smart"]
+    assert result.violated == ((1, last),)

@@ -81,9 +81,9 @@ def odds_of(outcomes: Outcomes) -> Callable[[str], Fraction]:
     return lambda name: Fraction(float(getattr(outcomes, name)))
 
 
-def close(found: float, expected: Fraction, by: Fraction = CLOSE) -> bool:
+def close(value: float, expected: Fraction, by: Fraction = CLOSE) -> bool:
     """Whether a number is the fraction, to ten digits."""
-    return abs(Fraction(float(found)) - expected) <= by * abs(expected)
+    return abs(Fraction(float(value)) - expected) <= by * abs(expected)
 
 
 probabilities = st.floats(0.0, 1.0)
@@ -101,19 +101,19 @@ def test_the_process_that_a_recursion_of_inverses_got_wrong() -> None:
     outcomes = Outcomes.genie(0.9, 0.9)
     A, Q, initial = exact(process.A), exact(process.Q), exact(process.initial_covariance)
     expected = [trace(E) for E in rationals.expectations(A, Q, initial, odds_of(outcomes), 60)]
-    found = theoretical_traces(process, outcomes, 60)
-    assert all(close(one, value) for one, value in zip(found, expected, strict=True))
-    assert np.all(theoretical_traces(process, Outcomes.legitimate(0.9, 0.9), 60)[1:] < found[1:])
+    result = theoretical_traces(process, outcomes, 60)
+    assert all(close(actual, value) for actual, value in zip(result, expected, strict=True))
+    assert np.all(theoretical_traces(process, Outcomes.legitimate(0.9, 0.9), 60)[1:] < result[1:])
 
 
 @settings(deadline=None, max_examples=examples(40))
 @given(models(), receivers)
 def test_expectations(model: Model, outcomes: Outcomes) -> None:
     """The covariances of each receiver's error and belief, in each slot."""
-    for one in (outcomes, outcomes.reported):
-        expected = rationals.expectations(model.A, model.Q, model.initial, odds_of(one), SLOTS)
-        found = theoretical_traces(model.process, one, SLOTS)
-        assert all(close(value, trace(E)) for value, E in zip(found, expected, strict=True))
+    for frequencies in (outcomes, outcomes.reported):
+        expected = rationals.expectations(model.A, model.Q, model.initial, odds_of(frequencies), SLOTS)
+        result = theoretical_traces(model.process, frequencies, SLOTS)
+        assert all(close(value, trace(E)) for value, E in zip(result, expected, strict=True))
 
 
 @settings(deadline=None, max_examples=examples(20))
@@ -154,7 +154,7 @@ def test_what_a_leak_leaves_beyond_the_largest_double() -> None:
     for _ in range(40):
         M, expected = remaining.next(), rationals.remaining(exact(Q), next(sigmas))
         for i, row in enumerate(expected):
-            assert all(close(found, value) for found, value in zip(M[i], row, strict=True))
+            assert all(close(actual, value) for actual, value in zip(M[i], row, strict=True))
     for _ in range(20_000):
         M = remaining.next()
     assert np.allclose(M, remaining_limit(process), rtol=1e-12, atol=0.0)
@@ -209,12 +209,12 @@ def test_bursts(model: Model, p: float, r: float, good: float, bad: float, kind:
         model.Q,
         model.initial,
         exact(transitions),
-        [Fraction(float(one)) for one in distribution],
+        [Fraction(float(probability)) for probability in distribution],
         [odds_of(at(good)), odds_of(at(bad))],
         SLOTS,
     )
-    found = ModulatedCovariance(model.process, LinkDistribution.steady(chain), at).next_traces(SLOTS)
-    assert all(close(one, value) for one, value in zip(found, expected, strict=True))
+    traces = ModulatedCovariance(model.process, LinkDistribution.steady(chain), at).next_traces(SLOTS)
+    assert all(close(actual, value) for actual, value in zip(traces, expected, strict=True))
 
 
 @settings(deadline=None, max_examples=examples(20))
@@ -224,8 +224,8 @@ def test_limits_behind_bursts(model: Model, p: float, r: float, good: float) -> 
     transitions = np.array([[1.0 - p, p], [r, 1.0 - r]])
     distribution = np.array([r, p]) / (p + r)
     outcomes = [Outcomes.legitimate(good, 0.6), Outcomes.legitimate(0.0, 0.6)]
-    T, weights = exact(transitions), [Fraction(float(one)) for one in distribution]
-    n, kept = model.process.n, [Fraction(one.kept) for one in outcomes]
+    T, weights = exact(transitions), [Fraction(float(probability)) for probability in distribution]
+    n, kept = model.process.n, [Fraction(outcome.kept) for outcome in outcomes]
     places = [(s, i, j) for s in range(2) for i in range(n) for j in range(n)]
     equations = [
         [
@@ -237,11 +237,11 @@ def test_limits_behind_bursts(model: Model, p: float, r: float, good: float) -> 
     source = [[weights[s] * Fraction(outcomes[s].predicted) * model.Q[i][j]] for s, i, j in places]
     solution = [row[0] for row in rationals.times(rationals.inverted(equations), source)]
     expected = sum((value for value, (_, i, j) in zip(solution, places, strict=True) if i == j), Fraction(0))
-    found = limit_behind(
+    result = limit_behind(
         model.process, Chain(transitions, distribution, np.array([good, 0.0])), lambda q: Outcomes.legitimate(q, 0.6)
     )
     amplified = 1 + expected / trace(model.Q)
-    assert close(found, expected, CLOSE * amplified)
+    assert close(result, expected, CLOSE * amplified)
 
 
 @settings(deadline=None, max_examples=examples(20))
@@ -259,7 +259,7 @@ def test_the_bound_of_twin_tracks(model: Model) -> None:
 def test_readers_of_references(model: Model, received: float, heard: float, unheard: float) -> None:
     """P is a reference's or a predicted error, and the reference is the error at the last acknowledgement."""
     acknowledged = (heard * received, unheard * (1.0 - received))
-    found = reference_covariances(model.process, received, acknowledged, SLOTS)
+    result = reference_covariances(model.process, received, acknowledged, SLOTS)
     hears, alone = Fraction(received), Fraction(acknowledged[1])
     P = R = [[Fraction(0)] * model.process.n for _ in range(model.process.n)]
     for k in range(SLOTS):
@@ -267,7 +267,7 @@ def test_readers_of_references(model: Model, received: float, heard: float, unhe
         carried = rationals.congruent(model.A, R)
         P = rationals.rounded(rationals.combined((hears, carried), (1 - hears, predicted)))
         R = rationals.rounded(rationals.combined((1 - alone, carried), (alone, predicted)))
-        assert close(float(np.trace(found[k])), trace(P))
+        assert close(float(np.trace(result[k])), trace(P))
 
 
 @settings(deadline=None, max_examples=examples(20))
@@ -279,10 +279,10 @@ def test_schedules_by_holding_time(
     acknowledged = (fraction * received, 0.5 * (1.0 - received))
     chain = (encrypted_schedule if encrypted else scheduled)(threshold, received, acknowledged)
     carried, all_ways = exact(chain.carried), exact(chain.carried + chain.reset)
-    distribution = [Fraction(float(one)) for one in chain.start]
+    distribution = [Fraction(float(probability)) for probability in chain.start]
     n, states = model.process.n, len(distribution)
     parts = [[[Fraction(0)] * n for _ in range(n)] for _ in distribution]
-    found = chain.covariances(model.process, SLOTS)
+    covariances = chain.covariances(model.process, SLOTS)
     for k in range(SLOTS):
         source = model.Q if k else model.initial
         grown = [
@@ -296,7 +296,7 @@ def test_schedules_by_holding_time(
         distribution = [
             sum((distribution[r] * all_ways[r][s] for r in range(states)), Fraction(0)) for s in range(states)
         ]
-        assert close(float(np.trace(found[k])), sum((trace(part) for part in parts), Fraction(0)))
+        assert close(float(np.trace(covariances[k])), sum((trace(part) for part in parts), Fraction(0)))
     late = chain.covariances(model.process, 2000)[-PERIODS:].mean(axis=0)
     assert np.trace(chain.limit(model.process)) == pytest.approx(np.trace(late), rel=1e-9)
 
@@ -314,8 +314,8 @@ def test_the_limiting_distribution(mu: float, mu_d: float, innovations: int, dro
     word = p_i**innovations * p_d ** (drops + 1) * synchronised
     assert close(word_probability(mu, mu_d, innovations, drops), word) or word < Fraction(1, 10**300)
     steps = [synchronised, *(p_d * synchronised * (p_i + p_d) ** (i - 1) for i in range(1, 6))]
-    for found, expected in zip(step_probabilities(mu, mu_d, 6), steps, strict=True):
-        assert close(found, expected) or expected < Fraction(1, 10**300)
+    for actual, expected in zip(step_probabilities(mu, mu_d, 6), steps, strict=True):
+        assert close(actual, expected) or expected < Fraction(1, 10**300)
 
 
 @pytest.mark.parametrize("excess", [1e-3, 1e-5])
@@ -336,5 +336,5 @@ def test_limits_near_the_bound_of_stability(excess: float) -> None:
 def test_expectations_of_many_processes(model: Model, outcomes: Outcomes) -> None:
     """As above, with more processes and states."""
     expected = rationals.expectations(model.A, model.Q, model.initial, odds_of(outcomes), SLOTS)
-    found = theoretical_traces(model.process, outcomes, SLOTS)
-    assert all(close(value, trace(E)) for value, E in zip(found, expected, strict=True))
+    result = theoretical_traces(model.process, outcomes, SLOTS)
+    assert all(close(value, trace(E)) for value, E in zip(result, expected, strict=True))

@@ -135,7 +135,7 @@ def test_the_upper_bound_of_the_random_policy(process: Process, open_loop: bool)
         (mu, heard ^ other, FLIP, (mu * (1 - FLIP), (1 - mu) * FLIP)),
         (mu_e, other, q, (q * mu_e, q * (1 - mu_e))),
     ):
-        factors = [np.where(one, p, 1 - p) for one, p in ((heard, quality), (other, chance), (plain, alpha))]
+        factors = [np.where(happened, p, 1 - p) for happened, p in ((heard, quality), (other, chance), (plain, alpha))]
         chances = np.prod(factors, axis=(0, 1))
         assert chances.sum() == pytest.approx(1.0)
         L = None if open_loop else code.at
@@ -163,10 +163,10 @@ def test_the_upper_bound_holds_in_simulation() -> None:
     """The mean traces of both receivers after some slots, above by many standard errors, and of the same size."""
     alpha, code = 0.5, ReferenceCode(STABLE)
     means = mean_traces(STABLE, TransmissionPolicy(alpha=alpha), (0.8, 0.6), 400, 50)
-    for found, quality, acknowledged in zip(means, (0.8, 0.6), ((0.72, 0.02), (0.74 * 0.6, 0.74 * 0.4)), strict=True):
+    for mean, quality, acknowledged in zip(means, (0.8, 0.6), ((0.72, 0.02), (0.74 * 0.6, 0.74 * 0.4)), strict=True):
         bound = np.trace(reference_covariances(STABLE, quality, acknowledged, 100, alpha, code.at)[50:].mean(axis=0))
-        assert found.mean() + 5.0 * found.std() / 20.0 < bound
-        assert bound < 3.0 * found.mean()
+        assert mean.mean() + 5.0 * mean.std() / 20.0 < bound
+        assert bound < 3.0 * mean.mean()
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.3, 0.5])
@@ -174,13 +174,13 @@ def test_the_limit_of_the_upper_bound(alpha: float) -> None:
     """With L = A: that of the recursion, unbounded from the factor 1 on, and that of `plain` if no acknowledgement is forged."""
     for process in (STABLE, MIXED, UNSTABLE):
         for quality, acknowledged in ((0.8, (0.72, 0.02)), (0.6, (0.444, 0.296))):
-            found = reference_limit(process, quality, acknowledged, alpha)
+            result = reference_limit(process, quality, acknowledged, alpha)
             late = np.trace(reference_covariances(process, quality, acknowledged, 400, alpha)[[300, 399]], 0, 1, 2)
-            if np.isinf(found):
+            if np.isinf(result):
                 assert process is not STABLE
                 assert late[1] > 1.01 * late[0]
             else:
-                assert late[1] == pytest.approx(found, rel=1e-9)
+                assert late[1] == pytest.approx(result, rel=1e-9)
     spared = theoretical_covariances(UNSTABLE, Outcomes.plain(0.8), 400)[-1]
     assert reference_limit(UNSTABLE, 0.8, (0.8, 0.0), alpha) == pytest.approx(np.trace(spared))
 
@@ -195,8 +195,8 @@ def test_a_limit_that_is_too_large_is_not_computed() -> None:
 
 def test_without_unencrypted_states_the_bound_is_the_expectation() -> None:
     """α = 0 and L = A: the recursion of state-secrecy codes."""
-    found = reference_covariances(UNSTABLE, 0.9, (0.6, 0.1), 5, 0.0, lambda _: UNSTABLE.A)
-    assert np.array_equal(found, reference_covariances(UNSTABLE, 0.9, (0.6, 0.1), 5))
+    result = reference_covariances(UNSTABLE, 0.9, (0.6, 0.1), 5, 0.0, lambda _: UNSTABLE.A)
+    assert np.array_equal(result, reference_covariances(UNSTABLE, 0.9, (0.6, 0.1), 5))
 
 
 PUBLISHED = [
@@ -230,14 +230,14 @@ def traces_of(
     mu_e: float, policy: dict[str, float], slots: int, trials: int, out: Path
 ) -> tuple[np.ndarray, np.ndarray]:
     """The mean of tr P over the slots, both receivers, and its standard error, by the means over slots of each."""
-    found = montecarlo(checked(flipped(mu_e, policy, slots=slots, seed=3), "it"), trials=trials, out=out)
-    table = found.slots.to_pydict()
+    result = montecarlo(checked(flipped(mu_e, policy, slots=slots, seed=3), "it"), trials=trials, out=out)
+    table = result.slots.to_pydict()
     means = {name: [] for name in ("legitimate", "eve")}  # type: dict[str, list[float]]
     for peer, trace, slot in zip(table["peer"], table["mean_trace_covariance"], table["slot"], strict=True):
         if slot >= 50:  # from then on it is stationary
             means[peer].append(trace)
     # Blocks of 50 slots are nearly independent.
-    blocks = np.array([np.array(one).reshape(-1, 50).mean(axis=1) for one in means.values()])
+    blocks = np.array([np.array(series).reshape(-1, 50).mean(axis=1) for series in means.values()])
     return blocks.mean(axis=1), blocks.std(axis=1, ddof=1) / np.sqrt(blocks.shape[1])
 
 
@@ -248,9 +248,9 @@ def test_the_published_numbers(
     mu_e: float, policy: dict[str, float], legitimate: float, eve: float, tmp_path: Path
 ) -> None:
     """40,000 slots, within 4.5 standard errors, and 1 % for the standard error of the published numbers."""
-    found, error = traces_of(mu_e, policy, 550, 80, tmp_path)
-    assert (error < 0.03 * found).all()
-    assert (np.abs(found - [legitimate, eve]) < 4.5 * error + 0.01 * found).all()
+    trace, error = traces_of(mu_e, policy, 550, 80, tmp_path)
+    assert (error < 0.03 * trace).all()
+    assert (np.abs(trace - [legitimate, eve]) < 4.5 * error + 0.01 * trace).all()
 
 
 @pytest.mark.long
@@ -262,9 +262,9 @@ def test_all_published_numbers(
 
     A published number is the mean of one run of 200,000 slots, whose standard error is up to 2 % itself.
     """
-    found, error = traces_of(mu_e, policy, 2050, 100, tmp_path)
-    assert (error < 0.02 * found).all()
-    assert (np.abs(found - [legitimate, eve]) < np.maximum(0.02 * found, 4.5 * np.sqrt(2.0) * error)).all()
+    trace, error = traces_of(mu_e, policy, 2050, 100, tmp_path)
+    assert (error < 0.02 * trace).all()
+    assert (np.abs(trace - [legitimate, eve]) < np.maximum(0.02 * trace, 4.5 * np.sqrt(2.0) * error)).all()
 
 
 def test_live_and_memory_are_the_same_bits(tmp_path: Path) -> None:
@@ -281,7 +281,7 @@ def test_live_and_memory_are_the_same_bits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "message"),
     [
         ({"attack": "flip", "flip": 1.5}, "flip: is 1.5; expected a number from 0 to 1, such as 0.1"),
         ({"attack": "flip", "flip": -0.1}, "flip: is -0.1; expected a number from 0 to 1, such as 0.1"),
@@ -292,17 +292,17 @@ def test_live_and_memory_are_the_same_bits(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_flips_are_checked(more: dict[str, Any], said: str) -> None:
+def test_flips_are_checked(more: dict[str, Any], message: str) -> None:
     """A probability, for the attack that flips, and for no other."""
     wrong = flipped(0.8, {"plain_probability": 0.4}, slots=60)
     wrong["acknowledgements"] = {"link": {"quality": 1.0}, **more}
     with pytest.raises(ScenarioError) as raised:
         checked(wrong, "it")
-    assert said in str(raised.value)
+    assert message in str(raised.value)
 
 
 @pytest.mark.parametrize(
-    ("policy", "said"),
+    ("policy", "message"),
     [
         (
             {"plain_probability": 0.0},
@@ -313,9 +313,9 @@ def test_flips_are_checked(more: dict[str, Any], said: str) -> None:
         ({"lost_belief": -0.2}, "lost_belief: is -0.2; expected a number from 0 to 1"),
     ],
 )
-def test_a_policy_that_never_sends_the_state_is_refused(policy: dict[str, float], said: str) -> None:
+def test_a_policy_that_never_sends_the_state_is_refused(policy: dict[str, float], message: str) -> None:
     """With the bound, and what to write instead."""
     with pytest.raises(ScenarioError) as raised:
         checked(flipped(0.8, policy, slots=60), "it")
-    assert said in str(raised.value)
+    assert message in str(raised.value)
     assert "expected a number" in str(raised.value)

@@ -38,15 +38,15 @@ def test_each_form_needs_a_link_and_acknowledgements_that_stay_the_same(scheme: 
     """Without either there is none; with both the expected error is finite in every slot, and no larger than without packets."""
     assert form_of(scheme, receiver, replace(HEARS, received=None, acknowledged=None)) is None
     assert form_of(scheme, receiver, replace(HEARS, acknowledged=None)) is None
-    found = form_of(scheme, receiver, HEARS)
-    assert found is not None
-    assert found.traces.shape == (6,)
-    assert found.growth is None
-    assert not found.infinite_variance
+    form = form_of(scheme, receiver, HEARS)
+    assert form is not None
+    assert form.traces.shape == (6,)
+    assert form.growth is None
+    assert not form.infinite_variance
     nothing = form_of(scheme, receiver, replace(HEARS, received=0.0, acknowledged=(0.0, 0.72)))
     assert nothing is not None
-    assert (found.traces <= nothing.traces + 1e-12).all()
-    assert found.limit <= nothing.limit + 1e-12
+    assert (form.traces <= nothing.traces + 1e-12).all()
+    assert form.limit <= nothing.limit + 1e-12
 
 
 @pytest.mark.parametrize(("scheme", "receiver"), [*CHAINS, ("quantised-schedule", "legitimate")])
@@ -68,9 +68,9 @@ def test_only_schedules_and_users_that_read_all_know_a_hijacked_sensor() -> None
     ):
         assert form_of(scheme, receiver, hijacked) is None
     assert form_of("quantised-schedule", "legitimate", hijacked) is not None
-    found = form_of("scheduled", "naive", hijacked)
-    assert found is not None
-    assert found.limit != getattr(form_of("scheduled", "naive", HEARS), "limit", None)
+    form = form_of("scheduled", "naive", hijacked)
+    assert form is not None
+    assert form.limit != getattr(form_of("scheduled", "naive", HEARS), "limit", None)
     assert form_of("scheduled", "naive", hijacked, threshold=LARGEST_OPERATOR // 12 + 1) is None
 
 
@@ -79,9 +79,9 @@ def test_references_of_a_user_matter_only_if_they_are_forged() -> None:
     legitimate = replace(HEARS, legitimate=True, received=0.8, acknowledged=(0.72, 0.2))
     for scheme, bound in (("acknowledged", True), ("open-loop", False)):
         assert form_of(scheme, "legitimate", legitimate) is None
-        found = form_of(scheme, "legitimate", replace(legitimate, forged=True))
-        assert found is not None
-        assert found.bound is bound
+        form = form_of(scheme, "legitimate", replace(legitimate, forged=True))
+        assert form is not None
+        assert form.bound is bound
         lost = form_of(scheme, "reference", HEARS, UNSTABLE)
         assert lost is not None
         assert (lost.limit, lost.infinite_variance) == (math.inf, False)  # it grows alike in all trials

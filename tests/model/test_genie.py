@@ -58,9 +58,9 @@ def test_a_slot_of_the_genie() -> None:
     """Lost, state and innovation, one trial at a time, against the formulas with inverses, on both processes."""
     for process in (EXAMPLE, MARGINAL):
         batch = Batch(14, 60)
-        one = READERS["genie"](Knowledge(process, 0.5, {}, keys(1)), batch)
+        genie = READERS["genie"](Knowledge(process, 0.5, {}, keys(1)), batch)
         x_hat, P = np.zeros((60, 2)), np.repeat(process.initial_covariance[None], 60, axis=0)
-        for slot, beliefs in followed({"genie": one}, slots(process, 0.5, 0.7, batch)):
+        for slot, beliefs in followed({"genie": genie}, slots(process, 0.5, 0.7, batch)):
             belief = beliefs["genie"]
             for r in range(60):
                 if slot.k:
@@ -128,14 +128,14 @@ def test_the_leak_where_the_state_covariance_cannot_be_inverted() -> None:
 @given(systems(), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
 def test_the_expectation_is_the_recursion(process: Process, mu_e: float, mu_d: float) -> None:
     """P_k = q(A P Aᵀ + Q) − μ_e(1−μ_d) QΣ_k⁻¹Q from P_0 = (1−μ_e)Σ0, to 1e-8, twelve slots."""
-    found = theoretical_covariances(process, Outcomes.genie(mu_e, mu_d), 12)
+    result = theoretical_covariances(process, Outcomes.genie(mu_e, mu_d), 12)
     q, P = 1.0 - mu_e * mu_d, (1.0 - mu_e) * process.initial_covariance
     for k in range(12):
         if k:
             leak = process.Q - conditioned(process, k)[1]
             P = q * (process.A @ P @ process.A.T + process.Q) - mu_e * (1.0 - mu_d) * leak
         scale = np.abs(process.Q).max() + np.abs(P).max()
-        assert np.allclose(found[k], P, rtol=1e-8, atol=1e-9 * scale)
+        assert np.allclose(result[k], P, rtol=1e-8, atol=1e-9 * scale)
 
 
 def test_known_values() -> None:
@@ -162,7 +162,8 @@ def test_nobody_without_the_secret_does_better(process: Process, mu: float, frac
         assert np.linalg.eigvalsh(genie[k] - ours[k])[0] >= -1e-11 * scale
         assert np.linalg.eigvalsh(smart[k] - genie[k])[0] >= -1e-11 * scale
     limits = [
-        limit_trace(process, one) for one in (Outcomes.genie(mu_e, mu_d), Outcomes.eavesdropper(mu_e, mu_d, 1, 0))
+        limit_trace(process, outcomes)
+        for outcomes in (Outcomes.genie(mu_e, mu_d), Outcomes.eavesdropper(mu_e, mu_d, 1, 0))
     ]
     assert math.isinf(limits[0]) == math.isinf(limits[1])
 
@@ -177,8 +178,8 @@ def test_the_limit_is_where_it_goes(process: Process) -> None:
     leaks = np.linalg.eigvalsh(process.Q - M)
     assert (leaks[-1] > 1e-3) == (process is MIXED)
     outcomes = Outcomes.genie(0.9, 0.9)
-    found = theoretical_covariances(process, outcomes, 601)[600]
-    assert np.allclose(found, limit(process, outcomes), rtol=1e-9, atol=1e-9 * np.abs(found).max())
+    last = theoretical_covariances(process, outcomes, 601)[600]
+    assert np.allclose(last, limit(process, outcomes), rtol=1e-9, atol=1e-9 * np.abs(last).max())
 
 
 @settings(deadline=None, max_examples=examples(40))
@@ -187,8 +188,8 @@ def test_the_limit_of_stable_processes(process: Process, mu_e: float, mu_d: floa
     """There Σ_k converges, and what remains of the noise is Q − QΣ⁻¹Q with Σ its limit."""
     assume(radius(process) < 1.0)
     outcomes = Outcomes.genie(mu_e, mu_d)
-    found = theoretical_covariances(process, outcomes, 400)[399]
-    assert np.allclose(found, limit(process, outcomes), rtol=1e-7, atol=1e-8 * np.abs(process.Q).max())
+    last = theoretical_covariances(process, outcomes, 400)[399]
+    assert np.allclose(last, limit(process, outcomes), rtol=1e-7, atol=1e-8 * np.abs(process.Q).max())
 
 
 def test_bursts_and_tails() -> None:
@@ -201,8 +202,8 @@ def test_bursts_and_tails() -> None:
     bursts = loss_of({"model": "gilbert-elliott", "p": 0.05, "r": 0.8}).chain
     assert even is not None
     assert bursts is not None
-    found = modulated.ModulatedCovariance(EXAMPLE, LinkDistribution.steady(even), at).next_traces(50)
-    assert np.allclose(found, theoretical_traces(EXAMPLE, Outcomes.genie(0.8, 0.8), 50), rtol=1e-12)
+    traces = modulated.ModulatedCovariance(EXAMPLE, LinkDistribution.steady(even), at).next_traces(50)
+    assert np.allclose(traces, theoretical_traces(EXAMPLE, Outcomes.genie(0.8, 0.8), 50), rtol=1e-12)
     for process in (EXAMPLE, MIXED):
         late = modulated.ModulatedCovariance(process, LinkDistribution.steady(bursts), at).next_traces(800)[-1]
         assert late == pytest.approx(modulated.limit_trace(process, bursts, at), rel=1e-9)
@@ -215,9 +216,9 @@ def test_simulated_genies_agree_with_theory() -> None:
     """Squared error and reported trace, every third slot of two processes, 4000 trials, at 4.5 standard errors."""
     for process, mu_d in ((MARGINAL, 0.3), (EXAMPLE, 0.9)):
         batch = Batch(31, 4000)
-        one = READERS["genie"](Knowledge(process, mu_d, {}, keys(3)), batch)
+        genie = READERS["genie"](Knowledge(process, mu_d, {}, keys(3)), batch)
         expected = theoretical_traces(process, Outcomes.genie(0.9, mu_d), 31)
-        for slot, beliefs in followed({"genie": one}, slots(process, mu_d, 0.9, batch, 3)):
+        for slot, beliefs in followed({"genie": genie}, slots(process, mu_d, 0.9, batch, 3)):
             belief = beliefs["genie"]
             if slot.k % 3 == 0 and slot.k:
                 for sample in (((slot.x - belief.x_hat) ** 2).sum(axis=0), np.trace(belief.P)):

@@ -41,10 +41,10 @@ def test_trials_share_the_states_however_they_are_read() -> None:
     """Blocks of any lengths; A x of the slot before, and 0 in slot 0."""
     rows = np.random.default_rng(2).standard_normal((7, 2))
     core = PlantCore(MARGINAL, bytes(32), Batch(7, 3), given=GivenStates(MARGINAL, recorded(rows), 3))
-    found = [core.advance(slots) for slots in (range(3), range(3, 4), range(4, 7))]
-    x = np.concatenate([one.x for one in found])
-    predicted = np.concatenate([one.predicted for one in found])
-    assert all(one.pushed is None for one in found)
+    advances = [core.advance(slots) for slots in (range(3), range(3, 4), range(4, 7))]
+    x = np.concatenate([advance.x for advance in advances])
+    predicted = np.concatenate([advance.predicted for advance in advances])
+    assert all(advance.pushed is None for advance in advances)
     assert np.array_equal(x, np.repeat(rows[:, :, None], 3, axis=2))
     assert np.array_equal(predicted[1:], product(MARGINAL.A, x[:-1]))
     assert not predicted[0].any()

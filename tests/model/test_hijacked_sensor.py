@@ -33,13 +33,13 @@ def hears(whose: str) -> Hears:
 def limits(alpha: float, attack: str, threshold: int = 4) -> dict[str, float]:
     """The traces of legitimate estimator's and eavesdropper's limit under `scheduled`."""
     rates, heed_rule = rates_of(attack, MU, MU_E, alpha), heed_rule_of(attack, alpha, MU_E)
-    found = {}
+    limits = {}
     for whose, split in (("legitimate", rates.legitimate), ("eve", rates.eavesdropper)):
         chain = scheduled(threshold, 0.9, split)
         if heed_rule is not None:
             chain = hijacked_schedule(threshold, MU, MU_E, heed_rule, hears(whose))
-        found[whose] = float(np.trace(chain.limit(UNSTABLE)))
-    return found
+        limits[whose] = float(np.trace(chain.limit(UNSTABLE)))
+    return limits
 
 
 @given(alpha=st.floats(0.0, 1.0), overheard=st.one_of(st.just(0.0), st.floats(0.01, 1.0)))
@@ -150,8 +150,8 @@ def test_perfect_secrecy_needs_an_acknowledgement_channel_that_loses_nothing(
 def test_where_few_are_lost_only_the_schedule_has_a_closed_form() -> None:
     """Of α > μ_e: for other schemes the sensor's memory is in no theory; nor is a chain that is too long."""
     tables = attacked("hijack")
-    known = {name: one.known for name, one in expectations_of(checked(tables, "it")).items()}
-    assert known == {"legitimate": True, "eve": True}
+    theoretical = {name: expectation.known for name, expectation in expectations_of(checked(tables, "it")).items()}
+    assert theoretical == {"legitimate": True, "eve": True}
     tables["encoding"] = {"scheme": "scheduled", "threshold": 60}
     assert not expectations_of(checked(tables, "it"))["eve"].known
     tables["encoding"] = {"scheme": "encrypted-schedule", "threshold": 2}
@@ -184,14 +184,14 @@ def test_it_sends_as_often_and_the_eavesdropper_gains() -> None:
         chunks = list(simulation.chunks())
         sent[attack] = simulation.packets.sent / 100.0
         for name in ("legitimate", "eve"):
-            one = np.concatenate([chunk.receivers[name].error for chunk in chunks]).mean(axis=0)
+            mean_error = np.concatenate([chunk.receivers[name].error for chunk in chunks]).mean(axis=0)
             expected = expectations_of(scenario)[name].traces(100).mean()
-            assert abs(one.mean() - expected) < 5.0 * one.std() / 20.0
-            errors[attack, name] = one
+            assert abs(mean_error.mean() - expected) < 5.0 * mean_error.std() / 20.0
+            errors[attack, name] = mean_error
         assert (chart_of(scenario) is None) is (attack == "hijack")
 
-    def apart(one: np.ndarray, other: np.ndarray) -> float:
-        return float((one.mean() - other.mean()) / np.hypot(one.std() / 20.0, other.std() / 20.0))
+    def apart(errors: np.ndarray, other: np.ndarray) -> float:
+        return float((errors.mean() - other.mean()) / np.hypot(errors.std() / 20.0, other.std() / 20.0))
 
     assert abs(apart(sent["none"], sent["hijack"])) < 5.0
     assert abs(apart(errors["none", "legitimate"], errors["hijack", "legitimate"])) < 5.0

@@ -38,12 +38,12 @@ def played_over(
 
 def holding_times(played: Played, link: np.ndarray, r: int) -> list[float]:
     """The holding time in every slot of a trial, told from what was received and acknowledged."""
-    found, last = [], -np.inf
+    holding_times, last = [], -np.inf
     for k in range(len(played.x)):
-        found.append(k - last)
+        holding_times.append(k - last)
         if played.received["legitimate"][k][r] and link[k, r]:
             last = k
-    return found
+    return holding_times
 
 
 @pytest.mark.parametrize("threshold", [1, 2, 4])
@@ -116,8 +116,8 @@ def test_limits_are_where_the_expectations_go(threshold: int) -> None:
         chain = form(threshold, 0.9, (0.5, 0.2))
         assert np.allclose((chain.reset + chain.carried).sum(1), 1.0)
         assert np.allclose(chain.stationary @ (chain.reset + chain.carried), chain.stationary)
-        found = chain.limit(STABLE)
-        assert np.allclose(found, chain.covariances(STABLE, 2000)[-1], rtol=1e-9)
+        result = chain.limit(STABLE)
+        assert np.allclose(result, chain.covariances(STABLE, 2000)[-1], rtol=1e-9)
     legitimate = closed_forms.scheduled(threshold, 0.9, (0.9, 0.0))
     assert np.isfinite(legitimate.limit(UNSTABLE)).all()
     if threshold == 1:
@@ -147,7 +147,9 @@ def test_blocked_acknowledgements_mistune_one_and_open_the_other() -> None:
     assert all(packet.sent is not None and packet.sent.all() for packet in opened.packets)
     shut = played_over("encrypted-schedule", STABLE, 5, (gamma, gamma, blocked))
     assert all((belief.action != Action.STATE).all() for belief in shut.beliefs["eve"])
-    assert all(np.array_equal(one.action == Action.STATE, gamma[k]) for k, one in enumerate(shut.beliefs["legitimate"]))
+    assert all(
+        np.array_equal(belief.action == Action.STATE, gamma[k]) for k, belief in enumerate(shut.beliefs["legitimate"])
+    )
 
 
 def test_late_acknowledgements_count_for_their_slot() -> None:

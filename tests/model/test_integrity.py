@@ -305,9 +305,9 @@ def test_attacks_come_back_from_plain_numbers() -> None:
 )
 def test_impossible_attacks_are_refused(name: str, given: dict[str, Any], entry: str, words: str) -> None:
     """Each with the entry and what is expected; possible ones are not."""
-    ((found, said),) = SENSOR_ATTACKS[name].objections(given, LOOP, 10)
-    assert found == entry
-    assert words in said
+    ((place, message),) = SENSOR_ATTACKS[name].objections(given, LOOP, 10)
+    assert place == entry
+    assert words in message
     for able in ({"matrix": [[0.5]]}, {"matrix": [[0.5]], "noise": [[0.1]]}):
         assert SENSOR_ATTACKS["replace"].objections(able, LOOP, 10) == []
     assert SENSOR_ATTACKS["replay"].objections({"recorded": 10}, LOOP, 10) == []
@@ -325,7 +325,7 @@ def test_impossible_attacks_are_refused(name: str, given: dict[str, Any], entry:
 )
 def test_wrong_parameters_of_a_policy_are_found(name: str, given: dict[str, float], entry: str) -> None:
     """One mistake each; the parameters that are given as examples have none."""
-    assert [found for found, _ in POLICIES[name].mistakes(given)] == [entry]
+    assert [key for key, _ in POLICIES[name].mistakes(given)] == [entry]
     assert POLICIES[name].mistakes(POLICIES[name].parameters) == []
 
 

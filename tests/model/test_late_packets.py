@@ -56,12 +56,12 @@ class OneByOne:
         """The belief after a slot."""
         heard = arrival.heard
         header = None if heard.header is None else heard.header[None]
-        found = self.core.take_slots(
+        beliefs = self.core.take_slots(
             range(k, k + 1),
             Arrivals(heard.gamma[None], heard.z[None], header, {0: arrival.late} if arrival.late else {}),
         )
-        self.late, self.used = np.zeros((2, len(self.late)), np.uint16) if found.late is None else found.late[:, 0]
-        assert same(found.beliefs.last, self.core.belief)
+        self.late, self.used = np.zeros((2, len(self.late)), np.uint16) if beliefs.late is None else beliefs.late[:, 0]
+        assert same(beliefs.beliefs.last, self.core.belief)
         return self.core.belief
 
 
@@ -77,25 +77,25 @@ def fates(window: int) -> Fates:
     return Link(schedule, "it", stream_keys(6, streams_of("it", schedule)), BATCH).fates(range(BATCH.slots))
 
 
-def same(one: Belief, other: Belief) -> bool:
+def same(belief: Belief, other: Belief) -> bool:
     """Whether two beliefs are the same to the bit; what was done in the last slot may differ."""
-    return one.x_hat.tobytes() == other.x_hat.tobytes() and one.P.tobytes() == other.P.tobytes()
+    return belief.x_hat.tobytes() == other.x_hat.tobytes() and belief.P.tobytes() == other.P.tobytes()
 
 
 @pytest.mark.parametrize("name", ["legitimate", "naive", "smart", "suspicious"])
 @pytest.mark.parametrize("window", [0, 1, 4])
 def test_a_late_packet_counts_as_if_it_had_been_in_time(name: str, window: int) -> None:
     """After every slot the belief is that of a receiver that was given at once all that has arrived by then."""
-    one, z, fate = receivers()[name], packets(), fates(window)
-    follower, transit = OneByOne(one, window), Transit()
+    receiver, z, fate = receivers()[name], packets(), fates(window)
+    follower, transit = OneByOne(receiver, window), Transit()
     assert fate.delays is not None
     there = fate.codes == Fate.DELIVERED
     late_seen = 0
     for k in range(BATCH.slots):
         belief = follower.take(k, transit.arrival(k, fate, k, z[k]))
-        expected = one.prior()
+        expected = receiver.prior()
         for j in range(k + 1):
-            expected = one.step(j, expected, Reception(there[j] & (j + fate.delays[j] <= k), z[j]))
+            expected = receiver.step(j, expected, Reception(there[j] & (j + fate.delays[j] <= k), z[j]))
         assert same(belief, expected), k
         arrivals = [there[j] & (j + fate.delays[j] == k) for j in range(k)]
         counts = np.sum(arrivals, axis=0) if arrivals else np.zeros(BATCH.trials)
@@ -112,9 +112,9 @@ def test_a_late_packet_counts_as_if_it_had_been_in_time(name: str, window: int) 
 
 def test_duplicates_change_nothing() -> None:
     """A second copy, of this slot or an earlier one, is not fresh."""
-    one, z = receivers()["legitimate"], packets()
+    legitimate, z = receivers()["legitimate"], packets()
     everybody = np.ones(BATCH.trials, bool)
-    plain, twice = OneByOne(one, 3), OneByOne(one, 3)
+    plain, twice = OneByOne(legitimate, 3), OneByOne(legitimate, 3)
     for k in range(6):
         heard = Reception(everybody, z[k])
         copies = tuple(Late(j, Reception(everybody, z[j]), copy=True) for j in range(max(0, k - 3), k + 1))
@@ -124,10 +124,10 @@ def test_duplicates_change_nothing() -> None:
 
 def test_what_is_older_than_the_window_changes_nothing() -> None:
     """One slot within the window is fresh, one slot beyond it is not."""
-    one, z = receivers()["legitimate"], packets()
+    legitimate, z = receivers()["legitimate"], packets()
     nobody, everybody = np.zeros(BATCH.trials, bool), np.ones(BATCH.trials, bool)
     for age, fresh in ((3, True), (4, False)):
-        plain, given_ = OneByOne(one, 3), OneByOne(one, 3)
+        plain, given_ = OneByOne(legitimate, 3), OneByOne(legitimate, 3)
         for k in range(8):
             late = (Late(k - age, Reception(everybody, z[k - age])),) if k == 7 else ()
             before = plain.take(k, Arrival(Reception(nobody, z[k])))
@@ -137,16 +137,16 @@ def test_what_is_older_than_the_window_changes_nothing() -> None:
 
 def test_an_absence_is_a_receiver_that_hears_nothing() -> None:
     """Carried on from any belief, and from the prior of any slot, to the bit."""
-    one = receivers()["smart"]
+    smart = receivers()["smart"]
     nothing = Reception(np.zeros(BATCH.trials, bool), np.zeros((2, BATCH.trials)))
     for first in (0, 1, 7):
-        absence, belief = Absence(PROCESS, prior(PROCESS, BATCH.trials, first)), one.prior(first)
+        absence, belief = Absence(PROCESS, prior(PROCESS, BATCH.trials, first)), smart.prior(first)
         for slots in (range(first, first + 1), range(first + 1, first + 5)):
-            found = absence.take_slots(slots)
+            result = absence.take_slots(slots)
             for row, k in enumerate(slots):
-                belief = one.step(k, belief, nothing)
-                assert same(Belief(found.x_hat[row], found.P[row], found.action[row]), belief)
-                assert np.array_equal(found.action[row], np.full(BATCH.trials, Action.LOST))
+                belief = smart.step(k, belief, nothing)
+                assert same(Belief(result.x_hat[row], result.P[row], result.action[row]), belief)
+                assert np.array_equal(result.action[row], np.full(BATCH.trials, Action.LOST))
 
 
 def test_the_prior_of_a_slot_is_the_state_covariance() -> None:
@@ -163,17 +163,17 @@ def test_the_prior_of_a_slot_is_the_state_covariance() -> None:
 def test_bursts_are_runs_of_losses(lost: list[list[bool]], piece: int) -> None:
     """Counted once they end, whatever the pieces; as itertools groups them."""
     rows = np.array(lost)
-    accountant, found = Accountant(0, 3), np.zeros(COUNTED_BURSTS, int)
+    accountant, bursts = Accountant(0, 3), np.zeros(COUNTED_BURSTS, int)
     for start in range(0, len(rows), piece):
         part = rows[start : start + piece]
         codes = np.where(part, np.uint8(Fate.LOST), np.uint8(Fate.DELIVERED))
-        found += accountant.account(range(start, start + len(part)), Fates(codes)).bursts
+        bursts += accountant.account(range(start, start + len(part)), Fates(codes)).bursts
     expected = np.zeros(COUNTED_BURSTS, int)
     for trial in rows.T:
         groups = [(value, len(list(run))) for value, run in itertools.groupby(trial)]
         for value, length in groups[:-1]:
             expected[min(length, COUNTED_BURSTS) - 1] += value
-    assert np.array_equal(found, expected)
+    assert np.array_equal(bursts, expected)
 
 
 @pytest.mark.parametrize("window", [0, 2, 6])
@@ -189,23 +189,25 @@ def test_every_packet_is_accounted_for(window: int) -> None:
     rows = np.concatenate([part.late for part in parts if part.late is not None]) if window else None
     for k in range(BATCH.slots):
         arrival = transit.arrival(k, fate, k, z)
-        counts = sum((one.heard.gamma.astype(int) for one in arrival.late if not one.copy), np.zeros(BATCH.trials, int))
+        counts = sum(
+            (packet.heard.gamma.astype(int) for packet in arrival.late if not packet.copy), np.zeros(BATCH.trials, int)
+        )
         assert np.array_equal(counts, np.zeros(BATCH.trials) if rows is None else rows[k])
 
 
 def test_slots_that_a_receiver_was_away_are_lost_and_end_its_window() -> None:
     """It predicts through them, and a packet from before them is not fresh any more."""
-    one, z = receivers()["legitimate"], packets()
+    legitimate, z = receivers()["legitimate"], packets()
     everybody = np.ones(BATCH.trials, bool)
-    follower, expected = OneByOne(one, 3), one.prior()
+    follower, expected = OneByOne(legitimate, 3), legitimate.prior()
     for k in range(2):
         follower.take(k, Arrival(Reception(~everybody, z[k])))
     follower.core.miss(range(2, 5))
     for k in range(5):
-        expected = one.step(k, expected, Reception(~everybody, z[k]))
+        expected = legitimate.step(k, expected, Reception(~everybody, z[k]))
     assert same(follower.core.belief, expected)
     after = follower.take(5, Arrival(Reception(~everybody, z[5]), (Late(1, Reception(everybody, z[1])),)))
-    assert same(after, one.step(5, expected, Reception(~everybody, z[5])))
+    assert same(after, legitimate.step(5, expected, Reception(~everybody, z[5])))
     assert not follower.late.any()
 
 
@@ -219,13 +221,13 @@ def test_a_late_packet_has_its_own_header(with_header: bool) -> None:
     encoder, states = scheme.encoder(keys, batch), np.random.default_rng(1).normal(size=(slots, 2, 2))
     sent = [encoder.encode(k, states[k], states[k]) for k in range(slots)]
     both, first = np.ones(2, bool), np.array([True, False])
-    receptions = [Reception(first, one.z, one.header if with_header else None) for one in sent]
+    receptions = [Reception(first, slot.z, slot.header if with_header else None) for slot in sent]
     follower = OneByOne(scheme.estimator(keys, batch), 2)
     follower.take(0, Arrival(Reception(~both, sent[0].z)))
     follower.take(1, Arrival(receptions[1] if with_header else Reception(~both, sent[1].z)))
     late = Late(1, Reception(both, sent[1].z, sent[1].header))
-    found = follower.take(2, Arrival(Reception(~both, sent[2].z, sent[2].header), (late,)))
-    assert np.allclose(found.x_hat, states[1], atol=1e-9)
+    belief = follower.take(2, Arrival(Reception(~both, sent[2].z, sent[2].header), (late,)))
+    assert np.allclose(belief.x_hat, states[1], atol=1e-9)
     assert follower.late.tolist() == ([0, 1] if with_header else [1, 1])
 
 
@@ -257,10 +259,10 @@ def test_packets_are_under_way_until_they_arrive() -> None:
 def test_a_link_without_delays_has_all_its_packets_in_time() -> None:
     """Where packets could be late, none is; those that went through took no slot."""
     codes = np.array([[Fate.DELIVERED, Fate.LOST], [Fate.DELIVERED, Fate.UNSENT]], np.uint8)
-    found = Accountant(3, 2).account(range(2), Fates(codes))
-    assert found.late is not None
-    assert not found.late.any()
-    assert found.delays.tolist() == [2, 0, 0, 0, 0]
-    assert found.unsent is not None
-    assert found.unsent.tolist() == [0, 1]
+    accounted = Accountant(3, 2).account(range(2), Fates(codes))
+    assert accounted.late is not None
+    assert not accounted.late.any()
+    assert accounted.delays.tolist() == [2, 0, 0, 0, 0]
+    assert accounted.unsent is not None
+    assert accounted.unsent.tolist() == [0, 1]
     assert Accountant(0, 2).account(range(1), Fates(codes[:1])).unsent is None

@@ -36,11 +36,11 @@ def bits_of(ratio: Fraction) -> float:
 @given(models(lowest=0.5))
 def test_the_bits_of_an_innovation(model: Model) -> None:
     """½ log₂ det Σ_k / det A Σ_{k−1} Aᵀ, for noise of any condition: nothing cancels, in large leaks and in small ones."""
-    found = LeakedBits(model.process).next(SLOTS)
-    assert found[0] == 0.0
+    bits = LeakedBits(model.process).next(SLOTS)
+    assert bits[0] == 0.0
     sigmas = rationals.state_covariances(model.A, model.Q, model.initial)
     carried = rationals.congruent(model.A, next(sigmas))
-    for value in found[1:]:
+    for value in bits[1:]:
         sigma = next(sigmas)
         expected = bits_of(rationals.determinant(sigma) / rationals.determinant(carried))
         assert value == pytest.approx(expected, rel=1e-7)
@@ -85,9 +85,9 @@ def test_the_bits_add_up_to_what_the_path_revealed(process: Process) -> None:
 
 def test_a_stable_mode_goes_on_leaking() -> None:
     """The limit is that of M: 0 without a stable mode, and reached however large the state has become."""
-    found = LeakedBits(UNSTABLE).next(3000)
+    bits = LeakedBits(UNSTABLE).next(3000)
     expected = 0.5 * math.log2(np.linalg.det(UNSTABLE.Q) / np.linalg.det(remaining_limit(UNSTABLE)))
-    assert found[-1] == pytest.approx(expected, rel=1e-9)
+    assert bits[-1] == pytest.approx(expected, rel=1e-9)
     assert round(expected, 3) == 0.706  # as docs/mathematics.md says
     growing = Process(np.array([[1.3, 0.2], [0.0, 1.1]]), np.eye(2), np.eye(2))
     assert 0.0 <= LeakedBits(growing).next(400)[-1] < 1e-20
@@ -112,13 +112,13 @@ def test_bits_do_not_depend_on_how_many_slots_are_asked_for() -> None:
 
 def test_schemes_say_what_their_packets_reveal() -> None:
     """The table of docs/mathematics.md; nothing is claimed where it depends on the packets before."""
-    found = {}
+    bits = {}
     for name in SCHEMES:
-        known = scheme_of(MICROGRID, {"scheme": name, **SCHEMES[name].parameters}).revealed_bits()
-        if known is not None:
-            found[name] = [one[-1] for one in known.next(3)]
+        revealed = scheme_of(MICROGRID, {"scheme": name, **SCHEMES[name].parameters}).revealed_bits()
+        if revealed is not None:
+            bits[name] = [row[-1] for row in revealed.next(3)]
     leak = LeakedBits(MICROGRID).next(3)[-1]
-    assert found == {
+    assert bits == {
         "cipher": [0.0, 0.0],
         "innovation": [math.inf, leak],
         "noise": [math.inf, 0.0],

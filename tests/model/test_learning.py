@@ -32,24 +32,24 @@ def learner(
     return LearningEm(Knowledge(process, mu_d, {"knows": [*knows], "keeps": keeps}, {}), batch)
 
 
-def relative(found: Floats, true: Floats) -> Floats:
+def relative(estimates: Floats, true: Floats) -> Floats:
     """|found − true| / |true| of matrices (n, n, R), by the Frobenius norm, (R,)."""
-    error: Floats = np.linalg.norm(found - true[:, :, None], axis=(0, 1)) / np.linalg.norm(true)
+    error: Floats = np.linalg.norm(estimates - true[:, :, None], axis=(0, 1)) / np.linalg.norm(true)
     return error
 
 
-def learned_by(one: Receiver, belief: Belief) -> tuple[Floats, Floats, Floats]:
+def learned_by(receiver: Receiver, belief: Belief) -> tuple[Floats, Floats, Floats]:
     """A, Q and μ_d as learned."""
-    assert isinstance(one, Eavesdropper)
-    found = one.learned(belief)
-    return found["A"], found["Q"], found["mu_d"]
+    assert isinstance(receiver, Eavesdropper)
+    learned = receiver.learned(belief)
+    return learned["A"], learned["Q"], learned["mu_d"]
 
 
-def last_of(one: Receiver, heard: Sequence[Slot]) -> Belief:
+def last_of(receiver: Receiver, heard: Sequence[Slot]) -> Belief:
     """Its belief after all slots."""
-    belief = one.prior()
+    belief = receiver.prior()
     for slot in heard:
-        belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z))
+        belief = receiver.step(slot.k, belief, Reception(slot.gamma, slot.z))
     return belief
 
 
@@ -62,11 +62,11 @@ def test_if_it_knows_everything_it_is_the_bayesian_eavesdropper(process: Process
         "bayesian": Bayesian(Knowledge(process, 0.6, {}, {}), batch, CAPACITY),
     }
     for slot, beliefs in followed(both, slots(process, 0.6, 0.8, batch)):
-        one, two = beliefs.values()
+        first, two = beliefs.values()
         size = np.abs(slot.x).max() + np.sqrt(np.abs(two.P).max())
-        assert np.allclose(one.x_hat, two.x_hat, rtol=0.0, atol=1e-7 * size)
-        assert np.allclose(one.P, two.P, rtol=0.0, atol=1e-7 * size * size)
-        assert np.array_equal(one.action, two.action)
+        assert np.allclose(first.x_hat, two.x_hat, rtol=0.0, atol=1e-7 * size)
+        assert np.allclose(first.P, two.P, rtol=0.0, atol=1e-7 * size * size)
+        assert np.array_equal(first.action, two.action)
 
 
 @pytest.mark.parametrize("knows", [["mu_d"], ["mu_d", "A"], ["mu_d", "Q"]])
@@ -75,8 +75,8 @@ def test_without_innovations_and_losses_it_is_least_squares(knows: list[str]) ->
     K, R = 16, 5
     batch = Batch(K, R)
     heard = list(slots(STABLE, 1.0, 1.0, batch))
-    one = learner(STABLE, batch, knows, K, 1.0)
-    A, Q, mu_d = learned_by(one, last_of(one, heard))
+    eavesdropper = learner(STABLE, batch, knows, K, 1.0)
+    A, Q, mu_d = learned_by(eavesdropper, last_of(eavesdropper, heard))
     x = np.array([slot.x for slot in heard])
     assert (mu_d == 1.0).all()
     for r in range(R):
@@ -100,7 +100,9 @@ def test_it_learns() -> None:
     off, errors = {}, {name: np.zeros(40) for name in receivers}
     for slot, beliefs in followed(receivers, slots(STABLE, 0.6, 0.9, batch)):
         A, Q, mu_d = learned_by(receivers["learner"], beliefs["learner"])
-        off[slot.k + 1] = [np.median(one) for one in (relative(A, STABLE.A), relative(Q, STABLE.Q), np.abs(mu_d - 0.6))]
+        off[slot.k + 1] = [
+            np.median(errors) for errors in (relative(A, STABLE.A), relative(Q, STABLE.Q), np.abs(mu_d - 0.6))
+        ]
         for name, belief in beliefs.items():
             errors[name] += ((belief.x_hat - slot.x) ** 2).sum(axis=0) * (slot.k >= 64)
     assert off[96][0] < off[32][0] < off[16][0]
@@ -117,16 +119,16 @@ def test_it_learns_nothing_from_masked_packets() -> None:
     batch = Batch(40, 20)
     own = stream_keys(3, ("process", "mask"))
     encoder, trajectory = Cipher(STABLE).encoder(own, batch), Trajectory(STABLE, own["process"], batch)
-    one = learner(STABLE, batch)
-    belief, error, still = one.prior(), 0.0, 0.0
+    eavesdropper = learner(STABLE, batch)
+    belief, error, still = eavesdropper.prior(), 0.0, 0.0
     for k in range(40):
         x = trajectory.advance()
         packet = encoder.encode(k, x, trajectory.predicted)
-        belief = one.step(k, belief, Reception(np.ones(20, np.bool_), packet.z))
+        belief = eavesdropper.step(k, belief, Reception(np.ones(20, np.bool_), packet.z))
         error += float(((belief.x_hat - x) ** 2).sum())
         still += float((x**2).sum())
     assert error > still
-    assert np.median(relative(learned_by(one, belief)[0], STABLE.A)) > 0.5
+    assert np.median(relative(learned_by(eavesdropper, belief)[0], STABLE.A)) > 0.5
 
 
 @pytest.mark.parametrize(
@@ -146,8 +148,8 @@ def test_a_trial_has_the_same_bits_alone_and_among_others(process: Process) -> N
         part = slice(r, r + 1)
         own = [slot._replace(z=slot.z[:, part], gamma=slot.gamma[part]) for slot in heard]
         alone = last_of(single, own)
-        sets = [(of.x_hat, of.P, of.action, *learned_by(one, of)) for one, of in ((many, among), (single, alone))]
-        assert all(one[..., part].tobytes() == two.tobytes() for one, two in zip(*sets, strict=True))
+        sets = [(of.x_hat, of.P, of.action, *learned_by(reader, of)) for reader, of in ((many, among), (single, alone))]
+        assert all(value[..., part].tobytes() == two.tobytes() for value, two in zip(*sets, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -162,11 +164,11 @@ def test_a_trial_has_the_same_bits_alone_and_among_others(process: Process) -> N
 def test_it_stays_finite(process: Process, mu_e: float) -> None:
     """With a process that grows, and with hardly a packet, whatever it takes the process to be."""
     batch = Batch(90, 20)
-    one = learner(process, batch, keeps=16)
-    belief = one.prior()
+    eavesdropper = learner(process, batch, keeps=16)
+    belief = eavesdropper.prior()
     for slot in slots(process, 0.5, mu_e, batch):
-        belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z))
-        assert all(np.isfinite(part).all() for part in (*belief[:2], *learned_by(one, belief)))
+        belief = eavesdropper.step(slot.k, belief, Reception(slot.gamma, slot.z))
+        assert all(np.isfinite(part).all() for part in (*belief[:2], *learned_by(eavesdropper, belief)))
         size = np.trace(belief.P)
         assert (np.linalg.eigvalsh(np.moveaxis(belief.P, -1, 0))[:, 0] >= -1e-9 * size).all()
 
@@ -175,23 +177,23 @@ def test_a_known_state_is_known() -> None:
     """Once it is told x_k, its estimate is x_k, and the next one A x_k with the A that it has learned."""
     batch = Batch(30, 4)
     heard = list(slots(STABLE, 0.6, 0.9, batch))
-    one = learner(STABLE, batch, keeps=16)
-    told = one.knowing(29, heard[-1].x, last_of(one, heard))
+    eavesdropper = learner(STABLE, batch, keeps=16)
+    told = eavesdropper.knowing(29, heard[-1].x, last_of(eavesdropper, heard))
     assert np.array_equal(told.x_hat, heard[-1].x)
     assert not told.P.any()
-    after = one.step(30, told, Reception(np.zeros(4, bool), np.zeros((2, 4))))
-    assert np.allclose(after.x_hat, np.einsum("ijr,jr->ir", learned_by(one, told)[0], told.x_hat))
+    after = eavesdropper.step(30, told, Reception(np.zeros(4, bool), np.zeros((2, 4))))
+    assert np.allclose(after.x_hat, np.einsum("ijr,jr->ir", learned_by(eavesdropper, told)[0], told.x_hat))
 
 
 def test_one_that_joins_late_climbs_as_late() -> None:
     """A process that starts at slot 7 knows I and nothing else until it has listened to as many slots as any other."""
     batch, age = Batch(30, 3), climbing_slots(2, 16)[0]
-    one = learner(STABLE, batch, keeps=16)
-    belief = one.prior(7)
+    eavesdropper = learner(STABLE, batch, keeps=16)
+    belief = eavesdropper.prior(7)
     for slot in slots(STABLE, 0.6, 1.0, batch):
         if slot.k >= 7:
-            belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z))
-            still = (learned_by(one, belief)[0] == np.eye(2)[:, :, None]).all()
+            belief = eavesdropper.step(slot.k, belief, Reception(slot.gamma, slot.z))
+            still = (learned_by(eavesdropper, belief)[0] == np.eye(2)[:, :, None]).all()
             assert still == (slot.k - 7 + 1 < age)
 
 
@@ -219,9 +221,9 @@ def test_when_it_climbs() -> None:
 )
 def test_mistakes_in_its_parameters(given: dict[str, Any], entry: str, message: str) -> None:
     """Unknown names, and invalid numbers of slots."""
-    (found,) = LearningEm.mistakes(given)
-    assert found[0] == entry
-    assert found[1].startswith(message)
+    (mistake,) = LearningEm.mistakes(given)
+    assert mistake[0] == entry
+    assert mistake[1].startswith(message)
     assert not LearningEm.mistakes({"knows": ["A", "mu_d"], "keeps": 8})
 
 
@@ -247,4 +249,4 @@ def test_estimates_out_of_all_proportion_to_the_packets_are_made_smaller() -> No
     assert bounded_mean.tolist() == [[8.0], [0.5]]
     assert np.allclose(bounded_covariance[:, :, 0], [[64.0, 8.0], [8.0, 4.0]])
     told = learner(MARGINAL, Batch(4, 1), ["A"]).in_proportion(x_hat, P, largest)
-    assert all(np.array_equal(one, other) for one, other in zip(told, (x_hat, P), strict=True))
+    assert all(np.array_equal(value, other) for value, other in zip(told, (x_hat, P), strict=True))

@@ -44,21 +44,21 @@ def test_if_it_knows_everything_it_is_the_bayesian_eavesdropper(process: Process
         "bayesian": Bayesian(Knowledge(process, 0.6, {}, {}), batch, CAPACITY),
     }
     for slot, beliefs in followed(both, slots(process, 0.6, 0.8, batch)):
-        one, two = beliefs.values()
+        first, two = beliefs.values()
         size = np.abs(slot.x).max() + np.sqrt(np.abs(two.P).max())
-        assert np.allclose(one.x_hat, two.x_hat, rtol=0.0, atol=1e-7 * size)
-        assert np.allclose(one.P, two.P, rtol=0.0, atol=1e-7 * size * size)
-        assert np.array_equal(one.action, two.action)
+        assert np.allclose(first.x_hat, two.x_hat, rtol=0.0, atol=1e-7 * size)
+        assert np.allclose(first.P, two.P, rtol=0.0, atol=1e-7 * size * size)
+        assert np.array_equal(first.action, two.action)
 
 
 def test_it_learns() -> None:
     """The longer it listens, the less its A errs, and then it errs far less than an eavesdropper that does not listen."""
     batch = Batch(96, 20)
-    one = learner(STABLE, batch, particles=48)
-    receivers = {"learner": one, "constant": STRATEGIES["constant"](Knowledge(STABLE, 0.6, {}, {}), batch)}
+    eavesdropper = learner(STABLE, batch, particles=48)
+    receivers = {"learner": eavesdropper, "constant": STRATEGIES["constant"](Knowledge(STABLE, 0.6, {}, {}), batch)}
     off, errors = {}, {name: np.zeros(20) for name in receivers}
     for slot, beliefs in followed(receivers, slots(STABLE, 0.6, 0.9, batch)):
-        A, Q, _ = learned_by(one, beliefs["learner"])
+        A, Q, _ = learned_by(eavesdropper, beliefs["learner"])
         off[slot.k + 1] = np.median(relative(A, STABLE.A)), np.median(relative(Q, STABLE.Q))
         for name, belief in beliefs.items():
             errors[name] += ((belief.x_hat - slot.x) ** 2).sum(axis=0) * (slot.k >= 64)
@@ -72,11 +72,11 @@ def test_it_learns() -> None:
 def test_it_can_follow_a_process_that_grows() -> None:
     """In the paper's example half of the trials follow the state at slot 60 to a thousandth of its size, and all are finite."""
     batch = Batch(60, 16)
-    one = learner(EXAMPLE, batch, particles=48)
-    belief = one.prior()
+    eavesdropper = learner(EXAMPLE, batch, particles=48)
+    belief = eavesdropper.prior()
     for slot in slots(EXAMPLE, 0.7, 0.9, batch):
-        belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z))
-        assert all(np.isfinite(part).all() for part in (belief.x_hat, belief.P, *learned_by(one, belief)))
+        belief = eavesdropper.step(slot.k, belief, Reception(slot.gamma, slot.z))
+        assert all(np.isfinite(part).all() for part in (belief.x_hat, belief.P, *learned_by(eavesdropper, belief)))
     error = np.linalg.norm(belief.x_hat - slot.x, axis=0) / np.linalg.norm(slot.x, axis=0)
     assert np.median(error) < 1e-3
 
@@ -93,8 +93,8 @@ def test_a_trial_has_the_same_bits_alone_and_among_others(process: Process) -> N
         own = [slot._replace(z=slot.z[:, part], gamma=slot.gamma[part]) for slot in heard]
         single = learner(process, Batch(24, 1, r))
         alone = last_of(single, own)
-        sets = [(of.x_hat, of.P, of.action, *learned_by(one, of)) for one, of in ((many, among), (single, alone))]
-        assert all(one[..., part].tobytes() == two.tobytes() for one, two in zip(*sets, strict=True))
+        sets = [(of.x_hat, of.P, of.action, *learned_by(reader, of)) for reader, of in ((many, among), (single, alone))]
+        assert all(value[..., part].tobytes() == two.tobytes() for value, two in zip(*sets, strict=True))
     other = last_of(learner(process, Batch(24, 1, 9)), own)
     assert not np.array_equal(other.x_hat, alone.x_hat)
 
@@ -103,11 +103,11 @@ def test_a_known_state_is_known_and_nothing_is_forgotten() -> None:
     """Once it is told x_k, its estimate is x_k; the next is A x_k with the mean of the particles' A."""
     batch = Batch(12, 4)
     heard = list(slots(STABLE, 0.6, 0.9, batch))
-    one = learner(STABLE, batch)
-    told = one.knowing(11, heard[-1].x, last_of(one, heard))
+    eavesdropper = learner(STABLE, batch)
+    told = eavesdropper.knowing(11, heard[-1].x, last_of(eavesdropper, heard))
     assert np.array_equal(told.x_hat, heard[-1].x)
-    after = one.step(12, told, Reception(np.zeros(4, np.bool_), np.zeros((2, 4))))
-    assert np.allclose(after.x_hat, np.einsum("ijr,jr->ir", learned_by(one, told)[0], told.x_hat))
+    after = eavesdropper.step(12, told, Reception(np.zeros(4, np.bool_), np.zeros((2, 4))))
+    assert np.allclose(after.x_hat, np.einsum("ijr,jr->ir", learned_by(eavesdropper, told)[0], told.x_hat))
 
 
 @pytest.mark.parametrize("knows", [[], ["A"], ["Q"], ["mu_d"], ["A", "Q"]])
@@ -128,9 +128,9 @@ def test_draws_have_the_distribution_of_the_posterior(knows: list[str]) -> None:
     told = known(process, 0.6, knows)
     theta = told.start(np.ones(R))._replace(A=alike(A), mu_d=np.full(R, 0.6))
     numbers = random.standard_normal((numbers_of(n), R))
-    after, found = drawn(moments, theta, np.ones(R), told, numbers)
-    assert found.A.shape == (n, n, R)
-    away = found.A.reshape(4, R) - A.reshape(4, 1)
+    after, parameters = drawn(moments, theta, np.ones(R), told, numbers)
+    assert parameters.A.shape == (n, n, R)
+    away = parameters.A.reshape(4, R) - A.reshape(4, 1)
     if "A" in knows:
         assert not away.any()
     else:
@@ -138,19 +138,19 @@ def test_draws_have_the_distribution_of_the_posterior(knows: list[str]) -> None:
         assert (np.abs(away.mean(axis=1)) < 5.0 * np.sqrt(np.diag(wanted) / R)).all()
         # An unknown Q scatters by 1/√40, which adds a little to the covariance.
         assert np.allclose(np.cov(away), wanted, atol=0.004 if "Q" not in knows else 0.002)
-    drawn_Q = covariance(Factors(found.lower, found.diagonal))
+    drawn_Q = covariance(Factors(parameters.lower, parameters.diagonal))
     if "Q" in knows:
         assert np.allclose(drawn_Q, alike(Q))
     else:
         assert np.allclose(drawn_Q.mean(axis=-1), Q, rtol=0.06)
         assert np.std(drawn_Q[0, 0]) / Q[0, 0] == pytest.approx(np.sqrt(2.0 / 81.0), rel=0.15)
     if "mu_d" in knows:
-        assert (found.mu_d == 0.6).all()
+        assert (parameters.mu_d == 0.6).all()
     else:
-        assert found.mu_d.mean() == pytest.approx(0.6, abs=0.01)
-        assert found.mu_d.std() == pytest.approx(np.sqrt(0.24 / 100.0), rel=0.1)
+        assert parameters.mu_d.mean() == pytest.approx(0.6, abs=0.01)
+        assert parameters.mu_d.std() == pytest.approx(np.sqrt(0.24 / 100.0), rel=0.1)
     # The moments are about the new A: with it, the cross moments are those of the difference.
-    step = found.A - alike(A)
+    step = parameters.A - alike(A)
     assert np.allclose(after.cross, -np.einsum("ijr,jk->ikr", step, H))
 
 
@@ -175,9 +175,9 @@ def test_a_delegate_tells_what_its_reader_has_learned() -> None:
     parameters = {**knowledge.parameters, "reads_as": "learning-particle"}
     group = STRATEGIES["colluding"](Knowledge(STABLE, 0.6, parameters, keys(1)), batch)
     assert isinstance(group, Delegate)
-    one = LearningParticle(knowledge, batch)
+    reader = LearningParticle(knowledge, batch)
     heard = list(slots(STABLE, 0.6, 0.9, batch))
-    pairs = zip(learned_by(group, last_of(group, heard)), learned_by(one, last_of(one, heard)), strict=True)
+    pairs = zip(learned_by(group, last_of(group, heard)), learned_by(reader, last_of(reader, heard)), strict=True)
     assert all(np.array_equal(*pair) for pair in pairs)
     still = STRATEGIES["constant"](Knowledge(STABLE, 0.6, {}, {}), batch)
     assert still.learned(still.prior()) == {}
@@ -194,7 +194,7 @@ def test_a_delegate_tells_what_its_reader_has_learned() -> None:
 )
 def test_mistakes_in_its_parameters(given: dict[str, Any], entry: str, message: str) -> None:
     """Unknown names, and invalid numbers of particles."""
-    (found,) = LearningParticle.mistakes(given)
-    assert found[0] == entry
-    assert found[1].startswith(message)
+    (mistake,) = LearningParticle.mistakes(given)
+    assert mistake[0] == entry
+    assert mistake[1].startswith(message)
     assert not LearningParticle.mistakes({"knows": ["A"], "particles": 2})

@@ -61,9 +61,9 @@ def whole_of(fates: Fates) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return fates.codes, np.where(fates.codes == Fate.DELIVERED, delays, 0), again
 
 
-def same(one: Fates, other: Fates) -> bool:
+def same(fates: Fates, other: Fates) -> bool:
     """Whether the fates are the same."""
-    return all(np.array_equal(a, b) for a, b in zip(whole_of(one), whole_of(other), strict=True))
+    return all(np.array_equal(a, b) for a, b in zip(whole_of(fates), whole_of(other), strict=True))
 
 
 @pytest.mark.parametrize("name", SCHEDULES)
@@ -83,8 +83,8 @@ def test_bits_do_not_depend_on_pieces_or_on_the_batch(name: str) -> None:
     """However slots are asked for, and alone or among others, a trial's packets have the same fates."""
     schedule, batch = SCHEDULES[name], Batch(70, 6, 3)
     whole = link(schedule, batch).fates(range(70))
-    one = link(schedule, batch)
-    parts = [one.fates(range(a, b)) for a, b in ((0, 1), (1, 20), (20, 21), (21, 55), (55, 70))]
+    channel = link(schedule, batch)
+    parts = [channel.fates(range(a, b)) for a, b in ((0, 1), (1, 20), (20, 21), (21, 55), (55, 70))]
     assert np.array_equal(np.concatenate([part.codes for part in parts]), whole.codes)
     alone = link(schedule, Batch(70, 1, 5)).fates(range(70))
     assert same(alone, whole.part(trials=slice(2, 3)))
@@ -113,7 +113,7 @@ def reference(schedule: LinkSchedule, batch: Batch) -> tuple[np.ndarray, np.ndar
             if "delay" in setting and not chances[k, 1, r] < setting.get("reorder", 0.0):
                 delay += max(0.0, setting["delay"]["mean"] + setting["delay"]["standard_deviation"] * numbers[k, r])
             delays[k, r] = arrives = math.floor(delay)
-            away = [one.reason for one in schedule.outages if k < one.stop and k + arrives >= one.start]
+            away = [outage.reason for outage in schedule.outages if k < outage.stop and k + arrives >= outage.start]
             stops = (
                 (full, Fate.OVERFLOW),
                 (cut, Fate.CUT),
@@ -157,16 +157,16 @@ def test_a_change_known_late_is_one_known_early(at: int, kind: str, name: str) -
     """Amended in the middle of what was planned, a link goes on as one that knew of the change from the start."""
     schedule, batch = SCHEDULES[name], Batch(60, 3)
     change = {"cut": Change(at, cut=True), "loss": Change(at, BURSTS), "all": Change(at, FULL)}[kind]
-    earlier = tuple(one for one in schedule.changes if one.at < at)
+    earlier = tuple(change for change in schedule.changes if change.at < at)
     knowing = LinkSchedule(
         schedule.settings, schedule.window, (*earlier, change), schedule.outages, schedule.correlation
     )
     expected = link(knowing, batch).fates(range(60))
-    one = link(schedule, batch)
+    channel = link(schedule, batch)
     start = at - at % 7
-    before = one.fates(range(start)) if start else None
-    planned = one.planned(range(start, 60)).part(slice(0, at - start))
-    rest = one.amended(at, [change])
+    before = channel.fates(range(start)) if start else None
+    planned = channel.planned(range(start, 60)).part(slice(0, at - start))
+    rest = channel.amended(at, [change])
     parts = [part.codes for part in (before, planned, rest) if part is not None]
     assert np.array_equal(np.concatenate(parts), expected.codes)
 
@@ -179,11 +179,11 @@ def test_correlation_ties_losses_and_leaves_each_link_alone() -> None:
     other = Link(LinkSchedule(settings_), "it", key, batch).fates(range(400)).in_time
     for strength in (0.0, 0.35, 1.0):
         schedule = LinkSchedule(settings_, correlation=("other", strength))
-        found = link(schedule, batch).fates(range(400)).in_time
-        assert abs(found.mean() - q) < 5 * math.sqrt(q * (1 - q) / found.size)
-        correlation = np.corrcoef(found.ravel(), other.ravel())[0, 1]
-        assert abs(correlation - strength) < 5 / math.sqrt(found.size)
-    assert np.array_equal(found, other)
+        in_time = link(schedule, batch).fates(range(400)).in_time
+        assert abs(in_time.mean() - q) < 5 * math.sqrt(q * (1 - q) / in_time.size)
+        correlation = np.corrcoef(in_time.ravel(), other.ravel())[0, 1]
+        assert abs(correlation - strength) < 5 / math.sqrt(in_time.size)
+    assert np.array_equal(in_time, other)
 
 
 SPECS: dict[str, dict[str, Any]] = {
@@ -203,12 +203,12 @@ def test_delays_have_the_distribution_they_say(name: str) -> None:
     assert fates.delays is not None
     model = delay_of(SPECS[name])
     for lag in range(8):
-        expected, found = model.arrived(lag), float((fates.delays <= lag).mean())
+        expected, fraction = model.arrived(lag), float((fates.delays <= lag).mean())
         if expected is None:
             assert name == "trace"
-            assert found == pytest.approx([1 / 3, 2 / 3, 1, 1, 1, 1, 1, 1][lag], abs=1e-9)
+            assert fraction == pytest.approx([1 / 3, 2 / 3, 1, 1, 1, 1, 1, 1][lag], abs=1e-9)
         else:
-            assert abs(found - expected) <= 5 * math.sqrt(expected * (1 - expected) / fates.delays.size) + 1e-12
+            assert abs(fraction - expected) <= 5 * math.sqrt(expected * (1 - expected) / fates.delays.size) + 1e-12
 
 
 @pytest.mark.parametrize(
@@ -223,9 +223,9 @@ def test_delays_have_the_distribution_they_say(name: str) -> None:
 )
 def test_wrong_delays_are_named(model: str, given_: dict[str, Any], entries: list[str]) -> None:
     """Each wrong parameter, with what was expected."""
-    found = DELAY_MODELS[model].mistakes(given_)
-    assert [entry for entry, _ in found] == entries
-    assert all("expected" in what for _, what in found)
+    mistakes = DELAY_MODELS[model].mistakes(given_)
+    assert [entry for entry, _ in mistakes] == entries
+    assert all("expected" in sentence for _, sentence in mistakes)
 
 
 def test_fates_of_packets_that_are_not_sent() -> None:
@@ -250,6 +250,6 @@ def test_an_outage_of_other_slots_loses_nothing() -> None:
     course = LinkSchedule(
         {"loss": {"model": "bernoulli", "quality": 1.0}}, outages=(ReceiverOutage(10, 12, Fate.DOWN),)
     )
-    one = link(course, Batch(20, 2))
-    codes = [one.fates(slots).codes for slots in (range(10), range(10, 12), range(12, 20))]
+    channel = link(course, Batch(20, 2))
+    codes = [channel.fates(slots).codes for slots in (range(10), range(10, 12), range(12, 20))]
     assert [sorted(set(part.ravel().tolist())) for part in codes] == [[Fate.DELIVERED], [Fate.DOWN], [Fate.DELIVERED]]

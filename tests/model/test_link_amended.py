@@ -27,15 +27,15 @@ def link(*changes: Change) -> Link:
     return Link(schedule, "it", keys, Batch(SLOTS, 4))
 
 
-def steered(known: Changes, orders: dict[int, list[Changes]]) -> list[Fates]:
+def steered(planned_changes: Changes, orders: dict[int, list[Changes]]) -> list[Fates]:
     """The fates of all slots, planned in batches; orders: slot → what is due from it on, each time that it is changed."""
-    one, parts = link(*known), []
+    channel, parts = link(*planned_changes), []
     for first in range(0, SLOTS, BATCH):
-        start, fates = first, one.planned(range(first, first + BATCH))
+        start, fates = first, channel.planned(range(first, first + BATCH))
         for k in range(first, first + BATCH):
             for changes in orders.get(k, []):
                 parts.append(fates.part(slice(0, k - start)))
-                start, fates = k, one.amended(k, changes)
+                start, fates = k, channel.amended(k, changes)
         parts.append(fates)
     return parts
 
@@ -53,22 +53,22 @@ def columns(parts: list[Fates]) -> list[np.ndarray]:
 def test_an_amended_link_is_one_that_knew(k: int) -> None:
     """Changes at any slot of a batch, several at one, and a later one that is replaced: the same fates as all at once."""
     settings = ({"loss": COINS}, {"loss": BURSTS}, DELAYED)
-    known = (Change(5, {"loss": COINS}), Change(20, {"loss": BURSTS}), Change(30, cut=True), Change(33, cut=False))
-    kept = tuple(change for change in known if change.at >= k)
-    later = tuple(Change(one.at, DELAYED if one.settings else None, one.cut) for one in kept)
+    changes = (Change(5, {"loss": COINS}), Change(20, {"loss": BURSTS}), Change(30, cut=True), Change(33, cut=False))
+    kept = tuple(change for change in changes if change.at >= k)
+    later = tuple(Change(change.at, DELAYED if change.settings else None, change.cut) for change in kept)
     first, second = (*kept, Change(k, settings[0])), (Change(k, settings[0]), Change(k, settings[1]), *kept)
     last = (Change(k, settings[0]), Change(k, settings[1]), Change(k, settings[2]), *later)
-    found = steered(known, {k: [first, second, last]})
-    at_once = link(*(change for change in known if change.at < k), *last)
-    for mine, theirs in zip(columns(found), columns([at_once.fates(range(SLOTS))]), strict=True):
+    result = steered(changes, {k: [first, second, last]})
+    at_once = link(*(change for change in changes if change.at < k), *last)
+    for mine, theirs in zip(columns(result), columns([at_once.fates(range(SLOTS))]), strict=True):
         np.testing.assert_array_equal(mine, theirs)
 
 
 def test_only_slots_that_are_planned_can_be_amended() -> None:
     """Slots that are decided for good, or not decided yet, are refused."""
-    one = link()
+    channel = link()
     with pytest.raises(ValueError, match="slot 3 is not among those last planned"):
-        one.amended(3, ())
-    one.planned(range(8))
+        channel.amended(3, ())
+    channel.planned(range(8))
     with pytest.raises(ValueError, match="slot 8 is not among those last planned"):
-        one.amended(8, ())
+        channel.amended(8, ())

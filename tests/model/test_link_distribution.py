@@ -30,15 +30,15 @@ def aged(quality: Callable[[int], float], there: Callable[[int], float], window:
     quality: of a slot; there: probability that a packet is there after so many slots, of those that come through.
     """
     Q, sigma = 0.3, 2.0
-    found = []
+    totals = []
     for k in range(SLOTS):
         missing, total = 1.0, 0.0
         for j in range(k, -1, -1):
             arrived = quality(j) * there(min(k - j, window))
             total += missing * arrived * Q * (k - j)
             missing *= 1.0 - arrived
-        found.append(total + missing * (sigma + Q * k))
-    return found
+        totals.append(total + missing * (sigma + Q * k))
+    return totals
 
 
 def traces(schedule: LinkSchedule) -> np.ndarray:

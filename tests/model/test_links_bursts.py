@@ -107,8 +107,8 @@ def test_fates_are_those_of_the_slot_by_slot_reference(
     spec: dict[str, Any], data: st.DataObject, slots: int, trials: int, first: int
 ) -> None:
     """However the slots are asked for, alone or in a batch, every packet has the fate the reference gives it."""
-    found = {name: value for name, value in spec.items() if name != "model"}
-    assert LOSS_MODELS[spec["model"]].mistakes(found) == []
+    parameters = {name: value for name, value in spec.items() if name != "model"}
+    assert LOSS_MODELS[spec["model"]].mistakes(parameters) == []
     u = drawn(slots, range(first, first + trials), LOSS_MODELS[spec["model"]].uniforms_per_slot)
     expected = np.array([REFERENCES[spec["model"]](spec, u[:, r]) for r in range(trials)]).T
     link, start, parts = link_of(spec, KEY, Batch(slots, trials, first)), 0, []
@@ -199,12 +199,12 @@ def test_slot_zero_has_the_stationary_distribution() -> None:
 def test_two_states_are_a_markov_chain() -> None:
     """Gilbert–Elliott and the Markov chain of its transitions have one chain and one quality."""
     spec = {"model": "markov", "transitions": [[0.9, 0.1], [0.3, 0.7]], "loss": [0.02, 0.7]}
-    one, other = loss_of(SOFT), loss_of(spec)
-    assert one.quality == pytest.approx(other.quality, abs=1e-15)
-    assert one.chain is not None
+    soft, other = loss_of(SOFT), loss_of(spec)
+    assert soft.quality == pytest.approx(other.quality, abs=1e-15)
+    assert soft.chain is not None
     assert other.chain is not None
     for name in ("transitions", "stationary", "quality"):
-        np.testing.assert_allclose(getattr(one.chain, name), getattr(other.chain, name), atol=1e-15)
+        np.testing.assert_allclose(getattr(soft.chain, name), getattr(other.chain, name), atol=1e-15)
 
 
 @settings(deadline=None)
@@ -236,9 +236,9 @@ def test_the_stationary_distribution_is_the_eigenvector(rows: list[list[float]])
 )
 def test_stationary_distributions_that_are_known(rows: list[list[float]], distribution: list[float]) -> None:
     """Periodic chains have one too, and a state that is never come back to has probability exactly 0."""
-    found = stationary(np.array(rows))
-    np.testing.assert_allclose(found, distribution, atol=1e-15)
-    assert [value == 0.0 for value in found] == [value == 0.0 for value in distribution]
+    result = stationary(np.array(rows))
+    np.testing.assert_allclose(result, distribution, atol=1e-15)
+    assert [value == 0.0 for value in result] == [value == 0.0 for value in distribution]
 
 
 def test_the_stationary_distribution_is_summed_in_order() -> None:
@@ -271,6 +271,6 @@ def test_a_trial_alone(spec: dict[str, Any]) -> None:
     u = drawn(700, range(5), loss.uniforms_per_slot).transpose(0, 2, 1)
     together = loss.fates(0, u)
     for trial in range(5):
-        alone, one = loss_of(spec), u[:, :, trial : trial + 1]
-        pieces = [alone.fates(start, one[start:stop]) for start, stop in ((0, 1), (1, 300), (300, 301), (301, 700))]
+        alone, own = loss_of(spec), u[:, :, trial : trial + 1]
+        pieces = [alone.fates(start, own[start:stop]) for start, stop in ((0, 1), (1, 300), (300, 301), (301, 700))]
         assert np.array_equal(np.concatenate(pieces)[:, 0], together[:, trial])

@@ -81,11 +81,11 @@ def test_fates_are_those_of_the_textbook(
         stop = data.draw(st.integers(start + 1, slots))
         parts.append(model.fates(first + start, u[start:stop]))
         start = stop
-    found = np.concatenate(parts) == Fate.DELIVERED
+    delivered = np.concatenate(parts) == Fate.DELIVERED
     for k in range(slots):
         for r in range(3):
             above = snr(whole, u[:, :, r], first + k, first) - whole["threshold"]
-            assert abs(above) < 1e-9 or found[k, r] == (above > 0.0)
+            assert abs(above) < 1e-9 or delivered[k, r] == (above > 0.0)
 
 
 def test_uniforms_that_are_zero_are_fates_too() -> None:
@@ -186,13 +186,13 @@ def test_ways_are_straight_between_waypoints(rows: list[tuple[int, float, float]
     """As numpy interpolates: standing before the first and after the last."""
     ordered = sorted({row[0]: list(row) for row in rows}.values())
     slots = np.arange(60.0)
-    for axis, found in enumerate(Way(ordered).at(slots), 1):
+    for axis, coordinate in enumerate(Way(ordered).at(slots), 1):
         expected = np.interp(slots, [row[0] for row in ordered], [row[axis] for row in ordered])
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-9)
+        np.testing.assert_allclose(coordinate, expected, rtol=1e-12, atol=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("changes", "entry", "said"),
+    ("changes", "entry", "message"),
     [
         ({"sender": 3}, "sender", "is 3; expected a position [x, y] in metres, or waypoints [[slot, x, y], …]"),
         ({"sender": []}, "sender", "is []; expected a position"),
@@ -215,12 +215,12 @@ def test_ways_are_straight_between_waypoints(rows: list[tuple[int, float, float]
         ({"fading_block": 2.0}, "fading_block", "is 2.0; expected a whole number of slots from 1 to 1000000"),
     ],
 )
-def test_a_mistake_is_named(changes: dict[str, Any], entry: str, said: str) -> None:
+def test_a_mistake_is_named(changes: dict[str, Any], entry: str, message: str) -> None:
     """One mistake, at its entry, with what was found and what was expected."""
     given = {name: value for name, value in {**STANDS, **changes}.items() if name != "model"}
-    ((found, what),) = Distance.mistakes(given)
-    assert found == entry
-    assert what.startswith(said)
+    ((place, sentence),) = Distance.mistakes(given)
+    assert place == entry
+    assert sentence.startswith(message)
 
 
 def test_all_mistakes_are_named_at_once() -> None:

@@ -25,14 +25,14 @@ def delivered(spec: dict[str, Any], slots: range, trials: int = 3) -> NDArray[np
     """What a fresh model delivers in these slots, (slots, trials)."""
     model = loss_of(spec)
     drawn = uniforms(Stream(KEY, range(trials), model.uniforms_per_slot).words(slots)).transpose(0, 2, 1)
-    found: NDArray[np.bool_] = model.fates(slots.start, drawn) == Fate.DELIVERED
-    return found
+    delivered_: NDArray[np.bool_] = model.fates(slots.start, drawn) == Fate.DELIVERED
+    return delivered_
 
 
 def test_a_looped_trace_begins_again() -> None:
     """Slot k has the outcome at place k, counted round and round, in every trial."""
-    found = delivered({"model": "trace", "outcomes": "11010"}, range(12))
-    assert found.T.tolist() == [[c == "1" for c in "110101101011"]] * 3
+    result = delivered({"model": "trace", "outcomes": "11010"}, range(12))
+    assert result.T.tolist() == [[c == "1" for c in "110101101011"]] * 3
     assert loss_of({"model": "trace", "outcomes": "11010"}).quality == pytest.approx(0.6)
 
 
@@ -49,12 +49,12 @@ def test_a_trace_is_read_once_up_to_its_end() -> None:
 def test_a_random_start_is_the_first_uniforms_place(outcomes: str, slots: int, first: int) -> None:
     """Trial r reads on round the recording from ⌊u · length⌋, u its uniform of the first slot asked for."""
     spec = {"model": "trace", "outcomes": outcomes, "random_start": True}
-    found = delivered(spec, range(first, first + slots), 4)
+    result = delivered(spec, range(first, first + slots), 4)
     u = uniforms(Stream(KEY, range(4), 1).words(range(first, first + 1)))[0, :, 0]
     for r in range(4):
         begin = int(u[r] * len(outcomes))
         expected = [outcomes[(begin + first + k) % len(outcomes)] == "1" for k in range(slots)]
-        assert found[:, r].tolist() == expected
+        assert result[:, r].tolist() == expected
 
 
 def test_random_starts_are_everywhere() -> None:
@@ -133,7 +133,7 @@ def test_the_rate_of_many_slots_has_its_limit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "entry", "said"),
+    ("given", "entry", "message"),
     [
         ({"outcomes": "12"}, "outcomes", 'is "12"; expected a word of 0 (lost) and 1 (delivered)'),
         ({"outcomes": ""}, "outcomes", 'is ""; expected a word'),
@@ -143,8 +143,8 @@ def test_the_rate_of_many_slots_has_its_limit() -> None:
         ({"once": True, "random_start": True}, "random_start", "is given together with once"),
     ],
 )
-def test_a_mistake_of_a_trace_is_named(given: dict[str, Any], entry: str, said: str) -> None:
+def test_a_mistake_of_a_trace_is_named(given: dict[str, Any], entry: str, message: str) -> None:
     """One mistake, at its entry."""
-    ((found, what),) = RecordedLoss.mistakes(given)
-    assert found == entry
-    assert said in what
+    ((place, sentence),) = RecordedLoss.mistakes(given)
+    assert place == entry
+    assert message in sentence

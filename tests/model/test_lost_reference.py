@@ -87,9 +87,9 @@ def test_the_remedy_is_the_bound(spec: dict[str, Any], entry: str) -> None:
     bound = float(lost.remedy.split()[-1])
     growths = []
     for value in (bound - 1e-5, bound + 1e-5):
-        found = scheme_of(MIXED, {**spec, entry: value}).lost_reference(0.8, LEGITIMATE_RATES)
-        assert found is not None
-        growths.append(found.growth)
+        lost_reference = scheme_of(MIXED, {**spec, entry: value}).lost_reference(0.8, LEGITIMATE_RATES)
+        assert lost_reference is not None
+        growths.append(lost_reference.growth)
     below, above = growths
     assert (below < 1.0 <= above) if entry == "lost_belief" else (above < 1.0 <= below)
     poor = scheme_of(MIXED, spec).lost_reference(0.2, (0.18, 0.08))

@@ -63,10 +63,10 @@ def test_chain_gives_the_limit_of_the_expectation() -> None:
 @pytest.mark.parametrize("case", chain.CASES)
 def test_simulated_occupation_is_the_limiting_distribution(case: tuple[float, float]) -> None:
     """Link and schedule of the emulator spend in each step and word the stated fraction of slots, at five errors."""
-    found = chain.simulate(*case, trials=400, slots=1500, progress=lambda _: None)
+    simulated = chain.simulate(*case, trials=400, slots=1500, progress=lambda _: None)
     for (mean, error), expected in (
-        (found.steps, step_probabilities(*case, chain.STEPS)),
-        (found.words, chain.words_by_theory(*case)),
+        (simulated.steps, step_probabilities(*case, chain.STEPS)),
+        (simulated.words, chain.words_by_theory(*case)),
     ):
         frequent = expected > 1e-3
         assert np.all(np.abs(mean - expected)[frequent] <= 5.0 * error[frequent])

@@ -124,8 +124,8 @@ def test_the_recursion_is_the_sum_over_all_words(use: tuple[float, float] | None
     """Every word of link states and packets, weighed and added up by hand, gives the recursion's last value."""
     chain = bursts(0.2, 0.4, 0.1, 0.9)
     outcomes_at = legitimate if use is None else eavesdropper(*use)
-    found = ModulatedCovariance(UNSTABLE, LinkDistribution.steady(chain), outcomes_at).next_traces(slots)
-    assert found[-1] == pytest.approx(enumerated(UNSTABLE, chain, use, slots)[-1], rel=1e-12)
+    next_traces = ModulatedCovariance(UNSTABLE, LinkDistribution.steady(chain), outcomes_at).next_traces(slots)
+    assert next_traces[-1] == pytest.approx(enumerated(UNSTABLE, chain, use, slots)[-1], rel=1e-12)
 
 
 def chain_of(spec: dict[str, Any]) -> Chain:
@@ -228,17 +228,17 @@ def recursion(process: Process, chain: Chain, outcomes_at: Callable[[float], Out
     odds = [outcomes_at(float(quality)) for quality in chain.quality]
     f = misled_covariances(process, slots)
     states = [
-        weight * one.initial * process.initial_covariance for weight, one in zip(chain.stationary, odds, strict=True)
+        weight * odd.initial * process.initial_covariance for weight, odd in zip(chain.stationary, odds, strict=True)
     ]
     traces = [float(np.trace(sum(states)))]
     for k in range(1, slots):
         states = [
-            one.kept
+            odd.kept
             * process.A
             @ sum(T * E for T, E in zip(chain.transitions[:, s], states, strict=True))
             @ process.A.T
-            + chain.stationary[s] * (one.predicted * process.Q + one.misled * f[k])
-            for s, one in enumerate(odds)
+            + chain.stationary[s] * (odd.predicted * process.Q + odd.misled * f[k])
+            for s, odd in enumerate(odds)
         ]
         traces.append(float(np.trace(sum(states))))
     return np.array(traces)
@@ -266,22 +266,22 @@ def late(process: Process, link: LinkDistribution, outcomes_at: Callable[[float]
     A packet of slot j counts in slot k with the probability that it has arrived by then.
     """
     window, f = link.window, misled_covariances(process, slots)
-    found: list[float] = []
+    traces: list[float] = []
 
     def after(states: list[Floats] | None, j: int, k: int) -> list[Floats]:
-        segment = [one for one in link.segments if one.start <= j][-1]
+        segment = [segment for segment in link.segments if segment.start <= j][-1]
         away = any(start <= j < stop for start, stop, _ in link.outages)
         reached = 0.0 if away else segment.passes * float(segment.arrived[k - j])
         odds = [outcomes_at(reached * float(quality)) for quality in segment.chain.quality]
         pi = segment.chain.stationary
         if states is None:
-            return [p * one.initial * process.initial_covariance for p, one in zip(pi, odds, strict=True)]
+            return [p * odd.initial * process.initial_covariance for p, odd in zip(pi, odds, strict=True)]
         fresh = j == segment.start
         weights = [pi[s] * np.ones(len(states)) if fresh else segment.chain.transitions[:, s] for s in range(len(pi))]
         return [
-            one.kept * process.A @ sum(T * E for T, E in zip(weights[s], states, strict=True)) @ process.A.T
-            + pi[s] * (one.predicted * process.Q + one.misled * f[j])
-            for s, one in enumerate(odds)
+            odd.kept * process.A @ sum(T * E for T, E in zip(weights[s], states, strict=True)) @ process.A.T
+            + pi[s] * (odd.predicted * process.Q + odd.misled * f[j])
+            for s, odd in enumerate(odds)
         ]
 
     settled: list[Floats] | None = None
@@ -291,8 +291,8 @@ def late(process: Process, link: LinkDistribution, outcomes_at: Callable[[float]
         states = settled
         for j in range(max(0, k - window + 1), k + 1):
             states = after(states, j, k)
-        found.append(float(np.trace(sum(states or []))))
-    return np.array(found)
+        traces.append(float(np.trace(sum(states or []))))
+    return np.array(traces)
 
 
 @pytest.mark.parametrize(
@@ -313,8 +313,8 @@ def test_blocks_of_slots_with_late_packets_are_what_slot_by_slot_gives(process: 
     link = LinkDistribution(segments, ((530, 532, True),))
     whole = ModulatedCovariance(process, link, outcomes_at).next_traces(slots)
     expected = late(process, link, outcomes_at, slots)
-    known = np.isfinite(expected)
-    np.testing.assert_allclose(whole[known], expected[known], rtol=1e-12)
+    finite = np.isfinite(expected)
+    np.testing.assert_allclose(whole[finite], expected[finite], rtol=1e-12)
     stream = ModulatedCovariance(process, link, outcomes_at)
     assert np.array_equal(np.concatenate([stream.next_traces(count) for count in (1, 2, 130, 17, 390)]), whole)
 
@@ -351,11 +351,11 @@ def test_many_states_are_followed_slot_by_slot() -> None:
     rates = np.linspace(0.5, 1.05, 9)
     chain = bursts(0.2, 0.5)
     many = Process(np.diag(rates), np.eye(9), 2.0 * np.eye(9))
-    found = ModulatedCovariance(many, LinkDistribution.steady(chain), Outcomes.plain).next_traces(400)
+    next_traces = ModulatedCovariance(many, LinkDistribution.steady(chain), Outcomes.plain).next_traces(400)
     one_by_one = [
         ModulatedCovariance(
             Process(np.array([[a]]), np.eye(1), 2.0 * np.eye(1)), LinkDistribution.steady(chain), Outcomes.plain
         )
         for a in rates
     ]
-    assert np.allclose(found, sum(one.next_traces(400) for one in one_by_one), rtol=1e-10)
+    assert np.allclose(next_traces, sum(chain.next_traces(400) for chain in one_by_one), rtol=1e-10)

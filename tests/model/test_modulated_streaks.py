@@ -44,7 +44,7 @@ def enumerated(process: Process, chain: Chain, outcomes_in: Callable[[int], Outc
         for unused in (False, True):
             for course in itertools.product(names, repeat=SLOTS - 1):
                 weight = likely * (odds[0].initial if unused else 1.0 - odds[0].initial)
-                weight *= np.prod([getattr(one, name) for one, name in zip(odds[1:], course, strict=True)])
+                weight *= np.prod([getattr(odd, name) for odd, name in zip(odds[1:], course, strict=True)])
                 P, kind, length = process.initial_covariance * unused, FIRST if unused else None, 0
                 for k in range(SLOTS):
                     if k:
@@ -68,9 +68,9 @@ def enumerated(process: Process, chain: Chain, outcomes_in: Callable[[int], Outc
 def found_in(link: LinkDistribution, at: OutcomesAt, slots: int, process: Process = PLANE) -> Streaks:
     """The streaks of a run that has them."""
     total = float(ModulatedCovariance(process, link, at).next_traces(slots).sum())
-    found = modulated_streaks(process, link, at, slots, total)
-    assert found is not None
-    return found
+    result = modulated_streaks(process, link, at, slots, total)
+    assert result is not None
+    return result
 
 
 @pytest.mark.parametrize("reader", AT)
@@ -80,12 +80,12 @@ def test_streaks_are_those_of_all_courses_of_a_run(chain: Chain, reader: str) ->
     link, mean = LinkDistribution.steady(chain), AT[reader](0.5)
     for slots_at in (lambda k: AT[reader](MU_D[min(k, SLOTS - 1)]), None):
         total = float(ModulatedCovariance(PLANE, link, mean, slots_at).next_traces(SLOTS).sum())
-        found = modulated_streaks(PLANE, link, mean, SLOTS, total, slots_at)
-        assert found is not None
+        result = modulated_streaks(PLANE, link, mean, SLOTS, total, slots_at)
+        assert result is not None
         number, carried = enumerated(PLANE, chain, slots_at or (lambda _: mean))
-        assert found.number == pytest.approx(number, rel=1e-9, abs=1e-15)
-        assert found.carried == pytest.approx(carried, rel=1e-9, abs=1e-15)
-        assert found.carried.sum() == pytest.approx(total, rel=1e-9)
+        assert result.number == pytest.approx(number, rel=1e-9, abs=1e-15)
+        assert result.carried == pytest.approx(carried, rel=1e-9, abs=1e-15)
+        assert result.carried.sum() == pytest.approx(total, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_streaks_are_those_of_all_courses_of_a_run(chain: Chain, reader: str) ->
 )
 def test_independent_losses_have_the_streaks_of_the_closed_form(outcomes: Outcomes) -> None:
     """A chain of one state, in a longer run."""
-    found = modulated_streaks(
+    result = modulated_streaks(
         PLANE,
         LinkDistribution.steady(STEADY),
         lambda _: outcomes,
@@ -101,11 +101,11 @@ def test_independent_losses_have_the_streaks_of_the_closed_form(outcomes: Outcom
         float(theoretical_traces(PLANE, outcomes, 40).sum()),
     )
     closed = streaks(PLANE, outcomes, 40)
-    assert found is not None
+    assert result is not None
     assert closed is not None
     for trials in (1, 30, 1000):
-        assert found.fraction(trials) == pytest.approx(closed.fraction(trials), rel=1e-6, abs=1e-8)
-    assert found.trials_for(0.01) == closed.trials_for(0.01)
+        assert result.fraction(trials) == pytest.approx(closed.fraction(trials), rel=1e-6, abs=1e-8)
+    assert result.trials_for(0.01) == closed.trials_for(0.01)
 
 
 def test_a_link_that_changes_during_the_run() -> None:
@@ -119,9 +119,9 @@ def test_a_link_that_changes_during_the_run() -> None:
         )
     )
     at = AT["suspicious"](0.4)
-    found = found_in(link, at, 60)
-    assert found.carried.sum() == pytest.approx(found.total, rel=2e-9)
-    assert np.all(np.diff(found.number) <= 0.0)
+    streaks = found_in(link, at, 60)
+    assert streaks.carried.sum() == pytest.approx(streaks.total, rel=2e-9)
+    assert np.all(np.diff(streaks.number) <= 0.0)
 
 
 def test_bursts_make_rare_events_rarer_and_larger() -> None:
@@ -139,8 +139,8 @@ def test_what_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     late = LinkDistribution((replace(link.segments[0], arrived=np.array([0.5, 1.0])),))
     away = replace(link, outages=((3, 5, True),))
     other = LinkDistribution((*link.segments, Segment(3, STEADY, 1.0, np.ones(1))))
-    for one in (late, away, other):
-        assert modulated_streaks(PLANE, one, at, 9, 1.0) is None
+    for schedule in (late, away, other):
+        assert modulated_streaks(PLANE, schedule, at, 9, 1.0) is None
     assert modulated_streaks(PLANE, link, at, 9, float("inf")) is None
     total = found_in(link, at, 9).total
     for name, most in (("_LARGEST_RUN", 9 * 4 * 2 - 1), ("MOST_NUMBERS", 9 * 4 * 2 * 3)):

@@ -152,9 +152,9 @@ def test_where_there_is_no_solution_the_inputs_are_held(monkeypatch: pytest.Monk
 )
 def test_parameters_that_are_none_are_said(given: dict[str, Any], entry: str) -> None:
     """Which entry, what was found, an example."""
-    ((found, what),) = Mpc.mistakes(given)
-    assert found == entry
-    assert "expected a" in what
+    ((place, sentence),) = Mpc.mistakes(given)
+    assert place == entry
+    assert "expected a" in sentence
     assert Mpc.mistakes({"horizon": 60, "soft": 1000}) == []
 
 
@@ -164,9 +164,9 @@ def test_without_the_solver_it_says_what_to_install(monkeypatch: pytest.MonkeyPa
     ((entry, _),) = Mpc.objections(assigned(input_weights=np.zeros(2), rate_weights=np.zeros(2)))
     assert entry == "input_weights"
     monkeypatch.setattr(controllers, "find_spec", lambda _: None)
-    ((entry, what),) = Mpc.objections(assigned())
+    ((entry, sentence),) = Mpc.objections(assigned())
     assert entry == "strategy"
-    assert "pip install '.[microgrid]' in the checkout" in what
+    assert "pip install '.[microgrid]' in the checkout" in sentence
 
 
 def test_the_strategy_is_registered_with_defaults() -> None:

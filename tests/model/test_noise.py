@@ -61,7 +61,7 @@ def test_packets_are_states_or_noise_of_the_given_covariance(given: Any) -> None
             assert 1e-6 < stats.chi2.cdf(np.sum(white * white), white.size) < 1 - 1e-6
             others = x[:, packet.nu] / np.sqrt(np.diag(state_covariances(STABLE, k + 1)[k]))[:, None]
             products = [white[0] * white[1], *(a * b for a in white for b in others)]
-            assert max(abs(float(one.mean())) for one in products) < 5.5 / np.sqrt(noise.shape[1])
+            assert max(abs(float(product.mean())) for product in products) < 5.5 / np.sqrt(noise.shape[1])
 
 
 @DISTRIBUTIONS
@@ -98,9 +98,9 @@ def test_errors_are_the_closed_forms(given: Any) -> None:
     made["suspicious"] = spy("suspicious", given, batch, 0.4, **some)
     gamma = {name: coins(0.8, slots, trials, i) for i, name in enumerate(("legitimate", *made))}
     played = play(scheme, batch, gamma, made)
-    known = {"legitimate": scheme.outcomes(0.8), "smart": scheme.eavesdropper_outcomes(0.8, 1.0, 0.0)}
+    forms = {"legitimate": scheme.outcomes(0.8), "smart": scheme.eavesdropper_outcomes(0.8, 1.0, 0.0)}
     for name in gamma:
-        outcomes = known.get(name)
+        outcomes = forms.get(name)
         if outcomes is None:
             taken = taken_by(scheme, name, 0.8, **(some if name == "suspicious" else {}))
             expected = taken.covariances(slots)
@@ -139,7 +139,7 @@ def test_the_error_of_taking_noise_is_that_of_all_courses(given: Any) -> None:
     mu_e, mu_d = 0.7, 0.6
     p_d, p_r, p_i = 1.0 - mu_e, mu_e * mu_d, mu_e * (1.0 - mu_d)
     taken = NoiseTaken(STABLE, NoiseDistribution(given), mu_d, mu_e, (1.0, 1.0))
-    found, A, Q = taken.covariances(5), STABLE.A, STABLE.Q
+    covariances, A, Q = taken.covariances(5), STABLE.A, STABLE.Q
     total = np.zeros((2, 2))
     for course in words((0, 1, 2), repeat=4):
         for first in (False, True):  # whether the packet of slot 0, always the state, is used
@@ -150,7 +150,7 @@ def test_the_error_of_taking_noise_is_that_of_all_courses(given: Any) -> None:
                 P = (A @ P @ A.T + Q, np.zeros((2, 2)), noise)[event]
                 weight *= (p_d, p_r, p_i)[event]
             total += weight * P
-    np.testing.assert_allclose(found[4], total, rtol=1e-12)
+    np.testing.assert_allclose(covariances[4], total, rtol=1e-12)
     np.testing.assert_allclose(taken.covariances(2000)[-1], taken.limit, rtol=1e-9)
 
 
@@ -158,9 +158,9 @@ def test_limits_of_taking_noise() -> None:
     """Unbounded where the process is unstable; that of smart if no noise is taken; beyond double precision all slots are inf."""
     unstable = NoiseTaken(UNSTABLE, NoiseDistribution(PACKETS), 0.6, 0.7, (1.0, 1.0))
     assert np.isinf(unstable.limit).all()
-    found = unstable.covariances(1200)
-    assert np.isfinite(found[1000]).all()
-    assert np.isinf(found[-1]).all()
+    covariances = unstable.covariances(1200)
+    assert np.isfinite(covariances[1000]).all()
+    assert np.isinf(covariances[-1]).all()
     never = NoiseTaken(STABLE, NoiseDistribution(PACKETS), 0.6, 0.7, (1.0, 0.0))
     assert np.array_equal(never.limit, limit(STABLE, Outcomes.eavesdropper(0.7, 0.6, 1.0, 0.0)))
     assert Plain.closed_forms == {}
@@ -233,10 +233,10 @@ def test_the_bayesian_eavesdropper_is_the_posterior_over_all_words(given: Any) -
     """Six slots, eight trials: x̂ and P to 1e-8 of an enumeration of all words of types, with losses."""
     batch = Batch(6, 8)
     played = play(Noise(STABLE, 0.6, given), batch, {"legitimate": coins(0.8, 6, 8, 3)})
-    one = spy("bayesian", given, batch)
-    belief, z, gamma = one.prior(), [], []
+    reader = spy("bayesian", given, batch)
+    belief, z, gamma = reader.prior(), [], []
     for k, packet, heard in heard_slots(played):
-        belief = one.step(k, belief, Reception(heard, packet))
+        belief = reader.step(k, belief, Reception(heard, packet))
         z.append(packet)
         gamma.append(heard)
         for r in range(8):
@@ -251,15 +251,15 @@ def test_kernels_agree_on_mixtures_of_states_and_noise(given: Any) -> None:
     batch = Batch(30, 5)
     played = play(Noise(STABLE, 0.4, given), batch, {"legitimate": coins(0.8, 30, 5, 3)})
     z, gamma = np.array([packet.z for packet in played.packets]), np.array(played.received["legitimate"])
-    one = spy("bayesian", given, batch, 0.4)
-    assert isinstance(one, Bayesian)
-    beliefs, _ = one.follow(range(30), one.prior(), gamma, z)
+    reader = spy("bayesian", given, batch, 0.4)
+    assert isinstance(reader, Bayesian)
+    beliefs, _ = reader.follow(range(30), reader.prior(), gamma, z)
     leaks = Leaks(STABLE, NoiseDistribution(given)).block(range(30))
-    exact, before = np.zeros((30, STABLE.n)), one.prior().memory
-    found = reference.follow_mixture(STABLE.A, cholesky(STABLE.Q), leaks, exact, before, gamma, z, 0.4, 12, True)
-    assert np.array_equal(beliefs.x_hat, found[0])
-    assert np.array_equal(beliefs.P, found[1])
-    assert np.array_equal(beliefs.action, found[2])
+    exact, before = np.zeros((30, STABLE.n)), reader.prior().memory
+    followed = reference.follow_mixture(STABLE.A, cholesky(STABLE.Q), leaks, exact, before, gamma, z, 0.4, 12, True)
+    assert np.array_equal(beliefs.x_hat, followed[0])
+    assert np.array_equal(beliefs.P, followed[1])
+    assert np.array_equal(beliefs.action, followed[2])
 
 
 @DISTRIBUTIONS
@@ -268,10 +268,10 @@ def test_detectors_decide_by_the_ratio_of_densities(name: str, given: Any) -> No
     """The power test by the density of states at any time, `likelihood` by that of a state after its own estimate."""
     batch = Batch(12, 40)
     played = play(Noise(STABLE, 0.6, given), batch, {"legitimate": coins(0.8, 12, 40, 3)})
-    one = spy(name, given, batch)
-    belief, sigma, both = one.prior(), state_covariances(STABLE, 12), set()
+    reader = spy(name, given, batch)
+    belief, sigma, both = reader.prior(), state_covariances(STABLE, 12), set()
     for k, z, gamma in heard_slots(played):
-        after = one.step(k, belief, Reception(gamma, z))
+        after = reader.step(k, belief, Reception(gamma, z))
         for r in np.flatnonzero(gamma):
             m, P = STABLE.A @ belief.x_hat[:, r], STABLE.A @ belief.P[:, :, r] @ STABLE.A.T + STABLE.Q
             if name == "power-test":
@@ -295,10 +295,10 @@ def test_detectors_decide_by_the_ratio_of_densities(name: str, given: Any) -> No
 def test_a_power_test_needs_no_test_where_all_packets_are_alike(mu_d: float) -> None:
     """Of states alone it uses all; of noise alone none but the first; noise of a scheme without noise is as large as states."""
     strategy, gamma = STRATEGIES["power-test"], np.ones(3, bool)
-    one = strategy(Knowledge(STABLE, mu_d, {}, {}), Batch(2, 3))
-    first = one.step(0, one.prior(), Reception(gamma, np.ones((2, 3))))
+    reader = strategy(Knowledge(STABLE, mu_d, {}, {}), Batch(2, 3))
+    first = reader.step(0, reader.prior(), Reception(gamma, np.ones((2, 3))))
     assert (first.action == Action.STATE).all()
-    second = one.step(1, first, Reception(gamma, np.ones((2, 3))))
+    second = reader.step(1, first, Reception(gamma, np.ones((2, 3))))
     assert (second.action == (Action.STATE if mu_d else Action.DISCARDED)).all()
 
 
@@ -329,7 +329,7 @@ def test_no_receiver_without_the_secret_does_better_than_one_with_the_schedule()
 
 
 @pytest.mark.parametrize(
-    ("found", "why"),
+    ("value", "why"),
     [
         ("filter", "the sensor has no filter"),
         ("loud", 'expected "packets"'),
@@ -340,11 +340,11 @@ def test_no_receiver_without_the_secret_does_better_than_one_with_the_schedule()
         ([[1.0, 0.2], [0.1, 1.0]], "is not symmetric"),
     ],
 )
-def test_covariances_that_are_none_are_refused(found: Any, why: str) -> None:
+def test_covariances_that_are_none_are_refused(value: Any, why: str) -> None:
     """With what was found and what was expected."""
-    ((entry, what),) = Noise.mistakes({"noise_covariance": found})
+    ((entry, sentence),) = Noise.mistakes({"noise_covariance": value})
     assert entry == "noise_covariance"
-    assert why in what
+    assert why in sentence
 
 
 def test_the_noise_has_the_dimensions_of_the_state() -> None:
@@ -366,6 +366,6 @@ def test_the_user_follows_blocks_of_slots_as_single_ones() -> None:
     assert np.array_equal([shared.nu(k) for k in range(12)], [packet.nu for packet in played.packets])
     assert not shared.chi(3).any()
     legitimate, z = shared.estimator(), np.array([packet.z for packet in played.packets])
-    found, _ = legitimate.follow(range(12), legitimate.prior(), np.array(played.received["legitimate"]), z)
-    assert np.array_equal(found.x_hat, [belief.x_hat for belief in played.beliefs["legitimate"]])
-    assert np.array_equal(found.P, [belief.P for belief in played.beliefs["legitimate"]])
+    beliefs_, _ = legitimate.follow(range(12), legitimate.prior(), np.array(played.received["legitimate"]), z)
+    assert np.array_equal(beliefs_.x_hat, [belief.x_hat for belief in played.beliefs["legitimate"]])
+    assert np.array_equal(beliefs_.P, [belief.P for belief in played.beliefs["legitimate"]])

@@ -24,9 +24,11 @@ def scheme(name: str) -> Scheme:
     return scheme_of(UNSTABLE, {"scheme": name, **parameters})
 
 
-def parts(found: Outcomes) -> dict[str, float]:
+def parts(outcomes: Outcomes) -> dict[str, float]:
     """The outcomes of a slot that have a probability, rounded."""
-    entries = {name: round(getattr(found, name), 12) for name in ("predicted", "state", "misled", "decoded", "leaked")}
+    entries = {
+        name: round(getattr(outcomes, name), 12) for name in ("predicted", "state", "misled", "decoded", "leaked")
+    }
     return {name: value for name, value in entries.items() if value}
 
 
@@ -49,21 +51,21 @@ LEGITIMATE = {
 @pytest.mark.parametrize("name", LEGITIMATE)
 def test_the_legitimate_estimator_has_a_closed_form_where_slots_are_alike(name: str) -> None:
     """At the quality of its link."""
-    found = legitimate_outcomes(scheme(name))
-    if found is None:
+    result = legitimate_outcomes(scheme(name))
+    if result is None:
         assert LEGITIMATE[name] is None
     else:
-        assert parts(found(MU)) == LEGITIMATE[name]
-        assert parts(found(0.0)) == {"predicted": 1.0}
+        assert parts(result(MU)) == LEGITIMATE[name]
+        assert parts(result(0.0)) == {"predicted": 1.0}
         # In slot 0 every packet is the state; the secret of twin tracks tells the state without any packet.
-        assert found(MU).initial == pytest.approx(0.0 if name == "twin-track" else 0.2)
+        assert result(MU).initial == pytest.approx(0.0 if name == "twin-track" else 0.2)
 
 
 def test_withholding_is_a_worse_link() -> None:
     """With probability p a packet is sent: the outcomes of μp."""
-    found = legitimate_outcomes(scheme_of(UNSTABLE, {"scheme": "withholding", "state_probability": 0.5}))
-    assert found is not None
-    assert parts(found(MU)) == {"predicted": 0.6, "state": 0.4}
+    result = legitimate_outcomes(scheme_of(UNSTABLE, {"scheme": "withholding", "state_probability": 0.5}))
+    assert result is not None
+    assert parts(result(MU)) == {"predicted": 0.6, "state": 0.4}
 
 
 MISLED = {"predicted": 0.2, "state": 0.2, "misled": 0.6}
@@ -90,13 +92,13 @@ def test_an_eavesdropper_has_a_closed_form_where_one_slot_decides(
     name: str, strategy: str, parameters: dict[str, Any], expected: dict[str, float] | None
 ) -> None:
     """By what it does with a state and with an innovation; None where no closed form is known."""
-    found = eavesdropper_outcomes(scheme(name), strategy, parameters)
-    assert (None if found is None else parts(found(MU))) == expected
+    result = eavesdropper_outcomes(scheme(name), strategy, parameters)
+    assert (None if result is None else parts(result(MU))) == expected
 
 
 def test_a_constant_estimate_errs_alike_whatever_is_sent() -> None:
     """It never uses a packet."""
     for name in ("innovation", "plain", "cipher", "twin-track"):
-        found = eavesdropper_outcomes(scheme(name), "constant", {})
-        assert found is not None
-        assert parts(found(MU)) == {"predicted": 1.0}
+        result = eavesdropper_outcomes(scheme(name), "constant", {})
+        assert result is not None
+        assert parts(result(MU)) == {"predicted": 1.0}

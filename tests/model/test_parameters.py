@@ -34,9 +34,9 @@ EXAMPLES = [(kind, name) for kind, classes in KINDS.items() for name in classes]
 @pytest.mark.parametrize(("kind", "name"), EXAMPLES)
 def test_the_example_of_every_class_has_no_mistakes(kind: str, name: str) -> None:
     """Neither has a table without any parameters: what is missing is another check's affair."""
-    one = KINDS[kind][name]
-    assert one.mistakes({}) == []
-    assert [one.mistakes({entry: value}) for entry, value in one.parameters.items()] == [[]] * len(one.parameters)
+    kind_ = KINDS[kind][name]
+    assert kind_.mistakes({}) == []
+    assert [kind_.mistakes({entry: value}) for entry, value in kind_.parameters.items()] == [[]] * len(kind_.parameters)
 
 
 NUMBER = "expected a number from 0 to 1"
@@ -88,10 +88,10 @@ WRONG: list[tuple[str, str, dict[str, Any], list[tuple[str, str]]]] = [
 @pytest.mark.parametrize(("kind", "name", "given", "expected"), WRONG)
 def test_every_wrong_parameter_is_named(kind: str, name: str, given: dict[str, Any], expected: list[Any]) -> None:
     """With the value found and the values expected, in the order of the parameters."""
-    found = KINDS[kind][name].mistakes(given)
-    assert [entry for entry, _ in found] == [entry for entry, _ in expected]
-    for (_, what), (_, said) in zip(found, expected, strict=True):
-        assert what.startswith(said)
+    mistakes = KINDS[kind][name].mistakes(given)
+    assert [entry for entry, _ in mistakes] == [entry for entry, _ in expected]
+    for (_, sentence), (_, message) in zip(mistakes, expected, strict=True):
+        assert sentence.startswith(message)
 
 
 class Own(LossModel):
@@ -198,7 +198,9 @@ def test_a_solver_that_is_broken_is_named(monkeypatch: pytest.MonkeyPatch) -> No
     broken = ModuleType("osqp")
     broken.__spec__ = sys.modules["osqp"].__spec__
     monkeypatch.setitem(sys.modules, "osqp", broken)
-    ((entry, what),) = CONTROLLERS["mpc"].objections(assigned())
+    ((entry, sentence),) = CONTROLLERS["mpc"].objections(assigned())
     assert entry == "strategy"
-    assert what.startswith("is mpc, whose solver is broken (importing osqp raised AttributeError: module 'osqp' has no")
-    assert what.endswith("expected pip install --force-reinstall osqp first, or the strategy lqr")
+    assert sentence.startswith(
+        "is mpc, whose solver is broken (importing osqp raised AttributeError: module 'osqp' has no"
+    )
+    assert sentence.endswith("expected pip install --force-reinstall osqp first, or the strategy lqr")

@@ -34,9 +34,9 @@ READER = "clear-states"
 
 def scheme(process: Process, encrypted: list[int], mu_d: float) -> PartialEncryption:
     """The scheme."""
-    found = scheme_of(process, {"scheme": "partial-encryption", "encrypted": encrypted, "state_probability": mu_d})
-    assert isinstance(found, PartialEncryption)
-    return found
+    scheme_ = scheme_of(process, {"scheme": "partial-encryption", "encrypted": encrypted, "state_probability": mu_d})
+    assert isinstance(scheme_, PartialEncryption)
+    return scheme_
 
 
 def reader_of(process: Process, batch: Batch) -> Receiver:
@@ -44,20 +44,20 @@ def reader_of(process: Process, batch: Batch) -> Receiver:
     return READERS[READER](Knowledge(process, 1.0, {}, {}), batch)
 
 
-def sent(one: PartialEncryption, batch: Batch) -> Iterator[tuple[int, Floats, Floats, Packet]]:
+def sent(encryption: PartialEncryption, batch: Batch) -> Iterator[tuple[int, Floats, Floats, Packet]]:
     """Slot, state, prediction and packet of every slot."""
-    encoder, trajectory = one.encoder(KEYS, batch), Trajectory(one.process, KEYS["process"], batch)
+    encoder, trajectory = encryption.encoder(KEYS, batch), Trajectory(encryption.process, KEYS["process"], batch)
     for k in range(batch.slots):
         x = trajectory.advance()
         yield k, x, trajectory.predicted, encoder.encode(k, x, trajectory.predicted)
 
 
 def beliefs(
-    receiver: Receiver, one: PartialEncryption, gamma: Floats, batch: Batch
+    receiver: Receiver, encryption: PartialEncryption, gamma: Floats, batch: Batch
 ) -> Iterator[tuple[Floats, Packet, Belief]]:
     """State, packet and belief of every slot, for receptions γ (slots, R)."""
     belief = receiver.prior()
-    for k, x, _, packet in sent(one, batch):
+    for k, x, _, packet in sent(encryption, batch):
         belief = receiver.step(k, belief, Reception(gamma[k] > 0, packet.z, packet.header))
         yield x, packet, belief
 
@@ -80,21 +80,21 @@ def test_packets_show_what_is_not_encrypted() -> None:
 def test_the_user_loses_nothing(encrypted: list[int]) -> None:
     """Its error is that of Theorem IV.1: 0 after a state, A e after an innovation."""
     batch = Batch(60, 50)
-    one = scheme(MARGINAL, encrypted, 0.4)
+    encrypting = scheme(MARGINAL, encrypted, 0.4)
     gamma = (np.random.default_rng(1).random((60, 50)) < 0.7).astype(float)
     error = None
-    for x, packet, belief in beliefs(one.estimator(KEYS, batch), one, gamma, batch):
-        found = x - belief.x_hat
+    for x, packet, belief in beliefs(encrypting.estimator(KEYS, batch), encrypting, gamma, batch):
+        miss = x - belief.x_hat
         state = belief.action == Action.STATE
-        np.testing.assert_allclose(found[:, state], 0.0, atol=1e-12)
+        np.testing.assert_allclose(miss[:, state], 0.0, atol=1e-12)
         if error is not None:
             decoded = belief.action == Action.INNOVATION
-            np.testing.assert_allclose(found[:, decoded], MARGINAL.A @ error[:, decoded], atol=1e-12)
+            np.testing.assert_allclose(miss[:, decoded], MARGINAL.A @ error[:, decoded], atol=1e-12)
             np.testing.assert_array_equal(decoded, packet.nu & (belief.action != Action.LOST))
         else:
             np.testing.assert_array_equal(state, gamma[0] > 0)
-        error = found
-    assert one.outcomes(0.7) == Outcomes.legitimate(0.7, 0.4)
+        error = miss
+    assert encrypting.outcomes(0.7) == Outcomes.legitimate(0.7, 0.4)
 
 
 @pytest.mark.parametrize(
@@ -103,12 +103,12 @@ def test_the_user_loses_nothing(encrypted: list[int]) -> None:
 def test_the_reader_is_the_textbook_filter(process: Process, encrypted: list[int]) -> None:
     """With a selection matrix and an inverse, over a lossy link with both types of packets."""
     batch, n = Batch(40, 8), process.n
-    one = scheme(process, encrypted, 0.6)
+    encrypting = scheme(process, encrypted, 0.6)
     gamma = (np.random.default_rng(2).random((40, 8)) < 0.7).astype(float)
     clear = [i for i in range(n) if i not in encrypted]
     C = np.eye(n)[clear]
     x_hat, P = np.zeros((n, 8)), np.repeat(process.initial_covariance[None], 8, axis=0)
-    for k, (_, packet, belief) in enumerate(beliefs(reader_of(process, batch), one, gamma, batch)):
+    for k, (_, packet, belief) in enumerate(beliefs(reader_of(process, batch), encrypting, gamma, batch)):
         for r in range(8):
             innovation = gamma[k, r] and packet.nu[r]
             if k:
@@ -134,33 +134,33 @@ def test_the_reader_says_what_it_did() -> None:
     np.testing.assert_allclose(belief.P[:, :, 3], MARGINAL.initial_covariance)
     assert reader.step(1, belief, Reception(gamma, z, None)).action.tolist() == [1, 1, 1, 0]
     eavesdropper = READERS[READER](Knowledge(MARGINAL, 1.0, {}, {}), batch)
-    known = eavesdropper.knowing(1, z, belief)
+    belief_known = eavesdropper.knowing(1, z, belief)
     lost = Reception(np.zeros(4, np.bool_), z, header)
-    np.testing.assert_allclose(eavesdropper.step(2, known, lost).P[:, :, 1], MARGINAL.Q, rtol=1e-12)
+    np.testing.assert_allclose(eavesdropper.step(2, belief_known, lost).P[:, :, 1], MARGINAL.Q, rtol=1e-12)
     np.testing.assert_allclose(reader.prior(3).P[:, :, 0], state_covariances(MARGINAL, 3)[2], rtol=1e-12)
 
 
 def test_its_error_has_the_covariance_that_it_reports() -> None:
     """Over 4000 trials behind a lossy link, in the last slot: z within 4.5 for each entry of the error's square."""
     batch = Batch(12, 4000)
-    one = scheme(UNSTABLE, [0], 0.6)
+    scheme_ = scheme(UNSTABLE, [0], 0.6)
     gamma = (np.random.default_rng(3).random((12, 4000)) < 0.6).astype(float)
-    for x, _, belief in beliefs(reader_of(UNSTABLE, batch), one, gamma, batch):
+    for x, _, belief in beliefs(reader_of(UNSTABLE, batch), scheme_, gamma, batch):
         error = x - belief.x_hat
-    found = error[:, None] * error[None] - belief.P
-    scatter = found.std(axis=2, ddof=1) / math.sqrt(4000)
-    assert np.all(np.abs(found.mean(axis=2)) < 4.5 * scatter)
+    difference = error[:, None] * error[None] - belief.P
+    scatter = difference.std(axis=2, ddof=1) / math.sqrt(4000)
+    assert np.all(np.abs(difference.mean(axis=2)) < 4.5 * scatter)
 
 
 def test_one_encrypted_message_is_enough() -> None:
     """Only slot 0 is encrypted, all links are perfect: the estimator has no error, and the eavesdropper's is A^k Σ0 A^kᵀ."""
     batch = Batch(30, 5)
-    one = scheme(UNSTABLE, [0, 1], 0.0)
+    encrypting = scheme(UNSTABLE, [0, 1], 0.0)
     everything = np.ones((30, 5))
-    legitimate, other = one.estimator(KEYS, batch), reader_of(UNSTABLE, batch)
+    legitimate, other = encrypting.estimator(KEYS, batch), reader_of(UNSTABLE, batch)
     grown = UNSTABLE.initial_covariance
     for (x, packet, own), (_, _, theirs) in zip(
-        beliefs(legitimate, one, everything, batch), beliefs(other, one, everything, batch), strict=True
+        beliefs(legitimate, encrypting, everything, batch), beliefs(other, encrypting, everything, batch), strict=True
     ):
         np.testing.assert_allclose(own.x_hat, x, rtol=1e-9)
         assert not own.P.any()
@@ -168,10 +168,10 @@ def test_one_encrypted_message_is_enough() -> None:
         grown = UNSTABLE.A @ grown @ UNSTABLE.A.T
         assert packet.nu.all() or not packet.nu.any()
     assert np.trace(grown) > 1e6
-    outcomes = one.reader_outcomes(READER, 1.0)
+    outcomes = encrypting.reader_outcomes(READER, 1.0)
     assert outcomes is not None
     assert theoretical_traces(UNSTABLE, outcomes, 31)[30] == pytest.approx(np.trace(grown), rel=1e-9)
-    assert theoretical_traces(UNSTABLE, one.outcomes(1.0), 31)[30] == 0.0
+    assert theoretical_traces(UNSTABLE, encrypting.outcomes(1.0), 31)[30] == 0.0
     assert scheme(UNSTABLE, [0], 0.0).closed_form(READER, 1.0, 5).limit == math.inf  # type: ignore[union-attr]
 
 
@@ -184,9 +184,9 @@ def test_outcomes_are_known_where_all_or_nothing_is_encrypted() -> None:
     assert scheme(MARGINAL, [0, 1], 0.0).reader_outcomes(READER, 1.0) is None  # without noise a marginal error stays
     assert scheme(MARGINAL, [0], 0.25).reader_outcomes("naive", 0.8) is None
     assert scheme(MARGINAL, [0], 0.25).closed_form("naive", 0.8, 3) is None
-    found = eavesdropper_outcomes(scheme(MARGINAL, [], 0.3), "colluding", {"reads_as": READER})
-    assert found is not None
-    assert found(0.5) == Outcomes.legitimate(0.5, 0.3)
+    result = eavesdropper_outcomes(scheme(MARGINAL, [], 0.3), "colluding", {"reads_as": READER})
+    assert result is not None
+    assert result(0.5) == Outcomes.legitimate(0.5, 0.3)
     assert eavesdropper_outcomes(scheme(MARGINAL, [0], 0.3), READER, {}) is None
 
 
@@ -226,19 +226,19 @@ def test_theory_is_exact_over_a_perfect_link(mu_d: float) -> None:
     """The covariance of the reader, the same in every trial; behind a lossy link, and with both types, it is a lower bound."""
     batch = Batch(25, 20)
     for process in (MARGINAL, DRIFTING, UNSTABLE):
-        known = form(process, [0], mu_d)
-        assert not known.bound
-        assert not known.infinite_variance
-        one = scheme(process, [0], mu_d)
-        heard = beliefs(reader_of(process, batch), one, np.ones((25, 20)), batch)
-        found = [np.trace(belief.P) for _, _, belief in heard]
-        np.testing.assert_allclose(found, np.repeat(known.traces[:, None], 20, axis=1), rtol=1e-9)
+        formed = form(process, [0], mu_d)
+        assert not formed.bound
+        assert not formed.infinite_variance
+        encrypting = scheme(process, [0], mu_d)
+        heard = beliefs(reader_of(process, batch), encrypting, np.ones((25, 20)), batch)
+        traces = [np.trace(belief.P) for _, _, belief in heard]
+        np.testing.assert_allclose(traces, np.repeat(formed.traces[:, None], 20, axis=1), rtol=1e-9)
         lossy = (np.random.default_rng(4).random((25, 20)) < 0.6).astype(float)
         for chance in (mu_d, 0.5):
             lower = form(process, [0], chance, 0.6)
             assert lower.bound
-            one = scheme(process, [0], chance)
-            for k, (_, _, belief) in enumerate(beliefs(reader_of(process, batch), one, lossy, batch)):
+            encrypting = scheme(process, [0], chance)
+            for k, (_, _, belief) in enumerate(beliefs(reader_of(process, batch), encrypting, lossy, batch)):
                 assert np.all(np.trace(belief.P) >= lower.traces[k] * (1.0 - 1e-9))
 
 
@@ -292,10 +292,10 @@ def test_parameters_that_mean_nothing(given: dict[str, object], entry: str) -> N
 
 def test_costs_and_states_that_are_not_there() -> None:
     """A pad for each encrypted state; innovations are not encrypted; a state that the process does not have is a mistake."""
-    one = scheme(DRIFTING, [0, 2], 0.5)
-    assert (one.secret_bits, one.header_bits) == (128, 64)
-    packets = one.encoder(KEYS, Batch(5, 6)).encode_block(range(5), np.zeros((5, 3, 6)), np.zeros((5, 3, 6)))
-    np.testing.assert_array_equal(one.encrypted(packets), ~packets.nu)
+    encrypting = scheme(DRIFTING, [0, 2], 0.5)
+    assert (encrypting.secret_bits, encrypting.header_bits) == (128, 64)
+    packets = encrypting.encoder(KEYS, Batch(5, 6)).encode_block(range(5), np.zeros((5, 3, 6)), np.zeros((5, 3, 6)))
+    np.testing.assert_array_equal(encrypting.encrypted(packets), ~packets.nu)
     assert not scheme(DRIFTING, [], 0.5).encrypted(packets).any()
     assert PartialEncryption.mistakes_with(DRIFTING, {"encrypted": [0, 2]}) == []
     assert "has 3" in PartialEncryption.mistakes_with(DRIFTING, {"encrypted": [0, 3]})[0][1]

@@ -70,9 +70,9 @@ def test_the_gain_is_that_of_the_riccati_equation(seed: int, rate: float, period
 def test_what_no_input_reaches_has_no_regulator() -> None:
     """A weighted state that grows and is not reached is an objection, and so is an input without any weight."""
     beyond = assignment(np.diag([1.0, 1.2]), plant(np.array([[1.0], [0.0]])))
-    [(entry, what)] = Lqr.objections(beyond)
+    [(entry, sentence)] = Lqr.objections(beyond)
     assert entry == "state_weights"
-    assert "no input can keep from growing" in what
+    assert "no input can keep from growing" in sentence
     free = Assignment(beyond.process, beyond.plant, 1, 1.0, np.ones(2), np.zeros(1), np.zeros(1), np.zeros(1), {})
     assert Lqr.objections(free)[0][0] == "input_weights"
     assert Lqr.objections(assignment(np.eye(2), plant())) == []
@@ -183,24 +183,26 @@ def test_who_is_told_the_inputs_predicts_with_them() -> None:
     encoder = scheme.encoder(secret, batch)
     unaware, offset = scheme.estimator(secret, batch), Offset(process, of, 5)
     aware = InputAwareEstimator(scheme.estimator(secret, batch), of)
-    one, other = aware.prior(), unaware.prior()
+    prior, other = aware.prior(), unaware.prior()
     errors = []
     for k in range(200):
         x = trajectory.advance(drive.pushed(k))
         packet = encoder.encode(k, x, trajectory.predicted)
         heard = Reception(random.random(5) < 0.5, packet.z)
-        one, other = aware.step(k, one, heard), unaware.step(k, other, heard)
+        prior, other = aware.step(k, prior, heard), unaware.step(k, other, heard)
         u = random.normal(size=(2, 5))
-        assert np.allclose(one.x_hat, other.x_hat + offset.next(other.action, u), atol=1e-12)
-        assert np.array_equal(one.P, other.P)
-        if (one.action == Action.STATE).all():
-            assert np.array_equal(one.x_hat, x)
+        assert np.allclose(prior.x_hat, other.x_hat + offset.next(other.action, u), atol=1e-12)
+        assert np.array_equal(prior.P, other.P)
+        if (prior.action == Action.STATE).all():
+            assert np.array_equal(prior.x_hat, x)
         drive.set_inputs(u)
         aware.learn(k, u)
-        errors.append((np.abs(x - one.x_hat).max(), np.abs(x - other.x_hat).max()))
-    known = np.array(errors)[60:]
-    assert known[:, 0].max() < 1e-9, "without noise, a receiver that knows the inputs and has had one state knows all"
-    assert known[:, 1].max() > 1e-3
+        errors.append((np.abs(x - prior.x_hat).max(), np.abs(x - other.x_hat).max()))
+    aware_errors = np.array(errors)[60:]
+    assert aware_errors[:, 0].max() < 1e-9, (
+        "without noise, a receiver that knows the inputs and has had one state knows all"
+    )
+    assert aware_errors[:, 1].max() > 1e-3
 
 
 def test_a_riccati_equation_without_a_solution_is_said_to_have_none() -> None:
@@ -210,8 +212,11 @@ def test_a_riccati_equation_without_a_solution_is_said_to_have_none() -> None:
     for asked in (unreached, large):
         with pytest.raises(ValueError, match="the Riccati equation has no solution"):
             gain(asked)
-        ((entry, what),) = Lqr.objections(asked)
-        assert (entry, what.partition(":")[0]) == ("state_weights", "weigh a state that no input can keep from growing")
+        ((entry, sentence),) = Lqr.objections(asked)
+        assert (entry, sentence.partition(":")[0]) == (
+            "state_weights",
+            "weigh a state that no input can keep from growing",
+        )
 
 
 def test_the_inputs_change_nothing_of_what_an_estimator_does() -> None:

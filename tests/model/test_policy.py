@@ -106,12 +106,12 @@ def test_a_rule_that_ignores_the_eavesdropper_is_scheduled(process: Process, thr
     """The metrics by both holding times are those of the chain of `scheduled`, unbounded errors as well."""
     for mu, mu_e in ((0.8, 0.6), (0.95, 0.2), (1.0, 0.5), (0.9, 1.0), (0.7, 0.0)):
         send = np.broadcast_to(np.arange(1, 6)[:, None] >= threshold, (5, 5))
-        found = policy_metrics(process, send, mu, mu_e)
+        result = policy_metrics(process, send, mu, mu_e)
         expected = scheduled_metrics(process, links_of(mu, mu_e), threshold)
-        assert found.legitimate == pytest.approx(expected.legitimate, rel=1e-9, abs=1e-13)
-        assert found.eavesdropper == pytest.approx(expected.eavesdropper, rel=1e-9, abs=1e-13)
-        assert found.transmissions == pytest.approx(expected.transmissions, rel=1e-9)
-        assert found.transmissions == pytest.approx((1 / mu) / (threshold - 1 + 1 / mu))
+        assert result.legitimate == pytest.approx(expected.legitimate, rel=1e-9, abs=1e-13)
+        assert result.eavesdropper == pytest.approx(expected.eavesdropper, rel=1e-9, abs=1e-13)
+        assert result.transmissions == pytest.approx(expected.transmissions, rel=1e-9)
+        assert result.transmissions == pytest.approx((1 / mu) / (threshold - 1 + 1 / mu))
 
 
 def test_held_traces_are_the_errors_after_a_state() -> None:
@@ -144,10 +144,10 @@ def test_the_metrics_of_a_policy_are_those_of_following_it(weight: float) -> Non
 
 def test_a_point_of_the_front_is_what_the_scheme_does() -> None:
     """`scheduled` simulated with the best threshold of a point: squared errors and packets within 4.5 standard errors."""
-    found = front(STABLE, ScheduledLinks(0.7, 0.5, (0.56, 0.0), (0.28, 0.28)), (0.45, 0.5), (0.0,), 4)
-    threshold = found.points[-1].scheduled
+    result = front(STABLE, ScheduledLinks(0.7, 0.5, (0.56, 0.0), (0.28, 0.28)), (0.45, 0.5), (0.0,), 4)
+    threshold = result.points[-1].scheduled
     assert threshold > 1
-    metrics = found.thresholds[threshold - 1]
+    metrics = result.thresholds[threshold - 1]
     slots, trials, first = 160, 3000, 60
     events = (coins(0.7, slots, trials, 1), coins(0.5, slots, trials, 2), coins(0.8, slots, trials, 3))
     played = played_over("scheduled", STABLE, threshold, events)
@@ -170,39 +170,39 @@ def test_a_point_of_the_front_is_what_the_scheme_does() -> None:
 def test_the_front_is_a_front() -> None:
     """Along the weights the legitimate error falls; no point dominates another; weights with the same policy are one point."""
     weights = [i / 20 for i in range(21)]
-    found = front(MICROGRID, links_of(MU, MU_E), weights, (0.0, 1e-6), 6)
+    result = front(MICROGRID, links_of(MU, MU_E), weights, (0.0, 1e-6), 6)
     for price in (0.0, 1e-6):
-        ours = [point for point in found.points if point.price == price]
+        ours = [point for point in result.points if point.price == price]
         assert [point.weights for point in ours] == sorted(point.weights for point in ours)
         legitimate = [point.metrics.legitimate for point in ours]
         eavesdroppers = [point.metrics.eavesdropper for point in ours]
         assert legitimate == sorted(legitimate, reverse=True)
         assert eavesdroppers == sorted(eavesdroppers, reverse=True)
-        asked = {weight for weight, one in found.never if one == price}
+        asked = {weight for weight, priced in result.never if priced == price}
         asked |= {w for point in ours for w in weights if point.weights[0] <= w <= point.weights[1]}
-        assert found.dominated or asked == set(weights)
-    for one, other in itertools.permutations(found.points, 2):
-        assert not one.metrics.dominates(other.metrics)
-    assert len(found.thresholds) == 6
-    assert found.points[-1].weights[1] == 1.0
+        assert result.dominated or asked == set(weights)
+    for mine, other in itertools.permutations(result.points, 2):
+        assert not mine.metrics.dominates(other.metrics)
+    assert len(result.thresholds) == 6
+    assert result.points[-1].weights[1] == 1.0
 
 
 def test_a_dominated_policy_is_left_out() -> None:
     """Against an eavesdropper whose error is unbounded, the policy with the least error of the estimator dominates others."""
-    found = front(UNSTABLE, links_of(0.9, 0.5), [i / 20 for i in range(21)], (0.0, 1e-3), 4)
-    assert found.dominated == 1
-    assert all(math.isinf(point.metrics.eavesdropper) for point in found.points if point.weights[1] < 0.8)
-    assert found.as_dict()["dominated"] == 1
+    result = front(UNSTABLE, links_of(0.9, 0.5), [i / 20 for i in range(21)], (0.0, 1e-3), 4)
+    assert result.dominated == 1
+    assert all(math.isinf(point.metrics.eavesdropper) for point in result.points if point.weights[1] < 0.8)
+    assert result.as_dict()["dominated"] == 1
 
 
 def test_knowing_the_eavesdropper_helps() -> None:
     """At each weight the best policy costs no more than `scheduled` with any threshold, and sometimes less."""
     gains = []
     for weight in (0.5, 0.55, 0.6, 0.7, 0.8):
-        found = front(STABLE, links_of(0.9, 0.9), (weight,), (0.0,), 8)
-        (point,) = found.points
-        best = found.thresholds[point.scheduled - 1].cost(weight, 0.0)
-        assert best == min(one.cost(weight, 0.0) for one in found.thresholds)
+        result = front(STABLE, links_of(0.9, 0.9), (weight,), (0.0,), 8)
+        (point,) = result.points
+        best = result.thresholds[point.scheduled - 1].cost(weight, 0.0)
+        assert best == min(threshold.cost(weight, 0.0) for threshold in result.thresholds)
         gains.append(best - point.metrics.cost(weight, 0.0))
     assert min(gains) >= -1e-9
     assert max(gains) > 1e-4

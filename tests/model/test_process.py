@@ -64,9 +64,9 @@ def test_products_do_not_depend_on_the_batch(n: int, trials: int, seed: int, dat
     process = Process(rng.standard_normal((n, n)), np.eye(n), np.eye(n))
     x, P = rng.standard_normal((n, trials)), rng.standard_normal((n, n, trials))
     r = data.draw(st.integers(0, trials - 1))
-    one = slice(r, r + 1)
-    assert process.predict(x[:, one].copy()).tobytes() == process.predict(x)[:, one].tobytes()
-    assert process.carry(P[:, :, one].copy()).tobytes() == process.carry(P)[:, :, one].tobytes()
+    part = slice(r, r + 1)
+    assert process.predict(x[:, part].copy()).tobytes() == process.predict(x)[:, part].tobytes()
+    assert process.carry(P[:, :, part].copy()).tobytes() == process.carry(P)[:, :, part].tobytes()
 
 
 def states(process: Process, batch: Batch) -> np.ndarray:
@@ -102,14 +102,14 @@ def test_states_follow_the_process() -> None:
 
 def test_covariances_are_the_recursion() -> None:
     """Σ_k = A Σ_{k−1} Aᵀ + Q from Σ0, in closed form."""
-    found = state_covariances(DRIFTING, 20)
+    result = state_covariances(DRIFTING, 20)
     for k in (0, 1, 7, 19):
         power = np.linalg.matrix_power
         expected = power(DRIFTING.A, k) @ DRIFTING.initial_covariance @ power(DRIFTING.A, k).T
         expected += sum(
             (power(DRIFTING.A, j) @ DRIFTING.Q @ power(DRIFTING.A, j).T for j in range(k)), np.zeros((3, 3))
         )
-        assert np.allclose(found[k], expected, rtol=1e-12)
+        assert np.allclose(result[k], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("process", [UNSTABLE, DRIFTING])
@@ -123,9 +123,9 @@ def test_factors_are_of_the_covariances(process: Process) -> None:
         assert np.allclose(F @ F.T, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
         assert np.array_equal(F, StateFactors(process).carried(k))
     for slots in (range(3), range(3, 12), range(4, 6), range(20, 30), range(1)):
-        found = factors.block(slots)
+        block = factors.block(slots)
         for row, k in enumerate(slots):
-            assert np.array_equal(found[row], StateFactors(process).carried(k) if k else np.zeros(process.A.shape))
+            assert np.array_equal(block[row], StateFactors(process).carried(k) if k else np.zeros(process.A.shape))
 
 
 def test_factors_hold_where_cholesky_fails() -> None:
@@ -142,10 +142,10 @@ def test_factors_hold_where_cholesky_fails() -> None:
         if k < 60:
             exact = [[exact[i][j] + Q_[i][j] for j in range(2)] for i in range(2)]
     F = [[Fraction(v) for v in row] for row in StateFactors(UNSTABLE).carried(60).tolist()]
-    found = times(F, [list(row) for row in zip(*F, strict=True)])
+    result = times(F, [list(row) for row in zip(*F, strict=True)])
     for i in range(2):
         for j in range(2):
-            assert abs(found[i][j] / exact[i][j] - 1) < Fraction(1, 10**13)
+            assert abs(result[i][j] / exact[i][j] - 1) < Fraction(1, 10**13)
     with pytest.raises(np.linalg.LinAlgError):
         np.linalg.cholesky(state_covariances(UNSTABLE, 60)[-1] - UNSTABLE.Q)
 
@@ -171,8 +171,8 @@ def test_mistakes_are_named(name: str) -> None:
     """The reason why matrices are not a process is given for the right entry."""
     *matrices, entry, sentence = MISTAKES[name]
     A, Q, initial = (np.array(M, float) for M in matrices)
-    found = mistakes_of(A, Q, initial)
-    assert any(where == entry and re.search(sentence, what) for where, what in found), found
+    mistakes = mistakes_of(A, Q, initial)
+    assert any(where == entry and re.search(sentence, reason) for where, reason in mistakes), mistakes
 
 
 @pytest.mark.parametrize("process", [UNSTABLE, DRIFTING])
@@ -183,18 +183,18 @@ def test_a_process_has_no_mistakes(process: Process) -> None:
 
 def test_a_process_of_too_many_states_is_refused() -> None:
     """Before anything is computed of it."""
-    ((entry, what),) = mistakes_of(np.eye(MOST_STATES + 1), np.eye(2), np.eye(2))
+    ((entry, sentence),) = mistakes_of(np.eye(MOST_STATES + 1), np.eye(2), np.eye(2))
     assert entry == "A"
-    assert what.startswith(f"has {MOST_STATES + 1} rows; expected at most {MOST_STATES} states")
+    assert sentence.startswith(f"has {MOST_STATES + 1} rows; expected at most {MOST_STATES} states")
 
 
 @pytest.mark.parametrize("A", [np.array([[1.0, 0.1], [0.0, 1.0]]), np.eye(2)])
 def test_a_singular_Q_is_refused_with_the_entry_that_allows_it(A: Floats) -> None:
     """The Q of a double integrator gets a hint; no entry allows a Q with a negative eigenvalue."""
     Q = np.diag([0.0, 0.01])
-    found = mistakes_of(A, Q, np.eye(2))
-    assert found
-    assert all(entry == "Q" and "; or singular_noise = true" in what for entry, what in found)
+    mistakes = mistakes_of(A, Q, np.eye(2))
+    assert mistakes
+    assert all(entry == "Q" and "; or singular_noise = true" in sentence for entry, sentence in mistakes)
     assert mistakes_of(A, Q, np.eye(2), singular_noise=True) == []
     assert "singular_noise" not in str(mistakes_of(A, -Q, np.eye(2)))
 
@@ -246,11 +246,11 @@ def test_the_horizon_of_a_long_run_is_bisected() -> None:
     assert slot_by_slot(walk, 2) is None
     assert horizon(walk, 10**7) is None
     grows = Process(np.array([[1.000001]]), np.array([[1.0]]), np.array([[1.0]]))
-    found = horizon(grows, 10**8)
+    result = horizon(grows, 10**8)
     # Σ_k = a^2k + (a^2k − 1)/(a² − 1)
     a2 = 1.000001**2
     expected = np.log(((0.01 * 2.0**53) ** 2 * (a2 - 1) + 1) / a2) / np.log(a2)
-    assert found is not None
-    assert found > 4 * 2**20
-    assert abs(found - expected) < 2 + 1e-6 * expected
+    assert result is not None
+    assert result > 4 * 2**20
+    assert abs(result - expected) < 2 + 1e-6 * expected
     assert limit > 1.0

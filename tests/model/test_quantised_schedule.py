@@ -70,10 +70,10 @@ def test_the_error_is_white_and_uniform_whatever_the_state_is() -> None:
     scale = np.sqrt(np.diag(state_covariances(STABLE, 4)[3]))[:, None]
     for x in (np.full((2, trials), 0.3) * scale, np.random.default_rng(1).normal(size=(2, trials)) * scale):
         error = (quantiser.read(3, quantiser.levels(3, x)) - x) / quantiser.steps(3)[:, None]
-        for one, state in zip(error, x, strict=True):
-            assert stats.kstest(one, "uniform", args=(-0.5, 1.0)).pvalue > 1e-4
+        for error_of_state, state in zip(error, x, strict=True):
+            assert stats.kstest(error_of_state, "uniform", args=(-0.5, 1.0)).pvalue > 1e-4
             if state.std() > 0.0:
-                assert abs(np.corrcoef(one, state)[0, 1]) < 4.0 / np.sqrt(trials)
+                assert abs(np.corrcoef(error_of_state, state)[0, 1]) < 4.0 / np.sqrt(trials)
     expected = QuantisationError.of(3, 6.0).covariances(STABLE, 4)[3]
     assert np.allclose(np.diag(expected), quantiser.steps(3) ** 2 / 12.0)
 
@@ -128,7 +128,7 @@ def test_expectations_are_those_of_all_courses(process: Process, threshold: floa
     chances = np.prod([np.where(events, p, 1.0 - p) for events, p in odds], axis=0).prod(axis=0)
     R = error.covariances(process, slots)
     held, P = np.full(chances.shape, 10**6), {name: np.zeros((chances.size, 2, 2)) for name in ("legitimate", "eve")}
-    found = {
+    expected = {
         "legitimate": always_sent(MU).covariances(process, slots, error),
         "eve": encrypted_schedule(threshold, MU_E, (MU * MU_E * ARRIVES, MU * (1 - MU_E) * ARRIVES)).covariances(
             process, slots, error
@@ -141,7 +141,7 @@ def test_expectations_are_those_of_all_courses(process: Process, threshold: floa
         for name, heard in (("legitimate", gamma[k]), ("eve", gamma_e[k] & ~encrypted)):
             grown = process.A @ P[name] @ process.A.T + process.Q if k else process.initial_covariance
             P[name] = np.where(heard[:, None, None], R[k], grown)
-            assert np.allclose(np.tensordot(chances, P[name], axes=1), found[name][k], rtol=1e-9)
+            assert np.allclose(np.tensordot(chances, P[name], axes=1), expected[name][k], rtol=1e-9)
         held = np.where(gamma[k] & link[k], 1, held + 1)
     assert encrypted_fractions[0] == pytest.approx(1.0)
     # Once as many slots as the threshold have passed, the chain is as good as stationary.

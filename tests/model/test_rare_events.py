@@ -59,9 +59,9 @@ def enumerated(process: Process, outcomes: Outcomes, slots: int) -> tuple[Floats
 
 def found_in(process: Process, outcomes: Outcomes, slots: int) -> Streaks:
     """The streaks of a run that has them."""
-    found = streaks(process, outcomes, slots)
-    assert found is not None
-    return found
+    result = streaks(process, outcomes, slots)
+    assert result is not None
+    return result
 
 
 @pytest.mark.parametrize("process", [PLANE, STABLE], ids=["plane", "stable"])
@@ -70,11 +70,11 @@ def found_in(process: Process, outcomes: Outcomes, slots: int) -> Streaks:
 )
 def test_streaks_are_those_of_all_courses_of_a_run(process: Process, outcomes: Outcomes) -> None:
     """Numbers and carried errors agree with the enumeration of every course of six slots, kind by kind and slot by slot."""
-    found = found_in(process, outcomes, 6)
+    streaks_ = found_in(process, outcomes, 6)
     number, carried = enumerated(process, outcomes, 6)
-    assert found.number == pytest.approx(number, rel=1e-12, abs=1e-15)
-    assert found.carried == pytest.approx(carried, rel=1e-12, abs=1e-15)
-    assert found.total == pytest.approx(carried.sum(), rel=1e-12)
+    assert streaks_.number == pytest.approx(number, rel=1e-12, abs=1e-15)
+    assert streaks_.carried == pytest.approx(carried, rel=1e-12, abs=1e-15)
+    assert streaks_.total == pytest.approx(carried.sum(), rel=1e-12)
 
 
 @pytest.mark.parametrize("outcomes", [LEGITIMATE, MISLED, SMART, Outcomes.legitimate(0.8, 0.0)])
@@ -93,22 +93,22 @@ def test_streaks_do_not_depend_on_the_parts_of_a_run(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("outcomes", [LEGITIMATE, MISLED, SMART], ids=["legitimate", "misled", "smart"])
 def test_streaks_of_a_long_run_carry_the_whole_expectation(outcomes: Outcomes) -> None:
     """Over several blocks of powers, all but the fraction that is left out is carried; the numbers fall with the length."""
-    found = found_in(STABLE, outcomes, 3000)
-    assert found.total == pytest.approx(float(theoretical_traces(STABLE, outcomes, 3000).sum()), rel=1e-12)
-    assert found.carried.sum() == pytest.approx(found.total, rel=2e-9)
-    assert np.all(np.diff(found.number) <= 0.0)
+    streaks_ = found_in(STABLE, outcomes, 3000)
+    assert streaks_.total == pytest.approx(float(theoretical_traces(STABLE, outcomes, 3000).sum()), rel=1e-12)
+    assert streaks_.carried.sum() == pytest.approx(streaks_.total, rel=2e-9)
+    assert np.all(np.diff(streaks_.number) <= 0.0)
 
 
 def test_the_fraction_is_of_streaks_that_too_few_trials_meet() -> None:
     """The fraction falls with the trials, and `trials_for` gives the number at which it reaches a level."""
-    found = found_in(PLANE, SMART, 200)
-    fractions = [found.fraction(trials) for trials in (1, 10, 100, 10_000, 10**9)]
+    streaks_ = found_in(PLANE, SMART, 200)
+    fractions = [streaks_.fraction(trials) for trials in (1, 10, 100, 10_000, 10**9)]
     assert fractions == sorted(fractions, reverse=True)
     assert fractions[0] > 0.1
     assert fractions[-1] < 0.001
     for level in (0.2, 0.05, 0.001):
-        trials = int(found.trials_for(level))
-        assert found.fraction(trials) <= level < found.fraction(trials - 20)
+        trials = int(streaks_.trials_for(level))
+        assert streaks_.fraction(trials) <= level < streaks_.fraction(trials - 20)
 
 
 def test_a_small_fraction_is_not_rounded_away() -> None:
@@ -122,24 +122,24 @@ def test_a_small_fraction_is_not_rounded_away() -> None:
 def test_the_fraction_of_an_initial_covariance_that_no_trial_misses_packets_of() -> None:
     """A first packet that one trial in a thousand loses carries nearly all of the error if nothing else does."""
     process = Process(np.array([[0.5]]), np.array([[1e-9]]), np.array([[1.0]]))
-    found = found_in(process, Outcomes.plain(0.999), 50)
-    assert found.fraction(19_000) > 0.99
-    assert found.fraction(20_001) < 0.01
-    assert found.trials_for(0.05) == 20_000.0
+    streaks_ = found_in(process, Outcomes.plain(0.999), 50)
+    assert streaks_.fraction(19_000) > 0.99
+    assert streaks_.fraction(20_001) < 0.01
+    assert streaks_.trials_for(0.05) == 20_000.0
 
 
 def test_a_receiver_without_error_has_no_rare_events() -> None:
     """A perfect link has no error that anything could carry."""
-    found = found_in(STABLE, Outcomes.plain(1.0), 20)
-    assert (found.total, found.fraction(1), found.trials_for(0.05)) == (0.0, 0.0, 1.0)
+    streaks_ = found_in(STABLE, Outcomes.plain(1.0), 20)
+    assert (streaks_.total, streaks_.fraction(1), streaks_.trials_for(0.05)) == (0.0, 0.0, 1.0)
 
 
 def test_a_number_of_trials_beyond_double_precision_is_infinite() -> None:
     """A start that grows faster than its streak dies out is carried by a streak that no number of trials meets."""
     process = Process(np.array([[1e3]]), np.array([[1.0]]), np.array([[1.0]]))
-    found = found_in(process, Outcomes.plain(1.0 - 1e-5), 70)
-    assert found.fraction(10**9) > 0.99
-    assert found.trials_for(0.05) == math.inf
+    streaks_ = found_in(process, Outcomes.plain(1.0 - 1e-5), 70)
+    assert streaks_.fraction(10**9) > 0.99
+    assert streaks_.trials_for(0.05) == math.inf
 
 
 def test_streaks_are_unknown_where_they_cannot_be_computed(monkeypatch: pytest.MonkeyPatch) -> None:

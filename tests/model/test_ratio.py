@@ -44,38 +44,40 @@ def ratio(process: Process, mu: float, mu_e: float, mu_d: float) -> float:
 @pytest.mark.parametrize("mu_e", mostly_long([0.95, 0.9, 0.85], [0.9]))
 def test_the_cheapest_is_the_largest_of_the_grid(mu_e: float) -> None:
     """No μ_d of a grid above it has the ratio, it has it, and all in the intervals do; a large enough one at every place."""
-    one = Adversary("smart", mu_e, 1.0, 0.0)
+    smart = Adversary("smart", mu_e, 1.0, 0.0)
     for wanted in (1.5, 2.0, 2.4):
-        found = cheapest(UNSTABLE, 0.9, [one], wanted)
-        inside = [any(low < mu_d < high for low, high in found.intervals) for mu_d in np.linspace(0.56, 0.999, 90)]
+        result = cheapest(UNSTABLE, 0.9, [smart], wanted)
+        inside = [any(low < mu_d < high for low, high in result.intervals) for mu_d in np.linspace(0.56, 0.999, 90)]
         truly = [ratio(UNSTABLE, 0.9, mu_e, mu_d) >= wanted for mu_d in np.linspace(0.56, 0.999, 90)]
         assert inside == truly
-        there = ratio(UNSTABLE, 0.9, mu_e, found.mu_d)
-        assert found.ratios["smart"] == pytest.approx(there, rel=1e-6)
-        assert there == pytest.approx(wanted, rel=1e-6) or (there > wanted and found.mu_d == 1.0)
+        there = ratio(UNSTABLE, 0.9, mu_e, result.mu_d)
+        assert result.ratios["smart"] == pytest.approx(there, rel=1e-6)
+        assert there == pytest.approx(wanted, rel=1e-6) or (there > wanted and result.mu_d == 1.0)
         plain = limit(UNSTABLE, 0.9, 0.0)
-        assert found.cost == pytest.approx(limit(UNSTABLE, 0.9 * found.mu_d, 0.9 * (1 - found.mu_d)) / plain, rel=1e-6)
+        assert result.cost == pytest.approx(
+            limit(UNSTABLE, 0.9 * result.mu_d, 0.9 * (1 - result.mu_d)) / plain, rel=1e-6
+        )
 
 
 def test_the_largest_ratio_is_that_of_a_grid() -> None:
     """Over the admissible μ_d, where it is attained; the refusal says how large it is, and where."""
-    found = largest_ratio(UNSTABLE, 0.9, [SMART])
-    assert found is not None
+    result = largest_ratio(UNSTABLE, 0.9, [SMART])
+    assert result is not None
     grid = np.linspace(0.56, 0.999, 400)
     ratios = [ratio(UNSTABLE, 0.9, 0.95, mu_d) for mu_d in grid]
-    assert found.ratio == pytest.approx(max(ratios), rel=1e-4)
-    assert found.ratio >= max(ratios) * (1 - 1e-9)
-    assert found.mu_d == pytest.approx(grid[int(np.argmax(ratios))], abs=2e-3)
-    with pytest.raises(UsageError, match=re.escape(f"the most is {found.ratio:.4g}× at μ_d = {found.mu_d:.4g}")):
-        cheapest(UNSTABLE, 0.9, [SMART], 1.01 * found.ratio)
+    assert result.ratio == pytest.approx(max(ratios), rel=1e-4)
+    assert result.ratio >= max(ratios) * (1 - 1e-9)
+    assert result.mu_d == pytest.approx(grid[int(np.argmax(ratios))], abs=2e-3)
+    with pytest.raises(UsageError, match=re.escape(f"the most is {result.ratio:.4g}× at μ_d = {result.mu_d:.4g}")):
+        cheapest(UNSTABLE, 0.9, [SMART], 1.01 * result.ratio)
 
 
 def test_several_eavesdroppers_need_the_ratio_all() -> None:
     """The intervals are those in which each of them has it."""
-    each = [large_enough(UNSTABLE, 0.9, [one], 2.0) for one in (SMART, DULL, GENIE, NAIVE)]
+    each = [large_enough(UNSTABLE, 0.9, [adversary], 2.0) for adversary in (SMART, DULL, GENIE, NAIVE)]
     every = large_enough(UNSTABLE, 0.9, [SMART, DULL, GENIE, NAIVE], 2.0)
     for mu_d in np.linspace(0.5343, 0.9997, 211):
-        in_all = all(any(low < mu_d < high for low, high in one) for one in each)
+        in_all = all(any(low < mu_d < high for low, high in intervals) for intervals in each)
         assert any(low < mu_d < high for low, high in every) == in_all
 
 
@@ -89,9 +91,9 @@ def test_a_largest_trace_bounds_the_choice() -> None:
 
 def test_a_marginal_process_has_the_closed_form() -> None:
     """A = I: J = (1−μ) tr Q/(μ μ_d) and J_e = (1−μ_e μ_d) tr Q/(μ_e μ_d), so the ratio R is at μ_d = (1 − R(1−μ))/μ."""
-    found = cheapest(MICROGRID, 0.6, [Adversary("smart", 0.6, 1.0, 0.0)], 1.8)
-    assert found.mu_d == pytest.approx((1.0 - 1.8 * 0.4) / 0.6, rel=1e-9)
-    assert found.cost == pytest.approx(1.0 / found.mu_d, rel=1e-9)
+    result = cheapest(MICROGRID, 0.6, [Adversary("smart", 0.6, 1.0, 0.0)], 1.8)
+    assert result.mu_d == pytest.approx((1.0 - 1.8 * 0.4) / 0.6, rel=1e-9)
+    assert result.cost == pytest.approx(1.0 / result.mu_d, rel=1e-9)
 
 
 def test_without_an_admissible_probability_there_is_no_choice() -> None:
@@ -113,7 +115,7 @@ def test_a_refusal_names_what_each_eavesdropper_has() -> None:
 
 def test_a_choice_as_json_has_null_for_infinity() -> None:
     """A naive eavesdropper's error is unbounded; the design has the choice beside its other entries."""
-    found = cheapest(UNSTABLE, 0.9, [SMART, NAIVE], 2.0)
-    assert found.as_dict()["ratios"] == {"smart": pytest.approx(2.0, rel=1e-6), "naive": None}
-    assert found.as_dict()["intervals"] == [list(one) for one in found.intervals]
-    assert design(UNSTABLE, 0.9, 0.6, [SMART, NAIVE], slots=20, min_ratio=2.0).as_dict()["choice"] == found.as_dict()
+    result = cheapest(UNSTABLE, 0.9, [SMART, NAIVE], 2.0)
+    assert result.as_dict()["ratios"] == {"smart": pytest.approx(2.0, rel=1e-6), "naive": None}
+    assert result.as_dict()["intervals"] == [list(interval) for interval in result.intervals]
+    assert design(UNSTABLE, 0.9, 0.6, [SMART, NAIVE], slots=20, min_ratio=2.0).as_dict()["choice"] == result.as_dict()

@@ -36,14 +36,14 @@ def test_packets_are_independent_of_the_state(process: Process) -> None:
     for _ in range(12):
         sigmas.append(combined((1, congruent(A, sigmas[-1])), (1, Q)))
     for t in (0, 1, 5):
-        L, crossed, found = identity(process.n), sigmas[t], np.eye(process.n)
+        L, crossed, inverse = identity(process.n), sigmas[t], np.eye(process.n)
         for k in range(t + 1, 13):
             # One slot's L is A + Q A⁻ᵀ Σ⁻¹; the covariance of x_k and x_t is A^{k−t} Σ_t.
             step = combined((1, A), (1, times(Q, transposed(inverted(A)), inverted(sigmas[k - 1]))))
-            L, crossed, found = times(step, L), times(A, crossed), code.at(k) @ found
+            L, crossed, inverse = times(step, L), times(A, crossed), code.at(k) @ inverse
             assert combined((1, sigmas[k]), (-1, times(L, transposed(crossed)))) == combined((0, Q))
             expected = np.array([[float(value) for value in row] for row in L])
-            assert np.allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+            assert np.allclose(inverse, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
 def errors_after_a_critical_slot(scheme: type[Scheme]) -> dict[int, np.ndarray]:

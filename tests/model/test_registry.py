@@ -62,7 +62,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     yield tmp_path
-    for name in [one for one in sys.modules if one.startswith("registered")]:
+    for name in [module for module in sys.modules if module.startswith("registered")]:
         del sys.modules[name]
 
 
@@ -73,17 +73,17 @@ def registry(group: str = GROUP, **given: Any) -> Registry[LossModel]:
 
 def test_the_built_in_classes_are_what_it_iterates_over(folder: Path) -> None:
     """Others are looked up by their names."""
-    found = registry()
-    assert (list(found), len(found), found["bernoulli"]) == (["bernoulli"], 1, Bernoulli)
-    assert found.names == ["bernoulli", "gone", "here", "mine"]
+    result = registry()
+    assert (list(result), len(result), result["bernoulli"]) == (["bernoulli"], 1, Bernoulli)
+    assert result.names == ["bernoulli", "gone", "here", "mine"]
     assert registry("evedrop.tests.none").names == ["bernoulli"]
-    assert [found.foreign(name) for name in ("bernoulli", "mine", "registered:Mine")] == [False, True, True]
+    assert [result.foreign(name) for name in ("bernoulli", "mine", "registered:Mine")] == [False, True, True]
     assert [is_own(name) for name in ("bernoulli", "registered:Mine", 3)] == [False, True, False]
-    mine = found["mine"]
-    assert mine is found["registered:Mine"]
+    mine = result["mine"]
+    assert mine is result["registered:Mine"]
     assert issubclass(mine, Bernoulli)
-    assert "mine" in found
-    assert "other" not in found
+    assert "mine" in result
+    assert "other" not in result
 
 
 REFUSED = {
@@ -140,21 +140,21 @@ def test_a_class_that_must_not_run_here_has_a_remote_class(folder: Path) -> None
         asked_for.append(name)
         return type("Elsewhere", (Bernoulli,), {"parameters": {"model": 1} if name.endswith("Taken") else {}})
 
-    found = registry(remote_class=remote_class)
-    assert found["mine"].__name__ == "Elsewhere"
-    assert found["bernoulli"] is Bernoulli
+    result = registry(remote_class=remote_class)
+    assert result["mine"].__name__ == "Elsewhere"
+    assert result["bernoulli"] is Bernoulli
     assert "registered" not in sys.modules
     with pytest.raises(NotRegistered, match="one of whose parameters is called model"):
-        found["registered:Taken"]
+        result["registered:Taken"]
     with pytest.raises(NotRegistered, match=r"expected PACKAGE\.MODULE:CLASS"):
-        found["mine:"]
+        result["mine:"]
     assert asked_for == ["mine", "registered:Taken"]
-    assert found.imported("mine").__name__ == "Mine"
+    assert result.imported("mine").__name__ == "Mine"
 
 
-def checks(found: Any) -> type[Any]:
+def checks(value: Any) -> type[Any]:
     """A class whose check of parameters does so."""
-    return type("Mine", (Bernoulli,), {"mistakes": staticmethod(found), "__module__": __name__})
+    return type("Mine", (Bernoulli,), {"mistakes": staticmethod(value), "__module__": __name__})
 
 
 def test_the_mistakes_that_a_class_finds_are_texts() -> None:
@@ -165,13 +165,13 @@ def test_the_mistakes_that_a_class_finds_are_texts() -> None:
     def fails(given: Any) -> Any:
         raise ValueError("too   deep")
 
-    ((entry, what),) = asked(checks(fails), {"depth": 3})
+    ((entry, sentence),) = asked(checks(fails), {"depth": 3})
     assert entry == "depth"
-    assert what.startswith("cannot be checked: Mine.mistakes raised ValueError: too deep, test_registry.py line ")
-    assert what.endswith("; expected it to return a list of (entry, what is wrong)")
+    assert sentence.startswith("cannot be checked: Mine.mistakes raised ValueError: too deep, test_registry.py line ")
+    assert sentence.endswith("; expected it to return a list of (entry, what is wrong)")
     for wrong in (None, ["depth"], [("depth",)]):
-        said = f"cannot be checked: Mine.mistakes returned {wrong!r}; expected it to return a list of (entry, what is wrong)"
-        assert asked(checks(lambda _, wrong=wrong: wrong), {}) == [("parameters", said)]
+        message = f"cannot be checked: Mine.mistakes returned {wrong!r}; expected it to return a list of (entry, what is wrong)"
+        assert asked(checks(lambda _, wrong=wrong: wrong), {}) == [("parameters", message)]
 
 
 def raised(code: str, file: str = "/there/mine.py") -> BaseException:

@@ -33,24 +33,24 @@ def method(name: str, code: str) -> str:
 @pytest.fixture
 def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
     """The processes that answer, in order."""
-    found: list[subprocess.Popen[bytes]] = []
+    processes: list[subprocess.Popen[bytes]] = []
     start = subprocess.Popen
 
     def keeping(*given: Any, **options: Any) -> subprocess.Popen[bytes]:
-        found.append(start(*given, **options))
-        return found[-1]
+        processes.append(start(*given, **options))
+        return processes[-1]
 
     monkeypatch.setattr(subprocess, "Popen", keeping)
-    return found
+    return processes
 
 
 @pytest.fixture
 def calls(tmp_path: Path, started: list[subprocess.Popen[bytes]]) -> Iterator[RemoteCalls]:
     """Of classes in a folder; afterwards no process is left."""
-    found = RemoteCalls()
-    found.folder = str(tmp_path)
-    yield found
-    found.forget()
+    remote = RemoteCalls()
+    remote.folder = str(tmp_path)
+    yield remote
+    remote.forget()
     assert all(process.poll() is not None for process in started)
 
 
@@ -65,11 +65,11 @@ def test_a_class_answers_once_and_its_answers_are_kept(
     assert len(started) == 1
     assert started[0].poll() is None
     assert calls.folder_of(name) == str(tmp_path)
-    known = calls.of([name])
-    assert len(known) == 3
+    answers = calls.of([name])
+    assert len(answers) == 3
     assert calls.of(["other:Class"]) == {}
     told = RemoteCalls()
-    told.learn(known)
+    told.learn(answers)
     assert told.call(name, "betrayed", "STRATEGIES", {"slot": 4}) == 4
     assert len(started) == 1
 
@@ -115,11 +115,11 @@ def test_a_class_that_gives_no_answer_is_said_to(
     case: str, calls: RemoteCalls, tmp_path: Path, started: list[subprocess.Popen[bytes]]
 ) -> None:
     """With the reason. Its process ends, nothing is kept, and a corrected class answers the same question."""
-    code, said = BROKEN[case]
+    code, message = BROKEN[case]
     name = written(tmp_path, method("betrayed", code), f"answering_{case}")
     with pytest.raises(NoAnswer) as refused:
         calls.call(name, "betrayed", "STRATEGIES", {})
-    assert said in str(refused.value)
+    assert message in str(refused.value)
     assert started[-1].poll() is not None
     assert calls.of([name]) == {}
     if case == "raises":

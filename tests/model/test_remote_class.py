@@ -18,15 +18,15 @@ FACTS = {"parameters": GIVEN, "own_outcomes": True}
 OUTCOMES = {"predicted": 0.1, "state": 0.4, "misled": 0.25, "decoded": 0.25, "leaked": 0.0, "initial": 1.0}
 
 
-def remote_class(facts: Any = FACTS, at: Any = OUTCOMES, **said: Any) -> Any:
+def remote_class(facts: Any = FACTS, at: Any = OUTCOMES, **answers_: Any) -> Any:
     """The remote class of a class with these answers, without a process; at: its outcomes at μ_d = 0.5, μ_e = 0.25."""
     calls = RemoteCalls()
-    known: list[tuple[list[Any], Any]] = [
+    answers: list[tuple[list[Any], Any]] = [
         (["class", REGISTRY], facts),
-        *(([do, REGISTRY, GIVEN], found) for do, found in said.items()),
+        *(([do, REGISTRY, GIVEN], value) for do, value in answers_.items()),
     ]
-    known += [(["outcomes", REGISTRY, GIVEN, 0.5], bool(at)), (["outcomes_at", REGISTRY, GIVEN, 0.5, 0.25], at)]
-    calls.learn({json.dumps([NAME, *question]): {"is": found} for question, found in known})
+    answers += [(["outcomes", REGISTRY, GIVEN, 0.5], bool(at)), (["outcomes_at", REGISTRY, GIVEN, 0.5, 0.25], at)]
+    calls.learn({json.dumps([NAME, *question]): {"is": value} for question, value in answers})
     return RemoteClasses(calls, REGISTRY)(NAME)
 
 
@@ -46,7 +46,7 @@ def test_it_says_what_the_class_says() -> None:
 
 
 @pytest.mark.parametrize(
-    ("do", "found", "said"),
+    ("do", "value", "message"),
     [
         ("mistakes", [["threshold"]], "mistakes() is [['threshold']]; expected a list of (entry, what is wrong)"),
         ("mistakes", "none", "expected a list of (entry, what is wrong)"),
@@ -56,11 +56,11 @@ def test_it_says_what_the_class_says() -> None:
         ("follows_gamma", 1, "follows_gamma() is 1; expected True or False"),
     ],
 )
-def test_an_answer_of_another_kind_is_refused(do: str, found: Any, said: str) -> None:
+def test_an_answer_of_another_kind_is_refused(do: str, value: Any, message: str) -> None:
     """With the method and what it was expected to return."""
     with pytest.raises(NoAnswer) as refused:
-        getattr(remote_class(**{do: found}), do)(GIVEN)
-    assert said in str(refused.value)
+        getattr(remote_class(**{do: value}), do)(GIVEN)
+    assert message in str(refused.value)
 
 
 @pytest.mark.parametrize("facts", [[], {"parameters": 3}, {}])
@@ -76,10 +76,10 @@ def test_it_does_not_run() -> None:
         remote_class()()
 
 
-@pytest.mark.parametrize("found", [None, [0.5], [0.5, 1.5], [0.5, float("nan")], [True, 0.5]])
-def test_probabilities_of_use_are_probabilities(found: Any) -> None:
+@pytest.mark.parametrize("value", [None, [0.5], [0.5, 1.5], [0.5, float("nan")], [True, 0.5]])
+def test_probabilities_of_use_are_probabilities(value: Any) -> None:
     """Two of them."""
-    kind = remote_class({**FACTS, "takes": True, "own_outcomes": False}, use_probabilities=found)
+    kind = remote_class({**FACTS, "takes": True, "own_outcomes": False}, use_probabilities=value)
     with pytest.raises(NoAnswer, match="expected two probabilities"):
         kind.use_probabilities(GIVEN)
     assert remote_class({**FACTS, "takes": True}, use_probabilities=[0.5, 1]).use_probabilities(GIVEN) == (0.5, 1)
@@ -102,7 +102,7 @@ def test_without_a_theory_of_its_own_the_probabilities_of_use_give_the_outcomes(
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"misled": 0.5}, "that sum to 1"),
         ({"misled": 1.25, "state": -0.6}, "expected probabilities"),
@@ -110,11 +110,11 @@ def test_without_a_theory_of_its_own_the_probabilities_of_use_give_the_outcomes(
         ({"other": 0.0}, "expected the probabilities predicted, state, misled, decoded, leaked, initial"),
     ],
 )
-def test_outcomes_that_are_no_probabilities_are_refused(change: dict[str, Any], said: str) -> None:
+def test_outcomes_that_are_no_probabilities_are_refused(change: dict[str, Any], message: str) -> None:
     """Of each entry, of their sum, and of no others."""
     with pytest.raises(NoAnswer) as refused:
         remote_class(at={**OUTCOMES, **change}).outcomes(GIVEN, 0.5)(0.25)
-    assert said in str(refused.value)
+    assert message in str(refused.value)
 
 
 def test_a_class_that_cannot_be_asked_is_not_registered() -> None:

@@ -56,8 +56,8 @@ def test_a_constant_schedule_has_the_expectations_of_the_scheme(process: Process
     at = EAVESDROPPERS[eavesdropper].outcomes
     mu_d = np.array([[0.3] * 12, [0.9] * 12])
     for outcomes_at in (legitimate_at, at):
-        found = SlotRecursion(process, outcomes_at, 12).traces(mu_d)
-        for row, value in zip(found, (0.3, 0.9), strict=True):
+        traces = SlotRecursion(process, outcomes_at, 12).traces(mu_d)
+        for row, value in zip(traces, (0.3, 0.9), strict=True):
             assert np.allclose(row, theoretical_traces(process, outcomes_at(value), 12), rtol=1e-9)
 
 
@@ -83,8 +83,8 @@ def test_expectations_are_those_of_all_courses(eavesdropper: str) -> None:
                 chance / 4.0 ** (slots - 1 - k) * np.trace(P)
             )  # as often as there are courses of the later slots
     outcomes_at = legitimate_at if eavesdropper == "legitimate" else EAVESDROPPERS[eavesdropper].outcomes
-    found = SlotRecursion(UNSTABLE, outcomes_at, slots).traces(np.array([mu_d]))[0]
-    assert np.allclose(found, expected, rtol=1e-12)
+    trace = SlotRecursion(UNSTABLE, outcomes_at, slots).traces(np.array([mu_d]))[0]
+    assert np.allclose(trace, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("eavesdropper", EAVESDROPPERS)
@@ -102,12 +102,12 @@ def test_the_program_finds_the_best_of_the_grid(
     """With room for all candidates it is the best of every schedule on the grid, and says so."""
     problem = problem_of(process, eavesdropper, 5, max_trace, weight)
     sums = problem.sums(mesh_of(5, 5))
-    found = best_schedule(
+    result = best_schedule(
         process, MU, EAVESDROPPERS[eavesdropper].outcomes, 5, max_trace, weight, levels=5, capacity=10_000
     )
-    assert found.exact
-    assert found.grid.value == pytest.approx(sums.max(), rel=1e-9)
-    assert max(found.grid.legitimate) <= max_trace * (1 + 1e-9)
+    assert result.exact
+    assert result.grid.value == pytest.approx(sums.max(), rel=1e-9)
+    assert max(result.grid.legitimate) <= max_trace * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("eavesdropper", EAVESDROPPERS)
@@ -122,11 +122,11 @@ def test_the_program_finds_the_best_of_the_grid(
 def test_the_best_schedule_is_as_good_as_brute_force(process: Process, max_trace: float, eavesdropper: str) -> None:
     """No schedule on a fine mesh of all does better."""
     problem = problem_of(process, eavesdropper, 4, max_trace)
-    found = best_schedule(process, MU, EAVESDROPPERS[eavesdropper].outcomes, 4, max_trace).best
-    assert found.value >= problem.sums(mesh_of(4, 41)).max() * (1 - 1e-6)
-    assert max(found.legitimate) <= max_trace * (1 + 1e-9)
-    assert found.mu_d[0] == 1.0
-    assert found.value == pytest.approx(sum(found.eavesdropper))
+    best = best_schedule(process, MU, EAVESDROPPERS[eavesdropper].outcomes, 4, max_trace).best
+    assert best.value >= problem.sums(mesh_of(4, 41)).max() * (1 - 1e-6)
+    assert max(best.legitimate) <= max_trace * (1 + 1e-9)
+    assert best.mu_d[0] == 1.0
+    assert best.value == pytest.approx(sum(best.eavesdropper))
 
 
 _NOISE = np.array([[1e-2, 2e-3], [2e-3, 5e-3]])
@@ -144,7 +144,7 @@ def evolved(problem: ScheduleProblem) -> float:
         return losses
 
     solve: Any = differential_evolution
-    found = solve(
+    result = solve(
         loss,
         [(0.0, 1.0)] * (problem.slots - 1),
         maxiter=400,
@@ -155,7 +155,7 @@ def evolved(problem: ScheduleProblem) -> float:
         updating="deferred",
         polish=False,
     )
-    return -float(found.fun)
+    return -float(result.fun)
 
 
 @pytest.mark.parametrize(
@@ -174,20 +174,20 @@ def test_an_independent_solver_finds_nothing_better(
     process: Process, max_trace: float, mu: float, mu_e: float, eavesdropper: str
 ) -> None:
     """Against misled eavesdroppers, whose sum has many local maxima, over seven slots."""
-    one = replace(EAVESDROPPERS[eavesdropper], mu_e=mu_e)
+    adversary = replace(EAVESDROPPERS[eavesdropper], mu_e=mu_e)
     legitimate = SlotRecursion(process, lambda mu_d: Outcomes.legitimate(mu, mu_d), 7)
-    problem = ScheduleProblem(legitimate, SlotRecursion(process, one.outcomes, 7), 7, max_trace, 0.0)
-    found = best_schedule(process, mu, one.outcomes, 7, max_trace).best
-    assert found.value >= evolved(problem) * (1 - 1e-5)
-    assert max(found.legitimate) <= max_trace * (1 + 1e-9)
+    problem = ScheduleProblem(legitimate, SlotRecursion(process, adversary.outcomes, 7), 7, max_trace, 0.0)
+    best = best_schedule(process, mu, adversary.outcomes, 7, max_trace).best
+    assert best.value >= evolved(problem) * (1 - 1e-5)
+    assert max(best.legitimate) <= max_trace * (1 + 1e-9)
 
 
 def test_a_single_packet_with_the_state_may_be_best() -> None:
     """A maximum far from every schedule that changes of one or two μ_d lead to: 2.6 % above what they find."""
     naive = Adversary("naive", 0.95, 1.0, 1.0)
-    found = best_schedule(DOUBLE, 0.85, naive.outcomes, 7, 0.012).best
-    assert found.value >= 0.61173
-    assert found.mu_d[3] == pytest.approx(0.814, abs=1e-3)
+    best = best_schedule(DOUBLE, 0.85, naive.outcomes, 7, 0.012).best
+    assert best.value >= 0.61173
+    assert best.mu_d[3] == pytest.approx(0.814, abs=1e-3)
 
 
 def test_changes_of_two_neighbours_find_what_changes_of_one_do_not() -> None:
@@ -195,35 +195,35 @@ def test_changes_of_two_neighbours_find_what_changes_of_one_do_not() -> None:
     naive = Adversary("naive", 0.9, 1.0, 1.0)
     legitimate = SlotRecursion(SETTLED, lambda mu_d: Outcomes.legitimate(0.8, mu_d), 5)
     problem = ScheduleProblem(legitimate, SlotRecursion(SETTLED, naive.outcomes, 5), 5, 0.0015, 0.0)
-    found = best_schedule(SETTLED, 0.8, naive.outcomes, 5, 0.0015).best
-    assert found.value >= problem.sums(mesh_of(5, 21)).max()
+    best = best_schedule(SETTLED, 0.8, naive.outcomes, 5, 0.0015).best
+    assert best.value >= problem.sums(mesh_of(5, 21)).max()
 
 
 @pytest.mark.parametrize("eavesdropper", ["smart", "naive"])
 def test_no_change_of_one_slot_improves_it(eavesdropper: str) -> None:
     """Every other value of a single μ_d either violates Ω or loses."""
     slots = 9
-    found = best_schedule(SETTLED, MU, EAVESDROPPERS[eavesdropper].outcomes, slots, 0.004, levels=5, capacity=20).best
+    best = best_schedule(SETTLED, MU, EAVESDROPPERS[eavesdropper].outcomes, slots, 0.004, levels=5, capacity=20).best
     problem = problem_of(SETTLED, eavesdropper, slots, 0.004)
     for k in range(1, slots):
-        tried = np.repeat(np.array([found.mu_d]), 101, axis=0)
+        tried = np.repeat(np.array([best.mu_d]), 101, axis=0)
         tried[:, k] = np.linspace(0.0, 1.0, 101)
-        assert problem.sums(tried).max() <= found.value * (1 + 1e-4)
+        assert problem.sums(tried).max() <= best.value * (1 + 1e-4)
 
 
 @pytest.mark.long
 def test_it_is_better_to_recover_than_to_be_kept_at_the_bound() -> None:
     """Against smart, in a long run: no states until the legitimate error reaches Ω, then a state, and again none."""
-    found = best_schedule(SETTLED, MU, EAVESDROPPERS["smart"].outcomes, 16, 0.005, levels=5, capacity=50)
-    assert found.best.mu_d[1:5] == (0.0,) * 4
+    result = best_schedule(SETTLED, MU, EAVESDROPPERS["smart"].outcomes, 16, 0.005, levels=5, capacity=50)
+    assert result.best.mu_d[1:5] == (0.0,) * 4
     kept = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.1720277, *[0.547] * 10]])
     problem = problem_of(SETTLED, "smart", 16, 0.005)
-    assert found.best.value > 1.035 * float(problem.sums(kept)[0]) > 0.0
-    assert found.best.mu_d[6:9] == (1.0, 0.0, 0.0)
-    assert found.best.value > 1.7 * found.constant.value
-    assert len(set(found.constant.mu_d[1:])) == 1
-    assert max(found.constant.legitimate) <= 0.005 * (1 + 1e-9)
-    assert not found.exact
+    assert result.best.value > 1.035 * float(problem.sums(kept)[0]) > 0.0
+    assert result.best.mu_d[6:9] == (1.0, 0.0, 0.0)
+    assert result.best.value > 1.7 * result.constant.value
+    assert len(set(result.constant.mu_d[1:])) == 1
+    assert max(result.constant.legitimate) <= 0.005 * (1 + 1e-9)
+    assert not result.exact
 
 
 def test_where_no_states_exceed_the_bound_all_slots_have_as_few_as_keep_it() -> None:
@@ -263,8 +263,8 @@ def test_the_weight_of_the_user_raises_the_probabilities() -> None:
     at = EAVESDROPPERS["smart"].outcomes
     assert best_schedule(STABLE, MU, at, 6, weight=1.0).best.mu_d == (1.0,) * 6
     assert best_schedule(STABLE, MU, at, 6).best.mu_d == (1.0,) + (0.0,) * 5
-    found = best_schedule(STABLE, MU, at, 6, weight=0.6).best
-    assert found.value == pytest.approx(0.4 * sum(found.eavesdropper) - 0.6 * sum(found.legitimate))
+    best = best_schedule(STABLE, MU, at, 6, weight=0.6).best
+    assert best.value == pytest.approx(0.4 * sum(best.eavesdropper) - 0.6 * sum(best.legitimate))
 
 
 def test_a_trace_that_no_schedule_keeps_is_refused() -> None:

@@ -80,12 +80,12 @@ def test_a_scheme_without_innovations_shares_neither_types_nor_noise() -> None:
 
 def test_the_bits_of_packets_and_secrets_are_counted() -> None:
     """64 for each number: of two states, headers, and words of shared secret."""
-    found = {
-        name: (one.packet_bits, one.secret_bits, one.initial_secret_bits)
+    bits = {
+        name: (scheme.packet_bits, scheme.secret_bits, scheme.initial_secret_bits)
         for name in SCHEMES
-        for one in [scheme_of(PROCESS, {"scheme": name, **SCHEMES[name].parameters})]
+        for scheme in [scheme_of(PROCESS, {"scheme": name, **SCHEMES[name].parameters})]
     }
-    assert found == {
+    assert bits == {
         "acknowledged": (192, 0, 0),
         "cipher": (128, 128, 0),
         "encrypted-schedule": (192, 128, 0),
@@ -105,9 +105,9 @@ def test_the_bits_of_packets_and_secrets_are_counted() -> None:
 
 def test_a_scheme_that_says_nothing_of_eavesdroppers_has_no_closed_form() -> None:
     """Its slots differ, or what the eavesdropper makes of its packets depends on more than their type."""
-    known = {
+    names = {
         name
         for name in SCHEMES
         if scheme_of(PROCESS, {"scheme": name, **SCHEMES[name].parameters}).eavesdropper_outcomes(0.5, 1.0, 0.0)
     }
-    assert known == {"innovation", "noise", "plain", "withholding"}
+    assert names == {"innovation", "noise", "plain", "withholding"}

@@ -44,11 +44,11 @@ def packets(scheme: str, process: Process, batch: Batch) -> Iterator[tuple[np.nd
 def beliefs(scheme: str, process: Process, batch: Batch, gamma: np.ndarray) -> list[Belief]:
     """What the legitimate estimator reports after every slot, given γ (slots, R)."""
     estimator = made(scheme, process).estimator(KEYS, batch)
-    belief, found = estimator.prior(), []
+    belief, beliefs = estimator.prior(), []
     for k, (_, z, _) in enumerate(packets(scheme, process, batch)):
         belief = estimator.step(k, belief, Reception(gamma[k], z))
-        found.append(Belief(belief.x_hat.copy(), belief.P.copy(), belief.action.copy()))
-    return found
+        beliefs.append(Belief(belief.x_hat.copy(), belief.P.copy(), belief.action.copy()))
+    return beliefs
 
 
 def chi_of(process: Process, k: int, r: int) -> Floats:
@@ -91,7 +91,7 @@ def test_legitimate_estimator_is_the_textbooks(process: Process, slots: int, see
     """Lost: (A x̂, A P Aᵀ + Q); state: (z, 0); innovation: (A x̂ + z − χ, A P Aᵀ); before slot 0: (0, Σ0), not predicted."""
     batch = Batch(slots, 2, 5)
     gamma = np.random.default_rng(seed).random((slots, 2)) < quality
-    found = beliefs("innovation", process, batch, gamma)
+    result = beliefs("innovation", process, batch, gamma)
     A, Q = process.A, process.Q
     for r in range(2):
         x_hat, P = np.zeros(process.n), process.initial_covariance
@@ -105,16 +105,16 @@ def test_legitimate_estimator_is_the_textbooks(process: Process, slots: int, see
             elif gamma[k, r]:
                 x_hat, P, action = x_hat + z[:, r] - chi_of(process, k, 5 + r), carried, Action.INNOVATION
             scale = max(1.0, float(np.abs(z).max()))
-            assert np.allclose(found[k].x_hat[:, r], x_hat, rtol=1e-10, atol=1e-9 * scale)
-            assert np.allclose(found[k].P[:, :, r], P, rtol=1e-10, atol=1e-12)
-            assert found[k].action[r] == action
+            assert np.allclose(result[k].x_hat[:, r], x_hat, rtol=1e-10, atol=1e-9 * scale)
+            assert np.allclose(result[k].P[:, :, r], P, rtol=1e-10, atol=1e-12)
+            assert result[k].action[r] == action
 
 
 def test_plain_scheme_is_the_textbooks() -> None:
     """Z = x always; lost: (A x̂, A P Aᵀ + Q), received: (z, 0)."""
     batch = Batch(40, 3)
     gamma = np.random.default_rng(0).random((40, 3)) < 0.6
-    found = beliefs("plain", DRIFTING, batch, gamma)
+    result = beliefs("plain", DRIFTING, batch, gamma)
     x_hat, P = np.zeros((3, 3)), np.repeat(DRIFTING.initial_covariance[:, :, None], 3, axis=2)
     for k, (x, z, nu) in enumerate(packets("plain", DRIFTING, batch)):
         assert np.array_equal(x, z)
@@ -123,9 +123,9 @@ def test_plain_scheme_is_the_textbooks() -> None:
             x_hat = DRIFTING.A @ x_hat
             P = np.einsum("ij,jkr,lk->ilr", DRIFTING.A, P, DRIFTING.A) + DRIFTING.Q[:, :, None]
         x_hat, P = np.where(gamma[k], x, x_hat), np.where(gamma[k], 0.0, P)
-        assert np.allclose(found[k].x_hat, x_hat, rtol=1e-12, atol=1e-13)
-        assert np.allclose(found[k].P, P, rtol=1e-12, atol=1e-15)
-        assert np.array_equal(found[k].action, np.where(gamma[k], Action.STATE, Action.LOST))
+        assert np.allclose(result[k].x_hat, x_hat, rtol=1e-12, atol=1e-13)
+        assert np.allclose(result[k].P, P, rtol=1e-12, atol=1e-15)
+        assert np.array_equal(result[k].action, np.where(gamma[k], Action.STATE, Action.LOST))
 
 
 def test_a_lost_packet_desynchronises_nothing() -> None:
@@ -133,13 +133,13 @@ def test_a_lost_packet_desynchronises_nothing() -> None:
     slots = 80
     gamma = np.ones((slots, 50), bool)
     gamma[10:30] = False
-    found = beliefs("innovation", DRIFTING, Batch(slots, 50), gamma)
+    result = beliefs("innovation", DRIFTING, Batch(slots, 50), gamma)
     sent = list(packets("innovation", DRIFTING, Batch(slots, 50)))
     synced = np.ones(50, bool)
     for k, (x, _, nu) in enumerate(sent):
         synced = (synced & gamma[k]) | (gamma[k] & ~nu)
-        assert np.allclose(found[k].x_hat[:, synced], x[:, synced], rtol=0, atol=1e-12)
-        assert not found[k].P[:, :, synced].any()
+        assert np.allclose(result[k].x_hat[:, synced], x[:, synced], rtol=0, atol=1e-12)
+        assert not result[k].P[:, :, synced].any()
     assert synced.all()
 
 

@@ -23,20 +23,20 @@ def made(name: str, process: Process, **changes: Any) -> Scheme:
 
 def bits(played: Played, part: slice) -> list[bytes]:
     """Everything sent and estimated in some trials."""
-    found = []
+    bits = []
     for packet in played.packets:
         header = np.zeros(0) if packet.header is None else packet.header[:, part]
         sent = np.zeros(0) if packet.sent is None else packet.sent[part]
-        found += [packet.z[:, part].tobytes(), packet.nu[part].tobytes(), header.tobytes(), sent.tobytes()]
+        bits += [packet.z[:, part].tobytes(), packet.nu[part].tobytes(), header.tobytes(), sent.tobytes()]
     for belief in played.beliefs["legitimate"]:
         memory = [array[..., part].tobytes() for array in belief.memory]
-        found += [
+        bits += [
             belief.x_hat[:, part].tobytes(),
             belief.P[..., part].tobytes(),
             belief.action[part].tobytes(),
             *memory,
         ]
-    return found
+    return bits
 
 
 @pytest.mark.parametrize("name", SCHEMES)
@@ -64,12 +64,12 @@ def test_a_step_is_pure(name: str) -> None:
         heard = Reception(gamma, packet.z, packet.header)
         before = [array.copy() for array in (belief.x_hat, belief.P, *belief.memory)]
         first, second = estimator.step(k, belief, heard), estimator.step(k, belief, heard)
-        for one, other in zip(
+        for before_, other in zip(
             (first.x_hat, first.P, *first.memory), (second.x_hat, second.P, *second.memory), strict=True
         ):
-            assert one.tobytes() == other.tobytes()
+            assert before_.tobytes() == other.tobytes()
         after = (belief.x_hat, belief.P, *belief.memory)
-        assert all(one.tobytes() == other.tobytes() for one, other in zip(before, after, strict=True))
+        assert all(array.tobytes() == other.tobytes() for array, other in zip(before, after, strict=True))
         belief = first
 
 

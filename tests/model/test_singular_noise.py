@@ -67,7 +67,7 @@ def packets(process: Process, random: np.random.Generator, slots: int = SLOTS) -
             w = times(G, numbers(process.n, 1))
             x.append(combined((1, times(A, x[-1])), (1, w)))
         z.append(combined((1, w), (1, numbers(process.n, 1))) if nu[k] else x[k])
-    flat = ([[row[0] for row in one] for one in many] for many in (z, x))
+    flat = ([[row[0] for row in matrix] for matrix in many] for many in (z, x))
     return Packets(next(flat), nu, next(flat))
 
 
@@ -85,15 +85,15 @@ class Covariances:
 
     def of(self, word: Sequence[bool], j: int, k: int) -> Matrix:
         """Cov(z_j, z_k) for j ≥ k, if `word` are the types; number len(word) is the last state."""
-        first, second = (one < len(word) and word[one] for one in (j, k))
+        first, second = (slot < len(word) and word[slot] for slot in (j, k))
         at, before = min(j, len(word) - 1), min(k, len(word) - 1)
         if first:
             return self._sigmas[at] if j == k else exact(np.zeros((self.n, self.n)))
-        known: dict[Any, Matrix] = self._with_innovation if second else self._with_state
+        covariances: dict[Any, Matrix] = self._with_innovation if second else self._with_state
         key = at - before if second else (at, before)
-        if key not in known:
-            known[key] = times(self._powers[at - before], self._Q if second else self._sigmas[before])
-        return known[key]
+        if key not in covariances:
+            covariances[key] = times(self._powers[at - before], self._Q if second else self._sigmas[before])
+        return covariances[key]
 
 
 def conditioned(of: Covariances, word: Sequence[bool], z: Matrix, heard: Sequence[bool]) -> Posterior:
@@ -103,12 +103,12 @@ def conditioned(of: Covariances, word: Sequence[bool], z: Matrix, heard: Sequenc
     blocks = {(j, k): of.of(word, j, k) for j in numbers for k in numbers if j >= k}
     blocks |= {(k, j): transposed(block) for (j, k), block in blocks.items()}
     joint = [[value for k in numbers for value in blocks[j, k][i]] for j in numbers for i in range(n)]
-    mean, known, log_density = [Fraction(0)] * len(joint), 0, 0.0
+    mean, count, log_density = [Fraction(0)] * len(joint), 0, 0.0
     values = [value for k in numbers[:-1] for value in z[k]]
     for i, value in enumerate(values):
         variance, rest = joint[i][i], value - mean[i]
         if variance == 0:
-            known += 1
+            count += 1
             if rest != 0:
                 return Posterior(mean, joint, 0, -math.inf)
             continue
@@ -117,28 +117,30 @@ def conditioned(of: Covariances, word: Sequence[bool], z: Matrix, heard: Sequenc
         mean = [m + g * rest for m, g in zip(mean, gain, strict=True)]
         own = joint[i]
         joint = [[a - g * b for a, b in zip(row, own, strict=True)] for row, g in zip(joint, gain, strict=True)]
-    return Posterior(mean[-n:], [row[-n:] for row in joint[-n:]], known, log_density)
+    return Posterior(mean[-n:], [row[-n:] for row in joint[-n:]], count, log_density)
 
 
 def enumerated(process: Process, z: Matrix, heard: Sequence[bool]) -> tuple[Floats, Floats]:
     """Mean and covariance of the last state over all words of types: those that explain the most numbers exactly, weighed."""
     some = [k for k in range(1, len(z)) if heard[k]]
-    covariances, found = Covariances(process, len(z)), []
+    covariances, posteriors = Covariances(process, len(z)), []
     for types in words_of([False, True], repeat=len(some)):
         word = [False] * len(z)
         for k, innovation in zip(some, types, strict=True):
             word[k] = innovation
-        one = conditioned(covariances, word, z, heard)
-        if one.log_density > -math.inf:
+        posterior = conditioned(covariances, word, z, heard)
+        if posterior.log_density > -math.inf:
             prior = sum(math.log(1.0 - MU_D if innovation else MU_D) for innovation in types)
-            found.append((one, one.log_density + prior))
-    most = max(one.exact for one, _ in found)
-    found = [(one, weight) for one, weight in found if one.exact == most]
-    top = max(weight for _, weight in found)
-    weights = np.array([math.exp(weight - top) for _, weight in found])
+            posteriors.append((posterior, posterior.log_density + prior))
+    most = max(posterior.exact for posterior, _ in posteriors)
+    posteriors = [(posterior, weight) for posterior, weight in posteriors if posterior.exact == most]
+    top = max(weight for _, weight in posteriors)
+    weights = np.array([math.exp(weight - top) for _, weight in posteriors])
     weights /= weights.sum()
-    means = np.array([[float(value) for value in one.mean] for one, _ in found])
-    within = np.array([[[float(value) for value in row] for row in one.covariance] for one, _ in found])
+    means = np.array([[float(value) for value in posterior.mean] for posterior, _ in posteriors])
+    within = np.array(
+        [[[float(value) for value in row] for row in posterior.covariance] for posterior, _ in posteriors]
+    )
     mean = weights @ means
     away = means - mean
     return mean, np.einsum("w,wij->ij", weights, within) + np.einsum("w,wi,wj->ij", weights, away, away)
@@ -212,8 +214,8 @@ def test_the_genie_is_the_exact_posterior_of_known_types(case: str) -> None:
     """Mean and covariance, after every slot, given the schedule."""
     process, random = PROCESSES[case], np.random.default_rng(5)
     genie, slots = Genie(knowledge(process), Batch(12, 1)), 12
-    known = knowledge(process)
-    schedule = Schedule(known.keys["schedule"], known.mu_d, Batch(12, 1))
+    informed = knowledge(process)
+    schedule = Schedule(informed.keys["schedule"], informed.mu_d, Batch(12, 1))
     word = [bool(k and schedule.at(k)[0]) for k in range(slots)]
     z = [[Fraction(int(value), 64) for value in random.integers(-96, 97, process.n)] for _ in range(slots)]
     A, G = exact(process.A), exact(process.noise_factor)
@@ -226,9 +228,9 @@ def test_the_genie_is_the_exact_posterior_of_known_types(case: str) -> None:
             z[k] = [row[0] for row in x]
     assert 0 < sum(word) < slots - 1
     for k, belief in enumerate(followed(genie, z, heard)):
-        one = conditioned(Covariances(process, k + 1), word[: k + 1], z, heard)
-        assert np.allclose(belief.x_hat[:, 0], np.array(one.mean, np.float64), rtol=0, atol=CLOSE)
-        assert np.allclose(belief.P[:, :, 0], np.array(one.covariance, np.float64), rtol=0, atol=CLOSE)
+        posterior = conditioned(Covariances(process, k + 1), word[: k + 1], z, heard)
+        assert np.allclose(belief.x_hat[:, 0], np.array(posterior.mean, np.float64), rtol=0, atol=CLOSE)
+        assert np.allclose(belief.P[:, :, 0], np.array(posterior.covariance, np.float64), rtol=0, atol=CLOSE)
 
 
 @pytest.mark.parametrize("strategy", [Bayesian, Likelihood])

@@ -64,7 +64,7 @@ def test_the_reader_of_references_is_the_exact_posterior(case: str, open_loop: b
         z = np.array(times(shown, drawn), np.float64)
         header = np.array([[reference]])
         belief = reader.step(k, belief, Reception(np.array([HEARD[k]]), z, header))
-        mean, P = conditioned(packets, [times(one, drawn) for one in packets], states[k])
+        mean, P = conditioned(packets, [times(factor, drawn) for factor in packets], states[k])
         assert np.allclose(belief.x_hat[:, 0], mean, rtol=0, atol=1e-6)
         assert np.allclose(belief.P[:, :, 0], P, rtol=0, atol=1e-6)
         if k in ACKNOWLEDGED:

@@ -24,10 +24,10 @@ def test_a_copy_reads_what_its_ancestor_read() -> None:
     for chunk in (1, 4, 9):
         reader = BlockReader(KEY, Batch(9, 4, lineage=lineage), 3)
         slots = [range(start, min(start + chunk, 9)) for start in range(0, 9, chunk)]
-        found = np.concatenate([reader.uniforms(one) for one in slots])
-        assert np.array_equal(found[:2], own[:2][..., first[second]])
-        assert np.array_equal(found[2:5], own[2:5][..., second])
-        assert np.array_equal(found[5:], own[5:])
+        uniforms = np.concatenate([reader.uniforms(slot) for slot in slots])
+        assert np.array_equal(uniforms[:2], own[:2][..., first[second]])
+        assert np.array_equal(uniforms[2:5], own[2:5][..., second])
+        assert np.array_equal(uniforms[5:], own[5:])
 
 
 def test_a_batch_is_the_same_whatever_its_lineage() -> None:
@@ -62,14 +62,14 @@ def test_equal_trials_count_alike() -> None:
 
 def played(rng: np.random.Generator, populations: int, size: int) -> Floats:
     """The estimate of E P_k by each population, (P, SLOTS), with splits in every second slot."""
-    of, P, found = SplitPopulations(populations, size), np.zeros((populations, size)), np.empty((populations, SLOTS))
+    of, P, errors = SplitPopulations(populations, size), np.zeros((populations, size)), np.empty((populations, SLOTS))
     for k in range(SLOTS):
         P = np.where(rng.random(P.shape) < KEPT, GROWTH * P + 1.0, 0.0)
-        found[:, k] = of.means(P)
+        errors[:, k] = of.means(P)
         of.weigh(P + 5.0)
         if k % 2:
             P = P.reshape(-1)[of.split(rng.random(populations))].reshape(P.shape)
-    return found
+    return errors
 
 
 def test_estimates_have_no_bias_and_their_error_is_true() -> None:
@@ -77,10 +77,10 @@ def test_estimates_have_no_bias_and_their_error_is_true() -> None:
     groups, expected, P = 400, np.empty(SLOTS), 0.0
     for k in range(SLOTS):
         expected[k] = P = KEPT * (GROWTH * P + 1.0)
-    found = played(np.random.default_rng(7), 32 * groups, 50)
-    spread = found.std(axis=0) / np.sqrt(len(found))
-    assert np.all(np.abs(found.mean(axis=0) - expected) < 4.5 * spread)
-    means = found.mean(axis=1).reshape(groups, 32)
+    result = played(np.random.default_rng(7), 32 * groups, 50)
+    spread = result.std(axis=0) / np.sqrt(len(result))
+    assert np.all(np.abs(result.mean(axis=0) - expected) < 4.5 * spread)
+    means = result.mean(axis=1).reshape(groups, 32)
     z = (means.mean(axis=1) - expected.mean()) / (means.std(axis=1, ddof=1) / np.sqrt(32))
     assert 0.03 < (np.abs(z) > 1.96).mean() < 0.10
 

@@ -36,7 +36,7 @@ def test_directions_without_noise_are_zeros_to_the_bit(case: str) -> None:
     assert np.allclose(stairs.outward(stairs.inward(x)), x, atol=1e-13)
     assert np.allclose(stairs.outward(A @ stairs.inward(x)), process.A @ x, atol=1e-12)
     many = np.random.default_rng(2).standard_normal((3, process.n, process.n, 4))
-    rows = [stairs.outward_covariance(one) for one in many]
+    rows = [stairs.outward_covariance(covariance) for covariance in many]
     assert np.array_equal(stairs.outward_covariance(many), rows)
 
 
@@ -48,12 +48,12 @@ def test_units_of_the_states_do_not_matter(n: int, rank: int, seed: int) -> None
     A = np.round(random.standard_normal((n, n)) * 8.0) / 8.0 + 2.0 * np.eye(n)
     G = np.round(random.standard_normal((n, min(rank, n - 1))) * 8.0) / 8.0
     units = 2.0 ** random.integers(-20, 21, n)
-    one = process_of(A.tolist(), G.tolist())
+    original = process_of(A.tolist(), G.tolist())
     other = Process(
-        units[:, None] * A / units, units[:, None] * one.Q * units, np.diag(units * units), singular_noise=True
+        units[:, None] * A / units, units[:, None] * original.Q * units, np.diag(units * units), singular_noise=True
     )
     try:
-        stairs = Staircase(one)
+        stairs = Staircase(original)
     except ValueError:
         return
     if not stairs.singular or np.linalg.cond(other.A) > 1e10:
@@ -82,11 +82,11 @@ def test_a_range_within_rounding_of_all_states_is_seen() -> None:
     """With a growing mode and one that noise never reaches, the reach of rounding becomes that of the states."""
     process = process_of([[2.0, 0.0], [0.0, 0.5]], [[1.0], [0.0]])
     near = process_of([[2.0, 0.0], [1.5, 0.5]], [[1.0], [1.0]])
-    for one, blurred in ((process, False), (near, True)):
-        leaks = Leaks(one)
+    for model, blurred in ((process, False), (near, True)):
+        leaks = Leaks(model)
         slots = [range(k, k + 1) for k in checked_slots(45)]
-        found = [leaks.stairs.blurred(leaks.block(some)[:, :2, :2], leaks.rounding(some)) for some in slots]
-        assert (found[0], any(found)) == (False, blurred)
+        blurs = [leaks.stairs.blurred(leaks.block(some)[:, :2, :2], leaks.rounding(some)) for some in slots]
+        assert (blurs[0], any(blurs)) == (False, blurred)
     assert checked_slots(1) == []
     assert checked_slots(3) == [1, 2]
     assert checked_slots(300)[-3:] == [128, 256, 299]

@@ -40,12 +40,12 @@ def knowledge_of(name: str, mu_d: float | tuple[float, ...]) -> Knowledge:
 def test_types_are_drawn_by_the_probability_of_their_slot() -> None:
     """Each slot's packets are those of a schedule with that μ_d in all slots, one by one and in blocks."""
     batch = Batch(SLOTS + 3, 200)
-    found = Schedule(KEYS["schedule"], MU_D, batch).block(range(SLOTS + 3))
+    block = Schedule(KEYS["schedule"], MU_D, batch).block(range(SLOTS + 3))
     single = Schedule(KEYS["schedule"], MU_D, batch)
     for k in range(SLOTS + 3):
         # The last number holds for later slots, which a dry run may have.
         alike = Schedule(KEYS["schedule"], MU_D[min(k, SLOTS - 1)], batch).at(k)
-        assert np.array_equal(found[k], alike)
+        assert np.array_equal(block[k], alike)
         assert np.array_equal(single.at(k), alike)
 
 
@@ -66,18 +66,18 @@ def test_parts_of_equal_probability_are_all_slots_in_order(numbers: list[float],
     parts = equal_slots(mu_d, slots)
     assert [k for part in parts for k in part] == list(slots)
     values = [{in_slot(mu_d, k) for k in part} for part in parts if part]
-    assert all(len(one) == 1 for one in values)
-    assert all(one != other for one, other in pairwise(values))
+    assert all(len(part) == 1 for part in values)
+    assert all(part != other for part, other in pairwise(values))
     assert equal_slots(0.5, slots) == [slots]
 
 
-def followed(one: Eavesdropper, slots: range, belief: Belief, heard: list[Reception]) -> list[Belief]:
+def followed(eavesdropper: Eavesdropper, slots: range, belief: Belief, heard: list[Reception]) -> list[Belief]:
     """Its beliefs, slot by slot."""
-    found = []
+    followed = []
     for k in slots:
-        belief = one.step(k, belief, heard[k])
-        found.append(belief)
-    return found
+        belief = eavesdropper.step(k, belief, heard[k])
+        followed.append(belief)
+    return followed
 
 
 @pytest.mark.parametrize("name", KNOWING)
@@ -85,15 +85,15 @@ def test_eavesdroppers_use_the_probability_of_the_slot(name: str) -> None:
     """In every slot an eavesdropper does what it would do with that μ_d in all slots, from the same belief."""
     batch, rng = Batch(SLOTS, 40), np.random.default_rng(2)
     heard = [Reception(rng.random(40) < MU, rng.standard_normal((2, 40))) for _ in range(SLOTS)]
-    one = READERS[name](knowledge_of(name, MU_D), batch)
-    beliefs = [one.prior(), *followed(one, range(SLOTS), one.prior(), heard)]
+    reader = READERS[name](knowledge_of(name, MU_D), batch)
+    beliefs = [reader.prior(), *followed(reader, range(SLOTS), reader.prior(), heard)]
     for k in range(SLOTS):
         alike = READERS[name](knowledge_of(name, MU_D[k]), batch)
         (after,) = followed(alike, range(k, k + 1), beliefs[k], heard)
         assert np.array_equal(after.x_hat, beliefs[k + 1].x_hat)
         assert np.array_equal(after.P, beliefs[k + 1].P)
     at_once, _ = READERS[name](knowledge_of(name, MU_D), batch).follow(
-        range(SLOTS), one.prior(), np.array([h.gamma for h in heard]), np.array([h.z for h in heard])
+        range(SLOTS), reader.prior(), np.array([h.gamma for h in heard]), np.array([h.z for h in heard])
     )
     assert np.array_equal(at_once.P, np.array([belief.P for belief in beliefs[1:]]))
 
@@ -103,15 +103,17 @@ def test_expectations_are_those_of_the_design(reader: str) -> None:
     """Behind independent losses the expectations of a run are those that `design --schedule` computes for it."""
     scheme = Innovation(UNSTABLE, MU_D)
 
-    def outcomes_in(one: Innovation) -> Any:
+    def outcomes_in(innovation: Innovation) -> Any:
         if reader == "legitimate":
-            return legitimate_outcomes(one)
-        return eavesdropper_outcomes(one, reader, PARAMETERS.get(reader, {}))
+            return legitimate_outcomes(innovation)
+        return eavesdropper_outcomes(innovation, reader, PARAMETERS.get(reader, {}))
 
     distribution = LinkDistribution.steady(loss_of({"model": "bernoulli", "quality": MU}).chain)  # type: ignore[arg-type]
-    found = ModulatedCovariance(UNSTABLE, distribution, outcomes_in(scheme), lambda k: outcomes_in(scheme.in_slot(k)))  # type: ignore[arg-type]
+    covariance = ModulatedCovariance(
+        UNSTABLE, distribution, outcomes_in(scheme), lambda k: outcomes_in(scheme.in_slot(k))
+    )  # type: ignore[arg-type]
     expected = SlotRecursion(UNSTABLE, lambda mu_d: outcomes_in(Innovation(UNSTABLE, mu_d))(MU), SLOTS)
-    assert np.allclose(found.next_traces(SLOTS), expected.traces(np.array([MU_D]))[0], rtol=1e-12)
+    assert np.allclose(covariance.next_traces(SLOTS), expected.traces(np.array([MU_D]))[0], rtol=1e-12)
 
 
 def test_a_scheme_with_one_probability_is_its_own_in_every_slot() -> None:
@@ -123,7 +125,7 @@ def test_a_scheme_with_one_probability_is_its_own_in_every_slot() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "said"),
+    ("value", "message"),
     [
         ([0.1, 1.0, 0, 1], None),
         (0.3, None),
@@ -133,7 +135,7 @@ def test_a_scheme_with_one_probability_is_its_own_in_every_slot() -> None:
         ("x", "expected a number from 0 to 1"),
     ],
 )
-def test_mistakes_in_lists(value: Any, said: str | None) -> None:
+def test_mistakes_in_lists(value: Any, message: str | None) -> None:
     """A number or a list of numbers is accepted, and a mistake names its slot."""
-    found = probabilities_mistakes({"it": value}, "it")
-    assert (not found) if said is None else (said in found[0][1])
+    result = probabilities_mistakes({"it": value}, "it")
+    assert (not result) if message is None else (message in result[0][1])

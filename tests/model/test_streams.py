@@ -69,8 +69,8 @@ def test_keys_are_keyed_blake2b() -> None:
     inner = hashlib.blake2b(root, digest_size=32).digest()
     assert stream_key(root, "link/eve") == hashlib.blake2b(b"link/eve", key=inner, digest_size=32).digest()
     roots = [root_of_seed(seed) for seed in (0, 1, 256)]
-    found = {stream_key(one, name) for one in roots for name in ("process", "schedule", "noise", "link/a", "link/ab")}
-    assert len(found) == 15
+    keys = {stream_key(root, name) for root in roots for name in ("process", "schedule", "noise", "link/a", "link/ab")}
+    assert len(keys) == 15
 
 
 @settings(deadline=None)
@@ -98,10 +98,10 @@ def test_what_was_drawn_stays() -> None:
     for trials, per_trial in ((1, 1), (1, 2), (1, 4), (3, 1), (3, 2)):
         reader = BlockReader(KEY, Batch(8, trials), per_trial)
         first = reader.uniforms(range(4)), reader.normals(range(4))
-        before = [one.copy() for one in first]
+        before = [array.copy() for array in first]
         reader.uniforms(range(4, 8))
         reader.normals(range(4, 8))
-        assert all(np.array_equal(one, was) for one, was in zip(first, before, strict=True))
+        assert all(np.array_equal(array, was) for array, was in zip(first, before, strict=True))
 
 
 @given(st.data(), st.sampled_from([(1, 1), (30, 1), (255, 1), (600, 1), (600, 1000), (40, 100_000)]))

@@ -27,7 +27,7 @@ def checked(numbers: Iterable[Any], start: Any = 0) -> Any:
     """In the place of `sum`. Raises AssertionError where the package adds more than two floats, which may be rounded twice."""
     every = list(numbers)
     caller = sys._getframe(1).f_globals.get("__name__", "")
-    floats = PLAIN(type(one) is float for one in every)
+    floats = PLAIN(type(number) is float for number in every)
     assert not caller.startswith("evedrop.") or floats <= 2, (
         f"{caller} adds {floats} floats with sum(); use sum_in_order()"
     )

@@ -56,11 +56,11 @@ def recursion(
 ) -> Floats:  # the textbook: one slot after the other, from the events' own conditional covariances
     """E_k by E_k = step(E_{k−1}, Σ_{k−1})."""
     E, sigma = first * process.initial_covariance, process.initial_covariance
-    found = [E]
+    covariances = [E]
     for _ in range(1, slots):
         E, sigma = step(E, sigma), process.A @ sigma @ process.A.T + process.Q
-        found.append(E)
-    return np.array(found)
+        covariances.append(E)
+    return np.array(covariances)
 
 
 def legitimate_recursion(process: Process, slots: int, mu: float, mu_d: float) -> Floats:
@@ -90,18 +90,18 @@ def eavesdropper_recursion(process: Process, slots: int, mu_e: float, mu_d: floa
     )
 
 
-def close(found: Floats, expected: Floats) -> bool:
+def close(actual: Floats, expected: Floats) -> bool:
     """Equal to 1e-10 of each slot's largest entry."""
     scale = np.abs(expected).max(axis=(1, 2), keepdims=True)
-    return bool(np.all(np.abs(found - expected) <= 1e-10 * scale + 1e-300))
+    return bool(np.all(np.abs(actual - expected) <= 1e-10 * scale + 1e-300))
 
 
 @given(processes(), probabilities, probabilities, st.integers(1, 80))
 @settings(deadline=None, max_examples=examples(60))
 def test_legitimate_expectation_is_the_recursion(process: Process, mu: float, mu_d: float, slots: int) -> None:
     """E P_k of the legitimate estimator equals the slot-by-slot recursion over its events."""
-    found = theoretical_covariances(process, Outcomes.legitimate(mu, mu_d), slots)
-    assert close(found, legitimate_recursion(process, slots, mu, mu_d))
+    result = theoretical_covariances(process, Outcomes.legitimate(mu, mu_d), slots)
+    assert close(result, legitimate_recursion(process, slots, mu, mu_d))
 
 
 @given(processes(), probabilities, probabilities, probabilities, probabilities, st.integers(1, 80))
@@ -110,8 +110,8 @@ def test_eavesdropper_expectation_is_the_recursion(
     process: Process, mu_e: float, mu_d: float, b0: float, b1: float, slots: int
 ) -> None:
     """E P_k of any strategy of the class equals the slot-by-slot recursion over its five events."""
-    found = theoretical_covariances(process, Outcomes.eavesdropper(mu_e, mu_d, b0, b1), slots)
-    assert close(found, eavesdropper_recursion(process, slots, mu_e, mu_d, b0, b1))
+    result = theoretical_covariances(process, Outcomes.eavesdropper(mu_e, mu_d, b0, b1), slots)
+    assert close(result, eavesdropper_recursion(process, slots, mu_e, mu_d, b0, b1))
 
 
 @given(processes(), probabilities, probabilities, probabilities, probabilities)
@@ -170,12 +170,12 @@ def test_expectation_is_the_mean_over_all_words(k: int) -> None:
     """E P_k is the probability-weighted mean over every sequence of events."""
     mu, mu_d, b0, b1 = 0.7, 0.6, 0.8, 0.3
     ours = {"L": 1 - mu, "S": mu * mu_d, "D": mu * (1 - mu_d)}
-    found = theoretical_covariances(UNSTABLE, Outcomes.legitimate(mu, mu_d), k + 1)[k]
-    assert found == pytest.approx(enumerated(UNSTABLE, k, ours, 1 - mu), rel=1e-12)
+    expected_covariance = theoretical_covariances(UNSTABLE, Outcomes.legitimate(mu, mu_d), k + 1)[k]
+    assert expected_covariance == pytest.approx(enumerated(UNSTABLE, k, ours, 1 - mu), rel=1e-12)
     theirs = {"S": mu * mu_d * b0, "M": mu * (1 - mu_d) * b1}
     theirs["L"] = 1 - sum(theirs.values())
-    found = theoretical_covariances(UNSTABLE, Outcomes.eavesdropper(mu, mu_d, b0, b1), k + 1)[k]
-    assert found == pytest.approx(enumerated(UNSTABLE, k, theirs, 1 - mu * b0), rel=1e-12)
+    expected_covariance = theoretical_covariances(UNSTABLE, Outcomes.eavesdropper(mu, mu_d, b0, b1), k + 1)[k]
+    assert expected_covariance == pytest.approx(enumerated(UNSTABLE, k, theirs, 1 - mu * b0), rel=1e-12)
 
 
 def test_belief_ignores_being_misled() -> None:

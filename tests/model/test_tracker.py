@@ -56,13 +56,13 @@ def spy(process: Process, batch: Batch, learns_at: int) -> Eavesdropper:
 
 def reported(process: Process, batch: Batch, gamma: np.ndarray, learns_at: int) -> list[tuple[Slot, Belief]]:
     """Every slot with the spy's belief after it."""
-    one, found = spy(process, batch, learns_at), []
-    belief = one.prior()
+    eavesdropper, rows = spy(process, batch, learns_at), []
+    belief = eavesdropper.prior()
     for slot in slots(process, batch, gamma):
         truth = slot.x if slot.k == learns_at else None
-        belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z, truth=truth))
-        found.append((slot, belief))
-    return found
+        belief = eavesdropper.step(slot.k, belief, Reception(slot.gamma, slot.z, truth=truth))
+        rows.append((slot, belief))
+    return rows
 
 
 def errors(pairs: list[tuple[Slot, Belief]]) -> np.ndarray:
@@ -150,17 +150,17 @@ def test_its_room_is_enough_for_as_many_packets_as_the_documents_say(process: Pr
     scale = float(np.sqrt(np.trace(process.initial_covariance + process.Q)))
     capacities = CAPACITY, 16
     trackers = [Tracker(Knowledge(process, 1.0, {}, {}), Batch(6, 40), capacity) for capacity in capacities]
-    beliefs, heard = [one.prior() for one in trackers], [dict[int, np.ndarray]() for _ in range(40)]
-    found = np.zeros((len(capacities), *gamma.shape))
+    beliefs, heard = [tracker.prior() for tracker in trackers], [dict[int, np.ndarray]() for _ in range(40)]
+    differences = np.zeros((len(capacities), *gamma.shape))
     for slot in slots(process, Batch(6, 40), gamma):
         reception = Reception(slot.gamma, slot.z)
-        beliefs = [one.step(slot.k, belief, reception) for one, belief in zip(trackers, beliefs, strict=True)]
+        beliefs = [tracker.step(slot.k, belief, reception) for tracker, belief in zip(trackers, beliefs, strict=True)]
         for r in range(40):
             if slot.gamma[r]:
                 heard[r][slot.k] = slot.z[:, r]
             mean = words.posterior(slot.k, heard[r], None)[0]
-            found[:, slot.k, r] = [np.abs(belief.x_hat[:, r] - mean).max() / scale for belief in beliefs]
-    usual, roomy = found
+            differences[:, slot.k, r] = [np.abs(belief.x_hat[:, r] - mean).max() / scale for belief in beliefs]
+    usual, roomy = differences
     packets = gamma.cumsum(axis=0)
     assert usual[packets <= 5].max() < 1e-7
     assert usual.max() < 0.02
@@ -174,11 +174,11 @@ def test_its_room_is_enough_for_as_many_packets_as_the_documents_say(process: Pr
 def test_before_the_leak_it_is_half_way_between_the_tracks(process: Process) -> None:
     """At least ½ tr A^k Σ0 A^kᵀ in the mean and, as soon as it has heard both tracks, no more; at five standard errors."""
     batch = Batch(15, 4000)
-    found, bound = errors(reported(process, batch, coins(0.9, 15, 4000), 14)), twin_track_bound(process, 15)
-    mean, error = found.mean(axis=1), found.std(axis=1) / np.sqrt(4000)
+    result, bound = errors(reported(process, batch, coins(0.9, 15, 4000), 14)), twin_track_bound(process, 15)
+    mean, error = result.mean(axis=1), result.std(axis=1) / np.sqrt(4000)
     assert np.all(mean[:14] + 5.0 * error[:14] > bound[:14])
     assert np.all(mean[8:14] - 5.0 * error[8:14] < 1.01 * bound[8:14])
-    assert not found[14].any()
+    assert not result[14].any()
 
 
 @pytest.mark.long
@@ -189,17 +189,17 @@ def test_one_betrayed_state_breaks_twin_tracks() -> None:
     """
     batch, learns_at = Batch(60, 2000), 20
     gamma = coins(0.9, 60, 2000)
-    found = errors(reported(DRIFTING, batch, gamma, learns_at))
+    result = errors(reported(DRIFTING, batch, gamma, learns_at))
     estimator = TwinTrack(DRIFTING).estimator(KEYS, batch)
     followed, belief = [], estimator.prior()
     for slot in slots(DRIFTING, batch, gamma):
         belief = estimator.step(slot.k, belief, Reception(slot.gamma, slot.z))
         followed.append((slot, belief))
     legitimate = errors(followed)
-    assert np.all(found[learns_at] == 0.0)
-    excess = (found - 1.5 * legitimate)[learns_at + 1 :].mean(axis=0)
+    assert np.all(result[learns_at] == 0.0)
+    excess = (result - 1.5 * legitimate)[learns_at + 1 :].mean(axis=0)
     assert excess.mean() + 5.0 * excess.std() / np.sqrt(2000) < 0.0
-    assert np.all(found[1:learns_at].mean(axis=1) > 1000.0 * legitimate[1:learns_at].mean(axis=1))
+    assert np.all(result[1:learns_at].mean(axis=1) > 1000.0 * legitimate[1:learns_at].mean(axis=1))
 
 
 def test_a_leak_beside_the_twins_packet_opens_everything() -> None:
@@ -230,8 +230,8 @@ def test_what_it_reports_is_true() -> None:
     """Before and after the leak tr P is its squared error in the mean, at five standard errors, where nothing is plain."""
     batch = Batch(30, 3000)
     pairs = reported(RESTLESS, batch, coins(0.8, 30, 3000), 12)
-    for slot, (one, belief) in enumerate(pairs):
-        error = ((one.x - belief.x_hat) ** 2).sum(axis=0) - np.trace(belief.P)
+    for slot, (reference, belief) in enumerate(pairs):
+        error = ((reference.x - belief.x_hat) ** 2).sum(axis=0) - np.trace(belief.P)
         assert abs(error.mean()) < 5.0 * error.std() / np.sqrt(3000) + 1e-12, slot
 
 
@@ -257,10 +257,10 @@ def test_a_trial_alone_and_a_shorter_run_are_the_same(process: Process) -> None:
     for first, count, length in ((77, 1, 40), (200, 6, 25)):
         part = slice(first, first + count)
         some = reported(process, Batch(length, count, first), gamma[:length, part], 9)
-        for (_, one), (_, other) in zip(some, among[:length], strict=True):
-            assert one.x_hat.tobytes() == other.x_hat[:, part].tobytes()
-            assert one.P.tobytes() == other.P[:, :, part].tobytes()
-            assert np.array_equal(one.action, other.action[part])
+        for (_, own), (_, other) in zip(some, among[:length], strict=True):
+            assert own.x_hat.tobytes() == other.x_hat[:, part].tobytes()
+            assert own.P.tobytes() == other.P[:, :, part].tobytes()
+            assert np.array_equal(own.action, other.action[part])
 
 
 @pytest.mark.long
@@ -268,12 +268,12 @@ def test_more_room_changes_little() -> None:
     """Where the tracks stay within a slot's noise, 16 times the room changes its mean error by less than 2 %."""
     batch, gamma, means = Batch(40, 30), coins(0.9, 40, 30), []
     for capacity in (CAPACITY, 128):
-        one, total = Tracker(Knowledge(RESTLESS, 1.0, {}, {}), batch, capacity), 0.0
-        belief = one.prior()
+        tracker, total = Tracker(Knowledge(RESTLESS, 1.0, {}, {}), batch, capacity), 0.0
+        belief = tracker.prior()
         for slot in slots(RESTLESS, batch, gamma):
-            belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z))
+            belief = tracker.step(slot.k, belief, Reception(slot.gamma, slot.z))
             if slot.k == 15:
-                belief = one.knowing(slot.k, slot.x, belief)
+                belief = tracker.knowing(slot.k, slot.x, belief)
             total += float(((slot.x - belief.x_hat) ** 2).sum())
             assert len(belief.memory[0]) <= capacity
         means.append(total)
@@ -283,13 +283,13 @@ def test_more_room_changes_little() -> None:
 def test_a_tracker_that_begins_later_has_the_same_prior() -> None:
     """A belief from slot 4 on is that of one that heard nothing before: after the next packets, too."""
     batch, first = Batch(8, 3), 4
-    one, other = (Tracker(Knowledge(UNSTABLE, 1.0, {}, {}), batch) for _ in range(2))
+    first_tracker, other = (Tracker(Knowledge(UNSTABLE, 1.0, {}, {}), batch) for _ in range(2))
     gamma = np.zeros((8, 3), bool)
     gamma[first:] = [[True, False, True], [True, True, False], [False, True, True], [True, True, True]]
-    waiting, late = one.prior(), other.prior(first)
+    waiting, late = first_tracker.prior(), other.prior(first)
     for slot in slots(UNSTABLE, batch, gamma):
         heard = Reception(slot.gamma, slot.z)
-        waiting = one.step(slot.k, waiting, heard)
+        waiting = first_tracker.step(slot.k, waiting, heard)
         if slot.k >= first:
             late = other.step(slot.k, late, heard)
             assert np.allclose(late.x_hat, waiting.x_hat, rtol=1e-9)

@@ -61,8 +61,8 @@ def test_errors_are_the_closed_form() -> None:
     expected = np.array([sum(terms[:k]) for k in range(slots)])
     theory = theoretical_covariances(DRIFTING, TwinTrack(DRIFTING).outcomes(mu), slots)
     assert np.allclose(np.trace(theory, axis1=1, axis2=2), expected, rtol=1e-12)
-    for found in (played.squared_error("legitimate"), played.trace("legitimate")):
-        assert (np.abs(found.mean(1) - expected) <= 5.0 * found.std(1) / np.sqrt(trials) + 1e-25).all()
+    for errors in (played.squared_error("legitimate"), played.trace("legitimate")):
+        assert (np.abs(errors.mean(1) - expected) <= 5.0 * errors.std(1) / np.sqrt(trials) + 1e-25).all()
 
 
 @pytest.mark.parametrize("process", [pytest.param(STABLE, marks=pytest.mark.long), UNSTABLE])
@@ -87,10 +87,10 @@ def test_no_strategy_is_below_the_bound(process: Process, quality: float) -> Non
     bound = twin_track_bound(process, slots)
     assert np.allclose(bound, [0.5 * np.trace(spread(process, k)) for k in range(slots)], rtol=1e-12)
     for name in eavesdroppers:
-        found = played.squared_error(name)
-        assert (found.mean(1) + 5.0 * found.std(1) / np.sqrt(trials) > bound).all()
+        squared_error = played.squared_error(name)
+        assert (squared_error.mean(1) + 5.0 * squared_error.std(1) / np.sqrt(trials) > bound).all()
         if name == "naive" and quality == 1.0:
-            assert (np.abs(found.mean(1) - 2.0 * bound) < 5.0 * found.std(1) / np.sqrt(trials)).all()
+            assert (np.abs(squared_error.mean(1) - 2.0 * bound) < 5.0 * squared_error.std(1) / np.sqrt(trials)).all()
 
 
 def test_exchanging_the_tracks_changes_no_packet() -> None:
@@ -100,12 +100,12 @@ def test_exchanging_the_tracks_changes_no_packet() -> None:
     w, coin = rng.standard_normal((12, 2)), rng.random(12) < 0.5
 
     def packets(start: np.ndarray, other: np.ndarray, on_twin: np.ndarray) -> list[np.ndarray]:
-        found, x, apart = [], start, other - start
+        sent, x, apart = [], start, other - start
         for k in range(12):
             if k:
                 x, apart = UNSTABLE.A @ x + w[k], UNSTABLE.A @ apart
-            found.append(x + apart if on_twin[k] else x)
-        return found
+            sent.append(x + apart if on_twin[k] else x)
+        return sent
 
     assert np.allclose(packets(x_0, y_0, coin), packets(y_0, x_0, ~coin), rtol=1e-9)
 

@@ -18,11 +18,11 @@ def test_the_error_of_a_slot_is_the_tables() -> None:
     rng = np.random.default_rng(3)
     e, w, misled = (rng.normal(size=(2, 5)) for _ in range(3))
     carried = UNSTABLE.A @ e
-    found = update.error(UNSTABLE, e, ACTIONS, INNOVATIONS, w, lambda: misled)
+    error = update.error(UNSTABLE, e, ACTIONS, INNOVATIONS, w, lambda: misled)
     expected = np.stack(
         [carried[:, 0] + w[:, 0], carried[:, 1] + w[:, 1], np.zeros(2), misled[:, 3], carried[:, 4]], axis=1
     )
-    assert np.allclose(found, expected, rtol=1e-14)
+    assert np.allclose(error, expected, rtol=1e-14)
 
 
 def test_the_actual_covariance_of_a_slot_is_the_tables() -> None:
@@ -44,9 +44,9 @@ def test_the_estimate_of_a_slot_is_the_tables() -> None:
     """A x̂ without a packet, z as the state, A x̂ + z − χ where an innovation is decoded; slot 0 is not predicted."""
     rng = np.random.default_rng(5)
     x_hat, z, chi = (rng.normal(size=(2, 5)) for _ in range(3))
-    known = Belief(x_hat, np.zeros((2, 2, 5)), ACTIONS)
+    given_belief = Belief(x_hat, np.zeros((2, 2, 5)), ACTIONS)
     for k, before in ((1, UNSTABLE.A @ x_hat), (0, x_hat)):
         expected = np.where(ACTIONS == Action.STATE, z, before)
-        found = update.belief(UNSTABLE, k, known, ACTIONS, z, chi)
+        belief = update.belief(UNSTABLE, k, given_belief, ACTIONS, z, chi)
         decoded = np.where(ACTIONS == Action.INNOVATION, before + (z - chi), expected)
-        assert np.allclose(found.x_hat, decoded, rtol=1e-14)
+        assert np.allclose(belief.x_hat, decoded, rtol=1e-14)

@@ -35,25 +35,25 @@ def test_errors_are_the_closed_form() -> None:
         ("naive", scheme.eavesdropper_outcomes(0.6, 1.0, 1.0)),
     ):
         expected = np.trace(theoretical_covariances(DRIFTING, outcomes, slots), axis1=1, axis2=2)
-        for found in (played.squared_error(name), played.trace(name)):
-            difference = np.abs(found.mean(1) - expected)
-            assert (difference < 5.0 * found.std(1) / np.sqrt(trials) + 1e-15).all()
+        for errors in (played.squared_error(name), played.trace(name)):
+            difference = np.abs(errors.mean(1) - expected)
+            assert (difference < 5.0 * errors.std(1) / np.sqrt(trials) + 1e-15).all()
 
 
 def test_the_limit_is_the_papers() -> None:
     """(1 − μp) S(μp)."""
-    found = limit(UNSTABLE, Withholding(UNSTABLE, 0.8).outcomes(0.9))
-    assert np.allclose(found, (1.0 - 0.72) * lyapunov(UNSTABLE, 1.0 - 0.72), rtol=1e-12)
+    result = limit(UNSTABLE, Withholding(UNSTABLE, 0.8).outcomes(0.9))
+    assert np.allclose(result, (1.0 - 0.72) * lyapunov(UNSTABLE, 1.0 - 0.72), rtol=1e-12)
 
 
 @pytest.mark.parametrize("p", [0, 0.0, -0.0])
 def test_a_sensor_that_never_sends_is_refused(p: float) -> None:
     """With the bound, and what to write instead; the least number above 0 is allowed."""
-    (found,) = Withholding.mistakes({"state_probability": p})
-    assert found[0] == "state_probability"
-    assert found[1].startswith(f"is {p}, so nothing is sent after slot 0")
-    assert found[1].endswith("expected a number above 0, up to 1")
+    (mistake,) = Withholding.mistakes({"state_probability": p})
+    assert mistake[0] == "state_probability"
+    assert mistake[1].startswith(f"is {p}, so nothing is sent after slot 0")
+    assert mistake[1].endswith("expected a number above 0, up to 1")
     assert Withholding.mistakes({"state_probability": 5e-324}) == []
     for other in (-0.1, 1.1, "0", False):
-        (found,) = Withholding.mistakes({"state_probability": other})
-        assert found[1].endswith("expected a number from 0 to 1")
+        (mistake,) = Withholding.mistakes({"state_probability": other})
+        assert mistake[1].endswith("expected a number from 0 to 1")

@@ -21,8 +21,8 @@ def test_there_are_four() -> None:
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_notebooks_are_kept_without_outputs(name: str) -> None:
     """Outputs would add pictures to every change, and might be those of an older version."""
-    found = json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))
-    for cell in found["cells"]:
+    notebook_ = json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))
+    for cell in notebook_["cells"]:
         assert (cell.get("outputs", []), cell.get("execution_count")) == ([], None)
 
 
@@ -41,10 +41,10 @@ def test_a_notebook_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (tmp_path / "work").mkdir()
     resources = {"metadata": {"path": str(tmp_path / "work")}}
     client.NotebookClient(notebook, timeout=300, kernel_name="python3", resources=resources).execute()
-    outputs: list[dict[str, Any]] = [one for cell in notebook.cells for one in cell.get("outputs", ())]
-    said = [one["text"] for one in outputs if one.get("name") == "stderr"]
-    shown = {kind for one in outputs for kind in one.get("data", {})}
-    assert said == []
+    outputs: list[dict[str, Any]] = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    errors = [output["text"] for output in outputs if output.get("name") == "stderr"]
+    shown = {kind for output in outputs for kind in output.get("data", {})}
+    assert errors == []
     assert {"text/html", "image/png"} <= shown
-    assert not any("<progress" in str(one.get("data")) for one in outputs), "a progress bar is left"
+    assert not any("<progress" in str(output.get("data")) for output in outputs), "a progress bar is left"
     assert not (tmp_path / "work" / "runs").exists()

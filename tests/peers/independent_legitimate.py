@@ -93,8 +93,8 @@ def normal(word: int) -> float:
 def dot(pairs: Iterable[tuple[float, float]]) -> float:
     """A sum in order: it starts with its first product."""
     total, *products = [a * b for a, b in pairs]
-    for one in products:
-        total += one
+    for product in products:
+        total += product
     return total
 
 
@@ -193,7 +193,7 @@ class Estimator:
                 self.hashes[r].update(struct.pack(f"<{self.n - i}d", *row[i:]))
             self.sums[r] += sum(P[i][i] for i in range(self.n))
         if k % 256 == 255 or k == self.slots - 1:
-            self.blocks[k - k % 256] = b"".join(one.digest() for one in self.hashes)
+            self.blocks[k - k % 256] = b"".join(hash_.digest() for hash_ in self.hashes)
             self.hashes = [xxh3_128() for _ in range(self.R)]
             self.block_sums[k - k % 256] = struct.pack(f"<{self.R}d", *self.sums)
             self.sums = [0.0] * self.R

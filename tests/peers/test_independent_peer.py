@@ -67,10 +67,10 @@ def test_same_deliveries_same_bits(process: Process, slots: int, first_trial: in
         peer.receive(packets.delivery(k, np.packbits(gamma, bitorder="little").tobytes(), z[:, gamma].tobytes()))
     extent = telemetry.Extent(slots, slots, model.n, 9, 2)
     report = telemetry.read_report(wire.Reader("telemetry", peer.report()), 0, extent, Blocks(slots))
-    assert np.array_equal(report.x_hat, [one.x_hat for one in beliefs])
-    assert np.array_equal(report.action, [one.action for one in beliefs])
-    assert np.array_equal(report.P, [one.P[:, :, :2] for one in beliefs])
-    assert np.allclose(report.trace[:, 0], [np.trace(one.P).sum() for one in beliefs], rtol=1e-12)
+    assert np.array_equal(report.x_hat, [belief.x_hat for belief in beliefs])
+    assert np.array_equal(report.action, [belief.action for belief in beliefs])
+    assert np.array_equal(report.P, [belief.P[:, :, :2] for belief in beliefs])
+    assert np.allclose(report.trace[:, 0], [np.trace(belief.P).sum() for belief in beliefs], rtol=1e-12)
     digest.add(blocks)
     assert peer.digest() == digest.hexadecimal
 
@@ -104,13 +104,13 @@ def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
                 )
             )
             stack.callback(running[name].kill)
-        said = {name: process.communicate(timeout=LIMIT)[0] for name, process in running.items()}
+        outputs = {name: process.communicate(timeout=LIMIT)[0] for name, process in running.items()}
         statuses = {name: process.returncode for name, process in running.items()}
-    assert set(statuses.values()) <= {0, 1}, (statuses, said)
+    assert set(statuses.values()) <= {0, 1}, (statuses, outputs)
     digest = montecarlo(scenario, trials=2, out=tmp_path / "memory").summary["peers"]["legitimate"]["digest"]
     summary = Results.read(out).summary
     assert summary["peers"]["legitimate"]["digest"] == digest
-    assert said["legitimate"].strip() == digest
+    assert outputs["legitimate"].strip() == digest
 
 
 def test_it_is_independent() -> None:

@@ -60,9 +60,9 @@ def briefs(**changes: Any) -> dict[str, AnyBrief]:
 @pytest.fixture
 def stage() -> Iterator[Stage]:
     """A stage in the place of the network."""
-    one = Stage()
-    yield one
-    one.commands.put(EndRun().pack())
+    stage = Stage()
+    yield stage
+    stage.commands.put(EndRun().pack())
 
 
 def deliveries(count: int = SLOTS) -> list[bytes]:
@@ -113,7 +113,7 @@ def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
 @pytest.mark.parametrize("batch", [1, 100, 256, 300])
 def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage) -> None:
     """However slots are batched, also across a digest's block, the same estimates and digests are reported."""
-    found = []
+    reports = []
     for flow in (Flow(1024, 7), Flow(1024, batch)):
         brief = replace(briefs(slots=600)[name], flow=flow, run="r")
         stage.fill(RunKeys("r").downlink(name), deliveries(600))
@@ -127,9 +127,9 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
             x_hat.append(report.x_hat)
             P.append(report.P)
             blocks |= {block: digests.tobytes() for block, digests in report.digests.items()}
-        found.append((end, np.concatenate(x_hat).tobytes(), np.concatenate(P).tobytes(), blocks))
-    assert found[0] == found[1]
-    assert set(found[0][3]) == {0, 256, 512}
+        reports.append((end, np.concatenate(x_hat).tobytes(), np.concatenate(P).tobytes(), blocks))
+    assert reports[0] == reports[1]
+    assert set(reports[0][3]) == {0, 256, 512}
 
 
 GOOD = deliveries()
@@ -150,11 +150,11 @@ BAD: dict[str, tuple[list[bytes], type[EvedropError], str]] = {
 }
 
 
-@pytest.mark.parametrize("what", BAD)
+@pytest.mark.parametrize("case", BAD)
 @pytest.mark.parametrize("name", ["legitimate", "suspicious"])
-def test_receiver_refuses(what: str, name: str, stage: Stage) -> None:
+def test_receiver_refuses(case: str, name: str, stage: Stage) -> None:
     """A gap that is not closed, or a malformed delivery, ends a receiver with an error that names the key and what was due."""
-    messages, error, text = BAD[what]
+    messages, error, text = BAD[case]
     brief = replace(briefs()[name], flow=Flow(WINDOW, BATCH, longest_outage=0.0))
     stage.fill(RunKeys(brief.run).downlink(name), messages)
     with pytest.raises(error, match=text) as caught:
@@ -166,7 +166,7 @@ def test_receiver_refuses(what: str, name: str, stage: Stage) -> None:
 def test_receiver_takes_each_slot_once(name: str, stage: Stage) -> None:
     """Slots that arrive again, barriers too, and slots before the one that is due do not change its reports."""
     brief = replace(briefs()[name], run="r")
-    found = []
+    taken = []
     good = deliveries()
     for messages in (
         good,
@@ -175,8 +175,8 @@ def test_receiver_takes_each_slot_once(name: str, stage: Stage) -> None:
         stage.fill(RunKeys("r").downlink(name), messages)
         stage.commands.put(EndRun().pack())
         RECEIVERS[name](brief, stage.session)
-        found.append(stage.all(RunKeys("r").telemetry(name)))
-    assert found[0] == found[1]
+        taken.append(stage.all(RunKeys("r").telemetry(name)))
+    assert taken[0] == taken[1]
 
 
 def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
@@ -354,9 +354,9 @@ def test_sensor_refuses_malformed_progress(k: float, stage: Stage) -> None:
     session = stage.session(briefs()["sensor"])
     window = Window(session, ("a",), 1, ReplayBuffer(print))
     stage.callbacks[session.keys.progress("a")](msgpack.packb({"k": k}))
-    with pytest.raises(MalformedMessage, match=rf"progress/a: k = {k}.*Check that a speaks") as found:
+    with pytest.raises(MalformedMessage, match=rf"progress/a: k = {k}.*Check that a speaks") as raised:
         window.wait(2)
-    assert found.value.at_fault == ("a",)
+    assert raised.value.at_fault == ("a",)
 
 
 @pytest.mark.parametrize("window", range(2, 40))

@@ -23,7 +23,7 @@ from evedrop.results.reading import Results
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Results]:
     """A run and others that differ from it in one respect."""
     folder = tmp_path_factory.mktemp("runs")
-    one: dict[str, dict[str, Any]] = {
+    changed: dict[str, dict[str, Any]] = {
         "whole": {},
         "again": {},
         "shorter": {"slots": 300},
@@ -36,30 +36,30 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Results]:
     }
     return {
         name: montecarlo("eavesdroppers", out=folder / name, **{"slots": 600, "trials": 6, **changes})
-        for name, changes in one.items()
+        for name, changes in changed.items()
     }
 
 
 def test_equal_runs_have_no_difference(runs: dict[str, Results]) -> None:
     """The same scenario twice; 6 trials of 4 receivers in 3 blocks."""
-    found = difference(runs["whole"], runs["again"])
-    assert found.same
-    assert found.text == "no difference in 72 blocks of 256 slots: legitimate, naive, smart, suspicious"
+    result = difference(runs["whole"], runs["again"])
+    assert result.same
+    assert result.text == "no difference in 72 blocks of 256 slots: legitimate, naive, smart, suspicious"
 
 
 def test_a_shorter_run_is_the_beginning_of_a_longer_one(runs: dict[str, Results]) -> None:
     """Blocks cut short are not compared by digest, and the text says that there is more in one run."""
     for pair in (("whole", "shorter"), ("shorter", "whole")):
-        found = difference(*(runs[name] for name in pair))
-        assert found.same, found.text
-        assert "are in one run only" in found.text
+        result = difference(*(runs[name] for name in pair))
+        assert result.same, result.text
+        assert "are in one run only" in result.text
 
 
 def test_later_trials_are_compared_by_number(runs: dict[str, Results]) -> None:
     """Trials 2 to 5 alone are those of the whole run."""
-    found = difference(runs["whole"], runs["later trials"])
-    assert found.same
-    assert found.text.startswith("no difference in 48 blocks")
+    result = difference(runs["whole"], runs["later trials"])
+    assert result.same
+    assert result.text.startswith("no difference in 48 blocks")
 
 
 def test_the_first_difference_is_named_with_both_values(runs: dict[str, Results]) -> None:
@@ -68,39 +68,39 @@ def test_the_first_difference_is_named_with_both_values(runs: dict[str, Results]
     order = ("slot", "trial", "peer")
     pairs = zip(*(sorted(rows, key=lambda row: tuple(row[key] for key in order)) for rows in (a, b)), strict=True)
     first, other = next((x, y) for x, y in pairs if x["x_hat"] != y["x_hat"] or x["action"] != y["action"])
-    found = difference(runs["recorded"], runs["recorded and weaker"])
-    assert not found.same
+    result = difference(runs["recorded"], runs["recorded and weaker"])
+    assert not result.same
     assert first["peer"] == "smart"
-    assert found.text.startswith(f"first difference: slot {first['slot']}, trial {first['trial']}, smart: ")
+    assert result.text.startswith(f"first difference: slot {first['slot']}, trial {first['trial']}, smart: ")
     for name in ("action", "x_hat", "P"):
-        assert (f"{name} {first[name]} against {other[name]}" in found.text) == (first[name] != other[name])
+        assert (f"{name} {first[name]} against {other[name]}" in result.text) == (first[name] != other[name])
 
 
 def test_a_difference_in_a_trial_that_is_not_recorded_is_placed(runs: dict[str, Results]) -> None:
     """Without rows, the digests still say which trial and which 256 slots, and what to do."""
     recorded = difference(runs["recorded"], runs["recorded and weaker"]).text
     trial = int(recorded.split("trial ")[1].split(",")[0])
-    found = difference(runs["whole"], runs["weaker"])
-    assert not found.same
+    result = difference(runs["whole"], runs["weaker"])
+    assert not result.same
     if trial:
-        assert f"smart differs in trial {trial} within slots 0 to 255, not recorded" in found.text
-        assert f"--first-trial {trial}" in found.text
+        assert f"smart differs in trial {trial} within slots 0 to 255, not recorded" in result.text
+        assert f"--first-trial {trial}" in result.text
     else:
-        assert found.text.startswith("first difference: slot ")
+        assert result.text.startswith("first difference: slot ")
 
 
 def test_another_seed_differs_at_once(runs: dict[str, Results]) -> None:
     """Slot 0 of the first trial, and the values of both runs are told."""
-    found = difference(runs["whole"], runs["other seed"])
-    assert found.text.startswith("first difference: slot 0, trial 0, legitimate: ")
-    assert " against " in found.text
+    result = difference(runs["whole"], runs["other seed"])
+    assert result.text.startswith("first difference: slot 0, trial 0, legitimate: ")
+    assert " against " in result.text
 
 
 def test_runs_without_a_trial_in_common_are_not_equal(runs: dict[str, Results]) -> None:
     """Nothing to compare is not the same as no difference."""
-    found = difference(runs["whole"], runs["far trials"])
-    assert not found.same
-    assert "in common" in found.text
+    result = difference(runs["whole"], runs["far trials"])
+    assert not result.same
+    assert "in common" in result.text
 
 
 def test_a_run_cut_short_before_its_first_block_is_compared_by_its_rows(
@@ -181,12 +181,12 @@ OTHER = {
 """What was done to a table → which table, how, and the expected message."""
 
 
-@pytest.mark.parametrize("what", OTHER)
-def test_a_table_of_another_version_is_refused(what: str, runs: dict[str, Results], tmp_path: Path) -> None:
+@pytest.mark.parametrize("case", OTHER)
+def test_a_table_of_another_version_is_refused(case: str, runs: dict[str, Results], tmp_path: Path) -> None:
     """Other columns, other types and empty cells: one line with the table, what differs, and a remedy."""
-    table, change, said = OTHER[what]
+    table, change, message = OTHER[case]
     other = rewritten(runs["recorded"], tmp_path / "other", table, change)
-    with pytest.raises(UsageError, match=said) as told:
+    with pytest.raises(UsageError, match=message) as told:
         difference(runs["recorded"], other)
     assert str(told.value).startswith(f"{other.folder / table}.parquet ")
     assert "\n" not in str(told.value)
@@ -207,11 +207,11 @@ def test_other_tables_of_a_run_with_older_digests_can_be_read(runs: dict[str, Re
 
 def test_runs_of_different_processes_differ(runs: dict[str, Results], tmp_path: Path) -> None:
     """One state against two: the first row is different, and no more is made of it."""
-    one: dict[str, Any] = {"process__A": [[1.0]], "process__Q": [[1e-3]], "process__initial_covariance": [[1.0]]}
-    other = montecarlo("eavesdroppers", slots=600, trials=6, out=tmp_path / "one", **one)
-    found = difference(runs["whole"], other)
-    assert not found.same
-    assert found.text.startswith("first difference: slot 0, trial 0, legitimate: ")
+    changes: dict[str, Any] = {"process__A": [[1.0]], "process__Q": [[1e-3]], "process__initial_covariance": [[1.0]]}
+    other = montecarlo("eavesdroppers", slots=600, trials=6, out=tmp_path / "one", **changes)
+    result = difference(runs["whole"], other)
+    assert not result.same
+    assert result.text.startswith("first difference: slot 0, trial 0, legitimate: ")
 
 
 def test_what_a_detector_says_is_compared(tmp_path: Path) -> None:
@@ -220,23 +220,23 @@ def test_what_a_detector_says_is_compared(tmp_path: Path) -> None:
     Not with the digest of other trials.
     """
     loop: dict[str, Any] = {"trials": 3, "expect": []}
-    known = montecarlo("replay-attack", out=tmp_path / "a", **loop)
+    original = montecarlo("replay-attack", out=tmp_path / "a", **loop)
     again = montecarlo("replay-attack", out=tmp_path / "b", **loop)
-    assert difference(known, again).same
+    assert difference(original, again).same
     fewer = montecarlo("replay-attack", out=tmp_path / "fewer", **{**loop, "trials": 2})
-    assert fewer.summary["integrity"]["digest"] != known.summary["integrity"]["digest"]
-    assert difference(known, fewer).same
+    assert fewer.summary["integrity"]["digest"] != original.summary["integrity"]["digest"]
+    assert difference(original, fewer).same
     changed = shutil.copytree(tmp_path / "b", tmp_path / "changed")
     summary = json.loads((changed / "summary.json").read_text(encoding="utf-8"))
     summary["integrity"]["digest"] = "0" * 64
     (changed / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
-    found = difference(known, Results.read(changed))
-    assert not found.same
-    assert found.text.startswith("the digest of integrity differs, in trials not recorded; record all trials")
-    rows = known.inputs
+    result = difference(original, Results.read(changed))
+    assert not result.same
+    assert result.text.startswith("the digest of integrity differs, in trials not recorded; record all trials")
+    rows = original.inputs
     assert rows is not None
     place = rows.column_names.index("statistic")
     raised = pc.add(rows["statistic"], pc.cast(pc.greater(rows["slot"], 30), pa.float64()))
     pq.write_table(rows.set_column(place, "statistic", raised), changed / "inputs.parquet")
-    found = difference(known, Results.read(changed))
-    assert found.text.startswith("first difference: slot 31, trial 0, controller: statistic ")
+    result = difference(original, Results.read(changed))
+    assert result.text.startswith("first difference: slot 31, trial 0, controller: statistic ")

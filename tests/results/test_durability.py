@@ -130,15 +130,15 @@ MOMENTS: dict[str, Callable[[Live], object]] = {
 }
 
 
-@pytest.mark.parametrize("what", mostly_long(MOMENTS, ["parquet"]))
-def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, what: str) -> None:
+@pytest.mark.parametrize("case", mostly_long(MOMENTS, ["parquet"]))
+def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, case: str) -> None:
     """From its first file to its last: the folder opens with whole tables, or says in a line why there is nothing."""
-    slots = 20000 if what == "metrics" else 3000
+    slots = 20000 if case == "metrics" else 3000
     live = evedrop.live("eavesdroppers", "--slots", str(slots))
-    wait_until(lambda: MOMENTS[what](live), what)
+    wait_until(lambda: MOMENTS[case](live), case)
     kill_all(live)
     if not last_round(live.folder).at and not (live.folder / "summary.json").exists():
-        assert what in {"a folder", "streams"}
+        assert case in {"a folder", "streams"}
         with pytest.raises(UsageError, match=r"run the scenario again|give the results folder of a run"):
             Results.read(live.folder)
         return
@@ -147,7 +147,7 @@ def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, what: str) -> None:
         cut_short(live)
     else:
         assert results.trials.num_rows == 4 * slots
-    if what in {"parquet", "end"}:
+    if case in {"parquet", "end"}:
         assert results.summary["slots"] == 3000
     assert evedrop("view", "run", "--table").status == 0
 
@@ -418,7 +418,7 @@ def test_all_rows_are_on_disk_before_the_recorder_waits_for_the_others_to_end(ev
 
 def test_a_broken_disk_is_not_called_full() -> None:
     """After an input/output error nobody can know what is on the disk, and room does not help."""
-    said = unwritten(OSError(errno.EIO, "Input/output error"))
-    assert "free some room" not in said
-    assert "look at the disk" in said
+    message = unwritten(OSError(errno.EIO, "Input/output error"))
+    assert "free some room" not in message
+    assert "look at the disk" in message
     assert "free some room" in unwritten(OSError(errno.ENOSPC, "No space left on device"))

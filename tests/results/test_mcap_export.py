@@ -36,7 +36,7 @@ def read_back(path: Path) -> dict[str, list[tuple[int, dict[str, Any]]]]:
     """Topic → time in nanoseconds and content of each message, as the library reads them."""
     from mcap.reader import make_reader
 
-    found: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+    messages: dict[str, list[tuple[int, dict[str, Any]]]] = {}
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
             assert schema is not None
@@ -44,8 +44,8 @@ def read_back(path: Path) -> dict[str, list[tuple[int, dict[str, Any]]]]:
             content = json.loads(message.data)
             assert content.keys() <= json.loads(schema.data)["properties"].keys()
             assert message.publish_time == message.log_time
-            found.setdefault(channel.topic, []).append((message.log_time, content))
-    return found
+            messages.setdefault(channel.topic, []).append((message.log_time, content))
+    return messages
 
 
 def known(row: dict[str, Any]) -> dict[str, Any]:
@@ -59,10 +59,10 @@ def known(row: dict[str, Any]) -> dict[str, Any]:
 
 def expected(results: Results) -> dict[str, list[tuple[int, dict[str, Any]]]]:
     """What the file should contain, from the tables as a whole."""
-    found: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+    messages: dict[str, list[tuple[int, dict[str, Any]]]] = {}
 
     def add(topic: str, slot: int, content: dict[str, Any]) -> None:
-        found.setdefault(topic, []).append((round(slot * PERIOD * 1e9), content))
+        messages.setdefault(topic, []).append((round(slot * PERIOD * 1e9), content))
 
     for event in results.events:
         time = {"sec": int(event.slot * PERIOD), "nsec": round(event.slot * PERIOD % 1 * 1e9)}
@@ -81,7 +81,7 @@ def expected(results: Results) -> dict[str, list[tuple[int, dict[str, Any]]]]:
         add(f"/statistics/{row.pop('peer')}", row["slot"], known(row))
     for row in results.journal.drop_columns("delivered_mask").to_pylist():
         add(f"/packets/{row.pop('link')}", row["slot"], known(row))
-    return found
+    return messages
 
 
 @pytest.mark.parametrize("kind", ["live", "loop"])
@@ -89,12 +89,12 @@ def test_the_file_has_every_value_of_the_results(kind: str, request: pytest.Fixt
     """At the time of its slot, in batches that are smaller than the tables; a value that JSON cannot represent is left out."""
     results: Results = request.getfixturevalue(kind)
     counts = export_mcap(results, tmp_path / "r.mcap", PERIOD, batch_rows=97)
-    found, wanted = read_back(tmp_path / "r.mcap"), expected(results)
-    assert found.keys() == wanted.keys() >= {"/truth", "/estimates/legitimate", "/statistics/legitimate"}
-    assert ("/inputs" in found, "/packets/legitimate" in found) == (kind == "loop", kind == "live")
+    actual, wanted = read_back(tmp_path / "r.mcap"), expected(results)
+    assert actual.keys() == wanted.keys() >= {"/truth", "/estimates/legitimate", "/statistics/legitimate"}
+    assert ("/inputs" in actual, "/packets/legitimate" in actual) == (kind == "loop", kind == "live")
     for topic, messages in wanted.items():
-        assert found[topic] == messages, topic
-    assert counts == {topic: len(messages) for topic, messages in found.items()}
+        assert actual[topic] == messages, topic
+    assert counts == {topic: len(messages) for topic, messages in actual.items()}
 
 
 def test_events_are_shown_as_a_log(live: Results, tmp_path: Path) -> None:
@@ -140,8 +140,8 @@ def test_a_missing_package_is_named(live: Results, tmp_path: Path, monkeypatch: 
 def test_the_command_says_what_it_wrote(loop: Results, evedrop: Evedrop) -> None:
     """Messages and topics; without --period a slot takes as long as the scenario says."""
     done = evedrop("export", str(loop.folder), "r.mcap")
-    found = read_back(evedrop.folder / "r.mcap")
-    assert done.out == f"{sum(map(len, found.values()))} messages on {len(found)} topics are in r.mcap\n"
+    back = read_back(evedrop.folder / "r.mcap")
+    assert done.out == f"{sum(map(len, back.values()))} messages on {len(back)} topics are in r.mcap\n"
     scenario = load(loop.folder / "scenario.toml")
     assert scenario.slot_seconds not in {None, 1.0}
-    assert found["/truth"][1][0] == 1e9 * (scenario.slot_seconds or 0.0)
+    assert back["/truth"][1][0] == 1e9 * (scenario.slot_seconds or 0.0)

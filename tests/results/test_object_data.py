@@ -55,7 +55,7 @@ def test_instances_come_back() -> None:
     assert back.inner.values.tobytes() == array.tobytes()
     assert [type(name) for name in back.table] == [Place]
     assert back.table[Place(1, 2.0)].values == (3, 4.0)
-    assert [type(one) for one in back.parts] == [Inner] * 3
+    assert [type(part) for part in back.parts] == [Inner] * 3
     assert back.parts[1].values.dtype == np.float32
     assert (back.parts[2].values.shape, back.parts[2].values.dtype) == ((0, 3), np.uint16)
     back.inner.values[0, 0] = 2.0  # an array of its own
@@ -90,9 +90,9 @@ def test_any_bytes_are_read_or_refused(noise: bytes, place: int) -> None:
     """Bytes that are damaged anywhere give a value or NotData, and no other error."""
     data = bytearray(packed(Outer(np.arange(3), Inner([1.5]))))
     data[place % len(data)] ^= 1 + place % 255
-    for one in (noise, bytes(data), bytes(data[: place % len(data)])):
+    for data_ in (noise, bytes(data), bytes(data[: place % len(data)])):
         with contextlib.suppress(NotData):
-            unpacked(one, Outer())
+            unpacked(data_, Outer())
 
 
 SHORT = {"slots": 12, "trials": 503, "record_trials": 2, "expect": []}

@@ -38,7 +38,7 @@ for place in sys.argv[1:]:
 
 def open_to_others(folder: Path) -> dict[str, str]:
     """Everything in a folder, itself included, whose mode is not the one for a single user: path → mode."""
-    found = {}
+    modes = {}
     for path in (folder, *folder.rglob("*")):
         try:
             mode = path.lstat().st_mode
@@ -46,20 +46,20 @@ def open_to_others(folder: Path) -> dict[str, str]:
             continue
         wanted = 0o700 if stat.S_ISDIR(mode) else 0o600
         if stat.S_IMODE(mode) != wanted:
-            found[str(path.relative_to(folder))] = oct(stat.S_IMODE(mode))
-    return found
+            modes[str(path.relative_to(folder))] = oct(stat.S_IMODE(mode))
+    return modes
 
 
 def watched(live: Live, top: Path) -> list[dict[str, str]]:
     """The files that were ever open to others while a command ran, from its first file on; it must end well."""
-    found = []
+    seen = []
     while live.process.poll() is None:
         if top.exists() and (bad := open_to_others(top)):
-            found.append(bad)
+            seen.append(bad)
         time.sleep(0.05)  # leave the command a processor
     assert live.end().status == 0
     assert live.folder.is_dir()
-    return [*found, *([bad] if (bad := open_to_others(top)) else [])]
+    return [*seen, *([bad] if (bad := open_to_others(top)) else [])]
 
 
 def test_a_run_under_way_and_its_results_are_private(evedrop: Evedrop) -> None:
@@ -185,6 +185,6 @@ def check_as_nobody(evedrop: Evedrop, live: Live) -> None:
     names = ("scenario.toml", "control.json", "slots.parquet", "logs", "logs/recorder.log")
     places = [live.folder, *(live.folder / name for name in names), *live.temporary.glob("evedrop-*")]
     command: list[Any] = [sys.executable, "-c", LOOK, evedrop.folder / "run.news", *places]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
-    assert said[0].startswith("b'"), "the other user must get as far as the folder's neighbours, or nothing is tested"
-    assert said[1:] == ["Permission denied"] * len(places)
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert lines[0].startswith("b'"), "the other user must get as far as the folder's neighbours, or nothing is tested"
+    assert lines[1:] == ["Permission denied"] * len(places)

@@ -62,13 +62,13 @@ def test_the_scenario_reference_has_every_entry(table: type[BaseModel]) -> None:
 
 def test_the_results_reference_has_every_column(results: Results) -> None:
     """Every column of every table, every action, every entry of the summary."""
-    known = words("results.md")
+    documented = words("results.md")
     for names in (results.slots.column_names, results.trials.column_names, JOURNAL.names, DIGESTS.names, ACTIONS):
-        assert set(names) - known == set()
+        assert set(names) - documented == set()
     summary = results.summary
     for part in (summary, summary["peers"]["smart"], summary["links"]["smart"], summary["secrecy"]["smart"]):
-        assert set(part) - known == set()
-    assert set(summary["expectations"][0]) <= known
+        assert set(part) - documented == set()
+    assert set(summary["expectations"][0]) <= documented
 
 
 def test_tables_have_a_row_for_everything(results: Results) -> None:
@@ -121,9 +121,9 @@ def test_rows_that_come_at_once_are_parted(monkeypatch: pytest.MonkeyPatch, tmp_
     monkeypatch.setattr(growing, "BATCH_BYTES", 1000)
     columns = masks(10, 400)
     assert journal(tmp_path, [columns]).num_row_groups >= 5
-    found = pq.read_table(tmp_path / "journal.parquet")
-    assert found["slot"].to_pylist() == list(range(10))
-    assert found["delivered_mask"].to_pylist() == [row.tobytes() for row in columns[-1]]
+    table = pq.read_table(tmp_path / "journal.parquet")
+    assert table["slot"].to_pylist() == list(range(10))
+    assert table["delivered_mask"].to_pylist() == [row.tobytes() for row in columns[-1]]
 
 
 def test_a_summary_is_replaced_as_a_whole(results: Results) -> None:

@@ -56,7 +56,7 @@ def test_folders_are_searched_in_order_and_each_scenario_is_taken_once(tmp_path:
     for place in ("b.toml", "a/z.toml", "a/c.toml", ".hidden/h.toml", "a/_not.toml"):
         (tmp_path / place).parent.mkdir(exist_ok=True)
         (tmp_path / place).write_text(SCENARIO, encoding="utf-8")
-    found = [str(tmp_path / place) for place in ("b.toml", "a/c.toml", "a/z.toml")]
-    assert [str(path) for path in scenarios_in(tmp_path)] == found
-    z, c, b = (found[i] for i in (2, 1, 0))
+    places = [str(tmp_path / place) for place in ("b.toml", "a/c.toml", "a/z.toml")]
+    assert [str(path) for path in scenarios_in(tmp_path)] == places
+    z, c, b = (places[i] for i in (2, 1, 0))
     assert scenarios_of([z, "vehicle", str(tmp_path), z, str(shipped()["vehicle"])]) == [z, "vehicle", b, c]

@@ -111,7 +111,7 @@ def test_a_wrong_event_is_named(name: str, golden: Golden) -> None:
 
 def test_all_wrong_entries_are_named_at_once() -> None:
     """A line for each, of events among other tables; what only other tables show waits until every table is valid."""
-    found = mistakes_of(
+    mistakes = mistakes_of(
         right,
         {"at": 100, "cut": "eve"},
         {"at": 1},
@@ -125,13 +125,13 @@ def test_all_wrong_entries_are_named_at_once() -> None:
         "legitimate.link.reorder",
         "legitimate.window",
     )
-    assert len(found) == len(starts), found
-    assert all(any(line.startswith(start) for line in found) for start in starts), found
+    assert len(mistakes) == len(starts), mistakes
+    assert all(any(line.startswith(start) for line in mistakes) for start in starts), mistakes
 
 
 def test_all_mistakes_across_tables_are_named_at_once() -> None:
     """Where every table is valid by itself, those of events among others."""
-    found = mistakes_of(
+    mistakes = mistakes_of(
         right,
         {"at": 100, "cut": "eve"},
         {"at": 1, "kill": "nobody"},
@@ -139,8 +139,8 @@ def test_all_mistakes_across_tables_are_named_at_once() -> None:
         record_trials=2,
     )
     starts = ("event.0.at", "event.1.kill", "legitimate.link.correlation.with", "record_trials")
-    assert len(found) == len(starts), found
-    assert all(any(line.startswith(start) for line in found) for start in starts), found
+    assert len(mistakes) == len(starts), mistakes
+    assert all(any(line.startswith(start) for line in mistakes) for start in starts), mistakes
 
 
 @pytest.mark.parametrize(
@@ -172,8 +172,8 @@ def test_all_mistakes_across_tables_are_named_at_once() -> None:
 def test_a_wrong_link_is_named(link: dict[str, Any], line: str) -> None:
     """With its path."""
     eve = {"eve": {"strategy": "smart", "link": {"quality": 0.9, **link}}}
-    found = mistakes_of(right, eavesdroppers=eve)
-    assert any(one.startswith(f"eavesdroppers.eve.link.{line}") for one in found), found
+    mistakes = mistakes_of(right, eavesdroppers=eve)
+    assert any(mistake.startswith(f"eavesdroppers.eve.link.{line}") for mistake in mistakes), mistakes
 
 
 def test_correlation_needs_links_that_lose_alike() -> None:
@@ -206,7 +206,7 @@ def test_what_events_come_to() -> None:
     )
     eve = scenario.schedule("eve")
     half, whole = ({"model": "bernoulli", "quality": quality} for quality in (0.5, 0.9))
-    assert [(one.at, one.settings, one.cut) for one in eve.changes] == [
+    assert [(change.at, change.settings, change.cut) for change in eve.changes] == [
         (10, {"loss": half}, None),
         (20, None, True),
         (25, None, False),
@@ -214,7 +214,9 @@ def test_what_events_come_to() -> None:
         (40, {"loss": whole}, None),
     ]
     outages = {
-        name: [(one.start, one.stop, one.reason, one.keeps_state) for one in scenario.timeline.outages[name]]
+        name: [
+            (outage.start, outage.stop, outage.reason, outage.keeps_state) for outage in scenario.timeline.outages[name]
+        ]
         for name in scenario.receivers
     }
     assert outages == {

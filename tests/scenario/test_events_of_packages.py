@@ -51,9 +51,9 @@ def test_an_event_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
     for name in ("memory", "live"):
         tables = tomllib.loads((evedrop.folder / name / "scenario.toml").read_text(encoding="utf-8"))
         assert {"at": 20, "dim": "smart"} in tables["event"]
-        said = (evedrop.folder / name / "summary.json").read_text(encoding="utf-8")
-        assert '"dim smart"' in said
-        assert '"smart is bright again"' in said
+        text = (evedrop.folder / name / "summary.json").read_text(encoding="utf-8")
+        assert '"dim smart"' in text
+        assert '"smart is bright again"' in text
     assert "dim" not in EVENTS.names
 
 
@@ -112,7 +112,7 @@ FAILING = {
 @pytest.mark.parametrize("case", FAILING)
 def test_an_event_that_fails_is_a_mistake_of_who_uses_it(evedrop: Evedrop, case: str) -> None:
     """Before anything is started, with the error and its line."""
-    line, instead, said = FAILING[case]
+    line, instead, message = FAILING[case]
     page = (DOCS / "your-own.md").read_text(encoding="utf-8")
     code = page.partition("# dimming.py\n")[2].partition("```")[0]
     assert line in code
@@ -120,7 +120,7 @@ def test_an_event_that_fails_is_a_mistake_of_who_uses_it(evedrop: Evedrop, case:
     (evedrop.folder / "dim.toml").write_text(SCENARIO)
     done = evedrop.process("check", "dim.toml", env=environment)
     assert done.status == 2
-    assert said in done.err
+    assert message in done.err
     assert "Traceback" not in done.err
 
 

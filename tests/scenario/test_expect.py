@@ -29,7 +29,7 @@ def expecting(*expectations: dict[str, Any], **changes: Any) -> Scenario:
 
 
 @pytest.mark.parametrize(
-    ("expectation", "said"),
+    ("expectation", "message"),
     [
         ({}, 'metric: is missing; expected metric = "legitimate.mean_squared_error", or one of link, secrecy, synchronised'),
         ({"by": 3}, 'synchronised: is missing; expected synchronised = "legitimate"'),
@@ -75,10 +75,10 @@ def expecting(*expectations: dict[str, Any], **changes: Any) -> Scenario:
         ({"metric": ERROR, "blow": 1.0}, "blow: is not an entry of this table; did you mean below?"),
     ],
 )  # fmt: skip
-def test_a_mistake_of_an_expectation_is_named(expectation: dict[str, Any], said: str) -> None:
+def test_a_mistake_of_an_expectation_is_named(expectation: dict[str, Any], message: str) -> None:
     """Its path, what was found, what was expected."""
-    found = mistakes_of(expecting, expectation)
-    assert [line for line in found if line.startswith("expect.0.") and said in line], found
+    mistakes = mistakes_of(expecting, expectation)
+    assert [line for line in mistakes if line.startswith("expect.0.") and message in line], mistakes
 
 
 AT_ONCE: dict[str, tuple[list[dict[str, Any]], set[str]]] = {
@@ -107,8 +107,8 @@ AT_ONCE: dict[str, tuple[list[dict[str, Any]], set[str]]] = {
 def test_all_mistakes_of_expectations_are_named_at_once(name: str) -> None:
     """Wrong entries of several tables, and wrong combinations of valid entries; then all that other tables show."""
     expectations, paths = AT_ONCE[name]
-    found = mistakes_of(expecting, *expectations)
-    assert sorted(line.partition(": ")[0] for line in found) == sorted(f"expect.{path}" for path in paths)
+    mistakes = mistakes_of(expecting, *expectations)
+    assert sorted(line.partition(": ")[0] for line in mistakes) == sorted(f"expect.{path}" for path in paths)
 
 
 def test_without_eavesdroppers_there_is_nobody_to_be_secret_from() -> None:
@@ -126,8 +126,8 @@ def test_a_quantile_needs_a_trial_beyond_it(quantile: float, least: int) -> None
     """The least number of trials is 1 over the fraction of trials beyond the quantile."""
     expectation = {"metric": ERROR, "below": 1.0, "quantile": quantile}
     assert expecting(expectation, trials=least).trials == least
-    (said,) = mistakes_of(expecting, expectation, trials=least - 1)
-    assert said.partition(" (line")[0].endswith(f"expected trials = {least} or more")
+    (mistake,) = mistakes_of(expecting, expectation, trials=least - 1)
+    assert mistake.partition(" (line")[0].endswith(f"expected trials = {least} or more")
 
 
 @pytest.mark.parametrize(
@@ -156,8 +156,8 @@ def test_what_is_wanted_of_a_metric(
     (made,) = expecting(expectation).expect
     assert made.text == text
     assert text.endswith(made.wanted)
-    assert all(made.holds(found) for found in holds)
-    assert not any(made.holds(found) for found in fails)
+    assert all(made.holds(hold) for hold in holds)
+    assert not any(made.holds(fail) for fail in fails)
 
 
 @pytest.mark.parametrize(

@@ -127,25 +127,25 @@ def test_theory_is_there_only_if_the_model_is_said_to_hold() -> None:
     """And then it is of a model: there is no z."""
     for theory in (None, False, True):
         entries = {"source": "file", "state_values": ROWS, "theory": theory}
-        found = expectations_of(checked(given(entries), "file"))["eve"]
-        assert found.of_model
-        assert found.known is (theory is True)
-        assert found.assumed is (theory is not True)
-        assert np.isfinite(found.traces(3)).all() == (theory is True)
+        expectation = expectations_of(checked(given(entries), "file"))["eve"]
+        assert expectation.of_model
+        assert expectation.known is (theory is True)
+        assert expectation.assumed is (theory is not True)
+        assert np.isfinite(expectation.traces(3)).all() == (theory is True)
 
 
 def test_the_results_of_given_states(tmp_path: Path) -> None:
     """No theory, and a sentence that says so; the folder repeats the run."""
     scenario = checked(given({"source": "file", "state_values": ROWS}), "file")
-    found = montecarlo(scenario, trials=12, out=tmp_path / "one", plan=Plan(workers=1))
-    peer = found.summary["peers"]["eve"]
+    result = montecarlo(scenario, trials=12, out=tmp_path / "one", plan=Plan(workers=1))
+    peer = result.summary["peers"]["eve"]
     assert peer["theoretical_trace_covariance"] is None
     assert peer["z"] == {"mean_squared_error": None}
-    assert found.summary["surprising"] is None
-    verdict = found.summary["secrecy"]["eve"]
+    assert result.summary["surprising"] is None
+    verdict = result.summary["secrecy"]["eve"]
     assert (verdict["relative_by_theory"], verdict["perfect_by_theory"], verdict["leak"]) == (None, None, None)
     assert "what theory expects of these states is not known" in verdict["sentence"]
-    assert difference(found, montecarlo(tmp_path / "one", trials=12, out=tmp_path / "two", plan=Plan(workers=1))).same
+    assert difference(result, montecarlo(tmp_path / "one", trials=12, out=tmp_path / "two", plan=Plan(workers=1))).same
 
 
 def test_a_recording_is_enough_for_other_schemes_and_for_covariances(tmp_path: Path) -> None:
@@ -161,8 +161,8 @@ def test_a_recording_is_enough_for_other_schemes_and_for_covariances(tmp_path: P
 def test_the_scenarios_of_a_comparison_can_be_run(tmp_path: Path) -> None:
     """They name the file of states in their folder."""
     scenario = checked(given({"source": "file", "state_values": ROWS}), "file")
-    found = compare(scenario, schemes=["plain"], adversaries=["naive"], trials=2, out=tmp_path, plan=Plan(workers=1))
-    cell = found.cell("plain", "naive").eavesdropper
+    result = compare(scenario, schemes=["plain"], adversaries=["naive"], trials=2, out=tmp_path, plan=Plan(workers=1))
+    cell = result.cell("plain", "naive").eavesdropper
     assert cell is not None
     assert cell.theory is None
     written = next((tmp_path / "scenarios").glob("*.toml"))
@@ -178,5 +178,5 @@ def test_a_program_cannot_be_asked_in_memory(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="the states are given"):
         montecarlo(checked(given(entries), "file"), out=tmp_path / "refused", plan=Plan(Mode.ERROR_COORDINATES))
     (tmp_path / "pose.csv").write_text("x,v\n" + "".join(f"{x},{v}\n" for x, v in ROWS))
-    found = states_of(checked(given({**entries, "source": "file"}), "file"))
-    assert np.array_equal(np.array(found), ROWS)
+    states = states_of(checked(given({**entries, "source": "file"}), "file"))
+    assert np.array_equal(np.array(states), ROWS)

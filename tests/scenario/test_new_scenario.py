@@ -38,14 +38,14 @@ SHORT = {"AckChannel": "Acknowledgements", "Correlation": "Legitimate", "Link": 
 
 def sections() -> dict[str, str]:
     """The lines below each heading, in comments or not, by the table's name in lower case; those above the first under ""."""
-    found: dict[str, str] = {"": ""}
+    headings: dict[str, str] = {"": ""}
     name = ""
     for line in NEW.splitlines():
         heading = re.match(r"(?:# )?\[{1,2}([a-z_]+)(?:\.\w+)?\]{1,2}", line)
         if heading is not None:
             name = heading[1]
-        found[name] = f"{found.get(name, '')}{line}\n"
-    return found
+        headings[name] = f"{headings.get(name, '')}{line}\n"
+    return headings
 
 
 def has_entry(text: str, entry: str) -> bool:
@@ -128,9 +128,9 @@ def test_a_scenario_without_entries_says_where_to_start(tmp_path: Path) -> None:
 
 def tables(kind: type[Table]) -> Iterator[type[Table]]:
     """The tables of a kind, and of the kinds made from it."""
-    for one in kind.__subclasses__():
-        yield one
-        yield from tables(one)
+    for subclass in kind.__subclasses__():
+        yield subclass
+        yield from tables(subclass)
 
 
 def test_an_entry_that_is_required_has_an_example() -> None:

@@ -47,8 +47,8 @@ def test_a_covariance_that_does_not_fit_is_refused() -> None:
     encoding = {"scheme": "noise", "state_probability": 0.5, "noise_covariance": "filter"}
     bare = noise_tables(encoding=encoding)
     del bare["plant"]
-    (found,) = mistakes_of(checked, bare, "file")
-    assert found.startswith(
+    (mistake,) = mistakes_of(checked, bare, "file")
+    assert mistake.startswith(
         'encoding.noise_covariance: is "filter", but the sensor has no filter; expected output_matrix and'
     )
     small = noise_tables(encoding={**encoding, "noise_covariance": [[0.1]]})
@@ -83,12 +83,12 @@ def test_theory_covers_those_that_take_noise_behind_independent_losses() -> None
         "power": {"strategy": "power-test", "link": link},
         "smart": {"strategy": "smart", "link": link},
     }
-    found = expectations_of(checked(noise_tables(eavesdroppers=eavesdroppers), "file"))
-    assert found["naive"].known
-    assert not found["naive"].infinite_variance
-    assert found["naive"].limit == pytest.approx(0.0270464, rel=1e-5)  # by the published recursion, minus tr P̄
-    assert found["naive"].traces(20)[-1] == pytest.approx(found["naive"].limit, rel=1e-3)
-    assert not found["bursts"].known
-    bound = found["power"].bound
+    expectations = expectations_of(checked(noise_tables(eavesdroppers=eavesdroppers), "file"))
+    assert expectations["naive"].known
+    assert not expectations["naive"].infinite_variance
+    assert expectations["naive"].limit == pytest.approx(0.0270464, rel=1e-5)  # by the published recursion, minus tr P̄
+    assert expectations["naive"].traces(20)[-1] == pytest.approx(expectations["naive"].limit, rel=1e-3)
+    assert not expectations["bursts"].known
+    bound = expectations["power"].bound
     assert bound is not None
-    assert np.array_equal(bound.traces(20), found["smart"].traces(20))
+    assert np.array_equal(bound.traces(20), expectations["smart"].traces(20))

@@ -276,7 +276,7 @@ def test_results_hold_the_disturbances_that_their_scenario_names(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("text", "what"),
+    ("text", "message"),
     [
         ("", "is empty; expected a line of names such as"),
         ("P_solar\n1\n", 'line 1 has no column "P_load", only "P_solar"; expected P_load among them'),
@@ -286,11 +286,11 @@ def test_results_hold_the_disturbances_that_their_scenario_names(tmp_path: Path)
         ("P_solar,P_load\n1,2\n", "has 1 rows; expected slots, which is 4, or more"),
     ],
 )
-def test_a_file_that_will_not_do_is_told(text: str, what: str, tmp_path: Path) -> None:
+def test_a_file_that_will_not_do_is_told(text: str, message: str, tmp_path: Path) -> None:
     """In the same words as any mistake, with the entry that names it."""
     with pytest.raises(ScenarioError) as caught:
         load(scenario_file(tmp_path, text))
-    assert any("plant.disturbance_file: " in line and what in line for line in caught.value.mistakes)
+    assert any("plant.disturbance_file: " in line and message in line for line in caught.value.mistakes)
 
 
 def test_what_may_never_end_is_not_read(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ SPY = {"strategy": "replay-informed", "learns_at": 5, "reads_as": "bayesian", "l
 
 
 @pytest.mark.parametrize(
-    ("table", "said"),
+    ("table", "starts"),
     [
         ({**POOL, "links": None}, ["links: is missing; the strategy colluding needs it; expected links = [{ quality"]),
         ({**POOL, "links": []}, ["links: has fewer than 2 entries; expected at least that many"]),
@@ -34,12 +34,12 @@ SPY = {"strategy": "replay-informed", "learns_at": 5, "reads_as": "bayesian", "l
         ({"strategy": "clever"}, ['strategy: is "clever"; expected']),
     ],
 )  # fmt: skip
-def test_a_mistake_of_an_eavesdropper_is_named(table: dict[str, Any], said: list[str]) -> None:
+def test_a_mistake_of_an_eavesdropper_is_named(table: dict[str, Any], starts: list[str]) -> None:
     """Missing, superfluous and wrong entries of a strategy: a line each."""
     given = {name: value for name, value in table.items() if value is not None}
-    found = mistakes_in_good({"eavesdroppers.eve": given})
-    assert len(found) == len(said), found
-    for line, start in zip(sorted(found), sorted(said), strict=True):
+    mistakes = mistakes_in_good({"eavesdroppers.eve": given})
+    assert len(mistakes) == len(starts), mistakes
+    for line, start in zip(sorted(mistakes), sorted(starts), strict=True):
         assert line.startswith(f"eavesdroppers.eve.{start}")
 
 
@@ -78,7 +78,7 @@ CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.
 
 
 @pytest.mark.parametrize(
-    ("link", "said"),
+    ("link", "message"),
     [
         ({}, "link.quality: is missing; expected quality = 0.9, or a loss model"),
         ({"quality": 0.9, "loss": BURSTS}, "link.quality: is given together with loss, whose short form it is"),
@@ -106,16 +106,16 @@ CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.
         ({"loss": {"model": "pattern", "outcomes": 11}}, "link.loss.outcomes: is 11; expected a word of 0 (lost)"),
     ],
 )  # fmt: skip
-def test_a_mistake_of_a_link_is_named(link: dict[str, Any], said: str) -> None:
+def test_a_mistake_of_a_link_is_named(link: dict[str, Any], message: str) -> None:
     """A mistake in the legitimate link or in an eavesdropper's link gets one line, with the path of the entry."""
     for receiver in ("legitimate", "eavesdroppers.smart"):
         (line,) = mistakes_in_good({f"{receiver}.link": link})
-        assert line.startswith(f"{receiver}.{said}")
+        assert line.startswith(f"{receiver}.{message}")
 
 
 def test_all_mistakes_of_links_are_named_at_once() -> None:
     """What is missing, unknown and wrong, in one loss model and in several."""
-    found = mistakes_in_good(
+    mistakes = mistakes_in_good(
         {
             "legitimate.link": {"loss": {"model": "gilbert-elliott", "p": 2.0, "q": 0.1}},
             "eavesdroppers.smart.link": {
@@ -135,5 +135,5 @@ def test_all_mistakes_of_links_are_named_at_once() -> None:
         ("eavesdroppers.other.link.loss.word: ", 1),
         ("slots: ", 1),
     ):
-        assert len([line for line in found if line.startswith(path)]) == count, path
-    assert len(found) == 9
+        assert len([line for line in mistakes if line.startswith(path)]) == count, path
+    assert len(mistakes) == 9

@@ -101,8 +101,8 @@ def test_a_missing_entry_is_named(entry: str) -> None:
 
 def test_an_uncontrollable_pair_is_named() -> None:
     """A process with noise that never reaches a direction of the state is refused."""
-    found = mistakes_in_good({"process.A": [[1.0, 0.0], [0.0, 1.0]], "process.Q": [[1.0, 0.0], [0.0, 0.0]]})
-    assert any("not controllable: the noise reaches 1 of 2 directions" in line for line in found)
+    mistakes = mistakes_in_good({"process.A": [[1.0, 0.0], [0.0, 1.0]], "process.Q": [[1.0, 0.0], [0.0, 0.0]]})
+    assert any("not controllable: the noise reaches 1 of 2 directions" in line for line in mistakes)
 
 
 WRONG_ENTRIES = {
@@ -145,8 +145,8 @@ WRONG_ACROSS = {
 )
 def test_all_mistakes_are_named_at_once(changes: dict[str, Any], without: str, paths: str) -> None:
     """No wrong table hides another; what only shows when tables are compared waits until all of them are valid."""
-    found = mistakes_in_good(changes, without)
-    assert sorted(line.partition(": ")[0] for line in found) == sorted(paths.split())
+    mistakes = mistakes_in_good(changes, without)
+    assert sorted(line.partition(": ")[0] for line in mistakes) == sorted(paths.split())
 
 
 def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:
@@ -163,10 +163,10 @@ def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:
 
 def test_more_slots_than_the_horizon_are_refused() -> None:
     """The bound and three ways out are named, and the bound is exact."""
-    (said,) = mistakes_in_good({"process.A": [[1.4, 0.3], [0.5, 1.0]], "slots": 4000})
-    assert "slots: is 4000; this process (spectral radius" in said
-    assert said.count(";") >= 3
-    bound = int(said.split("slots = ")[1].split()[0])
+    (mistake,) = mistakes_in_good({"process.A": [[1.4, 0.3], [0.5, 1.0]], "slots": 4000})
+    assert "slots: is 4000; this process (spectral radius" in mistake
+    assert mistake.count(";") >= 3
+    bound = int(mistake.split("slots = ")[1].split()[0])
     inside = {"process.A": [[1.4, 0.3], [0.5, 1.0]], "slots": bound}
     assert parse(tomli_w.dumps(GOOD), "scenario", inside).slots == bound
     assert mistakes_in_good({**inside, "slots": bound + 1})
@@ -188,7 +188,7 @@ def test_large_results_are_a_warning() -> None:
 
 
 @pytest.mark.parametrize(
-    ("dotted", "said"),
+    ("dotted", "message"),
     [
         ("a..b", "empty part"),
         ("", "empty part"),
@@ -197,9 +197,9 @@ def test_large_results_are_a_warning() -> None:
         ("process.A.x", "x is not an entry of a list of 2"),
     ],
 )
-def test_a_dotted_key_that_leads_nowhere_is_refused(dotted: str, said: str) -> None:
+def test_a_dotted_key_that_leads_nowhere_is_refused(dotted: str, message: str) -> None:
     """--set says which part of a key is wrong."""
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(UsageError, match=message):
         parse(tomli_w.dumps(GOOD), "scenario", {dotted: 1})
 
 
@@ -260,16 +260,16 @@ def test_a_new_scenario_is_commented_and_has_no_mistake(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "said"),
+    ("source", "message"),
     [
         ("eavesdroper", "did you mean eavesdroppers"),
         ("nothing.toml", "`evedrop list`"),
         (".", "without a scenario.toml"),
     ],
 )
-def test_a_scenario_that_is_not_there_is_named(tmp_path: Path, source: str, said: str) -> None:
+def test_a_scenario_that_is_not_there_is_named(tmp_path: Path, source: str, message: str) -> None:
     """A wrong name, a wrong file and a wrong folder each say what to give."""
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(UsageError, match=message):
         load(tmp_path if source == "." else source)
 
 

@@ -78,20 +78,20 @@ def test_live_and_memory_are_the_same_bits(name: str, batch: str, twins: Callabl
     for receiver, metrics in live.summary["peers"].items():
         same = memory.summary["peers"][receiver]
         assert metrics.keys() == same.keys()
-        for metric, found in metrics.items():
+        for metric, entry in metrics.items():
             # Differences of trials cancel more digits than their sums do.
             apart = 1e-9 if metric in {"standard_errors", "z"} else 1e-12
-            if isinstance(found, dict):
+            if isinstance(entry, dict):
                 alike = dict(same[metric])
-                if metric == "standard_errors" and found["mean_trace_covariance"] is None:
+                if metric == "standard_errors" and entry["mean_trace_covariance"] is None:
                     alike["mean_trace_covariance"] = None  # only memory knows tr P of trials that are not recorded
-                assert found.keys() == alike.keys()
-                for part, value in found.items():
+                assert entry.keys() == alike.keys()
+                for part, value in entry.items():
                     assert value == (alike[part] if alike[part] is None else pytest.approx(alike[part], rel=apart)), (
                         part
                     )
             elif metric != "digest":
-                assert found == (same[metric] if same[metric] is None else pytest.approx(same[metric], rel=apart))
+                assert entry == (same[metric] if same[metric] is None else pytest.approx(same[metric], rel=apart))
     for eavesdropper, verdict in live.summary["secrecy"].items():
         ratios = {
             key: pytest.approx(verdict[key], rel=1e-9) for key in ("ratio", "ratio_standard_error") if verdict[key]
@@ -131,9 +131,9 @@ def test_a_further_eavesdropper_changes_nobody_else(tmp_path: Path, twins: Calla
     extra: dict[str, Any] = {"eavesdroppers__extra__strategy": "smart", "eavesdroppers__extra__link__quality": 0.5}
     slots = load("numerical").slots
     live = run("numerical", slots=slots, pace=0.0, trials=1, first_trial=17, out=tmp_path / "extra", **extra)
-    found = digests_of(live)
-    assert found.pop("extra")
-    assert found == digests_of(twins("numerical", "a later trial")[1])
+    digests = digests_of(live)
+    assert digests.pop("extra")
+    assert digests == digests_of(twins("numerical", "a later trial")[1])
 
 
 def test_the_resolved_scenario_runs_to_the_same_digests(tmp_path: Path, twins: Callable[[str, str], Pair]) -> None:

@@ -90,20 +90,23 @@ def rare_events(expected: Expectation, slots: int, trials: int) -> RareEvents | 
     return None if streaks is None else RareEvents(streaks.fraction(trials), streaks.trials_for(RARE_FRACTION))
 
 
-def z_scores(one: Documented) -> dict[str, list[float | None]]:
+def z_scores(documented: Documented) -> dict[str, list[float | None]]:
     """Receiver → the z-score of its mean squared error in each study; for receivers whose expectation is known."""
-    scenario = one.scenario
-    run_tally, found = tally_of(scenario), {}
+    scenario = documented.scenario
+    run_tally, scores_of = tally_of(scenario), {}
     for name, expected in expectations_of(scenario).items():
         if not expected.known or expected.of_model:
             continue
         means: Floats = run_tally.tallies[name].window_errors.sum(axis=0) / scenario.slots
-        theory, rare = float(expected.traces(scenario.slots).mean()), rare_events(expected, scenario.slots, one.trials)
-        found[name] = [
+        theory, rare = (
+            float(expected.traces(scenario.slots).mean()),
+            rare_events(expected, scenario.slots, documented.trials),
+        )
+        scores_of[name] = [
             z_of_error(study, theory, expected, scenario.slots, rare)
-            for study in means.reshape(one.studies, one.trials)
+            for study in means.reshape(documented.studies, documented.trials)
         ]
-    return found
+    return scores_of
 
 
 @pytest.mark.long
@@ -111,15 +114,15 @@ def test_z_is_calibrated_at_the_sizes_of_the_documents(capsys: pytest.CaptureFix
     """Over 1000 studies: |z| above 1.96 in 3 to 7 % and above 3 in less than 0.6 %, legitimate estimator and eavesdroppers."""
     sides: dict[str, list[float]] = {"legitimate": [], "eavesdroppers": []}
     lines = []
-    for one in DOCUMENTED:
-        for name, scores in z_scores(one).items():
+    for documented in DOCUMENTED:
+        for name, scores in z_scores(documented).items():
             z = [score for score in scores if score is not None]
             sides["legitimate" if name == LEGITIMATE else "eavesdroppers"] += z
-            lines.append(f"| `{one.command}` | {name} | {row(scores)} |")
+            lines.append(f"| `{documented.command}` | {name} | {row(scores)} |")
     lines += [f"| all | {side} | {row(list(z))} |" for side, z in sides.items()]
     with capsys.disabled():
         print("", *lines, sep="\n")  # noqa: T201 - the table of the page
-    assert sum(one.studies for one in DOCUMENTED) == 1000
+    assert sum(documented.studies for documented in DOCUMENTED) == 1000
     for side, given in sides.items():
         beyond = np.abs(given)
         assert len(given) > 300, side
@@ -156,14 +159,16 @@ def gambled(initial: float, seed: int, strategy: str = "smart") -> Scenario:
 @pytest.mark.parametrize("initial", [1e6, 1e4])
 def test_no_verdict_is_false_where_rare_events_carry_the_users_error(seeds: int, initial: float) -> None:
     """The estimator's expected error is the larger one in all windows, or in all but the last: `held` is never true."""
-    expected = {name: one.traces(64)[1:].reshape(-1) for name, one in expectations_of(gambled(initial, 0)).items()}
+    expected = {
+        name: theory.traces(64)[1:].reshape(-1) for name, theory in expectations_of(gambled(initial, 0)).items()
+    }
     assert np.mean(expected["e"]) < np.mean(expected[LEGITIMATE])
-    found = []
+    relative = []
     for seed in range(seeds):
         scenario = gambled(initial, seed)
         (verdict,) = verdicts(scenario, tally_of(scenario).tallies)
-        found.append(verdict.relative)
-    assert Verdict.HELD not in found
+        relative.append(verdict.relative)
+    assert Verdict.HELD not in relative
 
 
 @pytest.mark.parametrize("seeds", [10, pytest.param(200, marks=pytest.mark.long)])

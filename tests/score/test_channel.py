@@ -56,13 +56,15 @@ def linked(seed: int, events: list[dict[str, Any]] | None = None) -> Scenario:
     )
 
 
-def tally_of(one: Scenario, name: str) -> Tally:
+def tally_of(scenario: Scenario, name: str) -> Tally:
     """What a run would have counted."""
-    schedule = one.schedule(name)
-    batch, accountant = Batch(one.slots, one.trials), Accountant(schedule.window, one.trials)
-    fates = Link(schedule, name, StreamKeys.from_scenario(one).link(name, schedule), batch).fates(range(one.slots))
-    account = accountant.account(range(one.slots), fates)
-    tally = Tally(one.slots, one.trials, done=one.slots, offered=one.slots * one.trials)
+    schedule = scenario.schedule(name)
+    batch, accountant = Batch(scenario.slots, scenario.trials), Accountant(schedule.window, scenario.trials)
+    fates = Link(schedule, name, StreamKeys.from_scenario(scenario).link(name, schedule), batch).fates(
+        range(scenario.slots)
+    )
+    account = accountant.account(range(scenario.slots), fates)
+    tally = Tally(scenario.slots, scenario.trials, done=scenario.slots, offered=scenario.slots * scenario.trials)
     tally.account(account.delivered, (account.delivered).astype(np.uint8), account.lost)
     tally.count(account)
     return tally
@@ -72,7 +74,7 @@ def test_right_links_are_within_their_intervals() -> None:
     """Every link that runs by its model, over 12 seeds: of 96 intervals of 99.9 % none is missed, or one."""
     outside = 0
     for seed in range(12):
-        one = linked(
+        right = linked(
             seed,
             [
                 {"from": 100, "to": 150, "link": "coins", "set": {"quality": 0.3}},
@@ -80,16 +82,16 @@ def test_right_links_are_within_their_intervals() -> None:
             ],
         )
         for name in LINKS:
-            outside += link_summary_of(one, name, tally_of(one, name)).within_interval is False
+            outside += link_summary_of(right, name, tally_of(right, name)).within_interval is False
     assert outside <= 1
 
 
 @pytest.mark.parametrize("name", ["coins", "bursts", "pattern", "far", "slow"])
 def test_a_link_with_another_model_is_flagged(name: str) -> None:
     """The counts of one link are outside the interval of a model with other losses."""
-    one = linked(3)
+    right = linked(3)
     changed = linked(3, [{"at": 1, "link": name, "set": {"quality": 0.45}}])
-    assert link_summary_of(changed, name, tally_of(one, name)).within_interval is False
+    assert link_summary_of(changed, name, tally_of(right, name)).within_interval is False
 
 
 def test_every_loss_has_a_reason_in_a_run_cut_short() -> None:
@@ -116,15 +118,15 @@ def test_the_interval_is_clopper_and_pearsons() -> None:
 
 def test_bursts_and_delays_stand_beside_their_models() -> None:
     """Mean burst length 1/r of a Gilbert link, within what 12 runs scatter; delay fractions within 5 standard errors."""
-    found = [link_summary_of(one := linked(seed), "bursts", tally_of(one, "bursts")) for seed in range(12)]
-    lengths = np.array([one.mean_burst for one in found])
-    assert found[0].expected_mean_burst == pytest.approx(1 / 0.3)
+    summaries = [link_summary_of(right := linked(seed), "bursts", tally_of(right, "bursts")) for seed in range(12)]
+    lengths = np.array([summary.mean_burst for summary in summaries])
+    assert summaries[0].expected_mean_burst == pytest.approx(1 / 0.3)
     assert (
         abs(lengths.mean() - 1 / 0.3) < 5 * lengths.std(ddof=1) / np.sqrt(12) + 0.3
     )  # long bursts at the end are not seen
-    one = linked(5)
-    slow = link_summary_of(one, "slow", tally_of(one, "slow"))
-    total = 0.8 * one.slots * one.trials
+    right = linked(5)
+    slow = link_summary_of(right, "slow", tally_of(right, "slow"))
+    total = 0.8 * right.slots * right.trials
     assert slow.delays is not None
     assert slow.expected_delays is not None
     for fraction, expected in zip(slow.delays, slow.expected_delays, strict=True):
@@ -134,6 +136,6 @@ def test_bursts_and_delays_stand_beside_their_models() -> None:
 
 def test_nothing_is_said_of_what_was_not_measured() -> None:
     """Of a run that did not begin."""
-    one = linked(1)
-    found = link_summary_of(one, "coins", Tally(one.slots, one.trials))
-    assert (found.rate, found.interval, found.within_interval, found.mean_burst) == (None, None, None, None)
+    right = linked(1)
+    summary = link_summary_of(right, "coins", Tally(right.slots, right.trials))
+    assert (summary.rate, summary.interval, summary.within_interval, summary.mean_burst) == (None, None, None, None)

@@ -15,8 +15,8 @@ SLOTS, TRIALS = 40, 4000
 
 def actions(seed: int, trials: int = TRIALS) -> Codes:
     """States, innovations, losses and discarded packets."""
-    found: Codes = np.random.default_rng(seed).choice(4, (SLOTS, trials), p=[0.3, 0.3, 0.2, 0.2]).astype(np.uint8)
-    return found
+    codes: Codes = np.random.default_rng(seed).choice(4, (SLOTS, trials), p=[0.3, 0.3, 0.2, 0.2]).astype(np.uint8)
+    return codes
 
 
 def errors(process: Process, action: Codes, seed: int) -> Floats:
@@ -53,9 +53,9 @@ def test_the_expectation_is_the_mean_of_many_trials_with_the_same_events() -> No
     action = np.repeat(actions(3, 1), TRIALS, axis=1)
     own = ConditionalError(MARGINAL, MARGINAL.initial_covariance, TRIALS)
     own.add_actions(action)
-    found = errors(MARGINAL, action, 4)
-    assert found.mean() == pytest.approx(own.expected[0], abs=4.5 * found.std() / np.sqrt(TRIALS))
-    assert 0.5 < found.var() / own.variance[0] < 1.3  # a bound; beyond 1 by chance only
+    result = errors(MARGINAL, action, 4)
+    assert result.mean() == pytest.approx(own.expected[0], abs=4.5 * result.std() / np.sqrt(TRIALS))
+    assert 0.5 < result.var() / own.variance[0] < 1.3  # a bound; beyond 1 by chance only
 
 
 @pytest.mark.parametrize("length", [1, 7, SLOTS])

@@ -30,13 +30,13 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Results:
     return montecarlo("partial-encryption", out=tmp_path_factory.mktemp("run"), plan=Plan(workers=1), **SOME)
 
 
-def test_the_error_in_a_direction_is_that_of_its_sum(found: Results) -> None:
+def test_the_error_in_a_direction_is_that_of_its_sum(results: Results) -> None:
     """Computed from the recorded rows, with the textbook's standard error, and compared with theory."""
     scenario = load("partial-encryption", SOME)
     process: Process = scenario.process.process
     weights = scenario.process.directions_as_arrays
-    rows = found.trials.to_pylist()
-    for receiver, entries in found.summary["directions"].items():
+    rows = results.trials.to_pylist()
+    for receiver, entries in results.summary["directions"].items():
         errors: dict[int, list[np.ndarray]] = {}
         for row in rows:
             if row["peer"] == receiver:
@@ -48,16 +48,16 @@ def test_the_error_in_a_direction_is_that_of_its_sum(found: Results) -> None:
     mu = scenario.quality["legitimate"]
     E = theoretical_covariances(process, Innovation(process, 1.0).outcomes(mu), 150)
     for name, v in weights.items():
-        entry = found.summary["directions"]["legitimate"][name]
+        entry = results.summary["directions"]["legitimate"][name]
         assert entry["expected"] == pytest.approx(np.mean([v @ P @ v for P in E]), rel=1e-12)
         assert abs(entry["z"]) < 4.5
         assert entry["unbounded"] is False
         assert entry["relative"] is entry["perfect"] is None
 
 
-def test_what_is_encrypted_is_secret_and_nothing_else(found: Results) -> None:
+def test_what_is_encrypted_is_secret_and_nothing_else(results: Results) -> None:
     """The position and what it is a part of; the speed is not secret, and theory denies that it is."""
-    antenna = found.summary["directions"]["antenna"]
+    antenna = results.summary["directions"]["antenna"]
     assert {name: entry["unbounded"] for name, entry in antenna.items()} == {
         "position": True,
         "speed": False,
@@ -70,21 +70,21 @@ def test_what_is_encrypted_is_secret_and_nothing_else(found: Results) -> None:
     }
     assert antenna["position"]["relative"] == antenna["position"]["perfect"] == "held"
     assert antenna["speed"]["relative"] == antenna["speed"]["perfect"] == "failed"
-    naive = found.summary["directions"]["naive"]
+    naive = results.summary["directions"]["naive"]
     assert {entry["unbounded"] for entry in naive.values()} == {None}
 
 
-def test_a_summary_is_read_again_with_and_without_directions(found: Results) -> None:
+def test_a_summary_is_read_again_with_and_without_directions(results: Results) -> None:
     """Results of an older version have none."""
-    entries = dict(found.summary)
-    assert Summary.read(entries).directions == found.typed_summary.directions
+    entries = dict(results.summary)
+    assert Summary.read(entries).directions == results.typed_summary.directions
     del entries["directions"]
     assert Summary.read(entries).directions == {}
 
 
-def test_the_report_has_a_table(found: Results, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_report_has_a_table(results: Results, capsys: pytest.CaptureFixture[str]) -> None:
     """Each receiver and direction, theory, and the verdicts."""
-    print_summary(found.typed_summary, "FOLDER")
+    print_summary(results.typed_summary, "FOLDER")
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     (position,) = (line for line in lines if line[:2] == ["antenna", "position"])
     assert position[-3:] == ["unbounded", "held", "held"]
@@ -104,7 +104,7 @@ def test_expectations_hold_in_directions(tmp_path: Path) -> None:
     some = {**SOME, "trials": 60, "record_trials": 1}
     results = montecarlo("partial-encryption", out=tmp_path / "run", plan=Plan(workers=1), expect=expect, **some)
     judged = results.typed_summary.expectations
-    assert [one.held for one in judged] == [True, False, False, True, True]
+    assert [expectation.held for expectation in judged] == [True, False, False, True, True]
     assert judged[0].text == "perfect secrecy of position against antenna promised by theory and shown by the run"
     assert judged[1].found == "theory denies it, the run shows that it fails"
     assert judged[3].found == "the run shows it"
@@ -126,7 +126,7 @@ def test_modes_without_estimates_have_no_directions(tmp_path: Path) -> None:
         process__directions={"sum": [1.0, 1.0]},
     )
     assert results.summary["directions"] == {}
-    assert [one.held for one in results.typed_summary.expectations] == [None, None]
+    assert [expectation.held for expectation in results.typed_summary.expectations] == [None, None]
 
 
 def test_trials_and_slots_in_parts_have_the_same_bits() -> None:
@@ -148,7 +148,7 @@ def test_trials_and_slots_in_parts_have_the_same_bits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"process.directions": {"a": [1.0]}}, "process.directions.a: has 1 entries; expected 2, one for each state"),
         ({"process.directions": {"a": [0.0, 0.0]}}, "process.directions.a: is zero; expected a direction, such as"),
@@ -176,7 +176,7 @@ def test_trials_and_slots_in_parts_have_the_same_bits() -> None:
         ),
     ],
 )
-def test_directions_that_mean_nothing(changes: dict[str, Any], said: str) -> None:
+def test_directions_that_mean_nothing(changes: dict[str, Any], message: str) -> None:
     """Are refused, and named."""
-    found = mistakes_in_good(changes)
-    assert any(line.startswith(said) for line in found), found
+    mistakes = mistakes_in_good(changes)
+    assert any(line.startswith(message) for line in mistakes), mistakes

@@ -28,17 +28,17 @@ def test_the_three_measures_by_hand() -> None:
     """A reference that buys 3 and sells 1, and a run that buys 2 and sells 2, one slot apart."""
     reference = np.array([1.0, 2.0, -1.0, 0.0])
     run = np.array([2.0, -1.0, 0.0, -1.0])
-    found = difference(run, reference)
-    assert np.isclose(found.net, 1.0)  # |0 − 2| / 2
-    assert np.isclose(found.total, 0.0)  # |4 − 4| / 4
-    assert np.isclose(found.summed, 6.0 / 4.0)
+    result = difference(run, reference)
+    assert np.isclose(result.net, 1.0)  # |0 − 2| / 2
+    assert np.isclose(result.total, 0.0)  # |4 − 4| / 4
+    assert np.isclose(result.summed, 6.0 / 4.0)
 
 
 def test_a_measure_of_nothing_is_said_to_be_none() -> None:
     """A reference that neither buys nor sells gives no fractions."""
-    found = difference(np.array([1.0, 1.0]), np.array([0.0, 0.0]))
-    assert np.isinf(found.net)
-    assert np.isinf(found.summed)
+    result = difference(np.array([1.0, 1.0]), np.array([0.0, 0.0]))
+    assert np.isinf(result.net)
+    assert np.isinf(result.summed)
     assert np.isnan(difference(np.zeros(2), np.zeros(2)).total)
 
 
@@ -48,13 +48,13 @@ def test_a_measure_of_nothing_is_said_to_be_none() -> None:
 )
 def test_what_differs_slot_by_slot_bounds_the_rest(run: np.ndarray, reference: np.ndarray) -> None:
     """Net and total differ by no more than the slots together, and a run differs from itself by nothing."""
-    found = difference(run, reference)
-    assert np.all(found.total <= found.summed + 1e-12)
-    assert np.all(found.net <= found.summed + 1e-12)
+    result = difference(run, reference)
+    assert np.all(result.total <= result.summed + 1e-12)
+    assert np.all(result.net <= result.summed + 1e-12)
     same = difference(reference, reference)
     assert same.net == same.total == same.summed == 0.0
     alone = [difference(run[:, r], reference).summed for r in range(3)]
-    assert np.array_equal(found.summed, alone)
+    assert np.array_equal(result.summed, alone)
 
 
 def test_a_meter_may_be_read_in_parts() -> None:

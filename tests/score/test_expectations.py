@@ -57,11 +57,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     """The same run live and in memory, once for all tests."""
 
     @cache
-    def one(where: str) -> Results:
+    def runs(where: str) -> Results:
         ways: dict[str, Callable[..., Results]] = {"live": run, "memory": montecarlo}
         return ways[where]("eavesdroppers", out=tmp_path_factory.mktemp(where), **OPTIONS)
 
-    return one
+    return runs
 
 
 def of_trials(results: Results, receiver: str) -> dict[str, Any]:
@@ -75,14 +75,16 @@ def test_live_and_memory_agree_on_every_expectation(made: Runs) -> None:
     """To the last bit, except for sums over all slots, and for the reported trace, which a live run sums over trials."""
     live, memory = (made(where).summary["expectations"] for where in ("live", "memory"))
     assert len(live) == len(OPTIONS["expect"])
-    for one, other in zip(live, memory, strict=True):
-        exact = ("slots" in one["text"] or "quantile" in one["text"]) and "mean_trace" not in one["text"]
-        exact = exact or not isinstance(one["found"], float)
-        assert one["found"] == (other["found"] if exact else pytest.approx(other["found"], rel=1e-12))
-        assert {key: one[key] for key in ("text", "held", "wanted")} == {
+    for expectation, other in zip(live, memory, strict=True):
+        exact = (
+            "slots" in expectation["text"] or "quantile" in expectation["text"]
+        ) and "mean_trace" not in expectation["text"]
+        exact = exact or not isinstance(expectation["found"], float)
+        assert expectation["found"] == (other["found"] if exact else pytest.approx(other["found"], rel=1e-12))
+        assert {key: expectation[key] for key in ("text", "held", "wanted")} == {
             key: other[key] for key in ("text", "held", "wanted")
         }
-        assert ("replay" in one) == ("replay" in other) == (one["held"] is False)
+        assert ("replay" in expectation) == ("replay" in other) == (expectation["held"] is False)
 
 
 def test_metrics_of_ranges_and_quantiles_are_those_of_the_table(made: Runs) -> None:
@@ -94,33 +96,35 @@ def test_metrics_of_ranges_and_quantiles_are_those_of_the_table(made: Runs) -> N
         "received_fraction": received,
         "used_fraction": received & (table["action"] != "discarded"),
     }
-    for expect, found in zip(ON_SUSPICIOUS, made("memory").summary["expectations"], strict=False):
+    for expect, expectation in zip(ON_SUSPICIOUS, made("memory").summary["expectations"], strict=False):
         means = columns[expect["metric"].split(".")[1]][slice(*expect.get("slots", (0, SLOTS)))].mean(axis=0)
-        known = np.quantile(means, expect["quantile"]) if "quantile" in expect else means.mean()
-        assert found["found"] == pytest.approx(known, rel=1e-12), found["text"]
-        assert found["held"] is True
+        value = np.quantile(means, expect["quantile"]) if "quantile" in expect else means.mean()
+        assert expectation["found"] == pytest.approx(value, rel=1e-12), expectation["text"]
+        assert expectation["held"] is True
 
 
 def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
     """Traces over a range, a link's account, secrecy by theory and run, and the slot by which all were synchronised."""
     results = made("live")
-    found = {one["text"]: one for one in results.summary["expectations"]}
+    expectations = {expectation["text"]: expectation for expectation in results.summary["expectations"]}
     rows = [row for row in results.slots.to_pylist() if row["peer"] == "naive" and FIRST <= row["slot"] < 70]
     for metric in ("mean_trace_covariance", "theoretical_trace_covariance"):
-        known = np.mean([row[metric] for row in rows])
-        assert found[f"naive.{metric} over slots {FIRST} to 69 above 0"]["found"] == pytest.approx(known, rel=1e-12)
-    assert found["links.naive.lost above 0"]["found"] == results.summary["links"]["naive"]["lost"]
-    unknown = found["links.naive.lost_by.nothing above 0"]
+        value = np.mean([row[metric] for row in rows])
+        assert expectations[f"naive.{metric} over slots {FIRST} to 69 above 0"]["found"] == pytest.approx(
+            value, rel=1e-12
+        )
+    assert expectations["links.naive.lost above 0"]["found"] == results.summary["links"]["naive"]["lost"]
+    unknown = expectations["links.naive.lost_by.nothing above 0"]
     assert (unknown["found"], unknown["held"]) == (None, None)
     assert Judged(**unknown).sentence.endswith(": FAILED, the run has no value for it")
-    perfect = found["perfect secrecy against smart promised by theory and shown by the run"]
+    perfect = expectations["perfect secrecy against smart promised by theory and shown by the run"]
     assert (perfect["held"], perfect["found"]) == (False, "theory denies it, the run shows that it fails")
     states = np.isin(of_trials(results, "suspicious")["action"], ("state", "misled"))
     for since, text in ((0, ""), (FIRST, f", since slot {FIRST}")):
-        one = found[f"suspicious synchronised by slot 80{text}"]
-        assert one["found"] == since + states[since:].argmax(axis=0).max()
-        assert one["held"] is (one["found"] <= 80)
-    late = found["suspicious synchronised by slot 0"]
+        expectation = expectations[f"suspicious synchronised by slot 80{text}"]
+        assert expectation["found"] == since + states[since:].argmax(axis=0).max()
+        assert expectation["held"] is (expectation["found"] <= 80)
+    late = expectations["suspicious synchronised by slot 0"]
     assert late["found"] > 0
     assert late["held"] is False
 
@@ -134,7 +138,10 @@ def test_expectations_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> 
         for workers in (1, 3)
     ]
     alone, spread = (
-        [{key: value for key, value in one.items() if key != "replay"} for one in made.summary["expectations"]]
+        [
+            {key: value for key, value in expectation.items() if key != "replay"}
+            for expectation in made.summary["expectations"]
+        ]
         for made in runs
     )
     assert alone == spread
@@ -149,20 +156,22 @@ def test_what_is_watched_does_not_depend_on_how_it_is_cut(cuts: set[int], blocks
     steps = [WatchedSlots(SYNCHRONISED, 0, 40), WatchedSlots(SYNCHRONISED, 11, 40)]
 
     def watched(trials: slice, ends: list[int]) -> WatchedTally:
-        one = WatchedTally([*watches, *steps], error[:, trials].shape[1])
+        whole_tally = WatchedTally([*watches, *steps], error[:, trials].shape[1])
         for first, end in zip([0, *ends], [*ends, 40], strict=True):
             nothing = np.zeros(end - first)
-            one.add_slots(ScoredSlots(first, error[first:end, trials], action[first:end, trials], nothing, nothing))
-        return one
+            whole_tally.add_slots(
+                ScoredSlots(first, error[first:end, trials], action[first:end, trials], nothing, nothing)
+            )
+        return whole_tally
 
     edges = [0, *sorted(blocks), 7]
     parts = WatchedTally.merged([watched(slice(*ends), sorted(cuts)) for ends in pairwise(edges)])
     whole = watched(slice(0, 7), [])
     for watch in watches:
-        found, expected = parts.tally(watch).of_trials, whole.tally(watch).of_trials
-        assert found is not None
+        values, expected = parts.tally(watch).of_trials, whole.tally(watch).of_trials
+        assert values is not None
         assert expected is not None
-        assert found.tolist() == expected.tolist()
+        assert values.tolist() == expected.tolist()
         assert parts.tally(watch).value == whole.tally(watch).value
     for watch in steps:
         firsts = [next(k for k in range(watch.first, 40) if action[k, r] == Action.STATE) for r in range(7)]
@@ -175,9 +184,9 @@ def test_a_trial_that_never_is_synchronised_is_found_as_nothing(tmp_path: Path) 
     results = montecarlo(
         "eavesdroppers", slots=9, trials=5, legitimate__link__quality=0.0, expect=expect, out=tmp_path / "a"
     )
-    (one,) = results.summary["expectations"]
-    assert (one["held"], one["found"], one["wanted"]) == (False, None, "by slot 3")
-    assert Judged(**one).sentence == "expected legitimate synchronised by slot 3: FAILED, found none"
+    (expectation,) = results.summary["expectations"]
+    assert (expectation["held"], expectation["found"], expectation["wanted"]) == (False, None, "by slot 3")
+    assert Judged(**expectation).sentence == "expected legitimate synchronised by slot 3: FAILED, found none"
     ranged = {"metric": "smart.used_fraction", "slots": [3, 9], "below": 1}
     secret = {"secrecy": "relative", "against": "smart"}
     scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged, secret]})
@@ -185,13 +194,13 @@ def test_a_trial_that_never_is_synchronised_is_found_as_nothing(tmp_path: Path) 
     open_ = Secrecy("smart", Verdict.UNDECIDED, Verdict.UNDECIDED, True, 1, "", True, 1.0, 1, "mean")
     peers = dict.fromkeys(scenario.receivers, PeerSummary({"used_fraction": 0.5}, None, False, None))
     judged = Evidence(scenario, peers, {}, short, {"smart": open_}).judged("evedrop run x")
-    assert [one.held for one in judged] == [None] * 3
-    assert [one.found for one in judged[:2]] == [None] * 2
-    assert not any("replay" in one.as_dict() for one in judged)
+    assert [judgement.held for judgement in judged] == [None] * 3
+    assert [judgement.found for judgement in judged[:2]] == [None] * 2
+    assert not any("replay" in judgement.as_dict() for judgement in judged)
 
 
 @pytest.mark.parametrize(
-    ("shown", "promised", "found", "held"),
+    ("shown", "promised", "value", "held"),
     [
         (Verdict.HELD, True, "theory promises it, the run shows it", True),
         (Verdict.UNDECIDED, True, "theory promises it, the run has too few trials to tell", False),
@@ -201,7 +210,7 @@ def test_a_trial_that_never_is_synchronised_is_found_as_nothing(tmp_path: Path) 
     ],
 )
 def test_secrecy_is_held_where_theory_and_run_agree(
-    shown: Verdict, promised: bool | None, found: str, held: bool
+    shown: Verdict, promised: bool | None, value: str, held: bool
 ) -> None:
     """Of both kinds; whatever the other kind's verdict is."""
     for kind in ("relative", "perfect"):
@@ -210,23 +219,23 @@ def test_secrecy_is_held_where_theory_and_run_agree(
         claims: dict[str, Any] = {"relative_by_theory": True, "perfect_by_theory": True, f"{kind}_by_theory": promised}
         verdict = Secrecy("smart", **{**other, kind: shown}, **claims, relative_from=None, windows="", ratio=1.0,
                           trials=9, judged_by="mean")  # fmt: skip
-        (one,) = Evidence(scenario, {}, {}, {}, {"smart": verdict}).judged(None)
-        assert (one.found, one.held) == (found, held)
+        (judged,) = Evidence(scenario, {}, {}, {}, {"smart": verdict}).judged(None)
+        assert (judged.found, judged.held) == (value, held)
 
 
 @pytest.mark.parametrize(
-    ("account", "found", "held"),
+    ("account", "value", "held"),
     [
         ({}, None, None),
         ({"rate": 0.8, "within_interval": True}, 0.8, True),
         ({"rate": 0.2, "within_interval": False}, 0.2, False),
     ],
 )
-def test_a_link_must_be_within_its_interval(account: dict[str, Any], found: float | None, held: bool | None) -> None:
+def test_a_link_must_be_within_its_interval(account: dict[str, Any], value: float | None, held: bool | None) -> None:
     """As its account says; an account that does not say leaves it open."""
     scenario = load("eavesdroppers", {"expect": [{"link": "smart"}]})
-    (one,) = Evidence(scenario, {}, {"smart": LinkSummary(9, 9, 0, 0, 0, **account)}, {}, {}).judged(None)
-    assert (one.found, one.held) == (found, held)
+    (judged,) = Evidence(scenario, {}, {"smart": LinkSummary(9, 9, 0, 0, 0, **account)}, {}, {}).judged(None)
+    assert (judged.found, judged.held) == (value, held)
 
 
 @pytest.mark.long
@@ -241,17 +250,21 @@ def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: 
     )  # fmt: skip
     assert (done.status, done.err) == (1, "")
     first = Results.read(evedrop.folder / "a run").summary["expectations"]
-    assert [one["held"] for one in first] == [False, False]
+    assert [expectation["held"] for expectation in first] == [False, False]
     assert "2 of 2 expectations FAILED" in done.out
-    said = [line.strip() for line in done.out.splitlines()]
-    for one in first:
-        assert said[said.index(Judged(**one).sentence) + 1] == f"see it again: {one['replay']}"
+    lines = [line.strip() for line in done.out.splitlines()]
+    for expectation in first:
+        assert lines[lines.index(Judged(**expectation).sentence) + 1] == f"see it again: {expectation['replay']}"
     words = shlex.split(first[0]["replay"])
     assert words[:2] == ["evedrop", command]
     again = evedrop(*words[1:], *view, "--json", "--out", "again")
     assert again.status == 1
-    for one, other in zip(first, json.loads(again.out)["expectations"], strict=True):
-        assert (one["text"], one["found"], one["held"]) == (other["text"], other["found"], other["held"])
+    for expectation, other in zip(first, json.loads(again.out)["expectations"], strict=True):
+        assert (expectation["text"], expectation["found"], expectation["held"]) == (
+            other["text"],
+            other["found"],
+            other["held"],
+        )
 
 
 def test_one_trial_of_a_study_can_be_watched_whatever_was_expected(evedrop: Evedrop) -> None:

@@ -45,15 +45,15 @@ def differences(studies: int) -> Floats:
     for start in range(0, scenario.trials, 2000):
         task = TrialsTask(scenario.model_dump(mode="json"), start, min(start + 2000, scenario.trials), Mode.EXACT)
         tallies = [block.run_tally.tallies for block in carry_out(task, lambda _: None, lambda: False).blocks]
-        legitimate, other = (merged([one[name] for one in tallies]) for name in ("legitimate", "alike"))
+        legitimate, other = (merged([tally[name] for tally in tallies]) for name in ("legitimate", "alike"))
         parts.append(window_means(other) - window_means(legitimate))
     whole = np.concatenate(parts, axis=1)
     return whole.reshape(WINDOWS, studies, TRIALS).swapaxes(0, 1)
 
 
-def counted(found: list[Verdict]) -> dict[Verdict, int]:
+def counted(verdicts: list[Verdict]) -> dict[Verdict, int]:
     """How often each verdict was reached."""
-    return {one: found.count(one) for one in Verdict}
+    return {verdict: verdicts.count(verdict) for verdict in Verdict}
 
 
 def most(studies: int) -> int:
@@ -69,14 +69,14 @@ STUDIES = pytest.mark.parametrize("studies", [200, pytest.param(1000, marks=pyte
 def test_failed_is_said_in_error_no_more_often_than_promised(studies: int, test: SignTestOf) -> None:
     """Without a difference in any window; with the whole rate for each window, 1000 studies would have too many."""
     samples = differences(studies)
-    found = counted([relative_verdict(one, test, SLOTS)[0] for one in samples])
-    assert found[Verdict.FAILED] <= most(studies)
-    assert found[Verdict.HELD] <= most(studies)
-    alone = sum(any(test(row).below <= ERROR_RATE for row in one) for one in samples)
-    assert alone > found[Verdict.FAILED]
+    result = counted([relative_verdict(sample, test, SLOTS)[0] for sample in samples])
+    assert result[Verdict.FAILED] <= most(studies)
+    assert result[Verdict.HELD] <= most(studies)
+    alone = sum(any(test(row).below <= ERROR_RATE for row in sample) for sample in samples)
+    assert alone > result[Verdict.FAILED]
     if studies == 1000:
         assert alone > most(studies)
-        low, high = binomtest(found[Verdict.FAILED], studies).proportion_ci(0.999)
+        low, high = binomtest(result[Verdict.FAILED], studies).proportion_ci(0.999)
         assert low <= ERROR_RATE <= high
 
 
@@ -85,6 +85,6 @@ def test_held_is_said_in_error_no_more_often_than_promised(studies: int) -> None
     """Without a difference in one window, and with a large one in all others: the worst case for this claim."""
     samples = differences(studies).copy()
     samples[:, 1:] += 1.0
-    found = counted([relative_verdict(one, sign_of_mean, SLOTS)[0] for one in samples])
-    assert 0 < found[Verdict.HELD] <= most(studies)
-    assert found[Verdict.FAILED] <= binom.ppf(1.0 - SURE, studies, ERROR_RATE / WINDOWS)
+    result = counted([relative_verdict(sample, sign_of_mean, SLOTS)[0] for sample in samples])
+    assert 0 < result[Verdict.HELD] <= most(studies)
+    assert result[Verdict.FAILED] <= binom.ppf(1.0 - SURE, studies, ERROR_RATE / WINDOWS)

@@ -41,9 +41,9 @@ def order_statistics(samples: Floats, level: float) -> set[float]:
 def test_a_quantile_is_within_a_quarter_octave_of_the_exact_one(samples: list[float]) -> None:
     """For any sample and each level, the order statistic and what is reported are less than 25 % apart."""
     exact = np.array(samples)
-    (found,) = histograms(exact[None, :]).quantiles()
-    for level, value in zip(LEVELS, found, strict=True):
-        close = (one / QUARTER_OCTAVE <= value <= one * QUARTER_OCTAVE for one in order_statistics(exact, level))
+    (quantiles,) = histograms(exact[None, :]).quantiles()
+    for level, value in zip(LEVELS, quantiles, strict=True):
+        close = (bound / QUARTER_OCTAVE <= value <= bound * QUARTER_OCTAVE for bound in order_statistics(exact, level))
         assert any(close), (level, value)
 
 
@@ -51,8 +51,8 @@ def test_a_quantile_is_within_a_quarter_octave_of_the_exact_one(samples: list[fl
 def test_quantiles_of_many_trials_are_close(seed: int) -> None:
     """Interpolated, the quantiles of 20 000 squared normals are within 4 % of numpy's."""
     samples = np.random.default_rng(seed).standard_normal((3, 20_000)) ** 2 * 1e-3
-    found = histograms(samples).quantiles()
-    assert found == pytest.approx(np.quantile(samples, LEVELS, axis=1).T, rel=0.04)
+    quantiles = histograms(samples).quantiles()
+    assert quantiles == pytest.approx(np.quantile(samples, LEVELS, axis=1).T, rel=0.04)
 
 
 def test_zero_and_infinity_have_their_places() -> None:
@@ -67,9 +67,9 @@ def test_zero_and_infinity_have_their_places() -> None:
 
 def test_slots_without_values_have_no_quantiles() -> None:
     """Slots that no trial reached are NaN, and so are those left out of a long run."""
-    found = histograms(np.full((2, 5), SCALE), first=1, slots=5).quantiles()
-    assert np.isnan(found[[0, 3, 4]]).all()
-    assert np.isfinite(found[[1, 2]]).all()
+    quantiles = histograms(np.full((2, 5), SCALE), first=1, slots=5).quantiles()
+    assert np.isnan(quantiles[[0, 3, 4]]).all()
+    assert np.isfinite(quantiles[[1, 2]]).all()
 
 
 @given(st.integers(4097, 30_000), st.lists(st.integers(1, 700), min_size=1, max_size=80))
@@ -84,12 +84,12 @@ def test_a_long_run_is_looked_at_in_even_steps(slots: int, lengths: list[int]) -
         made.add_values(first, numbers[first : first + length])
         first = min(first + length, end)
     stride = -(-slots // 4096)
-    found = made.quantiles()
-    assert len(found) == slots
-    there = np.flatnonzero(np.isfinite(found[:, 1]))
+    quantiles = made.quantiles()
+    assert len(quantiles) == slots
+    there = np.flatnonzero(np.isfinite(quantiles[:, 1]))
     assert there.tolist() == list(range(0, end, stride))
     assert len(there) <= 4096
-    assert found[there, 1] == pytest.approx(numbers[there, 0], rel=0.25)
+    assert quantiles[there, 1] == pytest.approx(numbers[there, 0], rel=0.25)
 
 
 @given(st.lists(st.lists(values, min_size=1, max_size=20), min_size=2, max_size=6), st.randoms())
@@ -113,9 +113,9 @@ def test_what_is_sent_is_small_and_adds_up_as_before() -> None:
     assert len(sent) < 8 * samples.size + 10_000 < made.counts.nbytes
     arrived = pickle.loads(sent)  # noqa: S301 - our own
     assert np.array_equal(arrived.quantiles(), made.quantiles(), equal_nan=True)
-    for one in (arrived, made):
-        one.add_values(0, samples[:, :7])
-        one.merge(histograms(samples))
+    for histogram in (arrived, made):
+        histogram.add_values(0, samples[:, :7])
+        histogram.merge(histograms(samples))
     assert np.array_equal(arrived.counts, made.counts)
 
 
@@ -123,6 +123,6 @@ def test_beyond_the_bins_only_the_side_is_known() -> None:
     """A value too large for the bins is infinite, one too small is 0: never a wrong number."""
     histograms = SlotHistograms(2, 1.0)
     histograms.add_values(0, np.array([[1e80, 1e90, 1e85], [1e-30, 0.0, 1e-25]]))
-    found = histograms.quantiles()
-    assert np.isinf(found[0]).all()
-    assert (found[1] == 0.0).all()
+    quantiles = histograms.quantiles()
+    assert np.isinf(quantiles[0]).all()
+    assert (quantiles[1] == 0.0).all()

@@ -83,11 +83,11 @@ def test_trials_in_parts_have_the_same_bits() -> None:
         for rows in (slice(0, 7), slice(7, 30)):
             part.add_slots(action[rows, trials], nu[rows, trials], HeardBits(by_type[rows], expected_bits[rows]))
         parts.append(part)
-    found, expected = LeakTally.merged(parts).summary, whole.summary
-    assert found is not None
+    summary, expected = LeakTally.merged(parts).summary, whole.summary
+    assert summary is not None
     assert expected is not None
-    assert found.expected_bits == pytest.approx(expected.expected_bits)
-    assert (found.bits, found.clear_fraction, found.standard_error) == (
+    assert summary.expected_bits == pytest.approx(expected.expected_bits)
+    assert (summary.bits, summary.clear_fraction, summary.standard_error) == (
         expected.bits,
         expected.clear_fraction,
         expected.standard_error,
@@ -122,10 +122,10 @@ def test_where_it_is_not_known(tmp_path: Path) -> None:
 def test_a_comparison_has_the_leak_of_schemes_and_pairs(tmp_path: Path) -> None:
     """Per packet for a scheme, whatever the link, and per slot for a pair, as in the summary; a dash where it is not known."""
     schemes = ["plain", "cipher", "innovation", "twin-track"]
-    found = compare(
+    result = compare(
         "bayesian", schemes=schemes, adversaries=["naive"], slots=40, trials=30, out=tmp_path / "run", plan=ALONE
     )
-    leaks = found.as_dict()["schemes"]
+    leaks = result.as_dict()["schemes"]
     assert leaks["plain"]["leak"] == {"clear_fraction": 1.0, "bits": None}
     assert leaks["cipher"]["leak"] == {"clear_fraction": 0.0, "bits": 0.0}
     assert leaks["twin-track"]["leak"] is None
@@ -133,7 +133,7 @@ def test_a_comparison_has_the_leak_of_schemes_and_pairs(tmp_path: Path) -> None:
     mu_d, bits = scenario.encoding.mu_d, LeakedBits(scenario.process.process).next(40)
     assert leaks["innovation"]["leak"]["clear_fraction"] == pytest.approx((1.0 + 39 * mu_d) / 40)
     assert leaks["innovation"]["leak"]["bits"] == pytest.approx(bits.sum() / 39)
-    rows = {row["scheme"]: row for row in found.table.to_pylist()}
+    rows = {row["scheme"]: row for row in result.table.to_pylist()}
     pair = leaks["innovation"]["against"]["naive"]["secrecy"]["leak"]
     assert rows["innovation"]["leaked_bits"] == pair["bits"] > 0.0
     assert rows["innovation"]["leaked_bits_theory"] == pair["expected_bits"]

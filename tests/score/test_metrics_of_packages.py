@@ -45,21 +45,21 @@ def test_a_metric_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
         "memory": ("montecarlo", "eavesdroppers", "--workers", "2", "--record-trials", "510", *RUN),
         "shards": ("run", "eavesdroppers", "--view", "off", "--set", "shards=2", *RUN),
     }
-    found, judged = {}, {}
+    largest, judged = {}, {}
     for name, arguments in runs.items():
         done = evedrop.process(*arguments, *EXPECT, "--out", name, env=environment)
         assert done.status == 1, done.err
         assert "largest |x−x̂|²" in done.out
         summary = Results.read(evedrop.folder / name).summary
-        found[name] = {receiver: peer["largest_error"] for receiver, peer in summary["peers"].items()}
-        judged[name] = [(one["held"], one["found"]) for one in summary["expectations"]]
-    assert found["live"] == found["memory"] == found["shards"]
+        largest[name] = {receiver: peer["largest_error"] for receiver, peer in summary["peers"].items()}
+        judged[name] = [(expectation["held"], expectation["found"]) for expectation in summary["expectations"]]
+    assert largest["live"] == largest["memory"] == largest["shards"]
     assert judged["live"] == judged["memory"] == judged["shards"]
     rows = [row for row in Results.read(evedrop.folder / "memory").trials.to_pylist() if row["peer"] == "smart"]
     errors = np.empty((20, 510))
     for row in rows:
         errors[row["slot"], row["trial"]] = row["squared_error"]
-    assert found["live"]["smart"] == errors.max()
+    assert largest["live"]["smart"] == errors.max()
     assert judged["live"] == [
         (True, errors.max()), (False, errors[5:15].max()), (True, np.quantile(errors.max(axis=0), 0.5)),
     ]  # fmt: skip
@@ -69,7 +69,7 @@ def test_a_metric_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
     assert done.status == 0, done.err
     assert "largest error" in done.out
     table = pq.read_table(evedrop.folder / "swept" / "sweep.parquet").to_pylist()
-    assert {row["peer"]: row["largest_error"] for row in table if row["slots"] == 20} == found["memory"]
+    assert {row["peer"]: row["largest_error"] for row in table if row["slots"] == 20} == largest["memory"]
     assert "largest_error" not in METRICS.names
 
 
@@ -106,23 +106,23 @@ def test_a_metric_that_needs_states_is_null_without_them(evedrop: Evedrop) -> No
 
 
 @pytest.mark.parametrize(
-    ("name", "module", "said"),
+    ("name", "module", "message"),
     [
         ("largest_error", "raise RuntimeError('not today')\n", "cannot be imported (RuntimeError: not today"),
         ("digest", of_the_docs(), "; expected a name of letters, digits and _"),
     ],
 )
-def test_a_metric_that_cannot_be_loaded_is_left_out(evedrop: Evedrop, name: str, module: str, said: str) -> None:
+def test_a_metric_that_cannot_be_loaded_is_left_out(evedrop: Evedrop, name: str, module: str, message: str) -> None:
     """The closing report says why; an expectation that names it is a mistake, with the reason."""
     environment = installed(evedrop, module, name)
     run = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "2")
     done = evedrop.process(*run, env=environment)
     assert done.status == 0, done.err
     assert f"the metric {name} is left out" in done.out
-    assert said in done.out
+    assert message in done.out
     done = evedrop.process(*run, "--set", f"expect.0={{metric = 'smart.{name}', below = 1.0}}", env=environment)
     assert done.status == 2
-    assert said in done.err
+    assert message in done.err
 
 
 def test_docs_say_of_every_metric_what_it_says_itself() -> None:
@@ -134,7 +134,7 @@ def test_docs_say_of_every_metric_what_it_says_itself() -> None:
         assert (f"`{name}`" in scenario) == (metric(name).only_in_mode is None)
 
 
-@pytest.mark.parametrize("name", [name for name, one in metrics_of("smart").items() if one.only_in_mode is None])
+@pytest.mark.parametrize("name", [name for name, metric in metrics_of("smart").items() if metric.only_in_mode is None])
 def test_a_metric_over_all_slots_is_that_of_the_totals(name: str) -> None:
     """Kept by its tally, or computed from what is counted of every receiver."""
     from evedrop.score.sums import Tally, slot_sums
@@ -171,16 +171,16 @@ FAILING = {
 @pytest.mark.parametrize("how", ["in memory", pytest.param("live", marks=pytest.mark.long)])
 def test_a_metric_that_fails_costs_no_other(evedrop: Evedrop, case: str, how: str) -> None:
     """It is null; all else is measured and saved; then the run fails with status 3, and names metric, error and line."""
-    line, instead, said = FAILING[case]
+    line, instead, message = FAILING[case]
     module = of_the_docs().replace(line, instead)
-    said = said.format(module[: module.find(instead.splitlines()[0])].count("\n") + 1)
+    message = message.format(module[: module.find(instead.splitlines()[0])].count("\n") + 1)
     environment = installed(evedrop, module)
     command = ("run", "--view", "off") if how == "live" else ("montecarlo", "--workers", "1")
     expect = "expect.0={metric = 'smart.largest_error', above = 0.0, quantile = 0.5}"
     changes = ("--slots", "30", "--trials", "4", "--set", expect, "--out", "run")
     done = evedrop.process(command[0], "eavesdroppers", *command[1:], *changes, env=environment)
     assert done.status == 3, done.err
-    assert f"the metric largest_error of an installed package failed: {said}" in done.err
+    assert f"the metric largest_error of an installed package failed: {message}" in done.err
     assert "Traceback" not in done.err
     summary = Results.read(evedrop.folder / "run").summary
     assert summary["ended"] in done.err

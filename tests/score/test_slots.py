@@ -21,7 +21,7 @@ def of_shape(name: str) -> Any:
 
 def whole() -> Slots:
     """Six slots with every entry that slots can have."""
-    plain = {one.name: of_shape(one.name) for one in fields(ReceiverSlots) if one.name != "lost"}
+    plain = {field.name: of_shape(field.name) for field in fields(ReceiverSlots) if field.name != "lost"}
     receivers = {
         "eve": ReceiverSlots(
             **plain, lost={"lost": np.arange(6, dtype=np.uint32), "cut": np.arange(7, 13, dtype=np.uint32)}
@@ -38,10 +38,10 @@ def part(value: Any, rows: slice) -> Any:
     if isinstance(value, np.ndarray):
         return value[rows]
     if isinstance(value, dict):
-        return {name: part(one, rows) for name, one in value.items()}
+        return {name: part(item, rows) for name, item in value.items()}
     if isinstance(value, int):
         return value + rows.start
-    return type(value)(**{one.name: part(getattr(value, one.name), rows) for one in fields(value)})
+    return type(value)(**{field.name: part(getattr(value, field.name), rows) for field in fields(value)})
 
 
 def entries(value: Any, path: str = "") -> dict[str, list[float]]:
@@ -52,12 +52,12 @@ def entries(value: Any, path: str = "") -> dict[str, list[float]]:
         value = (
             {"first": [value]}
             if isinstance(value, int)
-            else {one.name: getattr(value, one.name) for one in fields(value)}
+            else {field.name: getattr(value, field.name) for field in fields(value)}
         )
-    found: dict[str, list[float]] = {}
-    for name, one in value.items():
-        found |= {f"{path}.{name}": one} if isinstance(one, list) else entries(one, f"{path}.{name}")
-    return found
+    result: dict[str, list[float]] = {}
+    for name, item in value.items():
+        result |= {f"{path}.{name}": item} if isinstance(item, list) else entries(item, f"{path}.{name}")
+    return result
 
 
 def test_every_entry_is_kept() -> None:
@@ -73,16 +73,16 @@ def test_an_entry_that_only_some_parts_have_is_refused(name: str) -> None:
     first, second = (part(whole(), rows) for rows in (slice(0, 3), slice(3, 6)))
     with pytest.raises(ValueError, match="some of the parts have an entry that others lack"):
         concatenated([first, replace(second, **{name: None})])
-    assert getattr(concatenated([replace(one, **{name: None}) for one in (first, second)]), name) is None
+    assert getattr(concatenated([replace(slots, **{name: None}) for slots in (first, second)]), name) is None
 
 
 def test_a_part_of_the_trials_has_their_columns() -> None:
     """Of every entry that has trials; what is counted over trials stays."""
     some = slice(1, 3)
-    found, all_of = entries(whole().part(some)), whole()
-    assert found[".x"] == all_of.x[..., some].ravel().tolist()
+    result, all_of = entries(whole().part(some)), whole()
+    assert result[".x"] == all_of.x[..., some].ravel().tolist()
     assert all_of.inputs is not None
-    assert found[".inputs.failed"] == all_of.inputs.failed[..., some].ravel().tolist()
+    assert result[".inputs.failed"] == all_of.inputs.failed[..., some].ravel().tolist()
     counted = {
         ".first.first",
         ".receivers.eve.trace",
@@ -91,8 +91,8 @@ def test_a_part_of_the_trials_has_their_columns() -> None:
         ".receivers.eve.lost.cut",
     }
     for name, numbers in entries(whole()).items():
-        assert (found[name] == numbers) is (name in counted)
-        assert name in counted or 3 * len(found[name]) == 2 * len(numbers)
+        assert (result[name] == numbers) is (name in counted)
+        assert name in counted or 3 * len(result[name]) == 2 * len(numbers)
 
 
 def test_a_copy_shares_no_memory() -> None:
@@ -103,7 +103,7 @@ def test_a_copy_shares_no_memory() -> None:
     def arrays(value: Any) -> list[Any]:
         if isinstance(value, np.ndarray):
             return [value]
-        values = value.values() if isinstance(value, dict) else (getattr(value, one.name) for one in fields(value))
-        return [array for one in values if not isinstance(one, int) for array in arrays(one)]
+        values = value.values() if isinstance(value, dict) else (getattr(value, field.name) for field in fields(value))
+        return [array for value in values if not isinstance(value, int) for array in arrays(value)]
 
     assert all(array.base is None for array in arrays(part_of.copied()))

@@ -52,7 +52,7 @@ def of_trials(results: Results, receiver: str, value: Callable[[dict[str, Any]],
 
 def textbook(means: Floats) -> float:
     """The standard error of a mean of independent numbers."""
-    return math.sqrt(sum((one - means.mean()) ** 2 for one in means) / (len(means) - 1) / len(means))
+    return math.sqrt(sum((mean - means.mean()) ** 2 for mean in means) / (len(means) - 1) / len(means))
 
 
 def textbook_z(means: Floats, expected: float) -> float:
@@ -112,15 +112,15 @@ def test_a_live_run_has_the_standard_errors_of_memory(recorded: Results, tmp_pat
     live = run("eavesdroppers", record_trials=7, shards=2, out=tmp_path / "live", **some)
     others = run("eavesdroppers", record_trials=1, out=tmp_path / "others", **some)
     for name, peer in recorded.summary["peers"].items():
-        same, unrecorded = (one.summary["peers"][name] for one in (live, others))
+        same, unrecorded = (results.summary["peers"][name] for results in (live, others))
         assert same["standard_errors"] == pytest.approx(peer["standard_errors"], rel=1e-9)
         assert same["z"].keys() == peer["z"].keys()
         for metric, z in peer["z"].items():
             assert same["z"][metric] == (None if z is None else pytest.approx(z, rel=1e-6))
         assert same["rare_events"] == peer["rare_events"]
         assert unrecorded["standard_errors"] == pytest.approx(peer["standard_errors"], rel=1e-9)
-        for one in (same, unrecorded):
-            reported = one["standard_errors"]["mean_trace_covariance"]
+        for peers in (same, unrecorded):
+            reported = peers["standard_errors"]["mean_trace_covariance"]
             assert reported == peer["standard_errors"]["mean_trace_covariance"]
             assert reported is not None
 
@@ -128,8 +128,8 @@ def test_a_live_run_has_the_standard_errors_of_memory(recorded: Results, tmp_pat
 def test_workers_do_not_change_standard_errors() -> None:
     """Two tasks of several blocks and one of all give the same bits."""
     scenario = load("eavesdroppers", {"slots": 20, "trials": 1100, "expect": []})
-    one, three = (summary_of_study(scenario, workers) for workers in (1, 3))
-    assert one.peers == three.peers
+    single, three = (summary_of_study(scenario, workers) for workers in (1, 3))
+    assert single.peers == three.peers
 
 
 def test_one_trial_has_no_standard_error() -> None:
@@ -166,9 +166,9 @@ def test_a_covariance_only_study_has_the_z_of_its_own_metric() -> None:
     scenario = load("eavesdroppers", {"slots": 50, "trials": 20, "expect": []})
     peer = summary_of_study(scenario, mode=Mode.COVARIANCE_ONLY).peers["naive"]
     error, z = peer.standard_errors["mean_actual_trace_covariance"], peer.z["mean_actual_trace_covariance"]
-    found, expected = peer.metric("mean_actual_trace_covariance"), peer.metric("theoretical_trace_covariance")
-    assert None not in (error, z, found, expected)
-    assert z * (found - expected) > 0.0  # type: ignore[operator]
+    metric, expected = peer.metric("mean_actual_trace_covariance"), peer.metric("theoretical_trace_covariance")
+    assert None not in (error, z, metric, expected)
+    assert z * (metric - expected) > 0.0  # type: ignore[operator]
     assert peer.standard_errors["mean_squared_error"] is peer.z["mean_squared_error"] is None
     assert peer.standard_errors["mean_trace_covariance"] is not None
 
@@ -311,20 +311,20 @@ def report_of(summary: Summary, capsys: pytest.CaptureFixture[str]) -> str:
 def test_the_report_says_where_rare_events_carry_the_error(capsys: pytest.CaptureFixture[str]) -> None:
     """A first packet that is lost once in a thousand trials: a sentence in 40 trials, none in 20,000, none in one."""
     tables = scalar_tables(0.5, 1e-9, encoding={"scheme": "plain"}, legitimate={"link": {"quality": 0.999}}, slots=5)
-    few, many, one = (
+    few, many, single = (
         summary_of_study(Scenario.read({**tables, "trials": trials, "seed": 2})) for trials in (40, 20_001, 1)
     )
     rare = few.peers["legitimate"].rare_events
     assert rare is not None
     assert rare.fraction > 0.9
     assert rare.trials == 20_000
-    said = (
+    message = (
         "more than 99 % of its expected error is carried by events that are expected fewer than 20 times in 40 trials"
     )
-    assert said in report_of(few, capsys)
+    assert message in report_of(few, capsys)
     assert many.peers["legitimate"].rare_events is not None
     assert many.peers["legitimate"].rare_events.fraction < RARE_FRACTION
-    for summary in (many, one):
+    for summary in (many, single):
         assert "is carried by events" not in report_of(summary, capsys)
 
 
@@ -416,20 +416,20 @@ def z_of_studies(count: int) -> Floats:
         slots=30,
         trials=STUDY_TRIALS,
     )
-    found = []
+    scores = []
     for study in range(count):
         peers = summary_of_study(Scenario.read({**tables, "first_trial": study * STUDY_TRIALS})).peers
-        found.append([peers[name].z["mean_squared_error"] for name in ("legitimate", "smart")])
-    return np.array(found)
+        scores.append([peers[name].z["mean_squared_error"] for name in ("legitimate", "smart")])
+    return np.array(scores)
 
 
 def check_calibration(z: Floats) -> None:
     """Beyond 1.96 in 5 % of the studies: within the interval that contains a binomial count but once in a thousand."""
     from scipy.stats import binom
 
-    for one in z.T:
-        outside = int(np.count_nonzero(np.abs(one) > 1.96))
-        low, high = binom.interval(0.999, len(one), 0.05)
+    for scores in z.T:
+        outside = int(np.count_nonzero(np.abs(scores) > 1.96))
+        low, high = binom.interval(0.999, len(scores), 0.05)
         assert low <= outside <= high, outside
 
 

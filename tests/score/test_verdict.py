@@ -85,7 +85,7 @@ def test_a_window_that_is_only_slightly_unlikely_does_not_fail_the_claim() -> No
 
 
 @pytest.mark.parametrize(
-    ("p_values", "found"),
+    ("p_values", "numbers"),
     [
         ([0.002, 0.003, 0.009], [0, 1, 2]),
         ([0.009, 0.003, 0.006], [1]),  # 0.006 is above 1 % / 2, and what follows it is not looked at
@@ -94,9 +94,9 @@ def test_a_window_that_is_only_slightly_unlikely_does_not_fail_the_claim() -> No
         ([], []),
     ],
 )
-def test_holm_rejects_step_by_step(p_values: list[float], found: list[int]) -> None:
+def test_holm_rejects_step_by_step(p_values: list[float], numbers: list[int]) -> None:
     """The smallest against 1 % / 3, the next against 1 % / 2, the last against 1 %."""
-    assert rejected(dict(enumerate(p_values))) == found
+    assert rejected(dict(enumerate(p_values))) == numbers
 
 
 def test_an_unclear_window_leaves_the_verdict_open() -> None:
@@ -118,14 +118,14 @@ def test_rare_events_that_theory_expects_of_the_user_leave_held_open() -> None:
         lambda quality: Outcomes.eavesdropper(quality, 0.02, 1.0, 0.0),
     )
     legitimate, other = tally(around(0.1, trials=200)), tally(around(20.0, trials=200))
-    found = secrecy((legitimate, ours), ("eve", other, theirs))
-    assert found.relative is Verdict.UNDECIDED
-    assert "200 trials are too few to decide: theory expects a larger error of legitimate" in found.sentence
-    assert re.search(r"; [0-9,]+ trials would contain them, and montecarlo --rare estimates its mean;", found.sentence)
+    result = secrecy((legitimate, ours), ("eve", other, theirs))
+    assert result.relative is Verdict.UNDECIDED
+    assert "200 trials are too few to decide: theory expects a larger error of legitimate" in result.sentence
+    assert re.search(r"; [0-9,]+ trials would contain them, and montecarlo --rare estimates its mean;", result.sentence)
     # The same the other way round: an eavesdropper whose rare events are missing has not broken the secret.
-    found = secrecy((other, theirs), ("eve", legitimate, ours))
-    assert found.relative is Verdict.UNDECIDED
-    assert "theory expects a larger error of eve" in found.sentence
+    result = secrecy((other, theirs), ("eve", legitimate, ours))
+    assert result.relative is Verdict.UNDECIDED
+    assert "theory expects a larger error of eve" in result.sentence
 
 
 @pytest.mark.parametrize("trials", [200, 20_000])
@@ -134,11 +134,13 @@ def test_without_a_closed_form_an_event_that_no_trial_met_may_still_be_there(tri
     process = Process(np.array([[1.0]]), np.array([[1.0]]), np.array([[1e3]]))
     unknown = Expectation(process, distribution_of(LinkSchedule({"loss": good(0.99)})), None)
     quiet, loud = tally(around(0.1, trials=trials)), tally(around(5.0, trials=trials))
-    found = secrecy((quiet, unknown), ("eve", loud, unknown)), secrecy((loud, unknown), ("eve", quiet, unknown))
+    verdicts = secrecy((quiet, unknown), ("eve", loud, unknown)), secrecy((loud, unknown), ("eve", quiet, unknown))
     enough = trials > 200
-    assert [one.relative for one in found] == ([Verdict.HELD, Verdict.FAILED] if enough else [Verdict.UNDECIDED] * 2)
-    for name, one in zip(("legitimate", "eve"), found, strict=True):
-        assert ("no closed form bounds the error of " + name in one.sentence) != enough
+    assert [verdict.relative for verdict in verdicts] == (
+        [Verdict.HELD, Verdict.FAILED] if enough else [Verdict.UNDECIDED] * 2
+    )
+    for name, verdict in zip(("legitimate", "eve"), verdicts, strict=True):
+        assert ("no closed form bounds the error of " + name in verdict.sentence) != enough
 
 
 def test_one_trial_decides_nothing() -> None:
@@ -193,9 +195,9 @@ def test_windows_cover_the_slots_from_one_on_evenly(slots: int) -> None:
 )
 def test_perfect_secrecy_asks_for_growth(levels: Floats, verdict: Verdict) -> None:
     """Where theory says that the eavesdropper's error has no bound, the run must show it growing."""
-    found = judged(tally(around(1e-5)), tally(around(levels)), use_innovation=1.0)
-    assert found.perfect_by_theory
-    assert found.perfect is verdict
+    result = judged(tally(around(1e-5)), tally(around(levels)), use_innovation=1.0)
+    assert result.perfect_by_theory
+    assert result.perfect is verdict
 
 
 def test_perfect_secrecy_asks_for_a_bounded_legitimate_error() -> None:
@@ -206,8 +208,8 @@ def test_perfect_secrecy_asks_for_a_bounded_legitimate_error() -> None:
 
 def test_perfect_secrecy_is_not_claimed_where_theory_denies_it() -> None:
     """A smart eavesdropper of a marginally stable process is bounded, whatever a run shows."""
-    found = judged(tally(around(0.001)), tally(around(np.linspace(1.0, 9.0, WINDOWS))))
-    assert (found.perfect_by_theory, found.perfect) == (False, Verdict.FAILED)
+    result = judged(tally(around(0.001)), tally(around(np.linspace(1.0, 9.0, WINDOWS))))
+    assert (result.perfect_by_theory, result.perfect) == (False, Verdict.FAILED)
 
 
 def test_theory_of_relative_secrecy_needs_a_worse_eavesdropper() -> None:
@@ -222,10 +224,10 @@ def test_theory_of_secrecy_knows_bursts() -> None:
     """Behind a link that loses in bursts the claims of theory are those of its chain."""
     legitimate, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     smart, naive = expectation(BURSTS, 0.5, (1.0, 0.0)), expectation(BURSTS, 0.5, (1.0, 1.0))
-    found = secrecy((legitimate, expectation(BURSTS, 0.5)), ("eve", other, smart))
-    assert (found.relative_by_theory, found.perfect_by_theory, found.perfect) == (True, False, Verdict.FAILED)
-    found = secrecy((legitimate, expectation(BURSTS, 0.5)), ("eve", other, naive))
-    assert (found.relative_by_theory, found.perfect_by_theory, found.perfect) == (True, True, Verdict.HELD)
+    result = secrecy((legitimate, expectation(BURSTS, 0.5)), ("eve", other, smart))
+    assert (result.relative_by_theory, result.perfect_by_theory, result.perfect) == (True, False, Verdict.FAILED)
+    result = secrecy((legitimate, expectation(BURSTS, 0.5)), ("eve", other, naive))
+    assert (result.relative_by_theory, result.perfect_by_theory, result.perfect) == (True, True, Verdict.HELD)
 
 
 @pytest.mark.parametrize("links", [(ROTE, good(0.5)), (good(0.9), ROTE), (ROTE, ROTE)])
@@ -233,13 +235,13 @@ def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str,
     """Neither claim of theory is made, and the sentence says so; what the run shows is said all the same."""
     legitimate, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     expected = expectation(links[0], 0.5), expectation(links[1], 0.5, (1.0, 0.0))
-    found = secrecy((legitimate, expected[0]), ("eve", other, expected[1]))
-    assert (found.relative_by_theory, found.perfect_by_theory) == (None, None)
-    assert (found.relative, found.perfect) == (Verdict.HELD, Verdict.HELD)
-    assert found.sentence.endswith("no theory covers these links")
+    result = secrecy((legitimate, expected[0]), ("eve", other, expected[1]))
+    assert (result.relative_by_theory, result.perfect_by_theory) == (None, None)
+    assert (result.relative, result.perfect) == (Verdict.HELD, Verdict.HELD)
+    assert result.sentence.endswith("no theory covers these links")
     bounded = "stayed bounded" if links[0] == good(0.9) else "did not"
-    assert f"its error grew while the legitimate one {bounded};" in found.sentence
-    assert (found.summary.relative_by_theory, found.summary.perfect_by_theory) == (None, None)
+    assert f"its error grew while the legitimate one {bounded};" in result.sentence
+    assert (result.summary.relative_by_theory, result.summary.perfect_by_theory) == (None, None)
     nothing = secrecy((tally(around(0.0), done=0), expected[0]), ("eve", tally(around(0.0), done=0), expected[1]))
     assert nothing.sentence == "eve: nothing was measured; no theory covers these links"
 
@@ -248,9 +250,9 @@ def test_an_error_without_a_known_bound_must_not_grow() -> None:
     """If both errors grow, the legitimate error may be unbounded, too; with a known bound it may grow up to that."""
     legitimate, other = tally(around(np.linspace(1e-5, 2e-5, WINDOWS))), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     unknown = expectation(ROTE, 0.5), expectation(good(0.5), 0.5, (1.0, 1.0))
-    found = secrecy((legitimate, unknown[0]), ("eve", other, unknown[1]))
-    assert (found.relative, found.perfect) == (Verdict.HELD, Verdict.UNDECIDED)
-    assert "relative secrecy held" in found.sentence
+    result = secrecy((legitimate, unknown[0]), ("eve", other, unknown[1]))
+    assert (result.relative, result.perfect) == (Verdict.HELD, Verdict.UNDECIDED)
+    assert "relative secrecy held" in result.sentence
     assert judged(legitimate, other, use_innovation=1.0).perfect is Verdict.HELD
 
 
@@ -258,7 +260,7 @@ def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
     """Without a closed form, the genie is a bound: secrecy that holds against the genie holds; otherwise it is left open."""
     legitimate, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
 
-    def found(process: Process, mu: float, mu_e: float) -> Secrecy:
+    def judged_(process: Process, mu: float, mu_e: float) -> Secrecy:
         ours = Expectation(
             process,
             distribution_of(LinkSchedule({"loss": good(mu)})),
@@ -273,16 +275,16 @@ def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
     for process, mu_e, relative, perfect in (
         (STABLE, 0.9, True, None), (STABLE, 1.0, None, None), (unstable, 0.8, True, True), (unstable, 0.9, True, None),
     ):  # fmt: skip
-        one = found(process, 0.9, mu_e)
-        assert (one.relative_by_theory, one.perfect_by_theory) == (relative, perfect)
-        assert one.judged_by == ("median" if process is unstable else "mean")
+        verdict = judged_(process, 0.9, mu_e)
+        assert (verdict.relative_by_theory, verdict.perfect_by_theory) == (relative, perfect)
+        assert verdict.judged_by == ("median" if process is unstable else "mean")
         promise = (
             "perfect secrecy" if perfect else "relative secrecy" if relative else "relative secrecy from slot 7 on"
         )
-        assert one.sentence.endswith(f"theory promises {promise}")
+        assert verdict.sentence.endswith(f"theory promises {promise}")
     nothing = Expectation(STABLE, distribution_of(LinkSchedule({"loss": good(0.9)})), None)
-    one = secrecy((legitimate, expectation(good(0.9), 0.5)), ("eve", other, nothing))
-    assert one.sentence.endswith("no closed form of its error is known")
+    verdict = secrecy((legitimate, expectation(good(0.9), 0.5)), ("eve", other, nothing))
+    assert verdict.sentence.endswith("no closed form of its error is known")
 
 
 def test_rounding_on_a_perfect_link_is_no_failure() -> None:
@@ -298,7 +300,7 @@ def test_rounding_on_a_perfect_link_is_no_failure() -> None:
 
 def test_one_slot_proves_nothing() -> None:
     """Theory claims relative secrecy for slots k ≥ 1, and a run of one slot has none."""
-    one = Tally(1, 3)
-    one.done, one.offered, one.error = 1, 3, 1.0
-    found = secrecy((one, expectation(good(0.9), 0.5)), ("eve", one, expectation(good(0.9), 0.5, (1.0, 0.0))))
-    assert found.relative_by_theory is False
+    tally_ = Tally(1, 3)
+    tally_.done, tally_.offered, tally_.error = 1, 3, 1.0
+    result = secrecy((tally_, expectation(good(0.9), 0.5)), ("eve", tally_, expectation(good(0.9), 0.5, (1.0, 0.0))))
+    assert result.relative_by_theory is False

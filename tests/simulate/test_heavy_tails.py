@@ -37,7 +37,7 @@ def test_infinite_variance_is_flagged_where_theory_says(mu_d: float, tmp_path: P
     assert summary["peers"]["naive"]["infinite_variance"] == (mu_d == 1.0 and closed_form(1.3877986573692194, 0.85))
     assert summary["peers"]["legitimate"]["infinite_variance"] == (mu_d < 0.8116)
     for name, verdict in summary["secrecy"].items():
-        heavy = any(summary["peers"][one]["infinite_variance"] for one in ("legitimate", name))
+        heavy = any(summary["peers"][name_]["infinite_variance"] for name_ in ("legitimate", name))
         assert verdict["judged_by"] == ("median" if heavy else "mean")
 
 
@@ -53,9 +53,9 @@ def test_the_report_says_so(evedrop: Evedrop) -> None:
     """In words, with the quantiles it goes by; and not where the variance is finite."""
     done = evedrop("montecarlo", "numerical", "--trials", "40", "--out", "run")
     assert done.status == 0
-    said = [line for line in done.out.splitlines() if "has infinite variance" in line]
-    assert [line.partition(":")[0] for line in said] == ["legitimate", "smart", "equal", "better", "much-better"]
-    assert all("in the median" in line and "in nine of ten" in line for line in said)
+    lines = [line for line in done.out.splitlines() if "has infinite variance" in line]
+    assert [line.partition(":")[0] for line in lines] == ["legitimate", "smart", "equal", "better", "much-better"]
+    assert all("in the median" in line and "in nine of ten" in line for line in lines)
     assert "(judged by medians, because the variance is infinite)" in done.out
     done = evedrop("montecarlo", "eavesdroppers", "--slots", "40", "--trials", "40", "--out", "other")
     assert "infinite" not in done.out
@@ -63,9 +63,9 @@ def test_the_report_says_so(evedrop: Evedrop) -> None:
 
 def misses(test: SignTestOf, samples: Floats, truth: float) -> tuple[float, float]:
     """How often the samples, by row, are found to be above their true value, and below it."""
-    found = [test(row - truth) for row in samples]
-    return float(np.mean([one.above <= ERROR_RATE for one in found])), float(
-        np.mean([one.below <= ERROR_RATE for one in found])
+    tests = [test(row - truth) for row in samples]
+    return float(np.mean([sign.above <= ERROR_RATE for sign in tests])), float(
+        np.mean([sign.below <= ERROR_RATE for sign in tests])
     )
 
 

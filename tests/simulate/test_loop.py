@@ -151,36 +151,36 @@ LIVE["filtered and betrayed"] = {
 def test_errors_against_the_true_state_are_given_beside_those_of_the_transmitted(tmp_path: Path) -> None:
     """They add up, for x − x̂ˢ is orthogonal to all that anybody is told; the filter's error is its covariance's."""
     summary = in_memory(tmp_path / "run", trials=400, **MEASURED).summary
-    found = summary["filter"]
-    assert found["mean_squared_error"] == pytest.approx(found["mean_trace_covariance"], rel=0.03)
+    summary_ = summary["filter"]
+    assert summary_["mean_squared_error"] == pytest.approx(summary_["mean_trace_covariance"], rel=0.03)
     for name in ("legitimate", "smart"):
         transmitted = summary["peers"][name]["mean_squared_error"]
-        both = transmitted + found["mean_squared_error"]
-        assert found["mean_true_squared_errors"][name] == pytest.approx(both, rel=0.03)
-        assert found["mean_true_squared_errors"][name] > transmitted
+        both = transmitted + summary_["mean_squared_error"]
+        assert summary_["mean_true_squared_errors"][name] == pytest.approx(both, rel=0.03)
+        assert summary_["mean_true_squared_errors"][name] > transmitted
 
 
 def test_errors_against_the_true_state_have_standard_errors(tmp_path: Path) -> None:
     """Those of runs of one trial each, which have none; z compares the filter's errors with its covariance."""
-    found = in_memory(tmp_path / "run", **MEASURED).summary["filter"]
+    filtered = in_memory(tmp_path / "run", **MEASURED).summary["filter"]
     alone = [
         in_memory(tmp_path / str(trial), trials=1, record_trials=1, first_trial=trial, **MEASURED).summary["filter"]
         for trial in range(6)
     ]
-    errors = found["standard_errors"]
-    own = np.array([one["mean_squared_error"] for one in alone])
+    errors = filtered["standard_errors"]
+    own = np.array([entry["mean_squared_error"] for entry in alone])
     assert errors["mean_squared_error"] == pytest.approx(own.std(ddof=1) / 6**0.5, rel=1e-9)
     for name, error in errors["mean_true_squared_errors"].items():
-        values = np.array([one["mean_true_squared_errors"][name] for one in alone])
+        values = np.array([entry["mean_true_squared_errors"][name] for entry in alone])
         assert error == pytest.approx(values.std(ddof=1) / 6**0.5, rel=1e-9)
-    assert found["z"] == pytest.approx(z_of(own, found["mean_trace_covariance"]), rel=1e-6)
+    assert filtered["z"] == pytest.approx(z_of(own, filtered["mean_trace_covariance"]), rel=1e-6)
     assert alone[0]["z"] is alone[0]["standard_errors"]["mean_squared_error"] is None
 
 
 def test_a_singular_noise_runs_and_is_warned_of(evedrop: Evedrop) -> None:
     """One measurement of two states: Q has rank one, and the warning says what that gives away."""
-    one = {"plant__output_matrix": [[0.0, 1.0]], "plant__measurement_noise": [[0.01]]}
-    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(changed(TANK, **{**MEASURED, **one})))
+    measuring = {"plant__output_matrix": [[0.0, 1.0]], "plant__measurement_noise": [[0.01]]}
+    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(changed(TANK, **{**MEASURED, **measuring})))
     done = evedrop("montecarlo", "loop.toml", "--trials", "5", "--out", "run")
     assert done.status == 0
     assert (
@@ -210,7 +210,7 @@ def test_a_live_loop_is_the_one_in_memory(case: str, tmp_path: Path) -> None:
     for name, value in memory.summary["controller"].items():
         if name not in {*timed, "mean_squared_errors", "mean_trace_covariance", "standard_errors"}:
             assert live.summary["controller"][name] == value, name
-    here, there = (one.summary["controller"] for one in (memory, live))
+    here, there = (run.summary["controller"] for run in (memory, live))
     for mine, others in ((here, there), (here["standard_errors"], there["standard_errors"])):
         for name, value in others["mean_squared_errors"].items():
             same = mine["mean_squared_errors"][name]
@@ -244,8 +244,8 @@ def test_a_loop_can_be_paused_and_steered(evedrop: Evedrop) -> None:
     live = evedrop.live("loop.toml", "--paused")
     live.held()
     for words in (("step", "50"), ("pause",), ("link", "legitimate", "cut"), ("step", "20"), ("resume",)):
-        said = evedrop(words[0], "run", *words[1:])
-        assert (said.status, said.err) == (0, ""), words
+        done = evedrop(words[0], "run", *words[1:])
+        assert (done.status, done.err) == (0, ""), words
     assert live.end().status == 0
     results = live.results
     assert results.summary["ended"] == "complete"
@@ -255,11 +255,11 @@ def test_a_loop_can_be_paused_and_steered(evedrop: Evedrop) -> None:
 
 def test_what_the_controller_did_differently_is_found(tmp_path: Path) -> None:
     """By slot and trial, with both values, where only its weights differ; and by its digests where nothing is recorded."""
-    one, other = (in_memory(tmp_path / str(weight), controller__input_weights=[weight]) for weight in (0.1, 0.2))
-    found = difference(one, other)
-    assert not found.same
-    assert found.text.startswith("first difference: slot 0, trial 0, controller: u [")
-    assert " against [" in found.text
+    loop, other = (in_memory(tmp_path / str(weight), controller__input_weights=[weight]) for weight in (0.1, 0.2))
+    result = difference(loop, other)
+    assert not result.same
+    assert result.text.startswith("first difference: slot 0, trial 0, controller: u [")
+    assert " against [" in result.text
 
 
 def test_the_closing_report_has_a_line_on_the_loop(evedrop: Evedrop) -> None:
@@ -323,9 +323,9 @@ def test_late_packets_are_followed_with_the_inputs(tmp_path: Path) -> None:
         changes: dict[str, Any] = {"legitimate__link": link, "legitimate__window": 4, "legitimate__knows_input": knows}
         quiet: dict[str, Any] = {"plant__disturbance_values": [[0.0]] * 300, "plant__noise": [[0.0, 0.0], [0.0, 0.0]]}
         results = in_memory(tmp_path / str(knows), **changes, **quiet, controller__acts_on="truth")
-        found = results.summary["controller"]["mean_squared_errors"]
+        errors = results.summary["controller"]["mean_squared_errors"]
         in_loop = results.summary["peers"]["legitimate"]["mean_squared_error"]
-        assert found == {"ignoring_input": None, "knowing_input": None, _NAMES[knows]: in_loop}
+        assert errors == {"ignoring_input": None, "knowing_input": None, _NAMES[knows]: in_loop}
         late[knows] = column(results.slots, "mean_squared_error", peer="legitimate")[31:].max()
     assert late[True] < 1e-18
     assert late[False] > 1e-6
@@ -362,10 +362,12 @@ def test_other_modes_say_what_they_make_of_a_loop(tmp_path: Path) -> None:
 def test_workers_change_nothing(tmp_path: Path) -> None:
     """Trials of several blocks, by one worker and by two."""
     changes = {"slots": 20, "trials": 1100, "eavesdroppers": {}}
-    one, two = (in_memory(tmp_path / str(count), Plan(workers=count), **changes) for count in (1, 2))
+    single, two = (in_memory(tmp_path / str(count), Plan(workers=count), **changes) for count in (1, 2))
     timed = {"mean_solve_seconds", "longest_solve_seconds", "decisions"}
-    found = [{key: value for key, value in run.summary["controller"].items() if key not in timed} for run in (one, two)]
-    assert found[0] == found[1]
+    controllers = [
+        {key: value for key, value in run.summary["controller"].items() if key not in timed} for run in (single, two)
+    ]
+    assert controllers[0] == controllers[1]
 
 
 def test_a_results_folder_runs_again_to_the_same_digests(tmp_path: Path) -> None:

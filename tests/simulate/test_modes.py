@@ -65,14 +65,14 @@ def quality_of(link: LinkTable | None) -> float:
 def outcomes_of(of: Scenario) -> dict[str, Outcomes]:
     """Receiver → what it does with a slot, by the paper's definition of its strategy."""
     mu_d = of.encoding.mu_d
-    found = {"legitimate": Outcomes.legitimate(quality_of(of.legitimate.link), mu_d)}
+    outcomes = {"legitimate": Outcomes.legitimate(quality_of(of.legitimate.link), mu_d)}
     for name, table in of.eavesdroppers.items():
         uses = {"smart": (1.0, 0.0), "naive": (1.0, 1.0), "suspicious": (table.use_state, table.use_innovation)}
         use_state, use_innovation = uses[table.strategy]
         assert use_state is not None
         assert use_innovation is not None
-        found[name] = Outcomes.eavesdropper(quality_of(table.link), mu_d, use_state, use_innovation)
-    return found
+        outcomes[name] = Outcomes.eavesdropper(quality_of(table.link), mu_d, use_state, use_innovation)
+    return outcomes
 
 
 Arrays = dict[str, dict[str, np.ndarray[Any, Any]]]
@@ -83,9 +83,12 @@ def played(of: Scenario, mode: Mode, trials: int, first: int = 0) -> Arrays:
     parts: dict[str, dict[str, list[Any]]] = {name: {"error": [], "trace": [], "action": []} for name in of.receivers}
     for chunk in Simulation(of, range(first, first + trials), mode).chunks():
         for name, measured in chunk.receivers.items():
-            for what, arrays in parts[name].items():
-                arrays.append(getattr(measured, what).copy())
-    return {name: {what: np.concatenate(arrays) for what, arrays in one.items()} for name, one in parts.items()}
+            for metric, arrays in parts[name].items():
+                arrays.append(getattr(measured, metric).copy())
+    return {
+        name: {metric: np.concatenate(arrays) for metric, arrays in arrays_of.items()}
+        for name, arrays_of in parts.items()
+    }
 
 
 def agrees(samples: np.ndarray[Any, Any], expected: np.ndarray[Any, Any]) -> None:
@@ -150,19 +153,19 @@ def test_which_streams_are_drawn(mode: Mode, monkeypatch: pytest.MonkeyPatch) ->
 def test_means_agree_with_theory(mode: Mode) -> None:
     """Every receiver's error and belief, at every tenth slot of a marginally stable process, over 4000 trials."""
     of = studied(MARGINAL, 111, mu_d=0.4, **ALL)
-    found = played(of, mode, 4000)
+    result = played(of, mode, 4000)
     for name, outcomes in outcomes_of(of).items():
-        for what, theory in (("error", outcomes), ("trace", outcomes.reported)):
+        for metric, theory in (("error", outcomes), ("trace", outcomes.reported)):
             expected = theoretical_traces(of.process.process, theory, of.slots)
-            agrees(found[name][what][::10], expected[::10])
+            agrees(result[name][metric][::10], expected[::10])
 
 
 def test_error_coordinates_go_where_states_cannot_be_followed() -> None:
     """An unstable process, 400 slots (state of 10⁵⁵), μ_d with finite variances: means at every twentieth slot."""
     of = studied([[1.2]], 400, mu_d=0.97, smart={"strategy": "smart", "link": {"quality": 0.9}})
-    found = played(of, Mode.ERROR_COORDINATES, 4000)
+    result = played(of, Mode.ERROR_COORDINATES, 4000)
     for name, outcomes in outcomes_of(of).items():
-        agrees(found[name]["error"][::20], theoretical_traces(of.process.process, outcomes, of.slots)[::20])
+        agrees(result[name]["error"][::20], theoretical_traces(of.process.process, outcomes, of.slots)[::20])
 
 
 def test_heavy_tails_agree_by_quantiles() -> None:
@@ -172,22 +175,22 @@ def test_heavy_tails_agree_by_quantiles() -> None:
     covariance and a normal error. 6000 samples each, compared by the two-sample binomial bound at 4.5 σ.
     """
     of = studied(UNSTABLE, 301, mu_d=0.6)
-    found = played(of, Mode.ERROR_COORDINATES, 6000)["legitimate"]["error"][300]
+    errors = played(of, Mode.ERROR_COORDINATES, 6000)["legitimate"]["error"][300]
     random = np.random.default_rng(3)
     A, Q, samples = np.array(UNSTABLE), 1e-3 * np.eye(2), []
     for _ in range(6000):
         since = min(int(random.geometric(0.9 * 0.6)) - 1, 300)  # slots since a state was received
         P = np.zeros((2, 2))
         lost = random.random(since) < 0.1 / (1 - 0.9 * 0.6)
-        for one in lost:
-            P = A @ P @ A.T + (Q if one else 0.0)
+        for lost_ in lost:
+            P = A @ P @ A.T + (Q if lost_ else 0.0)
         error = np.linalg.cholesky(P) @ random.standard_normal(2) if lost.any() else np.zeros(2)
         samples.append(float(error @ error))
     synchronised = 0.54 / (1 - 0.9 * 0.4)
-    assert abs((found == 0.0).mean() - synchronised) < SURE * np.sqrt(synchronised * (1 - synchronised) / 6000)
+    assert abs((errors == 0.0).mean() - synchronised) < SURE * np.sqrt(synchronised * (1 - synchronised) / 6000)
     for level in (0.86, 0.9, 0.93, 0.96, 0.98):
         edge = np.quantile(samples, level)
-        below = float((found <= edge).mean())
+        below = float((errors <= edge).mean())
         assert abs(below - level) < SURE * np.sqrt(2 * level * (1 - level) / 6000), level
 
 
@@ -219,9 +222,9 @@ def test_random_scenarios_agree_with_theory(
         "eavesdroppers": {"eve": {"strategy": strategy, "link": {"quality": mu_e}, **extra}},
     }  # fmt: skip
     of = checked(tables, "random")
-    found = played(of, Mode.EXACT, 3000)
+    result = played(of, Mode.EXACT, 3000)
     for name, outcomes in outcomes_of(of).items():
-        error = found[name]["error"]
+        error = result[name]["error"]
         expected = theoretical_traces(of.process.process, outcomes, of.slots)
         spread = error.std(axis=1, ddof=1) / np.sqrt(3000)
         rare = 1e-3 * expected  # of an outcome that no trial may have had, the error is not sampled
@@ -260,8 +263,8 @@ def test_who_reads_packets_is_refused(plan: Plan, strategy: str, tmp_path: Path)
     more = entries.get(strategy, {"link": {"quality": 0.5}})
     of = studied(MARGINAL, 20, eve={"strategy": strategy, **more}, smart=SMART)
     option = f"--{plan.mode.value}"
-    said = rf"{option} follows .* the actions of eve \(strategy {strategy}\).*; leave {option} out, or remove eve"
-    with pytest.raises(UsageError, match=said):
+    message = rf"{option} follows .* the actions of eve \(strategy {strategy}\).*; leave {option} out, or remove eve"
+    with pytest.raises(UsageError, match=message):
         montecarlo(of, trials=2, plan=plan, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
@@ -292,7 +295,7 @@ def test_a_refused_study_runs_as_advised(name: str, option: str, evedrop: Evedro
     options = set(re.findall(r"--[a-z-]+", refused.err))
     assert f"; leave {option} out" in refused.err
     assert options == ({option, "--covariance-only"} if name == "heated-room" else {option})
-    for number, remedy in enumerate([[], *([one] for one in options - {option})]):
+    for number, remedy in enumerate([[], *([single_option] for single_option in options - {option})]):
         done = evedrop(*command, *remedy, "--out", f"advised {number}")
         assert done.status in {0, 1}, done.err  # 1: two trials do not meet every expectation
 

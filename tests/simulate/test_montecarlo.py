@@ -93,7 +93,7 @@ def test_the_tables_are_the_means_of_the_trials(tmp_path: Path) -> None:
 
 def least_probable(results: Results) -> tuple[tuple[int, str], float, float]:
     """Trial, receiver, expected mean error and probability, from every recorded trial, by textbook formulas."""
-    table, found = results.trials.to_pydict(), {}
+    table, probabilities = results.trials.to_pydict(), {}
     columns = (table[name] for name in ("peer", "trial", "action", "trace_covariance", "squared_error"))
     trials: dict[tuple[int, str], list[tuple[str, float, float]]] = {}
     for peer, trial, action, trace, error in zip(*columns, strict=True):
@@ -105,38 +105,38 @@ def least_probable(results: Results) -> tuple[tuple[int, str], float, float]:
             if action == "state":
                 sums.append(0.0)
             sums[-1] += trace
-        mean, spread = sum(sums), sum(one * one for one in sums)
+        mean, spread = sum(sums), sum(value * value for value in sums)
         if mean > 0.0:
             distribution = chi2(mean**2 / spread, scale=spread / mean)
             error = sum(error for *_, error in rows)
-            found[at] = (2.0 * min(distribution.cdf(error), distribution.sf(error)), mean / len(rows))
-    least = min(found, key=lambda at: found[at])
-    return least, found[least][1], found[least][0]
+            probabilities[at] = (2.0 * min(distribution.cdf(error), distribution.sf(error)), mean / len(rows))
+    least = min(probabilities, key=lambda at: probabilities[at])
+    return least, probabilities[least][1], probabilities[least][0]
 
 
 def test_the_most_surprising_trial_is_the_least_probable_one(tmp_path: Path) -> None:
     """Recomputed from every recorded trial: its error against what its own losses let expect."""
     results = montecarlo("eavesdroppers", slots=30, trials=40, record_trials=40, first_trial=5, out=tmp_path / "run")
-    found, (at, expected, probability) = results.summary["surprising"], least_probable(results)
-    assert at == (found["trial"], found["receiver"])
-    assert found["expected_error"] == pytest.approx(expected, rel=1e-9)
-    assert found["probability"] == pytest.approx(probability, rel=1e-6)
+    surprising, (at, expected, probability) = results.summary["surprising"], least_probable(results)
+    assert at == (surprising["trial"], surprising["receiver"])
+    assert surprising["expected_error"] == pytest.approx(expected, rel=1e-9)
+    assert surprising["probability"] == pytest.approx(probability, rel=1e-6)
     errors = [row["squared_error"] for row in results.trials.to_pylist() if (row["trial"], row["peer"]) == at]
-    assert found["mean_error"] == pytest.approx(np.mean(errors), rel=1e-9)
+    assert surprising["mean_error"] == pytest.approx(np.mean(errors), rel=1e-9)
 
 
 @pytest.mark.long
 def test_the_largest_error_is_not_the_most_surprising_trial(tmp_path: Path) -> None:
     """A trial that lost its first packets has an error that is far from the median, and as expected."""
     results = montecarlo("vehicle", slots=200, trials=50, record_trials=50, out=tmp_path / "run")
-    found, rows = results.summary["surprising"], results.trials.to_pylist()
+    surprising, rows = results.summary["surprising"], results.trials.to_pylist()
     errors: dict[int, float] = dict.fromkeys(range(50), 0.0)
     for row in rows:
-        if row["peer"] == found["receiver"]:
+        if row["peer"] == surprising["receiver"]:
             errors[row["trial"]] += row["squared_error"] / 200
     logarithms = np.log(list(errors.values()))
-    assert found["trial"] != np.argmax(np.abs(logarithms - np.median(logarithms)))
-    assert found["trial"] == least_probable(results)[0][0]
+    assert surprising["trial"] != np.argmax(np.abs(logarithms - np.median(logarithms)))
+    assert surprising["trial"] == least_probable(results)[0][0]
 
 
 @pytest.mark.parametrize("shards", mostly_long([1, 2], [2]))
@@ -164,14 +164,14 @@ def test_a_trial_surprises_only_where_its_own_expectation_is_known(
 ) -> None:
     """The modes with errors agree; elsewhere the entry is null."""
     plan = Plan(mode, workers=1)
-    found = montecarlo(name, slots=40, trials=15, expect=[], event=[], plan=plan, out=tmp_path / "run").summary
-    assert (found["surprising"] is not None) is there
+    summary = montecarlo(name, slots=40, trials=15, expect=[], event=[], plan=plan, out=tmp_path / "run").summary
+    assert (summary["surprising"] is not None) is there
     if name == "late":
-        assert found["surprising"]["receiver"] == "hasty"
+        assert summary["surprising"]["receiver"] == "hasty"
     if mode is Mode.ERROR_COORDINATES:
         exact = montecarlo(name, slots=40, trials=15, expect=[], out=tmp_path / "exact").summary["surprising"]
-        assert found["surprising"].pop("receiver") == exact.pop("receiver")
-        assert found["surprising"] == pytest.approx(exact, rel=1e-6)
+        assert summary["surprising"].pop("receiver") == exact.pop("receiver")
+        assert summary["surprising"] == pytest.approx(exact, rel=1e-6)
 
 
 def test_the_printed_command_shows_the_surprising_trial_live(evedrop: Evedrop) -> None:

@@ -44,15 +44,15 @@ def files(folder: Path, name: str = "") -> dict[str, bytes | str]:
 
     name: of the folder, by default its last two parts.
     """
-    found: dict[str, bytes | str] = {}
+    contents: dict[str, bytes | str] = {}
     for path in sorted(folder.rglob("*")):
         if path.suffix in {".json", ".html", ".toml"}:
             text = _TIMES.sub("", path.read_text())
             text = text.replace(name or f"{folder.parent.name}/{folder.name}", "FOLDER")
-            found[str(path.relative_to(folder))] = text.replace(str(folder.parents[1]), "ROOT")
+            contents[str(path.relative_to(folder))] = text.replace(str(folder.parents[1]), "ROOT")
         elif path.is_file():
-            found[str(path.relative_to(folder))] = path.read_bytes()
-    return found
+            contents[str(path.relative_to(folder))] = path.read_bytes()
+    return contents
 
 
 def interrupted_after(monkeypatch: pytest.MonkeyPatch, tasks: int) -> None:
@@ -223,7 +223,7 @@ def test_a_part_of_another_study_is_not_used(cut: Path, evedrop: Evedrop, whole:
 
 
 @pytest.mark.parametrize(
-    ("more", "what"),
+    ("more", "message"),
     [
         (("--seed", "7"), "seed is 11 there and 7 here"),
         (("--trials", "5000"), "trials is 4700 there and 5000 here"),
@@ -231,11 +231,11 @@ def test_a_part_of_another_study_is_not_used(cut: Path, evedrop: Evedrop, whole:
         (("--set", "eavesdroppers.smart.link.quality=0.5"), "quality is"),
     ],
 )
-def test_another_study_is_refused(more: tuple[str, ...], what: str, cut: Path, evedrop: Evedrop) -> None:
+def test_another_study_is_refused(more: tuple[str, ...], message: str, cut: Path, evedrop: Evedrop) -> None:
     """The message names the difference; the folder stays as it was."""
     before = files(cut)
     done = evedrop(*STUDY, *more, "--out", "cut/run", "--resume")
-    assert (done.status, "cut/run has another study: " in done.err, what in done.err) == (2, True, True), done.err
+    assert (done.status, "cut/run has another study: " in done.err, message in done.err) == (2, True, True), done.err
     assert files(cut) == before
 
 
@@ -294,8 +294,10 @@ def test_python_resumes_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_order_of_recorded_rows_does_not_depend_on_the_tasks(tmp_path: Path) -> None:
     """With more recorded trials than a block has, the tables are the same for any number of workers."""
     case: dict[str, Any] = {"trials": 1100, "slots": 4, "record_trials": 1100}
-    one, two = (montecarlo("eavesdroppers", workers=workers, out=tmp_path / str(workers), **case) for workers in (1, 2))
-    assert one.trials.equals(two.trials)
+    single, two = (
+        montecarlo("eavesdroppers", workers=workers, out=tmp_path / str(workers), **case) for workers in (1, 2)
+    )
+    assert single.trials.equals(two.trials)
 
 
 STUDIES = {
@@ -334,7 +336,7 @@ def test_other_studies_go_on_too(
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("name", "more", "what"),
+    ("name", "more", "message"),
     [
         ("sweep", ("--over", "seed=1,2"), "over.seed is missing there and [1, 2] here"),
         ("sweep", ("--covariance-only",), "mode is "),
@@ -342,14 +344,14 @@ def test_other_studies_go_on_too(
     ],
 )
 def test_another_sweep_or_comparison_is_refused(
-    name: str, more: tuple[str, ...], what: str, evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
+    name: str, more: tuple[str, ...], message: str, evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The message names the difference."""
     with monkeypatch.context() as patched:
         interrupted_after(patched, 1)
         assert evedrop(*STUDIES[name], "--out", "cut/run").status == 130
     done = evedrop(*STUDIES[name], *more, "--out", "cut/run", "--resume")
-    assert (done.status, "has another study: " in done.err, what in done.err) == (2, True, True), done.err
+    assert (done.status, "has another study: " in done.err, message in done.err) == (2, True, True), done.err
 
 
 @pytest.mark.long

@@ -79,7 +79,7 @@ def tables_of(scheme: str, **more: Any) -> dict[str, Any]:
             "sel": {"strategy": "selective", "window": 2, "link": dict(LATE)},
             "spy": {**spy, "link": {"quality": 0.6}},
         },
-        "event": [dict(one) for one in event],
+        "event": [dict(entry) for entry in event],
     }
     if scheme in NEEDS:
         tables["acknowledgements"] = {"link": {"quality": 0.9}, **attack}
@@ -123,10 +123,10 @@ def test_who_is_given_what(scheme: str) -> None:
     assert set(briefs["sensor"].keys) == {"process", *kind.secret_streams}
     assert set(briefs["legitimate"].keys) == set(kind.estimator_streams)
     assert briefs["naive"].keys == briefs["ref"].keys == briefs["spy"].keys == {}
-    holders = {name for name, one in briefs.items() if "link/acknowledgements" in one.keys}
+    holders = {name for name, brief in briefs.items() if "link/acknowledgements" in brief.keys}
     assert holders == ({"router"} if scheme in NEEDS else set())
     assert part_of(briefs["router"], RouterPart).leaks == part_of(briefs["sensor"], SensorPart).leaks == {"spy": 9}
-    assert {one.model.header for one in briefs.values()} == {len(kind.header)}
+    assert {brief.model.header for brief in briefs.values()} == {len(kind.header)}
 
 
 @pytest.mark.parametrize("scheme", RUNS)
@@ -239,7 +239,7 @@ def test_errors_in_runs_agree_with_the_closed_forms(scheme: str, receiver: str, 
     expected = expectations_of(scenario)[receiver]
     assert expected.known
     assert np.isfinite(expected.limit)
-    errors = np.concatenate([one.receivers[receiver].error for one in Simulation(scenario, range(3000)).chunks()])
+    errors = np.concatenate([chunk.receivers[receiver].error for chunk in Simulation(scenario, range(3000)).chunks()])
     apart = np.abs(errors.mean(axis=1) - expected.traces(24))
     assert (apart <= 5.0 * errors.std(axis=1) / np.sqrt(3000) + 1e-12).all()
 
@@ -248,14 +248,14 @@ def test_whose_reference_is_kept_and_whose_is_lost() -> None:
     """Blocking the critical acknowledgements is expected to be as good as being the legitimate estimator; listening is not."""
     eavesdroppers = {name: {"strategy": "reference", "link": {"quality": 0.8}} for name in ("ref", "listener")}
     scenario = running("acknowledged", event=[], eavesdroppers=eavesdroppers)
-    found = expectations_of(scenario)
-    assert np.allclose(found["ref"].traces(30), found["legitimate"].traces(30), rtol=1e-9)
-    assert not found["listener"].known
-    floor = found["listener"].bound
+    expectations = expectations_of(scenario)
+    assert np.allclose(expectations["ref"].traces(30), expectations["legitimate"].traces(30), rtol=1e-9)
+    assert not expectations["listener"].known
+    floor = expectations["listener"].bound
     assert floor is not None
     assert floor.traces(30)[-1] > 100.0
-    assert (floor.limit, found["listener"].infinite_variance) == (np.inf, False)  # it grows alike in all trials
-    assert np.isfinite(found["ref"].limit)
+    assert (floor.limit, expectations["listener"].infinite_variance) == (np.inf, False)  # it grows alike in all trials
+    assert np.isfinite(expectations["ref"].limit)
     jammed_later = running("acknowledged", eavesdroppers=eavesdroppers)
     assert not expectations_of(jammed_later)["listener"].known
     assert expectations_of(jammed_later)["legitimate"].known

@@ -108,12 +108,12 @@ def test_heavy_tails_agree_with_closed_forms() -> None:
     for name in scenario.receivers:
         means = Splitter(scenario, Mode.COVARIANCE_ONLY, name).estimated()
         traces = expected[name].traces(30)
-        found = means.estimate(100, expected[name])
-        assert found.doubt is None
-        assert found.z is not None
-        assert abs(found.z) < SURE, name
-        spread = np.array(found.slots["standard_error"])
-        assert np.all(np.abs(np.array(found.slots["mean_error"]) - traces) <= SURE * spread + 1e-12), name
+        estimate = means.estimate(100, expected[name])
+        assert estimate.doubt is None
+        assert estimate.z is not None
+        assert abs(estimate.z) < SURE, name
+        spread = np.array(estimate.slots["standard_error"])
+        assert np.all(np.abs(np.array(estimate.slots["mean_error"]) - traces) <= SURE * spread + 1e-12), name
         if name in ("legitimate", "bursts"):
             assert expected[name].infinite_variance
             assert plain[name].mean() < 0.8 * traces.mean()
@@ -122,12 +122,12 @@ def test_heavy_tails_agree_with_closed_forms() -> None:
 def test_an_initial_covariance_that_is_never_lost(tmp_path: Path) -> None:
     """The plain mean of 40 trials is far too small, and has no z; splitting is right."""
     plan = Plan(workers=1, rare=True)
-    found = montecarlo("eavesdroppers", slots=40, trials=40, plan=plan, out=tmp_path / "it").summary
-    legitimate = found["peers"]["legitimate"]
+    summary = montecarlo("eavesdroppers", slots=40, trials=40, plan=plan, out=tmp_path / "it").summary
+    legitimate = summary["peers"]["legitimate"]
     assert legitimate["mean_squared_error"] < 0.8 * legitimate["theoretical_trace_covariance"]
     assert legitimate["z"] == {"mean_squared_error": None}
     for name in ("legitimate", "naive", "suspicious", "smart"):
-        assert abs(found["peers"][name]["rare_estimate"]["z"]) < SURE, name
+        assert abs(summary["peers"][name]["rare_estimate"]["z"]) < SURE, name
 
 
 def test_the_exact_mode_estimates_the_same() -> None:
@@ -135,9 +135,9 @@ def test_the_exact_mode_estimates_the_same() -> None:
     wise = {"wise": {"strategy": "genie", "link": {"quality": 0.9}}}
     scenario = heavy(slots=20, eavesdroppers=wise)
     for name, expected in expectations_of(scenario).items():
-        found = Splitter(scenario, Mode.EXACT, name).estimated().estimate(100, expected)
-        assert found.z is not None
-        assert abs(found.z) < SURE, name
+        estimate = Splitter(scenario, Mode.EXACT, name).estimated().estimate(100, expected)
+        assert estimate.z is not None
+        assert abs(estimate.z) < SURE, name
 
 
 @pytest.mark.long
@@ -146,9 +146,9 @@ def test_flipped_acknowledgements_agree_with_many_trials() -> None:
     scenario = heavy(**ACKNOWLEDGED, slots=7)
     many = errors_of(scenario, Mode.EXACT, trials=4000)
     for receiver in scenario.receivers:
-        found, plain = Splitter(scenario, Mode.EXACT, receiver).estimated().of_populations, many[receiver].mean(axis=0)
-        spread = math.hypot(found.std(ddof=1) / math.sqrt(len(found)), plain.std(ddof=1) / math.sqrt(len(plain)))
-        assert abs(found.mean() - plain.mean()) < SURE * spread
+        split, plain = Splitter(scenario, Mode.EXACT, receiver).estimated().of_populations, many[receiver].mean(axis=0)
+        spread = math.hypot(split.std(ddof=1) / math.sqrt(len(split)), plain.std(ddof=1) / math.sqrt(len(plain)))
+        assert abs(split.mean() - plain.mean()) < SURE * spread
         assert spread < 0.1 * plain.mean()
 
 
@@ -158,8 +158,8 @@ def test_results_depend_on_the_seed_alone(tmp_path: Path) -> None:
     scenario = heavy(slots=10)
 
     def entry(folder: str, plan: Plan, **more: Any) -> Any:
-        found = montecarlo(scenario, trials=1001, plan=plan, out=tmp_path / folder, **more).summary
-        return {name: peer["rare_estimate"] for name, peer in found["peers"].items()}
+        summary = montecarlo(scenario, trials=1001, plan=plan, out=tmp_path / folder, **more).summary
+        return {name: peer["rare_estimate"] for name, peer in summary["peers"].items()}
 
     once = entry("one", Plan(workers=1, rare=True))
     assert once == entry("two", Plan(workers=2, rare=True))
@@ -188,10 +188,10 @@ def test_what_is_too_skewed_is_refused() -> None:
 
     def doubt(populations: list[float]) -> str | None:
         errors = np.repeat(np.array(populations)[:, None], 3, axis=1)
-        found = SplitMeans(errors, (), 1.0).estimate(100, expected)
-        assert (found.mean_error is None) == (found.doubt is not None)
-        assert bool(found.slots) == (found.doubt is None)
-        return found.doubt
+        estimate = SplitMeans(errors, (), 1.0).estimate(100, expected)
+        assert (estimate.mean_error is None) == (estimate.doubt is not None)
+        assert bool(estimate.slots) == (estimate.doubt is None)
+        return estimate.doubt
 
     assert str(doubt([1.0] * 15 + [9.0])).startswith(
         "its standard error would be 33 % of the mean; give more trials or"
@@ -211,9 +211,9 @@ def test_an_interrupted_study_has_no_estimates(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(studies, "rare_estimates", stopped_early)
     with pytest.raises(Interrupted):
         montecarlo(heavy(), trials=20, plan=Plan(workers=1, rare=True), out=tmp_path / "it")
-    found = Results.read(tmp_path / "it").summary
-    assert found["trials"] == 20
-    assert "rare_estimate" not in found["peers"]["legitimate"]
+    summary = Results.read(tmp_path / "it").summary
+    assert summary["trials"] == 20
+    assert "rare_estimate" not in summary["peers"]["legitimate"]
 
 
 def test_the_report_marks_them(evedrop: Evedrop) -> None:
@@ -225,9 +225,11 @@ def test_the_report_marks_them(evedrop: Evedrop) -> None:
     assert "legitimate: by splitting, 32 populations of 100 trials, copied after" in lines[0]
     row = next(line for line in done.out.splitlines() if line.strip().startswith("naive"))
     assert row.count("*") == 2
-    found = json.loads((evedrop.folder / "it" / "summary.json").read_text())["peers"]["legitimate"]["rare_estimate"]
-    assert len(found["slots"]["mean_error"]) == 12
-    assert found["populations"] == POPULATIONS
+    rare_estimate = json.loads((evedrop.folder / "it" / "summary.json").read_text())["peers"]["legitimate"][
+        "rare_estimate"
+    ]
+    assert len(rare_estimate["slots"]["mean_error"]) == 12
+    assert rare_estimate["populations"] == POPULATIONS
 
 
 def test_a_doubt_is_reported(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -241,9 +243,9 @@ def test_a_doubt_is_reported(capsys: pytest.CaptureFixture[str], tmp_path: Path)
     doubtful = type(rare)(None, None, None, 32, 100, 3, 0.2, "its standard error would be 40 % of the mean", {})
     changed: Summary = summary.with_rare_estimates({"smart": doubtful})
     print_summary(changed, "it")
-    said = capsys.readouterr().out
-    assert "smart: splitting gives no estimate that can be trusted: its standard error would be 40 %" in said
-    assert "*" not in said
+    output = capsys.readouterr().out
+    assert "smart: splitting gives no estimate that can be trusted: its standard error would be 40 %" in output
+    assert "*" not in output
 
 
 @pytest.mark.long
@@ -254,7 +256,7 @@ def test_the_stated_error_is_true() -> None:
         for seed in range(15):
             scenario = load("numerical", {"slots": 40, "seed": seed}, beyond_horizon=True)
             expected = expectations_of(scenario)[name].traces(40).mean()
-            found = Splitter(scenario, Mode.COVARIANCE_ONLY, name).estimated(32 * 20).of_populations.reshape(20, 32)
-            z.append((found.mean(axis=1) - expected) / (found.std(axis=1, ddof=1) / math.sqrt(32)))
+            errors = Splitter(scenario, Mode.COVARIANCE_ONLY, name).estimated(32 * 20).of_populations.reshape(20, 32)
+            z.append((errors.mean(axis=1) - expected) / (errors.std(axis=1, ddof=1) / math.sqrt(32)))
         beyond = (np.abs(np.concatenate(z)) > 1.96).mean()
         assert 0.04 < beyond < 0.12

@@ -273,8 +273,8 @@ def test_a_worker_is_given_no_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
 
     assert isinstance(outcome(tasks, on_progress=look), list)
     assert given
-    assert not [one for one in given if b"ACCESS_TOKEN" in one]
-    assert all(b"PATH=" in one for one in given)
+    assert not [variable for variable in given if b"ACCESS_TOKEN" in variable]
+    assert all(b"PATH=" in variable for variable in given)
 
 
 def test_what_was_merged_before_a_fault_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

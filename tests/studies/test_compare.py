@@ -61,9 +61,9 @@ def literature(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
     return compare("acknowledged", schemes=schemes, trials=100, out=tmp_path_factory.mktemp("compare") / "run")
 
 
-def last(found: Comparison, scheme: str, adversary: str) -> tuple[float, float]:
+def last(comparison: Comparison, scheme: str, adversary: str) -> tuple[float, float]:
     """Theory of the last slot: the adversary's, and the legitimate estimator's meanwhile."""
-    cell = found.cell(scheme, adversary)
+    cell = comparison.cell(scheme, adversary)
     assert cell.eavesdropper is not None
     assert cell.eavesdropper.theory is not None
     assert cell.legitimate is not None
@@ -73,34 +73,34 @@ def last(found: Comparison, scheme: str, adversary: str) -> tuple[float, float]:
 
 def test_every_pair_is_there_or_says_why_not(everything: Everything) -> None:
     """Every scheme has a cell for every adversary: two errors and a verdict, or a reason."""
-    found, _ = everything
-    assert set(found.schemes) == set(SCHEMES)
-    assert set(STRATEGIES) | set(ATTACKERS) == {*found.adversaries, "learning-em", "learning-particle"}
-    assert set(usual_adversaries(load("learning"))) == {*found.adversaries, "learning-em"}
-    for scheme in found.schemes.values():
-        assert tuple(scheme.cells) == found.adversaries
+    comparison, _ = everything
+    assert set(comparison.schemes) == set(SCHEMES)
+    assert set(STRATEGIES) | set(ATTACKERS) == {*comparison.adversaries, "learning-em", "learning-particle"}
+    assert set(usual_adversaries(load("learning"))) == {*comparison.adversaries, "learning-em"}
+    for scheme in comparison.schemes.values():
+        assert tuple(scheme.cells) == comparison.adversaries
         for cell in scheme.cells.values():
             played = [cell.eavesdropper, cell.legitimate, cell.secrecy, cell.ratio]
-            assert [one is None for one in played] == [cell.match.not_defined is not None] * 4
+            assert [cell_ is None for cell_ in played] == [cell.match.not_defined is not None] * 4
 
 
 def test_a_comparison_is_read_back_and_has_its_page(everything: Everything) -> None:
     """compare.json has the results, except for the sentences of verdicts; every pair has its cell on the page."""
-    found, folder = everything
+    comparison, folder = everything
 
     def without_sentences(of: dict[str, Any]) -> dict[str, Any]:
-        for one in of["schemes"].values():
-            for cell in one["against"].values():
+        for scheme in of["schemes"].values():
+            for cell in scheme["against"].values():
                 cell.get("secrecy", {}).pop("sentence", None)
         return of
 
     again = read_comparison(folder)
-    assert str(plain(without_sentences(again.as_dict()))) == str(plain(without_sentences(found.as_dict())))
+    assert str(plain(without_sentences(again.as_dict()))) == str(plain(without_sentences(comparison.as_dict())))
     write_report(folder)
     page = checked(folder)
-    assert page.values("class").count("verdict") == len(found.schemes) * len(found.adversaries)
-    for one in found.schemes.values():
-        assert {verdict(cell) for cell in one.cells.values() if cell.verdict is not None} <= set(page.texts)
+    assert page.values("class").count("verdict") == len(comparison.schemes) * len(comparison.adversaries)
+    for scheme in comparison.schemes.values():
+        assert {verdict(cell) for cell in scheme.cells.values() if cell.verdict is not None} <= set(page.texts)
 
 
 @pytest.mark.parametrize(
@@ -124,32 +124,32 @@ def test_pairs_that_mean_nothing_say_why(everything: Everything, scheme: str, ad
 
 def test_an_adversary_that_learns_a_state_is_not_the_closest(literature: Comparison) -> None:
     """Of two adversaries, the one with the larger error is the closest if the other is given a true state."""
-    one = literature.schemes["innovation"]
-    first = one.closest
+    innovation = literature.schemes["innovation"]
+    first = innovation.closest
     assert first is not None
     betrayed = replace(first, match=replace(first.match, betrayed=True))
-    then = replace(one, cells={**one.cells, first.match.adversary: betrayed})
+    then = replace(innovation, cells={**innovation.cells, first.match.adversary: betrayed})
     assert then.closest is not None
     assert then.closest.match.adversary != first.match.adversary
-    assert then.kept > one.kept
+    assert then.kept > innovation.kept
 
 
 def test_every_adversary_is_played_somewhere(everything: Everything) -> None:
     """None is there to be refused alone, and each scheme that needs acknowledgements meets all attacks on them."""
-    found, _ = everything
-    for adversary in found.adversaries:
-        assert any(found.cell(scheme, adversary).eavesdropper for scheme in found.schemes)
+    comparison, _ = everything
+    for adversary in comparison.adversaries:
+        assert any(comparison.cell(scheme, adversary).eavesdropper for scheme in comparison.schemes)
     for name, scheme in SCHEMES.items():
         for attacker in ATTACKERS:
-            assert (found.cell(name, attacker).eavesdropper is not None) == scheme.needs_acknowledgements
+            assert (comparison.cell(name, attacker).eavesdropper is not None) == scheme.needs_acknowledgements
 
 
 def test_a_cell_is_a_study_of_its_own(everything: Everything, tmp_path: Path) -> None:
     """The scenario that the folder has of a scheme gives the metrics of its cells, by `montecarlo`, to the bit."""
-    found, folder = everything
+    comparison, folder = everything
     for file, scheme in (("innovation", "innovation"), ("acknowledged-blocks-critical", "acknowledged")):
-        alone = montecarlo(folder / "scenarios" / f"{file}.toml", trials=found.trials, out=tmp_path / file).summary
-        matched = [cell for cell in found.schemes[scheme].cells.values() if cell.match.strategy in alone["peers"]]
+        alone = montecarlo(folder / "scenarios" / f"{file}.toml", trials=comparison.trials, out=tmp_path / file).summary
+        matched = [cell for cell in comparison.schemes[scheme].cells.values() if cell.match.strategy in alone["peers"]]
         attack = "none" if file == scheme else "critical"
         matched = [cell for cell in matched if cell.match.attack == attack]
         assert matched
@@ -172,14 +172,14 @@ def test_a_cell_is_a_study_of_its_own(everything: Everything, tmp_path: Path) ->
 
 def test_all_schemes_have_the_same_trials_and_losses(everything: Everything) -> None:
     """An eavesdropper that reads what any scheme sends unencrypted has the error that it has against `plain`."""
-    found, _ = everything
-    legitimate = found.schemes["plain"].legitimate.mean
-    assert found.schemes["cipher"].legitimate.mean == pytest.approx(legitimate, rel=1e-9)
-    assert found.schemes["acknowledged"].legitimate.mean == pytest.approx(legitimate, rel=1e-6)
-    constant = {scheme: found.cell(scheme, "constant").eavesdropper for scheme in SCHEMES}
-    assert len({one.mean for scheme, one in constant.items() if one is not None and scheme != "twin-track"}) == 1
-    blocked = found.cell("scheduled", "blocks-all").eavesdropper
-    clear = found.cell("plain", "naive").eavesdropper
+    comparison, _ = everything
+    legitimate = comparison.schemes["plain"].legitimate.mean
+    assert comparison.schemes["cipher"].legitimate.mean == pytest.approx(legitimate, rel=1e-9)
+    assert comparison.schemes["acknowledged"].legitimate.mean == pytest.approx(legitimate, rel=1e-6)
+    constant = {scheme: comparison.cell(scheme, "constant").eavesdropper for scheme in SCHEMES}
+    assert len({mean.mean for scheme, mean in constant.items() if mean is not None and scheme != "twin-track"}) == 1
+    blocked = comparison.cell("scheduled", "blocks-all").eavesdropper
+    clear = comparison.cell("plain", "naive").eavesdropper
     assert blocked is not None
     assert clear is not None
     assert blocked.mean == clear.mean
@@ -190,10 +190,10 @@ def test_simulation_agrees_with_theory(everything: Everything) -> None:
     judged = 0
     for scheme in everything[0].schemes.values():
         for cell in scheme.cells.values():
-            for one in (cell.eavesdropper, cell.legitimate):
-                if one is None or one.z is None:
+            for peer in (cell.eavesdropper, cell.legitimate):
+                if peer is None or peer.z is None:
                     continue
-                assert abs(one.z) < 4.5, cell.match
+                assert abs(peer.z) < 4.5, cell.match
                 judged += 1
     assert judged > 40
 
@@ -206,17 +206,17 @@ def test_the_cipher_dominates(everything: Everything, literature: Comparison) ->
 
 def test_verdicts(everything: Everything) -> None:
     """Plain packets are an open book; an error that grows without bound is perfect secrecy; equal errors are none."""
-    found, _ = everything
-    assert {pair: found.cell(*pair).verdict for pair in VERDICTS} == VERDICTS
+    comparison, _ = everything
+    assert {pair: comparison.cell(*pair).verdict for pair in VERDICTS} == VERDICTS
 
 
 def test_one_trial_decides_nothing(tmp_path: Path) -> None:
     """But what theory alone decides: too few trials to tell is the verdict, and no standard error is given."""
-    found = compare(
+    result = compare(
         "bayesian", schemes=["innovation"], adversaries=["naive", "smart"], trials=1, slots=40, out=tmp_path
     )
     for adversary in ("naive", "smart"):
-        cell = found.cell("innovation", adversary)
+        cell = result.cell("innovation", adversary)
         assert cell.eavesdropper is not None
         assert cell.verdict is SecrecyKept.UNDECIDED
         assert cell.eavesdropper.standard_error is None
@@ -224,15 +224,15 @@ def test_one_trial_decides_nothing(tmp_path: Path) -> None:
 
 def test_what_each_scheme_needs(everything: Everything) -> None:
     """Two states: payload and header of 64-bit numbers, and the secret of docs/schemes.md."""
-    needs = {name: one.needs for name, one in everything[0].schemes.items()}
-    assert {name: (one.payload_bits, one.header_bits) for name, one in needs.items()} == {
+    needs = {name: scheme.needs for name, scheme in everything[0].schemes.items()}
+    assert {name: (need.payload_bits, need.header_bits) for name, need in needs.items()} == {
         **dict.fromkeys(SCHEMES, (128, 0)),
         "acknowledged": (128, 64),
         **dict.fromkeys(("open-loop", "random-code", "threshold-code"), (128, 128)),
         **dict.fromkeys(("encrypted-schedule", "partial-encryption"), (128, 64)),
         "quantised-schedule": (16, 1),
     }
-    secret = {name: (one.secret_bits_per_slot, one.initial_secret_bits) for name, one in needs.items()}
+    secret = {name: (need.secret_bits_per_slot, need.initial_secret_bits) for name, need in needs.items()}
     assert secret == {
         **dict.fromkeys(SCHEMES, (0, 0)),
         "cipher": (128, 0),
@@ -242,7 +242,7 @@ def test_what_each_scheme_needs(everything: Everything) -> None:
         "partial-encryption": (64, 0),
         "twin-track": (64, 256),
     }
-    assert {name for name, one in needs.items() if one.acknowledgements} == {
+    assert {name for name, need in needs.items() if need.acknowledgements} == {
         "acknowledged",
         "encrypted-schedule",
         "open-loop",
@@ -257,12 +257,12 @@ def test_what_each_scheme_needs(everything: Everything) -> None:
 
 def test_bits_and_energy_are_those_of_the_packets(everything: Everything) -> None:
     """By default a packet costs 1 and its encryption 1 more; fractions agree with theory within five standard errors."""
-    needs = {name: one.needs for name, one in everything[0].schemes.items()}
-    for one in needs.values():
-        assert one.energy_per_slot == pytest.approx(one.sent_fraction + one.encrypted_fraction)
-        assert one.bits_per_slot == pytest.approx(one.packet_bits * one.sent_fraction)
-        assert (one.standard_errors["bits_per_slot"] == 0.0) is (one.sent_fraction == 1.0)
-    encrypted = {name: one.encrypted_fraction for name, one in needs.items()}
+    needs = {name: scheme.needs for name, scheme in everything[0].schemes.items()}
+    for need in needs.values():
+        assert need.energy_per_slot == pytest.approx(need.sent_fraction + need.encrypted_fraction)
+        assert need.bits_per_slot == pytest.approx(need.packet_bits * need.sent_fraction)
+        assert (need.standard_errors["bits_per_slot"] == 0.0) is (need.sent_fraction == 1.0)
+    encrypted = {name: need.encrypted_fraction for name, need in needs.items()}
     assert {name for name, fraction in encrypted.items() if fraction} == {
         *("cipher", "encrypted-schedule", "partial-encryption", "quantised-schedule"),
     }
@@ -280,7 +280,7 @@ def test_bits_and_energy_are_those_of_the_packets(everything: Everything) -> Non
 
 def test_the_energy_is_that_of_the_scenario(tmp_path: Path) -> None:
     """Per packet, per bit and per encrypted packet; one trial has no standard error."""
-    found = compare(
+    result = compare(
         "bayesian",
         schemes=["cipher", "plain"],
         adversaries=["naive"],
@@ -289,9 +289,9 @@ def test_the_energy_is_that_of_the_scenario(tmp_path: Path) -> None:
         out=tmp_path,
         energy={"packet": 3.0, "bit": 0.5, "encryption": 7.0},
     )
-    assert found.schemes["plain"].needs.energy_per_slot == 3.0 + 0.5 * 128
-    assert found.schemes["cipher"].needs.energy_per_slot == 3.0 + 0.5 * 128 + 7.0
-    assert set(found.schemes["plain"].needs.standard_errors.values()) == {None}
+    assert result.schemes["plain"].needs.energy_per_slot == 3.0 + 0.5 * 128
+    assert result.schemes["cipher"].needs.energy_per_slot == 3.0 + 0.5 * 128 + 7.0
+    assert set(result.schemes["plain"].needs.standard_errors.values()) == {None}
 
 
 def test_a_comparison_follows_packets(tmp_path: Path) -> None:
@@ -342,7 +342,7 @@ def test_the_numerical_example_at_slot_sixty(
     mu_d: float, legitimate: float, genie: float, smart: float, tmp_path: Path
 ) -> None:
     """Exact values for μ = μ_e = 0.9, Σ0 = Q, k = 60, of a scheme that is not the scenario's own."""
-    found = compare(
+    result = compare(
         "acknowledged",
         schemes=["innovation"],
         adversaries=["smart", "genie"],
@@ -351,16 +351,16 @@ def test_the_numerical_example_at_slot_sixty(
         slots=61,
         out=tmp_path,
     )
-    assert last(found, "innovation", "smart") == pytest.approx((smart, legitimate), rel=5e-4)
-    assert last(found, "innovation", "genie") == pytest.approx((genie, legitimate), rel=5e-4)
+    assert last(result, "innovation", "smart") == pytest.approx((smart, legitimate), rel=5e-4)
+    assert last(result, "innovation", "genie") == pytest.approx((genie, legitimate), rel=5e-4)
 
 
 def test_the_table_is_a_row_for_each_pair(everything: Everything) -> None:
     """In the order of schemes and adversaries."""
-    found, _ = everything
-    rows = found.table.to_pylist()
+    comparison, _ = everything
+    rows = comparison.table.to_pylist()
     assert [(row["scheme"], row["adversary"]) for row in rows] == [
-        (scheme, adversary) for scheme in found.schemes for adversary in found.adversaries
+        (scheme, adversary) for scheme in comparison.schemes for adversary in comparison.adversaries
     ]
 
 

@@ -81,9 +81,9 @@ def test_what_a_measuring_sensor_cannot_use_is_left_out() -> None:
     steered = load(
         "measured", {"process.initial_covariance": [[1.0, 0.0], [0.0, 1.0]], "eavesdroppers": {}, "expect": []}
     )
-    (one,) = matchups_of(steered, ["innovation"], ["colluding"]).undefined
-    assert one.not_defined is not None
-    assert one.not_defined.startswith(
+    (undefined,) = matchups_of(steered, ["innovation"], ["colluding"]).undefined
+    assert undefined.not_defined is not None
+    assert undefined.not_defined.startswith(
         "tests packets against the range of Q, but the sensor's filter moves its estimate"
     )
     with pytest.raises(ScenarioError, match="the scheme twin-track decides x_0 itself"):
@@ -95,8 +95,13 @@ def test_all_wrong_names_are_told_at_once(evedrop: Evedrop) -> None:
     options = ("--schemes", "cypher,plain", "--adversaries", "smrt", "--with", "innovation.mu_d=0.7")
     done = evedrop("compare", "numerical", *options)
     assert (done.status, done.out) == (2, "")
-    for said in ("cypher is not a scheme", "did you mean cipher?", "smrt is not an adversary", "did you mean smart?"):
-        assert said in done.err
+    for message in (
+        "cypher is not a scheme",
+        "did you mean cipher?",
+        "smrt is not an adversary",
+        "did you mean smart?",
+    ):
+        assert message in done.err
     assert "innovation.mu_d is not a parameter of a scheme" in done.err
     assert all(name in done.err for name in (*SCHEMES, *adversaries_of(), "innovation.state_probability"))
     assert not list(evedrop.folder.glob("runs/*"))
@@ -137,9 +142,9 @@ def test_a_scheme_that_cannot_be_used_is_left_out_with_its_reason(evedrop: Evedr
     assert (done.status, done.err) == (0, "")
     (line,) = (line for line in done.out.splitlines() if line.startswith("left out:"))
     assert line.startswith("left out: withholding: encoding.state_probability: is 0.0, so nothing is sent")
-    found = json.loads((evedrop.folder / "found/compare.json").read_text(encoding="utf-8"))
-    assert set(found["schemes"]) == set(SCHEMES) - {"withholding"}
-    assert [one[:24] for one in found["left_out"]["withholding"]] == ["encoding.state_probabili"]
+    comparison = json.loads((evedrop.folder / "found/compare.json").read_text(encoding="utf-8"))
+    assert set(comparison["schemes"]) == set(SCHEMES) - {"withholding"}
+    assert [sentence[:24] for sentence in comparison["left_out"]["withholding"]] == ["encoding.state_probabili"]
     assert evedrop("compare", "numerical", *silent, "--schemes", "plain,withholding").status == 2
 
 
@@ -160,8 +165,8 @@ def test_the_command_prints_a_table_and_writes_its_folder(evedrop: Evedrop) -> N
     names = ("--schemes", "innovation,acknowledged", "--adversaries", "smart,reference,blocks-critical")
     done = evedrop("compare", "acknowledged", *names, "--trials", "30", "--out", "found")
     assert (done.status, done.err) == (0, "")
-    for said in ("innovation", "acknowledged", "blocks-critical (reference)", "✕ broken", "not defined: smart"):
-        assert said in done.out
+    for text in ("innovation", "acknowledged", "blocks-critical (reference)", "✕ broken", "not defined: smart"):
+        assert text in done.out
     folder = evedrop.folder / "found"
     files = {"compare.json", "compare.pdf", "compare.png", "report.html", "scenarios"}
     assert {path.name for path in folder.iterdir()} == files
@@ -188,13 +193,13 @@ def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
     def refused(constant: str) -> None:
         raise AssertionError(constant)
 
-    found: dict[str, Any] = json.loads(done.out, parse_constant=refused)
+    comparison: dict[str, Any] = json.loads(done.out, parse_constant=refused)
     assert done.out.count("\n") == 1
-    assert found == json.loads((evedrop.folder / "found" / "compare.json").read_text())
-    assert set(found) == {
+    assert comparison == json.loads((evedrop.folder / "found" / "compare.json").read_text())
+    assert set(comparison) == {
         *("scenario", "slots", "trials", "seed", "first_trial", "adversaries", "dominant", "schemes", "left_out"),
     }
-    scheme = found["schemes"]["acknowledged"]
+    scheme = comparison["schemes"]["acknowledged"]
     assert set(scheme) == {"parameters", "needs", "legitimate", "leak", "closest", "against"}
     assert set(scheme["needs"]) == {
         *("acknowledgements", "payload_bits", "header_bits", "packet_bits", "sent_fraction"),
@@ -211,7 +216,7 @@ def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
     assert set(cell["eavesdropper"]) == set(cell["legitimate"]) == measured
     assert set(cell["legitimate"]["theory"]) == {"mean", "last", "limit", "bound"}
     assert cell["legitimate"]["theory"]["limit"] == "inf"
-    assert set(found["schemes"]["innovation"]["against"]["reference"]) == {"not_defined"}
+    assert set(comparison["schemes"]["innovation"]["against"]["reference"]) == {"not_defined"}
 
 
 def test_rare_events_are_said_below_the_table(evedrop: Evedrop) -> None:
@@ -223,9 +228,9 @@ def test_rare_events_are_said_below_the_table(evedrop: Evedrop) -> None:
         for line in done.out.splitlines()
         if line.startswith("events that are expected fewer than 20 times in 30 trials")
     )
-    found = json.loads((evedrop.folder / "found" / "compare.json").read_text())
-    for scheme, one in found["schemes"].items():
-        rare = [cell["eavesdropper"]["rare_events"] for cell in one["against"].values() if "eavesdropper" in cell]
+    comparison = json.loads((evedrop.folder / "found" / "compare.json").read_text())
+    for scheme, scheme_ in comparison["schemes"].items():
+        rare = [cell["eavesdropper"]["rare_events"] for cell in scheme_["against"].values() if "eavesdropper" in cell]
         fraction = max(each["fraction"] for each in rare)
         assert fraction > 0.1
         assert f"{scheme} up to {fraction_text(fraction)}" in line

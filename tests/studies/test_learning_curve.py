@@ -29,8 +29,8 @@ def test_errors_are_those_of_a_study_of_the_same_trials(tmp_path: Path) -> None:
     for name, metrics in study.summary["peers"].items():
         mean = sum(row.errors[name] * (row.stop - row.first) for row in rows) / SLOTS
         assert mean == pytest.approx(metrics["mean_squared_error"], rel=1e-12)
-    (one,) = learning_curve(load("learning", {**SMALL, "slots": 8}), lambda _: None)
-    assert one == rows[0]
+    (curve_row,) = learning_curve(load("learning", {**SMALL, "slots": 8}), lambda _: None)
+    assert curve_row == rows[0]
     last = rows[-1]
     for name, of in last.ratios["learning"].items():
         assert of.ratio == pytest.approx(last.errors["learning"] / last.errors[name])

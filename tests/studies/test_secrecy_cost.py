@@ -27,10 +27,10 @@ def grid_powers(folder: Path, **changes: Any) -> Floats:
     results = montecarlo("microgrid", out=folder, plan=Plan(workers=1), **options)
     assert results.inputs is not None
     table = results.inputs.to_pydict()
-    found = np.empty((SLOTS, TRIALS))
+    powers = np.empty((SLOTS, TRIALS))
     for slot, trial, u in zip(table["slot"], table["trial"], table["u"], strict=True):
-        found[slot, trial - 2] = np.clip(u[1], -3.0, 3.0)
-    return found
+        powers[slot, trial - 2] = np.clip(u[1], -3.0, 3.0)
+    return powers
 
 
 def test_metrics_are_those_of_pairs_of_studies(tmp_path: Path) -> None:
@@ -38,24 +38,24 @@ def test_metrics_are_those_of_pairs_of_studies(tmp_path: Path) -> None:
     ours = grid_powers(tmp_path / "ours")
     plain = grid_powers(tmp_path / "plain", encoding={"scheme": "plain"})
     truth = grid_powers(tmp_path / "truth", controller__acts_on="truth")
-    found = secrecy_cost(load("microgrid", {"slots": SLOTS, "trials": TRIALS, "first_trial": 2}), lambda _: None)
-    more = found.more_than_plain["net_energy"]
+    result = secrecy_cost(load("microgrid", {"slots": SLOTS, "trials": TRIALS, "first_trial": 2}), lambda _: None)
+    more = result.more_than_plain["net_energy"]
     differences = (ours - plain).sum(axis=0) / 3.6
     assert more.mean == pytest.approx(differences.mean(), rel=1e-6)
     interval = ttest_rel(ours.sum(axis=0) / 3.6, plain.sum(axis=0) / 3.6).confidence_interval()
     assert [more.low, more.high] == pytest.approx([interval.low, interval.high], rel=1e-6)
-    for name, one, other in (
+    for name, mine, other in (
         ("scheme_from_plain", ours, plain),
         ("scheme_from_truth", ours, truth),
         ("plain_from_truth", plain, truth),
     ):
-        summed = np.abs(one - other).sum(axis=0) / np.abs(other).sum(axis=0)
-        metric = found.differences[name]["summed"]
+        summed = np.abs(mine - other).sum(axis=0) / np.abs(other).sum(axis=0)
+        metric = result.differences[name]["summed"]
         assert metric.mean == pytest.approx(summed.mean(), rel=1e-9)
         assert metric.standard_error == pytest.approx(summed.std(ddof=1) / 2.0, rel=1e-6)
-        totals = np.abs(one).sum(axis=0), np.abs(other).sum(axis=0)
+        totals = np.abs(mine).sum(axis=0), np.abs(other).sum(axis=0)
         total = np.abs(totals[0] - totals[1]) / totals[1]
-        assert found.differences[name]["total"].mean == pytest.approx(total.mean(), rel=1e-6)
+        assert result.differences[name]["total"].mean == pytest.approx(total.mean(), rel=1e-6)
 
 
 def test_sets_of_trials_side_by_side_change_nothing() -> None:
@@ -69,20 +69,20 @@ def test_sets_of_trials_side_by_side_change_nothing() -> None:
 
 def test_a_controller_that_sees_the_truth_pays_nothing() -> None:
     """Its inputs do not depend on packets, so that all differences are 0 in every trial."""
-    found = secrecy_cost(load("microgrid", {"slots": 130, "trials": 2, "controller.acts_on": "truth"}), lambda _: None)
+    result = secrecy_cost(load("microgrid", {"slots": 130, "trials": 2, "controller.acts_on": "truth"}), lambda _: None)
     nothing = MeanEstimate(0.0, 0.0, 0.0, 0.0)
-    assert set(found.more_than_plain.values()) == {nothing}
-    assert {one for measures in found.differences.values() for one in measures.values()} == {nothing}
+    assert set(result.more_than_plain.values()) == {nothing}
+    assert {measure for measures in result.differences.values() for measure in measures.values()} == {nothing}
 
 
 @pytest.mark.long
 def test_a_days_cost_is_that_of_the_document() -> None:
     """Twenty whole days at μ_d = 0.1, within five standard errors of the table of docs/microgrid.md, made from a hundred."""
-    found = secrecy_cost(load("microgrid", {"trials": 20}), lambda _: None)
+    result = secrecy_cost(load("microgrid", {"trials": 20}), lambda _: None)
     documented = {"net": 1.13e-5, "total": 2.00e-4, "summed": 8.59e-3}
-    for measure, one in found.differences["scheme_from_plain"].items():
-        assert one.mean == pytest.approx(documented[measure], abs=5.0 * one.standard_error), measure
-    more = found.more_than_plain
+    for measure, measure_ in result.differences["scheme_from_plain"].items():
+        assert measure_.mean == pytest.approx(documented[measure], abs=5.0 * measure_.standard_error), measure
+    more = result.more_than_plain
     assert more["net_energy"].mean == pytest.approx(0.0924, abs=5.0 * more["net_energy"].standard_error)
     assert more["total_energy"].mean == pytest.approx(4.62, abs=5.0 * more["total_energy"].standard_error)
     assert more["total_energy"].low > 0.0
@@ -93,18 +93,18 @@ def test_the_command_prints_the_table_and_json(evedrop: Evedrop) -> None:
     command = ("cost", "microgrid", "--trials", "2", "--slots", "200")
     shown, entry = evedrop(*command), evedrop(*command, "--json")
     assert (shown.status, entry.status) == (0, 0)
-    found = json.loads(entry.out)
-    assert (found["scheme"], found["trials"]) == ("innovation", 2)
-    mean = found["more_than_plain"]["net_energy"]["mean"]
+    costs = json.loads(entry.out)
+    assert (costs["scheme"], costs["trials"]) == ("innovation", 2)
+    mean = costs["more_than_plain"]["net_energy"]["mean"]
     (line,) = (line for line in shown.out.splitlines() if "net energy: innovation less plain" in line)
     assert f" {mean:.3g} Wh" in line
-    fraction = found["differences"]["scheme_from_plain"]["summed"]["mean"]
+    fraction = costs["differences"]["scheme_from_plain"]["summed"]["mean"]
     (line,) = (line for line in shown.out.splitlines() if "summed: innovation from plain" in line)
     assert f" {100.0 * fraction:.3g} %" in line
-    for words, said in (
+    for words, message in (
         (("cost", "vehicle"), "there is no household with a controller; try the scenario microgrid"),
         (("cost", "microgrid", "--trials", "1"), "--trials 1: expected 2 or more"),
     ):
         refused = evedrop(*words)
         assert refused.status == 2
-        assert said in refused.err
+        assert message in refused.err

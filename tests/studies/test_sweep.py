@@ -71,7 +71,7 @@ def test_lists_are_read_as_toml(text: str, values: list[object]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("texts", "said"),
+    ("texts", "message"),
     [
         (["slots"], "expected KEY="),
         (["=1,2"], "expected KEY="),
@@ -88,9 +88,9 @@ def test_lists_are_read_as_toml(text: str, values: list[object]) -> None:
         (["a=0:1:0.001", "b=0:1:0.01"], "more than 10000 points"),
     ],
 )
-def test_what_is_no_grid_is_refused(texts: list[str], said: str) -> None:
+def test_what_is_no_grid_is_refused(texts: list[str], message: str) -> None:
     """One line that names the option."""
-    with pytest.raises(UsageError, match=said) as told:
+    with pytest.raises(UsageError, match=message) as told:
         grid_of(texts)
     assert str(told.value).startswith("--over")
     assert "\n" not in str(told.value)
@@ -209,7 +209,7 @@ BASE = ("sweep", "eavesdroppers", "--slots", "20", "--out", "run")
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "message"),
     [
         (("--over", "sluts=1,2", "--trials", "5"), "sluts: is not an entry of this table; did you mean slots?"),
         (
@@ -222,13 +222,13 @@ BASE = ("sweep", "eavesdroppers", "--slots", "20", "--out", "run")
         (("--over", "seed=1,2", "--trials", "5", "--workers", "0"), "workers=0: expected 1 or more"),
     ],
 )
-def test_what_cannot_be_swept_is_refused(evedrop: Evedrop, more: tuple[str, ...], said: str) -> None:
+def test_what_cannot_be_swept_is_refused(evedrop: Evedrop, more: tuple[str, ...], message: str) -> None:
     """One clear line, exit 2, nothing written."""
     done = evedrop(*BASE, *more)
     assert (done.status, done.out) == (2, "")
     lines = [line for line in done.err.splitlines() if not line.endswith("1 mistake, nothing was started")]
     assert len(lines) == 1
-    assert said in lines[0]
+    assert message in lines[0]
     assert not (evedrop.folder / "run").exists()
 
 
@@ -256,7 +256,7 @@ def test_the_ratio_is_that_of_the_second_half_of_each_trial(tmp_path: Path) -> N
             continue
         made = load("eavesdroppers", {**changes, "encoding.state_probability": row["encoding.state_probability"]})
         errors = {
-            name: np.concatenate([one.receivers[name].error for one in Simulation(made, range(40)).chunks()])[61:]
+            name: np.concatenate([chunk.receivers[name].error for chunk in Simulation(made, range(40)).chunks()])[61:]
             for name in ("legitimate", row["peer"])
         }
         theirs, ours = errors[row["peer"]].sum(axis=0), errors["legitimate"].sum(axis=0)

@@ -83,17 +83,17 @@ def test_a_folder_of_scenarios_is_tested_in_memory(evedrop: Evedrop) -> None:
     suites = ET.parse(evedrop.folder / "reports" / "junit.xml").getroot()  # noqa: S314 - our own
     (suite,) = suites
     assert (suites.tag, suite.tag, suite.get("name")) == ("testsuites", "testsuite", "evedrop")
-    for one in (suites, suite):
-        assert [one.get(count) for count in ("tests", "failures", "errors", "skipped")] == ["3", "1", "1", "0"]
+    for element in (suites, suite):
+        assert [element.get(count) for count in ("tests", "failures", "errors", "skipped")] == ["3", "1", "1", "0"]
     assert [(case.get("classname"), case.get("name")) for case in suite] == [
         ("cases", "fails"), ("cases", "holds"), ("cases", "wrong"),
     ]  # fmt: skip
     times = [float(str(case.get("time"))) for case in suite]
     assert float(str(suite.get("time"))) == pytest.approx(sum(times), abs=0.01)
     assert [[part.tag for part in case] for case in suite] == [["properties", "failure"], ["properties"], ["error"]]
-    known = {one.get("name"): one.get("value") for one in suite[0][0]}
+    properties = {element.get("name"): element.get("value") for element in suite[0][0]}
     seed = str(Results.read(evedrop.folder / "kept/fails").summary["seed"])
-    assert known == {"seed": seed, "results": "kept/fails", "report": "kept/fails/report.html"}
+    assert properties == {"seed": seed, "results": "kept/fails", "report": "kept/fails/report.html"}
     assert "1 of 2 expectations FAILED" in checked(evedrop.folder / "kept/fails").texts
     assert str(suite[0][1].get("message")).startswith(failed)
     assert str(suite[2][0].text).splitlines() == [line.strip() for line in lines[6:-1]]
@@ -179,11 +179,11 @@ def test_a_report_holds_what_xml_cannot() -> None:
     strange = '<a> & "b" ]]> \x00\x1b[31m \ud800 \U0001f512'
     finding = Finding(f"a{strange}b.toml", Outcome.BROKEN, 1.25, (strange, "second"), 7, Path(f"runs/{strange}"))
     (case,) = ET.fromstring(junit_of([finding], 0.0).decode())[0]  # noqa: S314 - our own
-    known = '<a> & "b" ]]> \ufffd\ufffd[31m \ufffd \U0001f512'
-    assert case.get("name") == f"a{known}b"
+    text = '<a> & "b" ]]> \ufffd\ufffd[31m \ufffd \U0001f512'
+    assert case.get("name") == f"a{text}b"
     assert case.get("time") == "1.250"
-    assert case[0][1].get("value") == f"runs/{known}"
-    assert (case[1].tag, case[1].get("message"), case[1].text) == ("error", known, f"{known}\nsecond")
+    assert case[0][1].get("value") == f"runs/{text}"
+    assert (case[1].tag, case[1].get("message"), case[1].text) == ("error", text, f"{text}\nsecond")
 
 
 def in_the_second(*words: str, evedrop: Evedrop) -> Live:
@@ -295,8 +295,8 @@ def test_pytest_collects_scenarios_as_tests(evedrop: Evedrop) -> None:
     assert "results: kept/fails" in done.out
     assert "sluts: is not an entry of this table; did you mean slots?" in done.out
     assert Results.read(kept).summary["mode"] == "exact"
-    for said in ('name="evedrop_results" value="kept/holds"', 'name="evedrop_report" value="kept/holds/report.html"'):
-        assert said in (evedrop.folder / "r.xml").read_text()
+    for text in ('name="evedrop_results" value="kept/holds"', 'name="evedrop_report" value="kept/holds/report.html"'):
+        assert text in (evedrop.folder / "r.xml").read_text()
 
 
 @pytest.mark.long

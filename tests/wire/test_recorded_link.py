@@ -74,33 +74,33 @@ def carried(
 def test_the_models_of_a_link_are_found_again(tmp_path: Path) -> None:
     """From 6000 messages of two keys: losses, delays, copies and damage, within about four standard errors."""
     carried(tmp_path, plan_of(SETTINGS), {"0/scan/a": 3000, "0/scan/b": 3000})
-    found = fit_messages(journal_recording(tmp_path, "scan"))
-    settings = found.settings
-    assert found.fit.chosen.name == "gilbert"
+    result = fit_messages(journal_recording(tmp_path, "scan"))
+    settings = result.settings
+    assert result.fit.chosen.name == "gilbert"
     assert settings["loss"]["p"] == pytest.approx(0.05, abs=0.013)
     assert settings["loss"]["r"] == pytest.approx(0.3, abs=0.065)
     assert settings["delay"]["mean"] == pytest.approx(0.02, abs=2e-4)
     assert settings["delay"]["standard_deviation"] == pytest.approx(0.003, abs=2e-4)
     assert settings["duplicate"] == pytest.approx(0.05, abs=0.013)
-    whole = len(found.recording.delays)  # of the delivered messages that were not damaged, which alone arrive twice
-    assert settings["duplicate"] == pytest.approx(found.recording.series.repeated / whole, rel=0.005)
+    whole = len(result.recording.delays)  # of the delivered messages that were not damaged, which alone arrive twice
+    assert settings["duplicate"] == pytest.approx(result.recording.series.repeated / whole, rel=0.005)
     assert settings["corrupt"] == pytest.approx(0.04, abs=0.011)
-    assert found.recording.series.parts == 2
-    assert found.slot == pytest.approx(0.1)
+    assert result.recording.series.parts == 2
+    assert result.slot == pytest.approx(0.1)
 
 
 @pytest.mark.long
 def test_a_fitted_link_in_a_wire_loses_as_the_recorded_one(tmp_path: Path) -> None:
     """The printed [[link]] in a wire file: rate and bursts of 20 000 other messages are within 10 % of the recording's."""
     carried(tmp_path, plan_of(SETTINGS), {"0/scan/a": 20_000})
-    found = fit_messages(journal_recording(tmp_path, "scan"))
-    (link,) = tomllib.loads(found.wire_toml)["link"]
+    result = fit_messages(journal_recording(tmp_path, "scan"))
+    (link,) = tomllib.loads(result.wire_toml)["link"]
     assert (link["from"], link["to"], link["keys"]) == ("robot", "base", "*/scan/**")
     sides = {"robot": {"listen": "tcp/127.0.0.1:0"}, "base": {"listen": "tcp/127.0.0.1:0"}}
     again = wire_of({"seed": 8, "side": sides, "link": [link]})
     fates = KeyFates(again.links[0], "0/scan/b", "put", 8)
     lost = np.array([fates.next()[0] == WireFate.LOST for _ in range(20_000)])
-    recorded = found.recording.series.outcomes == 0
+    recorded = result.recording.series.outcomes == 0
     assert lost.mean() == pytest.approx(recorded.mean(), rel=0.1)
 
     def burst(word: Any) -> float:
@@ -116,11 +116,11 @@ def test_what_hides_the_loss_model_cuts_the_messages_into_parts(tmp_path: Path) 
         **dict.fromkeys(range(100, 130), WireFate.CUT), 200: WireFate.OVERFLOW, 300: WireFate.HELD_UP, 399: WireFate.UNDERWAY,
     }  # fmt: skip
     carried(tmp_path, plan_of(settings), {"0/scan/a": 400}, hidden)
-    found = journal_recording(tmp_path, "scan")
+    result = journal_recording(tmp_path, "scan")
     expected = [0 if n % 30 == 29 else 1 for n in range(400) if hidden.get(n) not in {WireFate.CUT, WireFate.OVERFLOW}]
-    assert found.series.outcomes.tolist() == expected
-    assert found.series.parts == 3
-    assert any("31 messages met a cut" in note for note in found.notes)
+    assert result.series.outcomes.tolist() == expected
+    assert result.series.parts == 3
+    assert any("31 messages met a cut" in note for note in result.notes)
     carried(tmp_path / "all", plan_of(settings), {"0/scan/a": 200}, dict.fromkeys(range(0, 200, 5), WireFate.CUT))
     with pytest.raises(TraceError, match="cuts, queues and limits hide"):
         journal_recording(tmp_path / "all", "scan")
@@ -140,13 +140,13 @@ def test_missing_numbers_are_what_was_lost_before_the_wire(tmp_path: Path) -> No
                 journal.record(1e9 + 0.1 * number, n, number + 1, 0.0, *codes, 64, 0, Kind.PUT, fate)
                 n += 1
         journal.record(1e9, 0, 5, 0.0, journal.key_code("0/scan/q"), 0, 64, 0, Kind.QUERY, WireFate.DELIVERED)
-    found = journal_recording(tmp_path, gaps=True)
+    result = journal_recording(tmp_path, gaps=True)
     expected: list[int] = []
     for word in words.values():
         places = np.flatnonzero(word)
         expected += word[places[0] : places[-1] + 1].astype(int).tolist()
-    assert found.series.outcomes.tolist() == expected
-    assert (found.series.parts, found.series.restarts, len(found.delays)) == (2, 0, 0)
+    assert result.series.outcomes.tolist() == expected
+    assert (result.series.parts, result.series.restarts, len(result.delays)) == (2, 0, 0)
 
 
 def test_the_command_takes_the_folder_of_a_wire(evedrop: Evedrop) -> None:
@@ -158,13 +158,13 @@ def test_the_command_takes_the_folder_of_a_wire(evedrop: Evedrop) -> None:
     text = done.out
     (wire,) = tomllib.loads(text[text.index("[[link]]") : text.index("# for a scenario")])["link"]
     assert wire["keys"] == "*/scan/a"
-    found = json.loads(evedrop("links", "fit", "runs", "--link", "scan", "--json").out)
-    assert found["outcomes"] == 2000
-    assert found["slot_seconds"] == pytest.approx(0.1)
+    fit_ = json.loads(evedrop("links", "fit", "runs", "--link", "scan", "--json").out)
+    assert fit_["outcomes"] == 2000
+    assert fit_["slot_seconds"] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ((), "has several links; expected --link and one of scan (300 messages), rest (1 messages)"),
         (("--link", "orders"), 'has no messages on a link "orders"; it has scan (300 messages), rest (1 messages)'),
@@ -179,13 +179,13 @@ def test_the_command_takes_the_folder_of_a_wire(evedrop: Evedrop) -> None:
         (("--link", "scan", "--outage", "5"), "--outage: expected --gaps with it"),
     ],
 )
-def test_mistakes_are_said(evedrop: Evedrop, arguments: Iterable[str], said: str) -> None:
+def test_mistakes_are_said(evedrop: Evedrop, arguments: Iterable[str], message: str) -> None:
     """One line, exit 2."""
     carried(evedrop.folder / "runs", plan_of(SETTINGS), {"0/scan/a": 300})
     done = evedrop("links", "fit", "runs", *arguments)
     assert (done.status, done.out) == (2, "")
     (line,) = done.err.splitlines()
-    assert said in line
+    assert message in line
 
 
 def test_a_folder_without_a_journal_is_refused(tmp_path: Path) -> None:

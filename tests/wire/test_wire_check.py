@@ -120,7 +120,7 @@ def test_keys_that_zenoh_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ([], "wire: expected a FILE; `evedrop wire --example` prints one"),
         (["--example", "FILE"], "wire --example: expected no FILE; it prints an example of one"),
@@ -133,13 +133,13 @@ def test_keys_that_zenoh_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[s
     ],
 )
 def test_what_the_command_refuses(
-    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Before it starts anything, with what was expected."""
     path = tmp_path / "wire.toml"
     path.write_text(example_wire())
     assert main(["wire", *(str(path) if word == "FILE" else word for word in words)]) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_key_without_any_link() -> None:
@@ -194,7 +194,7 @@ def test_the_command_runs_a_wire(tmp_path: Path, capsys: pytest.CaptureFixture[s
     printed = capsys.readouterr()
     endpoints = dict(line.split() for line in printed.out.splitlines()[:2])
     assert endpoints.keys() == {"robot", "base"}
-    assert all(re.fullmatch(r"tcp/127\.0\.0\.1:[1-9]\d*", one) for one in endpoints.values())
+    assert all(re.fullmatch(r"tcp/127\.0\.0\.1:[1-9]\d*", endpoint) for endpoint in endpoints.values())
     assert [line for line in printed.out.splitlines() if " s: " in line] == [
         "0.0 s: off we go",
         "0.0 s: cut robot-base",

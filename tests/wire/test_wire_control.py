@@ -40,36 +40,36 @@ def steered(folder: Path) -> Iterator[WireAtWork]:
 def test_a_wire_is_steered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Its links are changed, cut and healed, its sides partitioned and joined, and its status tells so."""
 
-    def said(*words: str) -> str:
+    def command(*words: str) -> str:
         status = main([words[0], str(tmp_path), *words[1:]])
         out, err = capsys.readouterr()
         return f"{status} {out or err}".strip()
 
     with steered(tmp_path) as wire, wire.program("robot") as sender:
         assert (
-            said("link", "robot-base", "quality=0.9")
+            command("link", "robot-base", "quality=0.9")
             == '0 link robot-base: loss = { model = "bernoulli", quality = 0.9 }'
         )
         assert wire.journal.changes_of("robot-base", "new", "put")[-1].settings["loss"]["quality"] == 0.9  # type: ignore[index]
-        assert said("link", "robot-base", "cut") == "0 cut robot-base"
+        assert command("link", "robot-base", "cut") == "0 cut robot-base"
         assert wire.relay.links["robot-base"].cut
-        assert said("partition", "robot", "base") == "0 partition robot, base"
-        assert said("link", "base-robot", "cut") == "0 cut base-robot"
-        assert said("link", "robot-base", "heal") == "0 heal robot-base"
+        assert command("partition", "robot", "base") == "0 partition robot, base"
+        assert command("link", "base-robot", "cut") == "0 cut base-robot"
+        assert command("link", "robot-base", "heal") == "0 heal robot-base"
         wait_until(lambda: sender.put("a", b"") or len(wire.rows), "a message is heard")
-        status = said("status").splitlines()
+        status = command("status").splitlines()
         assert status[0].endswith(" s, journal complete")
         assert status[1] == f"side robot: {wire.relay.endpoints['robot'][0]}"
         assert any(line.startswith("link robot-base: 0 of ") and line.endswith("cut") for line in status)
         assert status[-1].endswith(" s: heal robot-base")
-        assert said("heal", "base", "robot") == "0 heal robot, base"
+        assert command("heal", "base", "robot") == "0 heal robot, base"
         assert not wire.relay.links["robot-base"].cut
         assert wire.relay.links["base-robot"].cut
-        assert said("link", "base-robot", "heal") == "0 heal base-robot"
-        found = json.loads(said("status", "--json").removeprefix("0 "))
-        assert found["links"]["base-robot"] == {"heard": 0, "delivered": 0, "cut": False}
+        assert command("link", "base-robot", "heal") == "0 heal base-robot"
+        answer = json.loads(command("status", "--json").removeprefix("0 "))
+        assert answer["links"]["base-robot"] == {"heard": 0, "delivered": 0, "cut": False}
     assert not (tmp_path / "control.json").exists()
-    assert said("status").startswith("2 evedrop: no run is going on in")
+    assert command("status").startswith("2 evedrop: no run is going on in")
 
 
 class NoEvent(OperatorRequest):

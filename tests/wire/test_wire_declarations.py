@@ -25,7 +25,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "wire.md"
 def alive(session: zenoh.Session, key: str = "**") -> list[str]:
     """The tokens that a program sees."""
     replies = session.liveliness().get(key, zenoh.handlers.FifoChannel(10_000), timeout=5.0)
-    return sorted({str(one.ok.key_expr) for one in replies if one.ok is not None})
+    return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
 
 def test_more_tokens_cross_than_a_channel_of_zenoh_holds(tmp_path: Path) -> None:
@@ -66,17 +66,17 @@ def _matches(declared: Any) -> bool:
 
 def test_the_same_token_at_both_sides_lives_as_long_as_one_of_its_programs(tmp_path: Path) -> None:
     """Whichever ends first, the token of the other is seen from both sides in the end, and then it is gone."""
-    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as one, wire.program("base") as other:
-        for first, second in ((one, other), (other, one)):
+    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as first_program, wire.program("base") as other:
+        for first, second in ((first_program, other), (other, first_program)):
             token = first.liveliness().declare_token("both")
-            wait_until(lambda: alive(one) == alive(other) == ["both"], "both see it")
+            wait_until(lambda: alive(first_program) == alive(other) == ["both"], "both see it")
             further = second.liveliness().declare_token("both")
             token.undeclare()
-            found = partial(wire_knows, wire, "base" if second is other else "robot")
-            wait_until(found, "the wire finds the second")
-            wait_until(lambda: alive(one) == alive(other) == ["both"], "both see that of the second")
+            knows = partial(wire_knows, wire, "base" if second is other else "robot")
+            wait_until(knows, "the wire finds the second")
+            wait_until(lambda: alive(first_program) == alive(other) == ["both"], "both see that of the second")
             further.undeclare()
-            wait_until(lambda: not alive(one) and not alive(other), "it is gone")
+            wait_until(lambda: not alive(first_program) and not alive(other), "it is gone")
 
 
 @contextmanager
@@ -90,7 +90,9 @@ def router(*connect: str) -> Iterator[tuple[zenoh.Session, str]]:
         "adminspace": {"enabled": True},
     }
     with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
-        told = [one.ok.payload.to_bytes() for one in session.get(f"@/{session.zid()}/router") if one.ok is not None]
+        told = [
+            reply.ok.payload.to_bytes() for reply in session.get(f"@/{session.zid()}/router") if reply.ok is not None
+        ]
         yield session, json.loads(told[0])["locators"][0]
 
 
@@ -165,14 +167,14 @@ def test_a_program_that_passes_probes_on_joins_no_side_without_a_router(tmp_path
 
 def test_routers_that_do_not_join_sides_are_no_loop(tmp_path: Path) -> None:
     """Each side may have a router of its own, as robots have."""
-    with router() as (one, first), router() as (other, second):
+    with router() as (session, first), router() as (other, second):
         sides = {"robot": Side("robot", (ANYWHERE,), (first,)), "base": Side("base", (ANYWHERE,), (second,))}
         with at_work(plan_of(link("robot", "base"), sides=sides), tmp_path) as wire:
             heard: list[bytes] = []
             other.declare_subscriber("a", lambda sample: heard.append(sample.payload.to_bytes()))
 
             def crossed() -> bool:
-                one.put("a", b"x")
+                session.put("a", b"x")
                 return bool(heard)
 
             wait_until(crossed, "a message crosses from router to router")

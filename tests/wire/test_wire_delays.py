@@ -46,7 +46,7 @@ def test_a_delayed_message_comes_later_and_in_order(tmp_path: Path) -> None:
         robot.delete("x", congestion_control=BLOCK)
         wait_until(lambda: len(got) == len(come) == 21, "they come")
         assert min(come) - sent >= 0.2
-        assert [one.payload.to_string() for one in got] == [*(str(n) for n in range(20)), ""]
+        assert [sample.payload.to_string() for sample in got] == [*(str(n) for n in range(20)), ""]
         assert got[-1].kind == zenoh.SampleKind.DELETE
         assert got[0].attachment is not None
         delayed = wire.rows_of("x")
@@ -79,7 +79,7 @@ def test_what_is_still_delayed_when_the_wire_ends_is_counted(tmp_path: Path) -> 
         wait_until(lambda: robot.put("x", b"") or len(wire.rows) >= 3, "the wire hears")
     reasons = pa.concat_tables(journal_tables(tmp_path))["reason"].to_pylist()
     assert len(reasons) >= 3
-    assert {str(one).lower() for one in reasons} == {"underway"}
+    assert {str(reason).lower() for reason in reasons} == {"underway"}
 
 
 def test_a_doubled_message_comes_twice(tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_a_doubled_message_comes_twice(tmp_path: Path) -> None:
         robot.put("x", b"1")
         robot.delete("x")
         wait_until(lambda: len(got) == 4, "four come")
-        assert [one.kind == zenoh.SampleKind.PUT for one in got] == [True, True, False, False]
+        assert [sample.kind == zenoh.SampleKind.PUT for sample in got] == [True, True, False, False]
         doubled = wire.rows_of("x")
         assert doubled["kind"].tolist() == [Kind.PUT | AGAIN, Kind.DELETE | AGAIN]
 
@@ -107,18 +107,18 @@ def test_a_link_of_limited_rate_queues_messages_and_drops_what_does_not_fit(tmp_
         wait_until(lambda: len(wire.rows_of("x")) == 8, "the wire hears")
         rows = wire.rows_of("x")
         assert rows["fate"].tolist() == [WireFate.DELIVERED] * 5 + [WireFate.OVERFLOW] * 3
-        assert [round(one) for one in rows["delay"].tolist()] == [1, 2, 3, 4, 5, 0, 0, 0]
+        assert [round(delay) for delay in rows["delay"].tolist()] == [1, 2, 3, 4, 5, 0, 0, 0]
 
 
 def test_events_cut_and_part_links_and_change_them_while_the_wire_runs(tmp_path: Path) -> None:
     """But what is lossless passes; an operator's events are like those of the file."""
     plan = both_ways(lossless=("stop/**",), events=(WireEvent(0.0, None, note="go"),))
-    said: list[str] = []
+    messages: list[str] = []
     with (
         at_work(plan, tmp_path) as wire,
         wire.program("robot") as robot,
         wire.program("base") as base,
-        WireConductor(plan, wire.relay, said.append) as conductor,
+        WireConductor(plan, wire.relay, messages.append) as conductor,
     ):
         ready(wire, robot, base)
         got = reader(base, "stop/**")
@@ -130,7 +130,7 @@ def test_events_cut_and_part_links_and_change_them_while_the_wire_runs(tmp_path:
         wait_until(lambda: robot.put("x", b"") or 0 in wire.fates()[count + 1 :], "it passes again")
         conductor.change({"link": "robot-base", "set": {"quality": 0.0}})
         wait_until(lambda: robot.put("x", b"") or WireFate.LOST in wire.fates(), "the link loses everything")
-    assert [line.partition(": ")[2] for line in said][:3] == ["go", "partition robot, base", "heal robot, base"]
+    assert [line.partition(": ")[2] for line in messages][:3] == ["go", "partition robot, base", "heal robot, base"]
 
 
 def test_a_late_reader_gets_the_history_of_an_advanced_publisher(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_a_late_reader_gets_the_history_of_an_advanced_publisher(tmp_path: Path)
             subscriber: Any = advanced_subscriber(
                 late,
                 "map",
-                lambda one: got.append(one.payload.to_string()),
+                lambda sample: got.append(sample.payload.to_string()),
                 history=HistoryConfig(detect_late_publishers=True),
             )
             wait_until(lambda: len(got) == 3, "its history comes")
@@ -164,7 +164,7 @@ def test_an_advanced_reader_recovers_what_a_link_lost(tmp_path: Path) -> None:
         with wire.program("base") as base:
             got: list[str] = []
             subscriber: Any = advanced_subscriber(
-                base, "scan", lambda one: got.append(one.payload.to_string()), recovery=recovery
+                base, "scan", lambda sample: got.append(sample.payload.to_string()), recovery=recovery
             )
             wait_until(lambda: publisher.put("first") or got, "the reader is known")
             for n in range(30):
@@ -188,8 +188,8 @@ def test_every_row_is_in_the_files_of_the_journal(tmp_path: Path) -> None:
             base.put("b", str(n), congestion_control=BLOCK)
         wait_until(lambda: len(wire.rows) == 100, "the wire hears")
     table = pa.concat_tables(journal_tables(tmp_path))
-    found = pc.value_counts(table["link"].cast(pa.string())).to_pylist()
-    assert sorted(found, key=lambda one: str(one["values"]), reverse=True) == [
+    counts = pc.value_counts(table["link"].cast(pa.string())).to_pylist()
+    assert sorted(counts, key=lambda row: str(row["values"]), reverse=True) == [
         {"values": "robot-base", "counts": 50},
         {"values": "base-robot", "counts": 50},
     ]

@@ -33,10 +33,10 @@ def test_measured_deliveries(model: str) -> None:
     for ranges in ([range(2000)], RANGES):
         mean, variance = expected(settings, changes, ranges)
         taken = np.concatenate([np.arange(some.start, some.stop) for some in ranges])
-        found = (codes[:, taken] == Fate.DELIVERED).sum(axis=1)
+        delivered = (codes[:, taken] == Fate.DELIVERED).sum(axis=1)
         low, high = bounds(KEYS * mean, KEYS * variance, KEYS * len(taken))
-        assert low <= found.sum() <= high
-        spread, wide = float(np.var(found)) / variance, 4.0 * math.sqrt(2.0 / KEYS)
+        assert low <= delivered.sum() <= high
+        spread, wide = float(np.var(delivered)) / variance, 4.0 * math.sqrt(2.0 / KEYS)
         assert spread < 1.0 + wide
         if loss_of(LOSSES[model]).chain is not None or len(ranges) == 1:
             assert spread > 1.0 - wide
@@ -62,9 +62,9 @@ def test_variance_of_a_chain_with_gaps(model: str) -> None:
                 ahead = np.linalg.matrix_power(chain.transitions, abs(i - j))
                 both = float((chain.stationary * chain.quality) @ ahead @ chain.quality)
                 total += p * q * (both - mean * mean)
-    found = expected(settings, changes, ranges)
-    assert found[0] == pytest.approx(mean * sum(passes), rel=1e-12)
-    assert found[1] == pytest.approx(total, rel=1e-9)
+    result = expected(settings, changes, ranges)
+    assert result[0] == pytest.approx(mean * sum(passes), rel=1e-12)
+    assert result[1] == pytest.approx(total, rel=1e-9)
 
 
 def test_variance_of_a_recording_that_begins_anywhere() -> None:
@@ -88,14 +88,14 @@ def test_variance_of_a_recording_that_begins_anywhere() -> None:
 def test_a_change_of_the_loss_model_begins_a_new_memory() -> None:
     """Variances on both sides add up; a change of something else leaves them tied."""
     bursts = {"loss": LOSSES["gilbert-elliott"]}
-    one = expected(bursts, [], [range(100)])
+    whole = expected(bursts, [], [range(100)])
     other = expected(bursts, [], [range(500, 600)])
     between = [Change(100, {"loss": LOSSES["pattern"]}), Change(500, bursts)]
     apart = expected(bursts, between, [range(100), range(500, 600)])
-    assert apart == pytest.approx((one[0] + other[0], one[1] + other[1]))
+    assert apart == pytest.approx((whole[0] + other[0], whole[1] + other[1]))
     tied = expected(bursts, [Change(100, {**bursts, "duplicate": 0.5})], [range(200)])
     assert tied == pytest.approx(expected(bursts, [], [range(200)]))
-    assert tied[1] > 1.01 * (one[1] + other[1])
+    assert tied[1] > 1.01 * (whole[1] + other[1])
 
 
 def test_many_messages() -> None:

@@ -52,16 +52,16 @@ def example(wire: WireAtWork, side: str, name: str, *options: str) -> Iterator[E
     where = ["-m", "client", "-e", wire.relay.endpoints[side][0], "--no-multicast-scouting"]
     command = [sys.executable, "-u", str(EXAMPLES / f"{name}.py"), *where, *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    found = Example(process)
+    example = Example(process)
     try:
-        yield found
+        yield example
     finally:
-        found.end()
+        example.end()
 
 
-def known(wire: WireAtWork, side: str, what: str, key: str) -> None:
+def known(wire: WireAtWork, side: str, subject: str, key: str) -> None:
     """Return when the router of a side knows a declaration."""
-    wait_until(lambda: is_declared(wire, side, what, key), f"{what} of {key}")
+    wait_until(lambda: is_declared(wire, side, subject, key), f"{subject} of {key}")
 
 
 def test_z_sub_hears_of_z_pub_exactly_what_the_link_lets_through(tmp_path: Path) -> None:

@@ -21,10 +21,10 @@ def test_a_failed_expectation_is_told_apart_from_the_rest(tmp_path: Path) -> Non
             ],
         }
     )
-    said: list[str] = []
+    messages: list[str] = []
     wrong: list[str] = []
-    with sending(said):
-        assert run_wire(plan, tmp_path / "out", seconds=1.0, say=said.append, complain=wrong.append) == 1
+    with sending(messages):
+        assert run_wire(plan, tmp_path / "out", seconds=1.0, say=messages.append, complain=wrong.append) == 1
     assert wrong == ["expected robot-base.delivery below 0.5: FAILED, found 1"]
-    assert "expected robot-base.delivery above 0.5: held, found 1" in said
-    assert wrong[0] not in said
+    assert "expected robot-base.delivery above 0.5: held, found 1" in messages
+    assert wrong[0] not in messages

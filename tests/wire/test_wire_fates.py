@@ -61,16 +61,16 @@ def test_delays_are_those_of_the_model_in_seconds(model: str) -> None:
     delay = delay_of(DELAYS[model])
     words = Stream(stream_key(root_of_seed(SEED), "wire/delay/scan/put/robot/scan"), range(1), 1).words(range(3000))
     numbers = (normals(words) if delay.normal else uniforms(words))[:, :, 0]
-    found = taken(of_scan({"loss": {"model": "bernoulli", "quality": 1.0}, "delay": DELAYS[model]}), 3000)
-    assert [one[1] for one in found] == delay.delays(0, numbers)[:, 0].tolist()
-    assert {one[0] for one in found} == {Fate.DELIVERED}
+    result = taken(of_scan({"loss": {"model": "bernoulli", "quality": 1.0}, "delay": DELAYS[model]}), 3000)
+    assert [fate[1] for fate in result] == delay.delays(0, numbers)[:, 0].tolist()
+    assert {fate[0] for fate in result} == {Fate.DELIVERED}
 
 
 def test_duplicates_corruption_and_overtaking() -> None:
     """Each has its probability; only delivered messages have a copy, and a message that overtakes has no delay."""
     count = 20_000
-    found = taken(of_scan({**FULL, "loss": {"model": "bernoulli", "quality": 1.0}}), count)
-    codes, delays, again = (np.array(column) for column in zip(*found, strict=True))
+    result = taken(of_scan({**FULL, "loss": {"model": "bernoulli", "quality": 1.0}}), count)
+    codes, delays, again = (np.array(column) for column in zip(*result, strict=True))
     for rate, probability in (
         ((codes == Fate.CORRUPTED).mean(), 0.05),
         ((delays == 0.0).mean(), 0.1),
@@ -94,7 +94,7 @@ def test_other_keys_kinds_links_and_seeds_have_other_fates() -> None:
         KeyFates(wire_link(FULL), "robot/scan", "put", SEED + 1),
         KeyFates(wire_link(FULL, "other"), "robot/scan", "put", SEED),
     ]
-    in_turn = list(zip(*([one.next() for one in several] for _ in range(300)), strict=True))
+    in_turn = list(zip(*([fates_.next() for fates_ in several] for _ in range(300)), strict=True))
     assert len(set(in_turn)) == 5
     assert list(in_turn[0]) == taken(of_scan(FULL), 300)
 
@@ -154,14 +154,14 @@ def test_many_messages_before_the_start() -> None:
 def test_changes_while_messages_pass(turns: list[tuple[int, int]]) -> None:
     """A change holds from the next message on, as if it had been known from the beginning."""
     choices = (POOR, FULL, {"loss": LOSSES["markov"], "delay": DELAYS["pareto"]}, {"loss": LOSSES["distance"]})
-    fates, found, made = of_scan(FULL), [], []
+    fates, passed, made = of_scan(FULL), [], []
     for wait, choice in turns:
-        found += taken(fates, wait)
-        assert fates.change(choices[choice]) == len(found)
-        made.append(Change(len(found), choices[choice]))
-    found += taken(fates, 100)
-    assert fates.n == len(found)
-    assert found == taken(of_scan(FULL, changes=made), len(found))
+        passed += taken(fates, wait)
+        assert fates.change(choices[choice]) == len(passed)
+        made.append(Change(len(passed), choices[choice]))
+    passed += taken(fates, 100)
+    assert fates.n == len(passed)
+    assert passed == taken(of_scan(FULL, changes=made), len(passed))
 
 
 def test_correlated_links_lose_together() -> None:

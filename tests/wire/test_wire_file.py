@@ -212,7 +212,7 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
 
 def test_all_mistakes_of_tables_at_once() -> None:
     """They are in one message; those that only show across tables wait until every table is valid."""
-    found = mistakes_of(
+    mistakes = mistakes_of(
         of,
         """
     lossles = []
@@ -231,7 +231,7 @@ def test_all_mistakes_of_tables_at_once() -> None:
     partition = ["robot", "bsae"]
     """,
     )
-    assert found == [
+    assert mistakes == [
         'side.base.listen.1: is "tcp/127.0.0.1"; expected PROTOCOL/HOST:PORT with the protocol tcp, tls, quic, ws or '
         "unixsock-stream, such as tcp/127.0.0.1:7448",
         "link.0.quality: is 1.5; expected a number from 0 to 1, such as 0.9",
@@ -246,7 +246,7 @@ def test_all_mistakes_of_tables_at_once() -> None:
 
 def test_all_mistakes_across_tables_at_once() -> None:
     """Where every table is valid by itself, they are in one message."""
-    found = mistakes_of(
+    mistakes = mistakes_of(
         of,
         """
     [side.robot]
@@ -263,7 +263,7 @@ def test_all_mistakes_across_tables_at_once() -> None:
     link = "scan"
     """,
     )
-    assert found == [
+    assert mistakes == [
         'side.base.listen.0: is "tcp/0.0.0.0:7448", the same place as tcp/127.0.0.1:7448 at which side robot listens; '
         "expected another port",
         'link.0.from: is "robto"; expected robot or base; did you mean robot?',
@@ -335,7 +335,7 @@ def test_one_mistake(text: str, place: str | None, golden: Golden) -> None:
 
 def test_a_correlated_link_keeps_its_model() -> None:
     """Its uniform numbers are the other link's, and each model uses them in its own way."""
-    found = mistakes_of(
+    mistakes = mistakes_of(
         of,
         f"""{BASE}correlation = {{ with = "x", strength = 0.5 }}
     [[link]]
@@ -348,7 +348,7 @@ def test_a_correlated_link_keeps_its_model() -> None:
     set = {{ loss = {{ model = "pattern", outcomes = "10" }} }}
     """,
     )
-    assert found == [
+    assert mistakes == [
         "event.0.set.loss.model: differs from the first one, but the link's losses are tied to another link's; expected the same "
         "model"
     ]
@@ -380,7 +380,7 @@ def test_what_is_not_a_length_of_time(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "overlap"),
+    ("one_place", "other", "overlap"),
     [
         ("tcp/127.0.0.1:7", "tcp/127.0.0.1:7", True),
         ("tcp/127.0.0.1:7", "ws/localhost:7#a=b", True),
@@ -392,9 +392,9 @@ def test_what_is_not_a_length_of_time(text: str) -> None:
         ("unixsock-stream//a", "tcp/127.0.0.1:7", False),
     ],
 )
-def test_places(one: str, other: str, overlap: bool) -> None:
+def test_places(one_place: str, other: str, overlap: bool) -> None:
     """Two endpoints overlap if nothing can listen on both."""
-    first, second = place_of(one), place_of(other)
+    first, second = place_of(one_place), place_of(other)
     assert first is not None
     assert second is not None
     assert first.overlaps(second) == second.overlaps(first) == overlap

@@ -47,15 +47,15 @@ def removed_while_it_runs(running: RunningWire, remove: Callable[[Path], object]
         with robot, base, base.declare_subscriber("*", lambda sample: got.append(str(sample.key_expr))):
             wait_until(lambda: robot.put("before", b"") or "before" in got, "messages cross")
             remove(running.folder)
-            (said,) = wait_until(lambda: errors_of(running), "it is said at once")
-            assert f"{folder} was removed or moved while the wire runs, so the wire no longer has a journal" in said
+            (message,) = wait_until(lambda: errors_of(running), "it is said at once")
+            assert f"{folder} was removed or moved while the wire runs, so the wire no longer has a journal" in message
             wait_until(lambda: robot.put("after", b"") or "after" in got, "messages go on crossing")
 
 
-@pytest.mark.parametrize("what", mostly_long(LOST, ["all", "unfinished"]))
-def test_a_wire_without_its_folder_says_so_at_once(what: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("case", mostly_long(LOST, ["all", "unfinished"]))
+def test_a_wire_without_its_folder_says_so_at_once(case: str, tmp_path: Path) -> None:
     """Messages still cross; the last sentence says what is left, and the status is 3."""
-    remove, folder, summed_up = LOST[what]
+    remove, folder, summed_up = LOST[case]
     out = tmp_path / "out"
     links = [{"from": "robot", "to": "base"}, {"from": "base", "to": "robot"}]
     running = wire(side=["robot", "base"], link=links, out=out)

@@ -81,8 +81,8 @@ def test_a_wire_is_opened_steered_read_and_judged(tmp_path: Path) -> None:
     assert summary["links"]["scan"]["delivered"] == len(got)
     page = checked(tmp_path / "wire")
     assert {"1 of 1 expectations FAILED", "partition robot, base", *summary["made_with"].values()} <= set(page.texts)
-    assert [one["event"].split()[0] for one in summary["events"]] == ["link", "partition", "heal", "cut", "heal"]
-    assert {one["event"] for one in summary["events"]} <= set(page.texts)
+    assert [event["event"].split()[0] for event in summary["events"]] == ["link", "partition", "heal", "cut", "heal"]
+    assert {event["event"] for event in summary["events"]} <= set(page.texts)
     with pytest.raises(UsageError, match="no run is going on"):
         running.cut("scan")
 
@@ -119,8 +119,8 @@ def used(running: RunningWire, got: list[int]) -> None:
     assert {row["n"]: row["reason"] for row in rows if row["n"] > 399} == {
         400: None, 401: "cut", 402: "cut", 403: None,
     }  # fmt: skip
-    found = running.summary()["links"]["scan"]
-    assert (found["heard"], found["delivered"], found["lost_by"]["cut"]) == (404, len(got), 2)
+    scan = running.summary()["links"]["scan"]
+    assert (scan["heard"], scan["delivered"], scan["lost_by"]["cut"]) == (404, len(got), 2)
     running.expect("scan.delivery", above=0.5, below=0.7)
     running.expect(link="scan")
     with pytest.raises(ExpectationFailed, match=r"expected 0\.5 quantile of scan\.latency above 1: FAILED, found 0"):
@@ -197,7 +197,7 @@ def test_a_wire_that_cannot_begin_says_why(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "entries", "error", "said"),
+    ("arguments", "entries", "error", "message"),
     [
         (("missing.toml",), {}, UsageError, "cannot be read"),
         ((), {"side": ["robot"], "link": [LINK]}, ScenarioError, 'link.0.to: is "base"'),
@@ -205,10 +205,10 @@ def test_a_wire_that_cannot_begin_says_why(tmp_path: Path) -> None:
     ],
 )
 def test_mistakes_are_said_before_anything_begins(
-    arguments: tuple[Any, ...], entries: Mapping[str, Any], error: type[UsageError], said: str, tmp_path: Path
+    arguments: tuple[Any, ...], entries: Mapping[str, Any], error: type[UsageError], message: str, tmp_path: Path
 ) -> None:
     """By the call, before the `with` statement; no folder is made."""
-    with pytest.raises(error, match=said):
+    with pytest.raises(error, match=message):
         wire(*arguments, **{"out": tmp_path / "wire", **entries})
     assert list(tmp_path.iterdir()) == []
 
@@ -246,8 +246,8 @@ def test_metrics_from_the_disk_are_those_of_the_wire(tmp_path: Path) -> None:
     with WireJournal(tmp_path, plan) as journal:
         journal.record(1e9, 50, -1, 0.0, journal.key_code("scan/0"), 0, 64, 0, Kind.PUT, WireFate.DELIVERED)
         journal.flush()
-        found = scorekeeper_on_disk(tmp_path, plan).summary()
-    assert (found.start, found.heard, found.links["scan"].delivered) == (2, 1, 1)
+        summary = scorekeeper_on_disk(tmp_path, plan).summary()
+    assert (summary.start, summary.heard, summary.links["scan"].delivered) == (2, 1, 1)
 
 
 def test_a_journal_with_two_fates_of_a_message_is_refused(tmp_path: Path) -> None:

@@ -62,9 +62,9 @@ def test_the_lines_of_the_page_read_a_journal(tmp_path: Path, monkeypatch: pytes
             for n in range(heard):
                 put(journal, n)
             if heard:
-                found = read_as_the_page(lines)
+                frame = read_as_the_page(lines)
         assert read_as_the_page(lines).num_rows == heard
-    assert found.num_rows == 3
+    assert frame.num_rows == 3
 
 
 def read_as_the_page(lines: str) -> pa.Table:
@@ -92,15 +92,15 @@ def test_every_record_of_many_threads_is_in_parquet_exactly_once(tmp_path: Path)
 
     with WireJournal(tmp_path, wire_plan(), part_rows=1000) as journal:
         journal.listeners.append(heard.append)
-        threads = [threading.Thread(target=work, args=(f"scan/{one}",)) for one in range(4)]
+        threads = [threading.Thread(target=work, args=(f"scan/{index}",)) for index in range(4)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
     rows = rows_of(tmp_path)
-    for one in range(4):
-        assert [row["n"] for row in rows if row["key"] == f"scan/{one}"] == list(range(3000))
-        assert journal.counts["scan", f"scan/{one}", "put"] == 3000
+    for index in range(4):
+        assert [row["n"] for row in rows if row["key"] == f"scan/{index}"] == list(range(3000))
+        assert journal.counts["scan", f"scan/{index}", "put"] == 3000
     blocks = np.concatenate(heard)
     assert [(journal.key_of(key), n) for key, n in zip(blocks["key"], blocks["n"], strict=True)] == [
         (row["key"], row["n"]) for row in rows
@@ -288,14 +288,17 @@ def test_the_settings_that_each_message_had_are_known_after_a_restart(tmp_path: 
         put(first, n)
     first.change("scan", BETTER, {("scan/1", "put"): 6})
     first.close()
-    assert [(one.at, one.settings) for one in first.changes_of("scan", "scan/1", "put")] == [(0, LOSSY), (6, BETTER)]
-    assert [(one.at, one.settings) for one in first.changes_of("scan", "scan/2", "put")] == [(0, BETTER)]
+    assert [(change.at, change.settings) for change in first.changes_of("scan", "scan/1", "put")] == [
+        (0, LOSSY),
+        (6, BETTER),
+    ]
+    assert [(change.at, change.settings) for change in first.changes_of("scan", "scan/2", "put")] == [(0, BETTER)]
     history = tmp_path / "journal" / "history.jsonl"
     history.write_bytes(history.read_bytes() + b'{"change": "sc')  # torn
     with WireJournal(tmp_path, wire_plan()) as second:
-        changes = [(one.at, one.settings) for one in second.changes_of("scan", "scan/1", "put")]
+        changes = [(change.at, change.settings) for change in second.changes_of("scan", "scan/1", "put")]
         assert changes == [(0, LOSSY), (6, BETTER), (10, LOSSY)]
-        assert [one.at for one in second.changes_of("scan", "scan/2", "put")] == [0]
+        assert [change.at for change in second.changes_of("scan", "scan/2", "put")] == [0]
     assert [json.loads(line).get("start") for line in history.read_text().splitlines()] == [1, None, None, 2, None]
     history.write_text("nonsense\n")
     with pytest.raises(UsageError, match=r"history.jsonl, line 1, is not the history of a wire; give another folder"):
@@ -488,9 +491,9 @@ def test_a_table_of_records_gives_them_back() -> None:
     records["link"], records["key"] = np.where(at % 3 == 2, UNLINKED, at % 3), at % 4
     words = Words(["scan", "command"], {1: "scan/1", 2: "scan/2", 3: "stop"}, {})
     table = table_of(records, words)
-    found = records_of(table, {"scan": 0, "command": 1}, {"scan/1": 1, "scan/2": 2, "stop": 3})
+    result = records_of(table, {"scan": 0, "command": 1}, {"scan/1": 1, "scan/2": 2, "stop": 3})
     for name in RECORD.names or ():
-        assert np.array_equal(found[name], records[name]), name
+        assert np.array_equal(result[name], records[name]), name
     assert table["fate"].to_pylist() == [
         "delivered" if fate is WireFate.DELIVERED else "lost" if fate.emulated else "dropped"
         for fate in map(WireFate, records["fate"])

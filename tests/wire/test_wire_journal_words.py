@@ -34,10 +34,10 @@ class Overtaken(dict[str, int]):
 
     def get(self, key: str, default: Any = None) -> Any:
         """As of any dictionary."""
-        found, then, self.then = super().get(key, default), self.then, None
+        value, then, self.then = super().get(key, default), self.then, None
         if then is not None:
             then()
-        return found
+        return value
 
 
 def test_a_key_that_two_threads_name_at_once_is_admitted_once(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ DELIVERED, LOST, DELAYED = 6, 3, 1
 def folders(tmp_path: Path) -> Iterator[dict[str, Path]]:
     """The folders of a wire while it runs, and of one that was killed in its second start."""
     plan, out = both_ways(LOSSY), tmp_path / "running"
-    found = {"running": out, "killed": tmp_path / "killed"}
+    folders_ = {"running": out, "killed": tmp_path / "killed"}
     with WireJournal(out, plan) as journal:
         journal.record(time.time(), 0, -1, 0.0, journal.key_code("scan"), 0, 8, 0, Kind.PUT, WireFate.LOST)
     with WireJournal(out, plan) as journal:
@@ -43,8 +43,8 @@ def folders(tmp_path: Path) -> Iterator[dict[str, Path]]:
         for n, fate in enumerate(fates):
             delay, held = (1000.0, HELD) if n < DELAYED else (0.0, 0)
             journal.record(time.time(), 1 + n, -1, delay, journal.key_code("scan"), 0, 8, 0, Kind.PUT, fate | held)
-        shutil.copytree(out, found["killed"])
-        yield found
+        shutil.copytree(out, folders_["killed"])
+        yield folders_
 
 
 @pytest.mark.parametrize(
@@ -60,11 +60,11 @@ def test_a_wire_without_a_summary_is_summed_up_from_its_journal(
 ) -> None:  # fmt: skip
     """Its latest start: a message that was still delayed when the wire was killed did not arrive."""
     folder = folders[state]
-    found = summary_of_wire(folder)
-    link = found.links["robot-base"]
-    assert (found.state, found.start, found.heard) == (state, 2, DELIVERED + LOST + DELAYED)
+    summary = summary_of_wire(folder)
+    link = summary.links["robot-base"]
+    assert (summary.state, summary.start, summary.heard) == (state, 2, DELIVERED + LOST + DELAYED)
     assert (link.delivered, link.lost_by, link.dropped_by) == (delivered, {"loss": LOST}, dropped)
-    assert 0.0 < found.seconds < 100.0
+    assert 0.0 < summary.seconds < 100.0
     assert main(["view", str(folder), "--table"]) == 0
     sentence = f"{says}: these are the metrics that its journal gives so far"
     printed = capfd.readouterr().out
@@ -103,9 +103,9 @@ def test_a_wire_that_heard_nothing_has_lasted_until_it_was_last_alive(tmp_path: 
     plan = both_ways(LOSSY)
     with WireJournal(tmp_path, plan):
         (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
-        found = summary_of_wire(tmp_path)
-    assert (found.heard, found.state) == (0, "running")
-    assert 0.0 < found.seconds < 100.0
+        summary = summary_of_wire(tmp_path)
+    assert (summary.heard, summary.state) == (0, "running")
+    assert 0.0 < summary.seconds < 100.0
 
 
 @pytest.mark.parametrize("corrupt", [5, -0.1, "0.1"])

@@ -146,9 +146,9 @@ def test_a_key_that_was_forgotten_goes_on(lossy: LinkState, lossless: bool) -> N
     lossy.forget("put", "scan")
     lossy.change({**LOSSY, "rate": 1000.0, "queue": 60})
     decide = lossy.lane("put", "scan", lossless)
-    found = before + [decide(float(n), 1) for n in range(50, 100)]
+    decisions = before + [decide(float(n), 1) for n in range(50, 100)]
     fates = KeyFates(lossy.link, "scan", "put", 7)
-    assert [one[:2] for one in found] == [(n, 0 if lossless else fates.next()[0]) for n in range(100)]
+    assert [decision[:2] for decision in decisions] == [(n, 0 if lossless else fates.next()[0]) for n in range(100)]
     assert lossy.lane("query", "scan", lossless)(0.0, 1)[0] == 0
     assert lossy.lane("put", "pose", lossless)(0.0, 1)[0] == 0
 
@@ -235,7 +235,7 @@ def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
         "delay": {"model": "trace", "values": [n / 8 for n in range(40_000)]},
     }
     plan = both_ways(delays)
-    found: list[list[Decision]] = [[], [], []]
+    decisions: list[list[Decision]] = [[], [], []]
     before = sys.getswitchinterval()
     with WireJournal(tmp_path, plan) as journal:
         state = LinkState(plan.links[0], plan, journal)
@@ -245,7 +245,7 @@ def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
             for _ in range(10_000):
                 into.append(decide(0.0, 1))
 
-        threads = [threading.Thread(target=take, args=(into,)) for into in found]
+        threads = [threading.Thread(target=take, args=(into,)) for into in decisions]
         sys.setswitchinterval(1e-6)
         try:
             for thread in threads:
@@ -253,7 +253,7 @@ def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
             changes = 0
             while any(thread.is_alive() for thread in threads):
                 if (
-                    sum(map(len, found)) >= 100 * changes
+                    sum(map(len, decisions)) >= 100 * changes
                 ):  # as often as they like, changes would leave the threads no turn
                     changes += 1
                     state.change({**delays, "queue": changes})
@@ -261,7 +261,7 @@ def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
         finally:
             sys.setswitchinterval(before)
     assert changes > 1
-    assert sorted(one for into in found for one in into) == [(n, 0, n / 8, False) for n in range(30_000)]
+    assert sorted(decision for into in decisions for decision in into) == [(n, 0, n / 8, False) for n in range(30_000)]
 
 
 def test_settings_that_stay_the_same_are_not_written_again(lossy: LinkState, tmp_path: Path) -> None:

@@ -13,7 +13,9 @@ from tests.wire.wire_at_work import DEAD, at_work, both_ways, link, plan_of
 
 def alive(session: zenoh.Session, key: str = "**") -> list[str]:
     """The tokens that a program sees."""
-    return sorted({str(one.ok.key_expr) for one in session.liveliness().get(key, timeout=5.0) if one.ok is not None})
+    return sorted(
+        {str(reply.ok.key_expr) for reply in session.liveliness().get(key, timeout=5.0) if reply.ok is not None}
+    )
 
 
 @pytest.mark.parametrize("key", ["fleet/1", "@ros2_lv/0/abc/0/0/NN/%/%/talker"])
@@ -23,7 +25,7 @@ def test_a_token_crosses_with_its_history_and_goes_with_its_program(tmp_path: Pa
         seen: list[tuple[str, bool]] = []
         expression = key.split("/", maxsplit=1)[0] + "/**"
         watcher.liveliness().declare_subscriber(
-            expression, lambda one: seen.append((str(one.key_expr), one.kind == zenoh.SampleKind.PUT))
+            expression, lambda sample: seen.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
         )
         with wire.program("robot") as robot:
             token = robot.liveliness().declare_token(key)  # it lives as long as the object
@@ -32,7 +34,7 @@ def test_a_token_crosses_with_its_history_and_goes_with_its_program(tmp_path: Pa
                 assert alive(late, expression) == [key]
                 history: list[str] = []
                 late.liveliness().declare_subscriber(
-                    expression, lambda one: history.append(str(one.key_expr)), history=True
+                    expression, lambda sample: history.append(str(sample.key_expr)), history=True
                 )
                 wait_until(lambda: history == [key], "its history is there")
         wait_until(lambda: seen == [(key, True), (key, False)], "the token vanishes with its program")
@@ -49,7 +51,7 @@ def test_a_tap_shows_tokens_and_hides_the_listener(tmp_path: Path) -> None:
         wire.program("listener") as listener,
     ):
         programs = {"robot": robot, "base": base, "listener": listener}
-        tokens = [one.liveliness().declare_token(name) for name, one in programs.items()]
+        tokens = [program.liveliness().declare_token(name) for name, program in programs.items()]
         wait_until(lambda: alive(robot) == ["base", "robot"], "the base's token crosses against its link")
         wait_until(lambda: alive(listener) == ["listener", "robot"], "the listener sees the robot")
         wait_until(lambda: alive(base) == ["base", "robot"], "the base sees the robot")

@@ -45,4 +45,4 @@ def test_a_metric_is_a_number_of_the_summary(name: str, value: float) -> None:
 
 def test_a_latency_is_the_quantile_that_is_asked_for() -> None:
     """By default the median."""
-    assert [WIRE_METRICS["latency"].value(link(12), DELAYS, one) for one in (0.9, None)] == [0.9, 0.5]
+    assert [WIRE_METRICS["latency"].value(link(12), DELAYS, value) for value in (0.9, None)] == [0.9, 0.5]

@@ -23,9 +23,9 @@ def test_what_arrives_is_what_the_fates_say(tmp_path: Path) -> None:
         *(link("robot", "base", {"loss": loss}, f"{model}/**", name=model) for model, loss in LOSSES.items())
     )
     due = {}
-    for one in plan.links:
-        fates = KeyFates(one, f"{one.name}/x", "put", plan.seed)
-        due[one.name] = [n for n in range(COUNT) if fates.next()[0] == Fate.DELIVERED]
+    for wire_link in plan.links:
+        fates = KeyFates(wire_link, f"{wire_link.name}/x", "put", plan.seed)
+        due[wire_link.name] = [n for n in range(COUNT) if fates.next()[0] == Fate.DELIVERED]
     heard: dict[str, list[int]] = defaultdict(list)
 
     others: list[str] = []
@@ -54,7 +54,7 @@ def test_what_arrives_is_what_the_fates_say(tmp_path: Path) -> None:
                     other.put("of another key on the same link")
         wait_until(lambda: sum(map(len, heard.values())) >= sum(map(len, due.values())), "all messages have arrived")
     assert heard == due
-    for one in plan.links:
-        mean, variance = expected(one.settings, [], [range(COUNT)])
+    for wire_link in plan.links:
+        mean, variance = expected(wire_link.settings, [], [range(COUNT)])
         low, high = bounds(mean, variance, COUNT)
-        assert low <= len(heard[one.name]) <= high
+        assert low <= len(heard[wire_link.name]) <= high

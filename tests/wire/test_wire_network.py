@@ -74,16 +74,16 @@ def delivered(results: Results, receiver: str) -> list[bool]:
 
 def fates_on(plan: WirePlan, name: str, slots: int) -> list[bool]:
     """The same of messages that a program publishes, one in each slot, by the wire's own fates."""
-    link = next(one for one in plan.links if one.name == name)
-    fates, found, before = KeyFates(link, KEY, "put", plan.seed), [], link.settings
+    link = next(link for link in plan.links if link.name == name)
+    fates, fates_of, before = KeyFates(link, KEY, "put", plan.seed), [], link.settings
     for k in range(slots):
-        now = [one for one in moments(plan) if one.time <= k * SECONDS + 1e-9][-1]
+        now = [moment for moment in moments(plan) if moment.time <= k * SECONDS + 1e-9][-1]
         if now.settings[name] != before:
             before = now.settings[name]
             fates.change(before)
         code, delay, _ = fates.next()
-        found.append(code == Fate.DELIVERED and name not in now.cut and delay < SECONDS)
-    return found
+        fates_of.append(code == Fate.DELIVERED and name not in now.cut and delay < SECONDS)
+    return fates_of
 
 
 EVENTS = [
@@ -106,9 +106,9 @@ def test_packets_have_the_fates_of_messages(tmp_path: Path) -> None:
     scenario = replaced(plan)
     memory = montecarlo(scenario, trials=1, out=tmp_path / "memory", plan=Plan(workers=1))
     for receiver, name in (("legitimate", "radio"), ("eve", "tap")):
-        found = delivered(memory, receiver)
-        assert found == fates_on(plan, name, 300)
-        assert 0 < sum(found) < 300
+        result = delivered(memory, receiver)
+        assert result == fates_on(plan, name, 300)
+        assert 0 < sum(result) < 300
     live = run(scenario, out=tmp_path / "live")
     again = montecarlo(tmp_path / "live", trials=1, out=tmp_path / "again", plan=Plan(workers=1))
     assert difference(live, memory).same
@@ -139,11 +139,11 @@ def test_a_program_on_the_wire_loses_what_the_run_loses(tmp_path: Path) -> None:
         for k in range(200):
             publisher.put(str(k).encode())
         fates = work.when_heard(400)
-        expected = sum(one == 0 for one in fates)
+        expected = sum(fate == 0 for fate in fates)
         wait_until(lambda: sum(map(len, heard.values())) == expected, "all messages arrive")
-    found = montecarlo(replaced(plan, over_the_air(200)), trials=1, out=tmp_path / "run", plan=Plan(workers=1))
+    result = montecarlo(replaced(plan, over_the_air(200)), trials=1, out=tmp_path / "run", plan=Plan(workers=1))
     for receiver, side in (("legitimate", "base"), ("eve", "listener")):
-        assert {k for k, one in enumerate(delivered(found, receiver)) if one} == heard[side]
+        assert {k for k, fate in enumerate(delivered(result, receiver)) if fate} == heard[side]
 
 
 def test_states_may_cross_a_wire(tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_states_may_cross_a_wire(tmp_path: Path) -> None:
                 player.kill()
     lines = (tmp_path / "run" / "states.csv").read_text().splitlines()[1:]
     taken = [int(float(line.partition(",")[0])) for line in lines]
-    through = [k for k, one in enumerate(fates_on(plan, "radio", taken[-1] + 1)) if one]
+    through = [k for k, fate in enumerate(fates_on(plan, "radio", taken[-1] + 1)) if fate]
     assert taken == through[-40:]
     assert taken[-1] - taken[0] > 39
 
@@ -245,16 +245,18 @@ def test_the_command_takes_a_wire(tmp_path: Path, capsys: pytest.CaptureFixture[
     file.write_text(
         '[side.sensor]\n[side.base]\n[[link]]\nname = "radio"\nfrom = "sensor"\nto = "base"\nquality = 0.25\n'
     )
-    sides = [one for name in ("legitimate", "smart", "naive", "suspicious") for one in ("--wire-side", f"{name}=base")]
+    sides = [
+        word for name in ("legitimate", "smart", "naive", "suspicious") for word in ("--wire-side", f"{name}=base")
+    ]
     rest = ["--wire-key", KEY, *sides, "--slots", "40", "--trials", "2", "--out", str(out), "--set", "expect=[]"]
     assert main(["montecarlo", "eavesdroppers", "--wire", str(file), *rest]) == 0
-    found = load(out)
-    assert found.wire is not None
-    assert found.wire.links == dict.fromkeys(found.receivers, "radio")
-    assert set(found.quality.values()) == {0.25}
+    scenario = load(out)
+    assert scenario.wire is not None
+    assert scenario.wire.links == dict.fromkeys(scenario.receivers, "radio")
+    assert set(scenario.quality.values()) == {0.25}
     assert main(["montecarlo", "eavesdroppers", "--wire-key", KEY]) == 2
     assert main(["montecarlo", "eavesdroppers", "--wire", str(file), "--wire-side", "eve"]) == 2
     assert main(["montecarlo", "eavesdroppers", "--wire", str(tmp_path / "none.toml")]) == 2
-    said = capsys.readouterr().err
-    assert "give --wire FILE as well" in said
-    assert "--wire-side eve: expected PROCESS=SIDE" in said
+    errors = capsys.readouterr().err
+    assert "give --wire FILE as well" in errors
+    assert "--wire-side eve: expected PROCESS=SIDE" in errors

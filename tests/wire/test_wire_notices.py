@@ -24,8 +24,8 @@ from tests.wire.wire_rows import plan_of, robot_plan
 def steps_of(*counts: dict[WireFate, int]) -> WireSteps:
     """Steps of one link."""
     made = np.zeros((len(counts), 2, len(OUTCOMES)), np.int64)
-    for k, one in enumerate(counts):
-        for fate, number in one.items():
+    for k, count in enumerate(counts):
+        for fate, number in count.items():
             made[k, 0, OUTCOMES.index(fate)] = number
     return WireSteps(0, made, np.zeros((len(counts), 2, 3), np.int64))
 
@@ -37,13 +37,13 @@ def test_losses_of_the_wire_itself_are_told_once() -> None:
     )
     watcher = LinkWatcher(["scan"], 0.2)
     lines = watcher.watch(steps)
-    assert [(round(one.seconds, 6), one.level) for one in lines if "does not cross" in one.text] == [
+    assert [(round(line.seconds, 6), line.level) for line in lines if "does not cross" in line.text] == [
         (0.0, "ERROR"),
         (0.2, "ERROR"),
         (0.4, "ERROR"),
     ]
     assert "scan: the first message that does not cross: not taken by readers" in [line.text for line in lines]
-    assert not [one for one in watcher.watch(steps) if "does not cross" in one.text]
+    assert not [line for line in watcher.watch(steps) if "does not cross" in line.text]
 
 
 def test_frequent_stretches_get_few_lines() -> None:

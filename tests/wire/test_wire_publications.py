@@ -17,9 +17,9 @@ from tests.wire.wire_at_work import DEAD, LOSSY, PERFECT, WireAtWork, at_work, b
 
 def reader(session: zenoh.Session, key: str = "**") -> list[zenoh.Sample]:
     """The list into which all samples of a key go."""
-    found: list[zenoh.Sample] = []
-    session.declare_subscriber(key, found.append)
-    return found
+    samples: list[zenoh.Sample] = []
+    session.declare_subscriber(key, samples.append)
+    return samples
 
 
 def ready(wire: WireAtWork, sender: zenoh.Session, receiver: zenoh.Session) -> None:
@@ -78,12 +78,14 @@ def test_everything_that_a_message_carries_crosses(tmp_path: Path, often: int, m
         sender.put("thing/last", b"", priority=zenoh.Priority.BACKGROUND)
 
         def sorted_by_priority(samples: list[zenoh.Sample]) -> list[dict[str, Any]]:
-            return sorted((everything(one) for one in samples if "ready" not in str(one.key_expr)), key=str)
+            return sorted((everything(sample) for sample in samples if "ready" not in str(sample.key_expr)), key=str)
 
         wait_until(lambda: len(sorted_by_priority(here)) == 7 and len(sorted_by_priority(there)) == 7, "all cross")
         assert sorted_by_priority(there) == sorted_by_priority(here)
-        assert [one["source"] for one in sorted_by_priority(there)].count((str(sender.zid()), sender.id.eid, 41)) == 2
-        assert [one["timestamp"] for one in sorted_by_priority(there)].count(None) == 5
+        assert [entry["source"] for entry in sorted_by_priority(there)].count(
+            (str(sender.zid()), sender.id.eid, 41)
+        ) == 2
+        assert [entry["timestamp"] for entry in sorted_by_priority(there)].count(None) == 5
 
 
 def test_the_nth_message_of_a_key_has_the_fate_that_the_seed_gives(tmp_path: Path) -> None:
@@ -103,8 +105,8 @@ def test_the_nth_message_of_a_key_has_the_fate_that_the_seed_gives(tmp_path: Pat
             sender.put("other", b"", congestion_control=zenoh.CongestionControl.BLOCK)
 
         def rows() -> Any:
-            found = wire.rows
-            return found[found["key"] == wire.journal.key_code("scan")]
+            rows = wire.rows
+            return rows[rows["key"] == wire.journal.key_code("scan")]
 
         wait_until(lambda: len(rows()) == 200, "the wire hears all")
         fates = KeyFates(plan.links[0], "scan", "put", plan.seed)
@@ -114,7 +116,9 @@ def test_the_nth_message_of_a_key_has_the_fate_that_the_seed_gives(tmp_path: Pat
         delivered = [n for n in range(already, 200) if expected[n] == 0]
         wait_until(lambda: len(got) >= len(delivered) + expected[:already].count(0), "all that is delivered")
         numbers = [
-            int((one.attachment or one.payload).to_string()) for one in got if one.payload.to_bytes() != b"first"
+            int((sample.attachment or sample.payload).to_string())
+            for sample in got
+            if sample.payload.to_bytes() != b"first"
         ]
         assert numbers == delivered
 
@@ -147,9 +151,9 @@ def test_the_first_link_that_matches_takes_a_message_and_a_tap_has_losses_of_its
         wait_until(lambda: sender.put("ready", b"") or (at_base and at_listener), "both hear")
         sender.put("scan/1", b"x")
         sender.put("pose", b"y")
-        wait_until(lambda: "pose" in [str(one.key_expr) for one in at_base], "the other link carries it")
-        wait_until(lambda: "scan/1" in [str(one.key_expr) for one in at_listener], "the tap carries it")
-        assert "scan/1" not in [str(one.key_expr) for one in at_base]
+        wait_until(lambda: "pose" in [str(sample.key_expr) for sample in at_base], "the other link carries it")
+        wait_until(lambda: "scan/1" in [str(sample.key_expr) for sample in at_listener], "the tap carries it")
+        assert "scan/1" not in [str(sample.key_expr) for sample in at_base]
         assert wire.fates("scan") == [WireFate.LOST]
 
 

@@ -26,7 +26,7 @@ WAIT = 0.3
 def answers(session: zenoh.Session, key: str, **how: Any) -> list[bytes]:
     """The payloads of all replies without an error."""
     replies = session.get(key, **{"timeout": 5.0, **how})
-    return sorted(one.ok.payload.to_bytes() for one in replies if one.ok is not None)
+    return sorted(reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None)
 
 
 def offer(session: zenoh.Session, key: str, answer: bytes, complete: bool = False) -> None:
@@ -80,7 +80,9 @@ def test_a_query_and_its_reply_cross_whole(tmp_path: Path) -> None:
             source_info=zenoh.SourceInfo(asker.id, 5),
             timeout=5.0,
         )
-        put, delete = sorted((one.ok for one in replies if one.ok is not None), key=lambda one: str(one.key_expr))
+        put, delete = sorted(
+            (reply.ok for reply in replies if reply.ok is not None), key=lambda sample: str(sample.key_expr)
+        )
         assert heard == [("map/*", "x=1;y=2", b"give", "text/json", b"me", 5)]
         assert (str(put.key_expr), put.payload.to_bytes(), str(put.encoding)) == ("map/1", b"42", "text/plain")
         assert str(put.timestamp) == str(stamp)
@@ -104,7 +106,7 @@ def test_an_error_crosses(tmp_path: Path) -> None:
 
         server.declare_queryable("door", refuse)
         replies = wait_until(lambda: list(asker.get("door", timeout=5.0)), "the queryable is there")
-        assert [(one.err.payload.to_bytes(), str(one.err.encoding)) for one in replies] == [(b"no", "text/plain")]
+        assert [(reply.err.payload.to_bytes(), str(reply.err.encoding)) for reply in replies] == [(b"no", "text/plain")]
 
 
 def test_nobody_waits_for_a_queryable_that_is_not_there(tmp_path: Path) -> None:
@@ -266,7 +268,7 @@ def test_each_query_is_asked_once(tmp_path: Path) -> None:
 
 def test_local_queryables_are_not_hidden_by_those_of_the_other_side(tmp_path: Path) -> None:
     """A query gets replies from its own side too, and three sides answer together."""
-    plan = plan_of(*(link(one, other) for one in ("a", "b", "c") for other in ("a", "b", "c") if one != other))
+    plan = plan_of(*(link(name, other) for name in ("a", "b", "c") for other in ("a", "b", "c") if name != other))
     with (
         at_work(plan, tmp_path) as wire,
         wire.program("a") as asker,

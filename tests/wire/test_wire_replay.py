@@ -84,15 +84,19 @@ def test_a_picture_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) ->
     assert main(["view", str(folder), "--picture", str(folder / "w.png"), "--slot", "3"]) == 2
     assert "--slot is for runs" in capfd.readouterr().err
     status = main(["view", str(folder), "--picture", str(folder / "w.png")])
-    said = capfd.readouterr()
-    if "no Vulkan driver" in said.err:
-        skip(CannotRun(said.err))
-    assert (status, said.err) == (0, "")
+    output = capfd.readouterr()
+    if "no Vulkan driver" in output.err:
+        skip(CannotRun(output.err))
+    assert (status, output.err) == (0, "")
     pixels = np.asarray(matplotlib.image.imread(folder / "w.png"))
     assert pixels.shape[1::-1] == PICTURE_SIZE
-    colours = {tuple(round(255 * part) for part in one) for one in np.unique(pixels[:, :, :3].reshape(-1, 3), axis=0)}
+    colours = {
+        tuple(round(255 * part) for part in pixel) for pixel in np.unique(pixels[:, :, :3].reshape(-1, 3), axis=0)
+    }
     for state in (LaneState.DELIVERED, LaneState.SOME, LaneState.CUT):  # Rerun draws lanes darker
-        assert any(all(abs(a - 0.8 * b) < 14 for a, b in zip(one, state.colour, strict=True)) for one in colours), state
+        assert any(
+            all(abs(a - 0.8 * b) < 14 for a, b in zip(colour, state.colour, strict=True)) for colour in colours
+        ), state
 
 
 def test_a_summary_that_is_damaged_is_refused(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -117,11 +121,11 @@ def test_a_video_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) -> N
     path = folder / "w.gif"
     words = ["view", str(folder), "--video", str(path), "--size", "400x320", "--times"]
     status = main([*words, "0:99999:50000"])
-    said = capfd.readouterr().err
-    if "Vulkan" in said:
-        skip(CannotRun(said))
+    errors = capfd.readouterr().err
+    if "Vulkan" in errors:
+        skip(CannotRun(errors))
     assert status == 2
-    assert "50000 s is not a time of the wire" in said
+    assert "50000 s is not a time of the wire" in errors
     assert main([*words, "2:10:4"]) == 0
     with Image.open(path) as gif:
         assert (gif.size, getattr(gif, "n_frames", 1)) == ((400, 320), 3)

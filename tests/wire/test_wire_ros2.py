@@ -62,8 +62,8 @@ def test_a_message_is_known_by_gid_and_sequence_number(named: bool) -> None:
     codes = Codes()
     read = SourceReader(codes)
     other = bytes(reversed(GID))
-    found = [read(attachment(n, gid, named), None) for n, gid in [(1, GID), (2, GID), (2**62, other), (3, GID)]]
-    assert found == [(1, 1), (1, 2), (2, 2**62), (1, 3)]
+    numbers = [read(attachment(n, gid, named), None) for n, gid in [(1, GID), (2, GID), (2**62, other), (3, GID)]]
+    assert numbers == [(1, 1), (1, 2), (2, 2**62), (1, 3)]
     assert codes.names == [GID.hex(), other.hex()]
 
 
@@ -233,8 +233,8 @@ def test_a_log_that_cannot_be_written_is_reported_once(tmp_path: Path, capsys: p
     log = EntityLog(tmp_path / "gone")
     log.add("robot", NODE)
     log.add("robot", SERVICE)
-    said = capsys.readouterr().err
-    assert said.count("lacks entities of ROS 2 from now on (No such file or directory)") == 1
+    errors = capsys.readouterr().err
+    assert errors.count("lacks entities of ROS 2 from now on (No such file or directory)") == 1
 
 
 def test_a_log_does_not_grow_without_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

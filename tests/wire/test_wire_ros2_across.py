@@ -79,11 +79,11 @@ def test_a_listener_lacks_what_the_seed_says(field: Field) -> None:
     passed = [row["sequence"] for row in rows if fates.next()[0] == 0]
     assert 100 < len(passed) < 180
     wait_until(lambda: len(heard) >= len(passed), "the listener gets them")
-    assert [one.sequence for one in heard] == passed
-    assert {row["source"] for row in rows} == {one.gid for one in heard}
+    assert [message.sequence for message in heard] == passed
+    assert {row["source"] for row in rows} == {message.gid for message in heard}
     assert [row["sequence"] for row in rows if row["fate"] == "delivered"] == passed
     entities = [json.loads(line) for line in (field.folder / "ros2.jsonl").read_text().splitlines()]
-    (publisher,) = (one for one in entities if one["gid"] == heard[0].gid)
+    (publisher,) = (entity for entity in entities if entity["gid"] == heard[0].gid)
     assert (publisher["side"], publisher["node"], publisher["topic"]) == ("robot", "/talker", "/scan")
     assert heard[-1].text == f"scan {passed[-1] - 2}"
 
@@ -100,7 +100,7 @@ def test_a_service_answers_as_soon_as_it_is_seen(field: Field) -> None:
             caller.changed.clear()
         sequence = send(n, 40)
         wait_until(responses.__len__, "the response")
-        assert [(one.sequence, one.text) for one in responses] == [(sequence, n + 40)]
+        assert [(response.sequence, response.text) for response in responses] == [(sequence, n + 40)]
 
 
 def test_a_lost_request_is_never_answered(field: Field) -> None:
@@ -115,7 +115,9 @@ def test_a_lost_request_is_never_answered(field: Field) -> None:
     fates = KeyFates(LINKS[3], rows[0]["key"], "query", PLAN.seed)
     passed = [n for n in range(1, 41) if fates.next()[0] == 0]
     wait_until(lambda: len(responses) == len(passed), "the responses")
-    assert sorted(one.sequence for one in taken) == sorted(one.sequence for one in responses) == passed
+    assert (
+        sorted(response.sequence for response in taken) == sorted(response.sequence for response in responses) == passed
+    )
     assert {row["source"] for row in rows} == {responses[0].gid}
     assert {row["source"] for row in field.rows("lossy", "reply")} == {responses[0].gid}
 
@@ -144,13 +146,13 @@ def test_a_late_joiner_gets_the_history_and_what_follows(field: Field) -> None:
     wait_until(lambda: len(heard) >= 3 and len(field.rows("map", "reply")) == 6, "the history, asked for in two ways")
     publish("map 5")
     wait_until(lambda: len(heard) >= 4, "a new message")
-    assert [one.text for one in heard] == ["map 2", "map 3", "map 4", "map 5"]
-    assert [one.sequence for one in heard] == [3, 4, 5, 6]
+    assert [message.text for message in heard] == ["map 2", "map 3", "map 4", "map 5"]
+    assert [message.sequence for message in heard] == [3, 4, 5, 6]
 
 
 def has(heard: list[ReceivedMessage], text: str) -> bool:
     """Whether a message was heard."""
-    return any(one.text == text for one in heard)
+    return any(message.text == text for message in heard)
 
 
 def test_what_a_link_loses_of_a_reliable_topic_that_is_kept_is_fetched_again(tmp_path: Path) -> None:
@@ -186,5 +188,5 @@ def test_what_a_link_loses_of_a_reliable_topic_that_is_kept_is_fetched_again(tmp
                 wait_until(partial(has, heard, f"map {n}"), "it arrives")
         wait_until(partial(has, heard, f"map {lost}"), "what was lost arrives")
         rows = [row for table in journal_tables(tmp_path) for row in table.to_pylist() if row["fate"] == "lost"]
-    assert {one.text for one in heard} == {f"map {n}" for n in range(lost + 3)}
+    assert {message.text for message in heard} == {f"map {n}" for n in range(lost + 3)}
     assert [(row["kind"], row["n"]) for row in rows if "@adv" not in row["key"]] == [("put", lost)]

@@ -165,16 +165,16 @@ def test_programs_may_use_only_the_keys_of_their_side(tmp_path: Path) -> None:
         ready(wire, base, robot)
         here, there, everything = reader(robot, "robot/down"), reader(base, "**"), reader(robot, "secret/**")
         token = robot.liveliness().declare_token("robot/alive")
-        wait_until(lambda: [one for one in base.liveliness().get("robot/*") if one.ok], "its token crosses")
+        wait_until(lambda: [reply for reply in base.liveliness().get("robot/*") if reply.ok], "its token crosses")
         for n in range(3):
             robot.put("secret/up", str(n))
             base.put("secret/down", str(n))
             robot.put("robot/up", str(n))
             base.put("robot/down", str(n))
-        wait_until(lambda: sum(str(one.key_expr) == "robot/up" for one in there) == 3, "what is allowed crosses")
-        wait_until(lambda: sum(str(one.key_expr) == "robot/down" for one in here) == 3, "in both directions")
-        assert "secret/up" not in {str(one.key_expr) for one in there}
-        assert "secret/down" not in {str(one.key_expr) for one in everything}
+        wait_until(lambda: sum(str(sample.key_expr) == "robot/up" for sample in there) == 3, "what is allowed crosses")
+        wait_until(lambda: sum(str(sample.key_expr) == "robot/down" for sample in here) == 3, "in both directions")
+        assert "secret/up" not in {str(sample.key_expr) for sample in there}
+        assert "secret/down" not in {str(sample.key_expr) for sample in everything}
         del token
 
 
@@ -205,9 +205,9 @@ def test_a_side_with_tls_wants_certificates_of_its_authority(tmp_path: Path) -> 
     with at_work(plan_of(link("robot", "base"), sides=sides), tmp_path / "out") as wire, wire.program("base") as base:
         endpoint = {"endpoints": list(wire.relay.endpoints["robot"]), "timeout_ms": 0}
         certificate, key, authority = files_of("robot")
-        known = {"root_ca_certificate": authority}
+        transport = {"root_ca_certificate": authority}
         with pytest.raises(zenoh.ZError):
-            wire.program("robot", connect=endpoint, transport={"link": {"tls": known}})
-        own = {**known, "enable_mtls": True, "connect_certificate": certificate, "connect_private_key": key}
+            wire.program("robot", connect=endpoint, transport={"link": {"tls": transport}})
+        own = {**transport, "enable_mtls": True, "connect_certificate": certificate, "connect_private_key": key}
         with wire.program("robot", transport={"link": {"tls": own}}) as robot:
             ready(wire, robot, base)

@@ -30,7 +30,7 @@ def test_steps_hold_the_messages_of_their_time() -> None:
     for pieces in (1, 7, 300):
         steps = counted(np.array_split(rows, pieces))
         counts = np.concatenate([step.counts for step in steps])
-        assert [one.first for one in steps] == np.cumsum([0, *(len(one.counts) for one in steps)])[:-1].tolist()
+        assert [step.first for step in steps] == np.cumsum([0, *(len(step.counts) for step in steps)])[:-1].tolist()
         assert len(counts) == 200
         for link in range(3):
             for at, fate in enumerate(OUTCOMES):
@@ -51,26 +51,26 @@ rows_of_any_time = st.lists(
 
 @settings(deadline=None, max_examples=examples(40))
 @given(st.lists(rows_of_any_time, max_size=4))
-def test_every_message_is_counted_once(found: list[list[tuple[float, int, int]]]) -> None:
+def test_every_message_is_counted_once(block_: list[list[tuple[float, int, int]]]) -> None:
     """For any times, also before the start, long after it and out of order; steps do not overlap, and they are few."""
     blocks = []
-    for one in found:
-        block = np.zeros(len(one), RECORD)
-        for at, (seconds, link, fate) in enumerate(one):
+    for messages_ in block_:
+        block = np.zeros(len(messages_), RECORD)
+        for at, (seconds, link, fate) in enumerate(messages_):
             block[at]["time"], block[at]["link"], block[at]["fate"] = START + seconds, link, fate
         blocks.append(block)
     steps = counted(blocks)
     messages = sum(len(block) for block in blocks)
-    assert sum(int(one.counts.sum()) for one in steps) == messages
+    assert sum(int(step.counts.sum()) for step in steps) == messages
     for link in range(4):
         for at, fate in enumerate(OUTCOMES):
             of = sum(
                 int(np.sum((b["link"] == (UNLINKED if link == 3 else link)) & (b["fate"] == fate))) for b in blocks
             )
-            assert sum(int(one.counts[:, link, at].sum()) for one in steps) == of
-    ends = [one.first + len(one.counts) for one in steps]
-    assert all(one.first >= end for one, end in zip(steps[1:], ends[:-1], strict=True))
-    assert sum(len(one.counts) for one in steps) <= 64 * (2 * messages + 3)
+            assert sum(int(step.counts[:, link, at].sum()) for step in steps) == of
+    ends = [step.first + len(step.counts) for step in steps]
+    assert all(step.first >= end for step, end in zip(steps[1:], ends[:-1], strict=True))
+    assert sum(len(step.counts) for step in steps) <= 64 * (2 * messages + 3)
 
 
 def test_a_silence_takes_little() -> None:
@@ -78,8 +78,8 @@ def test_a_silence_takes_little() -> None:
     rows = np.zeros(2, RECORD)
     rows["time"] = START, START + 864_000.0
     steps = counted([rows])
-    assert sum(len(one.counts) for one in steps) < 200
-    assert [int(one.counts.sum()) for one in steps][-1] == 1
+    assert sum(len(step.counts) for step in steps) < 200
+    assert [int(step.counts.sum()) for step in steps][-1] == 1
     assert steps[-1].first == 8_639_999
 
 

@@ -71,9 +71,9 @@ to = "third"
 
 
 @contextlib.contextmanager
-def stopping(what: str, endpoint: str) -> Iterator[subprocess.Popen[str]]:
+def stopping(case: str, endpoint: str) -> Iterator[subprocess.Popen[str]]:
     """A program that `reads`, or `asks` for the map, and stops as soon as anything comes."""
-    command = [sys.executable, "-c", PROGRAM, what, endpoint]
+    command = [sys.executable, "-c", PROGRAM, case, endpoint]
     root = Path(__file__).parents[2]
     with subprocess.Popen(
         command, cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE, encoding="utf-8"

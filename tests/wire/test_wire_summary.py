@@ -49,9 +49,9 @@ def run(
         journal.close()
         status = keeper.finish(folder)
     path = folder / "summary.json"
-    found: dict[str, Any] = json.loads(path.read_text())
+    summary: dict[str, Any] = json.loads(path.read_text())
     assert WireSummary.read(path).text == path.read_text()
-    return found, status
+    return summary, status
 
 
 def read(folder: Path) -> WireSummary:
@@ -68,17 +68,17 @@ def test_links_agree_with_their_models(tmp_path: Path) -> None:
         **{name: {"loss": loss} for name, loss in LOSSES.items()},
     )
     for start in (1, 2):
-        found, status = run(tmp_path, plan)
+        summary, status = run(tmp_path, plan)
         assert status == 0
-        assert (found["start"], found["unaccounted"], found["unlinked"]) == (start, 0, 0)
-        assert found["heard"] == 9000 * len(plan.links)
-        for name, link in found["links"].items():
+        assert (summary["start"], summary["unaccounted"], summary["unlinked"]) == (start, 0, 0)
+        assert summary["heard"] == 9000 * len(plan.links)
+        for name, link in summary["links"].items():
             assert link["heard"] == 9000 == link["delivered"] + sum(link["lost_by"].values()), name
             assert link["dropped_by"] == {}
             assert link["within_bounds"] is True, (name, link)
             assert link["bytes"] == 90_000
-        assert found["links"]["perfect"]["rate"] == found["links"]["perfect"]["bounds"][1] == 1.0
-        assert set(found["links"]["corrupt"]["lost_by"]) == {"loss", "corrupted"}
+        assert summary["links"]["perfect"]["rate"] == summary["links"]["perfect"]["bounds"][1] == 1.0
+        assert set(summary["links"]["corrupt"]["lost_by"]) == {"loss", "corrupted"}
 
 
 @pytest.mark.parametrize(
@@ -93,8 +93,8 @@ def test_links_agree_with_their_models(tmp_path: Path) -> None:
 def test_a_wrong_model_is_told(tmp_path: Path, model: str, wrong: dict[str, Any]) -> None:
     """A link whose messages are lost by another model is outside its bounds, and a sentence says so."""
     actual = wire_plan(link={"loss": {**LOSSES[model], **wrong}})
-    found, _ = run(tmp_path, wire_plan(link={"loss": LOSSES[model]}), actual)
-    assert found["links"]["link"]["within_bounds"] is False
+    summary, _ = run(tmp_path, wire_plan(link={"loss": LOSSES[model]}), actual)
+    assert summary["links"]["link"]["within_bounds"] is False
     assert any(
         line.startswith("link is outside the 99 % bounds of its model") for line in wire_failures(read(tmp_path))
     )
@@ -179,9 +179,9 @@ def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
         journal.flush()
         journal.amend(row, WireFate.REFUSED)
     assert keeper.finish(tmp_path) == 0
-    found = json.loads((tmp_path / "summary.json").read_text())
-    link = found["links"]["link"]
-    assert (found["heard"], found["unlinked"], found["unaccounted"]) == (28, 1, 0)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    link = summary["links"]["link"]
+    assert (summary["heard"], summary["unlinked"], summary["unaccounted"]) == (28, 1, 0)
     assert (link["heard"], link["delivered"], link["again"]) == (27, 14, 1)
     assert link["lost_by"] == dict.fromkeys(("loss", "corrupted", "overflow", "cut"), 1)
     dropped = ("unlinked", "too_large", "held_up", "looped", "underway", "too_many_keys", "congested")
@@ -189,12 +189,12 @@ def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
     # Of delivered, lost, corrupted, held up, underway, congested and twice refused.
     assert link["rate"] == pytest.approx(6 / 8)
     assert link["gap_messages"] == 12
-    said = "\n".join(wire_sentences(read(tmp_path)))
-    assert "link lost 1 by loss, 1 by corrupted, 1 by overflow, 1 by cut" in said
+    text = "\n".join(wire_sentences(read(tmp_path)))
+    assert "link lost 1 by loss, 1 by corrupted, 1 by overflow, 1 by cut" in text
     apart = "overflow and cut and unlinked and too large and looped and too many keys"
-    assert f"link: rate, model and within leave out the messages by {apart}, on which its models did not decide" in said
-    assert "the wire itself, or Zenoh, dropped 1 by unlinked, 1 by too large" in said
-    assert "no link of the file takes 1 message" in said
+    assert f"link: rate, model and within leave out the messages by {apart}, on which its models did not decide" in text
+    assert "the wire itself, or Zenoh, dropped 1 by unlinked, 1 by too large" in text
+    assert "no link of the file takes 1 message" in text
     title, heading, _, first = [line for line in closing_lines(read(tmp_path)) if line.strip()][:4]
     assert title.startswith("wire · seed 7 · 28 messages · ")
     assert heading.split() == [
@@ -255,12 +255,12 @@ link = "scan"
 """
     )
     assert wire_of(tomllib.loads(resolved_wire(plan))) == plan
-    found, status = run(tmp_path, plan)
+    written, status = run(tmp_path, plan)
     assert status == 1
-    assert [one["held"] for one in found["expectations"]] == [True, True, False, False, True]
+    assert [expectation["held"] for expectation in written["expectations"]] == [True, True, False, False, True]
     summary = read(tmp_path)
-    said = list(wire_sentences(summary))
-    assert "expected 0.9 quantile of scan.latency below 0.025: held, found 0.02" in said
+    sentences = list(wire_sentences(summary))
+    assert "expected 0.9 quantile of scan.latency below 0.025: held, found 0.02" in sentences
     assert any(line.startswith("expected scan.gap_messages below 3: FAILED") for line in wire_failures(summary))
     (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
     write_report(tmp_path)
@@ -268,8 +268,8 @@ link = "scan"
     assert page.headings == ["Wire of robot and base", "Expectations", "Links", "Losses by reason", "Repeat it"]
     assert "2 of 5 expectations FAILED" in page.texts
     assert {cell for row in wire_table(summary).rows for cell in row} <= set(page.texts)
-    assert {"{:.4f} to {:.4f}".format(*found["links"]["scan"]["bounds"]), "lost: loss"} <= set(page.texts)
-    assert {*said[1:], *wire_failures(summary)} <= set(page.texts)
+    assert {"{:.4f} to {:.4f}".format(*written["links"]["scan"]["bounds"]), "lost: loss"} <= set(page.texts)
+    assert {*sentences[1:], *wire_failures(summary)} <= set(page.texts)
     assert "bernoulli: quality = 0.6" in page.texts
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(UsageError, match="not the summary of a wire of this version"):
@@ -308,7 +308,7 @@ def test_a_metric_without_a_value_has_failed(fate: WireFate, text: str, why: str
 
 
 @pytest.mark.parametrize(
-    ("entries", "said"),
+    ("entries", "message"),
     [
         ({"heard": "many"}, "heard: Input should be a valid integer"),
         ({"seed": None}, "seed: Input should be a valid integer"),
@@ -321,22 +321,22 @@ def test_a_metric_without_a_value_has_failed(fate: WireFate, text: str, why: str
         ({"made_with": ["python"]}, "made_with: "),
     ],
 )
-def test_a_summary_with_another_entry_is_refused(entries: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_a_summary_with_another_entry_is_refused(entries: dict[str, Any], message: str, tmp_path: Path) -> None:
     """With its file, the entry, and what is wrong with it."""
-    found, _ = run(tmp_path, wire_plan(), messages=1)
+    summary, _ = run(tmp_path, wire_plan(), messages=1)
     path = tmp_path / "summary.json"
-    path.write_text(json.dumps(found | entries))
-    with pytest.raises(UsageError, match=re.escape(f"{path} is not the summary of a wire of this version ({said}")):
+    path.write_text(json.dumps(summary | entries))
+    with pytest.raises(UsageError, match=re.escape(f"{path} is not the summary of a wire of this version ({message}")):
         WireSummary.read(path)
 
 
 @pytest.mark.parametrize("name", ["rate", "expected_rate", "bounds", "within_bounds"])
 def test_a_link_that_lacks_a_part_of_its_comparison_is_refused(name: str, tmp_path: Path) -> None:
     """The rate is given with all that the models say about it."""
-    found, _ = run(tmp_path, wire_plan(), messages=1)
-    for link in found["links"].values():
+    summary, _ = run(tmp_path, wire_plan(), messages=1)
+    for link in summary["links"].values():
         link[name] = None
-    (tmp_path / "summary.json").write_text(json.dumps(found))
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
     with pytest.raises(UsageError, match="rate, expected_rate, bounds and within_bounds must be given together"):
         read(tmp_path)
 
@@ -364,9 +364,9 @@ def test_a_wire_without_links_has_a_summary_and_a_page(tmp_path: Path) -> None:
 
 def test_the_summary_of_an_older_version_is_of_a_wire_that_ended(tmp_path: Path) -> None:
     """It has no state."""
-    found, _ = run(tmp_path, wire_plan(), messages=1)
-    del found["state"]
-    (tmp_path / "summary.json").write_text(json.dumps(found))
+    summary, _ = run(tmp_path, wire_plan(), messages=1)
+    del summary["state"]
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
     assert read(tmp_path).state == "ended"
 
 
@@ -394,7 +394,7 @@ below = 0.5
 below = 0.5
 """
         )
-    said = "\n".join(caught.value.mistakes)
+    text = "\n".join(caught.value.mistakes)
     for line in (
         "expect.0.below: is missing, and so is above; add one of them, or both",
         'expect.1.metric: is "scan.latencies"; expected LINK.heard, LINK.delivery, LINK.latency, LINK.gap_messages or LINK.ga',
@@ -404,7 +404,7 @@ below = 0.5
         "expect.4.below: is set, but a table with link has no other entries",
         "expect.5.metric: is missing",
     ):
-        assert line in said, said
+        assert line in text, text
     with pytest.raises(ScenarioError) as caught:
         expecting('[[expect]]\nmetric = "scam.delivery"\nabove = 0.5\n')
     (line,) = caught.value.mistakes
@@ -413,13 +413,13 @@ below = 0.5
     )
 
 
-@pytest.mark.parametrize(("bound", "found", "holds"), [
+@pytest.mark.parametrize(("bound", "value", "holds"), [
     ("below", 0.4, True), ("below", 0.5, False), ("below", 0.6, False),
     ("above", 0.4, False), ("above", 0.5, False), ("above", 0.6, True),
 ])  # fmt: skip
-def test_a_bound_itself_is_neither_below_nor_above(bound: str, found: float, holds: bool) -> None:
+def test_a_bound_itself_is_neither_below_nor_above(bound: str, value: float, holds: bool) -> None:
     """A metric must be on its side of the bound."""
-    assert WireExpectTable.model_validate({"metric": "scan.delivery", bound: 0.5}).holds(found) is holds
+    assert WireExpectTable.model_validate({"metric": "scan.delivery", bound: 0.5}).holds(value) is holds
 
 
 def test_a_latency_is_that_of_its_quantile(tmp_path: Path) -> None:
@@ -463,9 +463,9 @@ def test_a_metric_of_a_link_is_one_line_of_the_registry(tmp_path: Path, monkeypa
             return link.bytes
 
     monkeypatch.setitem(WIRE_METRICS, "bytes", Bytes())
-    found, _ = run(tmp_path, expecting('[[expect]]\nmetric = "scan.bytes"\nabove = 0.5\n'), messages=30)
-    (judged,) = found["expectations"]
-    assert (judged["held"], judged["found"]) == (True, found["links"]["scan"]["bytes"])
+    summary, _ = run(tmp_path, expecting('[[expect]]\nmetric = "scan.bytes"\nabove = 0.5\n'), messages=30)
+    (judged,) = summary["expectations"]
+    assert (judged["held"], judged["found"]) == (True, summary["links"]["scan"]["bytes"])
 
 
 def test_the_page_lists_every_metric_of_a_link() -> None:

@@ -88,9 +88,9 @@ def test_quantiles_of_delays_are_exact_until_there_are_too_many_to_keep() -> Non
     assert tally.delay_quantile(0.9) == 0.9
     for _ in range(9):
         tally.add(records)
-    found = tally.delay_quantile(0.9)
-    assert found is not None
-    assert found == pytest.approx(0.9, abs=0.005)
+    delay_quantile = tally.delay_quantile(0.9)
+    assert delay_quantile is not None
+    assert delay_quantile == pytest.approx(0.9, abs=0.005)
     assert LinkTally().delay_quantile(0.5) is None
 
 

@@ -47,7 +47,7 @@ def test_cuts_and_partitions_overlap() -> None:
         {"at": 8, "cut": "robot-listener"},
     )
     both = frozenset({"scan", "robot-base", "base-robot"})
-    assert [(one.time, one.cut, one.said) for one in moments(plan)] == [
+    assert [(moment.time, moment.cut, moment.said) for moment in moments(plan)] == [
         (0.0, frozenset(), ()),
         (1.0, {"scan"}, ("cut scan",)),
         (3.0, both, ("partition base, robot",)),
@@ -72,14 +72,14 @@ def test_changes_overlap() -> None:
 
 def test_an_operator_adds_events() -> None:
     """They last, on top of those of the file; what the plan then says can be written as a file."""
-    plan, said = with_change(plan_of({"from": 1, "to": 9, "partition": ["robot", "base"]}), {"cut": "scan"}, 2.0)
-    assert said == "cut scan"
-    plan, said = with_change(plan, {"link": "scan", "set": {"quality": 0.2}}, 3.0)
-    assert said == 'link scan: loss = { model = "bernoulli", quality = 0.2 }'
-    plan, said = with_change(plan, {"link": "scan", "set": {"rate": "1 kB/s"}}, 4.0)
-    assert said == "link scan: rate = 1000.0, queue = 256000"
-    plan, said = with_change(plan, {"link": "scan", "set": {"queue": 10}}, 5.0)
-    assert said == "link scan: queue = 10, rate = 1000.0"
+    plan, message = with_change(plan_of({"from": 1, "to": 9, "partition": ["robot", "base"]}), {"cut": "scan"}, 2.0)
+    assert message == "cut scan"
+    plan, message = with_change(plan, {"link": "scan", "set": {"quality": 0.2}}, 3.0)
+    assert message == 'link scan: loss = { model = "bernoulli", quality = 0.2 }'
+    plan, message = with_change(plan, {"link": "scan", "set": {"rate": "1 kB/s"}}, 4.0)
+    assert message == "link scan: rate = 1000.0, queue = 256000"
+    plan, message = with_change(plan, {"link": "scan", "set": {"queue": 10}}, 5.0)
+    assert message == "link scan: queue = 10, rate = 1000.0"
     assert moment_at(plan, 5.0).settings["scan"]["queue"] == 10
     assert quality(plan, 100.0) == 0.2
     assert "scan" in moment_at(plan, 100.0).cut
@@ -89,8 +89,8 @@ def test_an_operator_adds_events() -> None:
 def test_an_operator_ends_cuts() -> None:
     """Those that last; later ones of the file stay. A cut ended at its very beginning leaves nothing."""
     plan = plan_of({"at": 1, "cut": "scan"}, {"from": 2, "to": 9, "cut": "scan"}, {"from": 20, "to": 21, "cut": "scan"})
-    healed, said = with_cut_ended(plan, "scan", 4.0)
-    assert said == "heal scan"
+    healed, message = with_cut_ended(plan, "scan", 4.0)
+    assert message == "heal scan"
     assert [("scan" in moment_at(healed, time).cut) for time in (3, 4, 8, 20)] == [True, False, False, True]
     assert moment_at(with_cut_ended(plan, "scan", 1.0)[0], 1.5).cut == frozenset()
     assert wire_of(tomllib.loads(resolved_wire(with_cut_ended(plan, "scan", 1.0)[0])))
@@ -99,8 +99,8 @@ def test_an_operator_ends_cuts() -> None:
 def test_an_operator_ends_partitions() -> None:
     """Named in any order; cuts stay."""
     plan = plan_of({"at": 1, "partition": ["robot", "base"]}, {"at": 1, "cut": "scan"})
-    healed, said = with_partition_ended(plan, "base", "robot", 4.0)
-    assert said == "heal robot, base"
+    healed, message = with_partition_ended(plan, "base", "robot", 4.0)
+    assert message == "heal robot, base"
     assert moment_at(healed, 4.0).cut == {"scan"}
 
 

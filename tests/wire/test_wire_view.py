@@ -139,7 +139,7 @@ def test_graph_and_table_state_the_losses(rows: NDArray[Any], rrd: Path) -> None
         fates = rows[rows["link"] == link]["fate"]
         cut, lost = int(np.sum(fates == WireFate.CUT)), int(np.sum(fates == WireFate.LOST))
         assert label[3 + link] == f"{name}: {100 * (cut + lost) / len(fates):.0f} % lost"
-        (line,) = [one for one in table.splitlines() if one.startswith(f"| {name} ")]
+        (line,) = [line for line in table.splitlines() if line.startswith(f"| {name} ")]
         assert f"| {len(fates):,} |" in line
         assert f"{lost:,} lost" in line
         assert (f"{cut:,} cut" in line) == (link < 2)
@@ -233,12 +233,12 @@ def test_a_disk_that_takes_nothing_harms_only_the_view(tmp_path: Path, rows: NDA
     """No method raises, nothing that is added is kept in memory, and the reason is kept."""
     view = WireView(tmp_path / "nowhere" / "r.rrd", robot_plan(), "wire", START)
     added, amended, note = rows.copy(), rows[:1].copy(), Text("a note")
-    kept = [weakref.ref(one) for one in (added, amended, note)]
+    kept = [weakref.ref(thing) for thing in (added, amended, note)]
     view.add(added)
     view.amend(amended, WireFate.UNDERWAY)
     view.note(START, "INFO", note)
     del added, amended, note
-    assert [one() for one in kept] == [None] * 3
+    assert [reference() for reference in kept] == [None] * 3
     assert not view.close()
     assert "the recording is incomplete" in str(view.failure)
 
@@ -259,7 +259,7 @@ def test_a_view_that_is_far_behind_gives_up(tmp_path: Path, rows: NDArray[Any]) 
     kept = [weakref.ref(block) for block in blocks]
     while blocks:
         view.add(blocks.pop())
-    assert 0 < sum(one() is not None for one in kept) <= 5000 // len(rows) + 2
+    assert 0 < sum(reference() is not None for reference in kept) <= 5000 // len(rows) + 2
     assert "did not keep up" in str(view.failure)
     going_on.set()
     view.close()
@@ -282,16 +282,16 @@ def test_a_view_follows_a_running_wire(tmp_path: Path, capfd: pytest.CaptureFixt
     """With `--view FILE.rrd`, the file has what crossed and the events; the journal, too, keeps the events."""
     plan = both_ways(LOSSY, events=(WireEvent(0.5, None, partition=("robot", "base")),))
     out, path = tmp_path / "out", tmp_path / "wire.rrd"
-    said: list[str] = []
-    with sending(said):
-        assert run_wire(plan, out, seconds=1.5, say=said.append, view=str(path)) == 0
+    messages: list[str] = []
+    with sending(messages):
+        assert run_wire(plan, out, seconds=1.5, say=messages.append, view=str(path)) == 0
     table = shown(path, "table", "TextDocument:text")[-1][1][0]
     assert "cut" in table
     assert "partition robot, base" in [text for _, text in texts(path)]
     capfd.readouterr()
     assert main(["view", str(out), "--table"]) == 0
     printed = capfd.readouterr().out
-    assert printed.strip() == "\n".join(said[-1 - printed.count("\n") : -1]).strip()
+    assert printed.strip() == "\n".join(messages[-1 - printed.count("\n") : -1]).strip()
     replayed = replay_wire(out, tmp_path / "replayed.rrd")
     assert "partition robot, base" in [text for _, text in texts(replayed)]
     assert shown(replayed, "table", "TextDocument:text")[-1][1][0] == table

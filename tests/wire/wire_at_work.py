@@ -32,10 +32,10 @@ def link(source: str, target: str, settings: Mapping[str, Any] = PERFECT, keys: 
 
 def plan_of(*links: WireLink, sides: Mapping[str, Side] | None = None, **fields: Any) -> WirePlan:
     """A wire with these links, whose sides listen at any free port of this machine."""
-    names = dict.fromkeys(name for one in links for name in (one.source, one.target))
-    found = {name: Side(name, (ANYWHERE,)) for name in names} | dict(sides or {})
-    numbered = tuple(WireLink(**{**_fields(one), "number": at}) for at, one in enumerate(links))
-    return WirePlan(fields.pop("seed", 7), found, numbered, **fields)
+    names = dict.fromkeys(name for link in links for name in (link.source, link.target))
+    every_side = {name: Side(name, (ANYWHERE,)) for name in names} | dict(sides or {})
+    numbered = tuple(WireLink(**{**_fields(link), "number": at}) for at, link in enumerate(links))
+    return WirePlan(fields.pop("seed", 7), every_side, numbered, **fields)
 
 
 def both_ways(settings: Mapping[str, Any] = PERFECT, back: Mapping[str, Any] = PERFECT, **fields: Any) -> WirePlan:
@@ -57,20 +57,20 @@ class WireAtWork:
 
     def program(self, *sides: str, **config: Any) -> zenoh.Session:
         """A session of a program that is connected to these sides."""
-        return program([one for side in sides for one in self.relay.endpoints[side]], **config)
+        return program([endpoint for side in sides for endpoint in self.relay.endpoints[side]], **config)
 
     @property
     def rows(self) -> Records:
         """All rows of the journal so far."""
         self.journal.flush()
-        found: Records = np.concatenate([np.empty(0, RECORD), *self._rows])
-        return found
+        rows: Records = np.concatenate([np.empty(0, RECORD), *self._rows])
+        return rows
 
     def rows_of(self, key: str) -> Records:
         """The rows of a key so far."""
         rows = self.rows
-        found: Records = rows[rows["key"] == self.journal.key_code(key)]
-        return found
+        rows_of_key: Records = rows[rows["key"] == self.journal.key_code(key)]
+        return rows_of_key
 
     def fates(self, link_name: str | None = None) -> list[WireFate]:
         """The fates of all messages so far, or of those on one link."""
@@ -98,7 +98,7 @@ def at_work(plan: WirePlan, folder: Path) -> Iterator[WireAtWork]:
 
 
 @contextlib.contextmanager
-def sending(said: list[str]) -> Iterator[None]:
+def sending(messages: list[str]) -> Iterator[None]:
     """A program that publishes `scan` at the side robot of a wire from the moment at which `run_wire` says its endpoint.
 
     said: the list into which the wire says its lines.
@@ -106,7 +106,7 @@ def sending(said: list[str]) -> Iterator[None]:
     ended = Event()
 
     def endpoints() -> list[str]:
-        return [line.split(" ")[1] for line in said if line.startswith("robot ")]
+        return [line.split(" ")[1] for line in messages if line.startswith("robot ")]
 
     def send() -> None:
         with program(wait_until(endpoints, "the wire's endpoints")) as session:
@@ -134,11 +134,11 @@ def program(endpoints: Sequence[str], **config: Any) -> zenoh.Session:
     return zenoh.open(zenoh.Config.from_json5(json.dumps({**base, **config})))
 
 
-def is_declared(wire: WireAtWork, side: str, what: str, key: str) -> bool:
+def is_declared(wire: WireAtWork, side: str, subject: str, key: str) -> bool:
     """Whether a program at a side has declared a `subscriber` or `queryable` that includes a key."""
     session, remote = wire.relay.sides[side].session, zenoh.Locality.REMOTE
     declared: zenoh.Publisher | zenoh.Querier
-    if what == "subscriber":
+    if subject == "subscriber":
         declared = session.declare_publisher(key, allowed_destination=remote)
     else:
         declared = session.declare_querier(key, target=zenoh.QueryTarget.ALL, allowed_destination=remote)
@@ -147,5 +147,5 @@ def is_declared(wire: WireAtWork, side: str, what: str, key: str) -> bool:
         return bool(status.matching)
 
 
-def _fields(one: WireLink) -> dict[str, Any]:
-    return {name: getattr(one, name) for name in one.__dataclass_fields__}
+def _fields(link: WireLink) -> dict[str, Any]:
+    return {name: getattr(link, name) for name in link.__dataclass_fields__}

@@ -16,12 +16,12 @@ CUT = (6.0, 8.0)
 
 def shown(rrd: Path, entity: str, component: str) -> list[tuple[float, Any]]:
     """The component's values of one entity, with their times in seconds, in order of time."""
-    found = []
+    shown_ = []
     for chunk in RrdReader(rrd).stream().filter(content=f"/{entity}", is_static=False):
         columns = chunk.to_record_batch().to_pydict()
-        times = [one.total_seconds() for one in columns[ELAPSED]]
-        found += list(zip(times, columns[component], strict=True))
-    return sorted(found, key=lambda one: one[0])
+        times = [time.total_seconds() for time in columns[ELAPSED]]
+        shown_ += list(zip(times, columns[component], strict=True))
+    return sorted(shown_, key=lambda pair: pair[0])
 
 
 def texts(rrd: Path) -> list[tuple[float, str]]:

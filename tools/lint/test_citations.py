@@ -19,8 +19,8 @@ def words(text: str) -> str:
 def sections(page: Path) -> list[str]:
     """The headings of a page, and the bold beginnings of its paragraphs."""
     text = page.read_text(encoding="utf-8")
-    found = re.findall(r"^(?:#+ (.+)|\*\*(.+?)\*\*)", text, re.MULTILINE)
-    return [words(heading or beginning) for heading, beginning in found]
+    matches = re.findall(r"^(?:#+ (.+)|\*\*(.+?)\*\*)", text, re.MULTILINE)
+    return [words(heading or beginning) for heading, beginning in matches]
 
 
 def _names(cited: str, titles: list[str]) -> bool:
@@ -30,17 +30,17 @@ def _names(cited: str, titles: list[str]) -> bool:
 
 def missing(source: str, where: dict[str, list[str]]) -> list[str]:
     """The pages and sections that "Source:" cites and that are not there."""
-    found = []
+    absent = []
     for paragraph in re.findall(r"Source: (.+?)(?:\n\s*\n|\"\"\")", source, re.DOTALL):
         for match in CITED.finditer(" ".join(paragraph.split())):
             page, cited = match["page"], match["sections"] or ""
             if page not in where:
-                found.append(page)
+                absent.append(page)
                 continue
             titles = where[page]
             parts = [] if not cited or _names(cited, titles) else re.split(r",? and |, ", cited)
-            found += [f"{page}, {part}" for part in parts if not _names(part, titles)]
-    return found
+            absent += [f"{page}, {part}" for part in parts if not _names(part, titles)]
+    return absent
 
 
 PAGES = {path.relative_to(ROOT / "docs").as_posix(): sections(path) for path in (ROOT / "docs").rglob("*.md")}
@@ -52,11 +52,11 @@ FILES = [
 def test_every_cited_section_exists() -> None:
     """In all of the program."""
     wrong = {name: missing((ROOT / name).read_text(encoding="utf-8"), PAGES) for name in FILES}
-    assert {name: what for name, what in wrong.items() if what} == {}
+    assert {name: absent for name, absent in wrong.items() if absent} == {}
 
 
 @pytest.mark.parametrize(
-    ("source", "what"),
+    ("source", "expected"),
     [
         ('"""Values.\n\nSource: docs/a.md, what a thing cannot have.\n"""', ["a.md, what a thing cannot have"]),
         ('"""Values.\n\nSource: docs/a.md, things and plants; docs/b.md.\n"""', ["b.md"]),
@@ -64,6 +64,6 @@ def test_every_cited_section_exists() -> None:
         ('"""Values. Source: docs/a.md, how it\nworks."""', []),
     ],
 )
-def test_what_is_not_there_is_found(source: str, what: list[str]) -> None:
+def test_what_is_not_there_is_found(source: str, expected: list[str]) -> None:
     """So that the test above tests something."""
-    assert missing(source, {"a.md": ["things", "plant", "how it works"]}) == what
+    assert missing(source, {"a.md": ["things", "plant", "how it works"]}) == expected

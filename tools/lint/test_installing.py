@@ -21,21 +21,21 @@ def test_every_extra_is_installed_from_the_checkout_and_exists() -> None:
     """`pip install '.[EXTRA]'` everywhere; `evedrop[EXTRA]` would ask an index for whoever registered the name there."""
     with (ROOT / "pyproject.toml").open("rb") as file:
         extras = set(tomllib.load(file)["project"]["optional-dependencies"])
-    found = [
+    installs = [
         (path.name, *match.group("from", "extra"))
         for path in FILES
         for match in EXTRA.finditer(path.read_text("utf-8"))
     ]
-    assert len(found) > 10
-    assert [one for one in found if one[1] != "." or one[2] not in extras] == []
+    assert len(installs) > 10
+    assert [install for install in installs if install[1] != "." or install[2] not in extras] == []
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "groups"),
     [("`pip install 'evedrop[mcap]'`", ("evedrop", "mcap")), ("pip install '.[video]' in the", (".", "video"))],
 )
-def test_both_forms_are_recognised(text: str, said: tuple[str, str]) -> None:
+def test_both_forms_are_recognised(text: str, groups: tuple[str, str]) -> None:
     """So that the test above tests something."""
     match = EXTRA.search(text)
     assert match is not None
-    assert match.group("from", "extra") == said
+    assert match.group("from", "extra") == groups

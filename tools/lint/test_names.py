@@ -22,9 +22,9 @@ CLASS = re.compile(r"^class ([^\W_]\w*)", re.MULTILINE)
 @cache
 def texts() -> dict[Path, str]:
     """Every module of the package; links to folders are followed once."""
-    found = [path for path in SOURCES if ROOT / "emulator" / "evedrop" / "peers" not in path.parents]
-    assert len(found) > 200
-    return {path: path.read_text(encoding="utf-8") for path in found}
+    paths = [path for path in SOURCES if ROOT / "emulator" / "evedrop" / "peers" not in path.parents]
+    assert len(paths) > 200
+    return {path: path.read_text(encoding="utf-8") for path in paths}
 
 
 def classes_of(text: str) -> list[ast.ClassDef]:
@@ -44,7 +44,7 @@ def test_no_two_public_classes_have_one_name() -> None:
         name: [
             str(path)
             for path in where
-            if any(one.name == name and not one.col_offset for one in classes_of(texts()[path]))
+            if any(class_.name == name and not class_.col_offset for class_ in classes_of(texts()[path]))
         ]
         for name, where in twice.items()
     }
@@ -72,18 +72,18 @@ def test_no_class_is_named_by_a_gerund() -> None:
     """A class is a thing: a loop, a rule, a reporter."""
     tests = {path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py")}
     names = re.compile(r"^ *class _?((?:[A-Z]\w*?)??)([A-Z][a-z]*ing)\b", re.MULTILINE)
-    found = {word for text in (texts() | tests).values() for _, word in names.findall(text)}
-    assert len(found & set(GERUNDS)) > 5
-    assert found - set(GERUNDS) == set()
+    words = {word for text in (texts() | tests).values() for _, word in names.findall(text)}
+    assert len(words & set(GERUNDS)) > 5
+    assert words - set(GERUNDS) == set()
 
 
 def test_classes_say_that_they_are_final_by_the_decorator() -> None:
     """`@final` is checked by mypy; a sentence in a docstring is not. Only modules with such words are parsed."""
-    said = re.compile(r"(?:^|[.;] )Final(?:\.|;)")
+    pattern = re.compile(r"(?:^|[.;] )Final(?:\.|;)")
     tests = {path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py")}
     for path, text in (texts() | tests).items():
         for node in classes_of(text) if re.search("Final[.;]", text) else []:
-            assert not said.search(ast.get_docstring(node) or ""), f"{path}: {node.name}"
+            assert not pattern.search(ast.get_docstring(node) or ""), f"{path}: {node.name}"
 
 
 def test_no_two_test_files_have_the_same_name() -> None:
@@ -212,7 +212,7 @@ def former_words(text: str) -> set[str]:
 def meant_otherwise(path: Path) -> set[str]:
     """The former words that mean something else in a file."""
     name = path.relative_to(ROOT).as_posix()
-    words = {word for word, files in MEANT_OTHERWISE.items() if any(fnmatchcase(name, one) for one in files)}
+    words = {word for word, files in MEANT_OTHERWISE.items() if any(fnmatchcase(name, pattern) for pattern in files)}
     return words | {f"{word}s" for word in words}
 
 
@@ -225,7 +225,7 @@ def pattern_of(word: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("text", "found"),
+    ("text", "is_former"),
     [
         ("two rooms", True),
         ("def open_rooms():", True),
@@ -236,9 +236,9 @@ def pattern_of(word: str) -> str:
         ("roomster", False),
     ],
 )
-def test_parts_of_names_are_words(text: str, found: bool) -> None:
+def test_parts_of_names_are_words(text: str, is_former: bool) -> None:
     """And parts of words are not."""
-    assert former_words(text) == ({"rooms"} if found else set())
+    assert former_words(text) == ({"rooms"} if is_former else set())
 
 
 def test_former_words_are_gone() -> None:
@@ -249,12 +249,12 @@ def test_former_words_are_gone() -> None:
     ]
     assert len(paths) > 800
     own = Path(__file__)
-    found = {
+    former = {
         str(path.relative_to(ROOT)): words
         for path in {*PROSE, *paths} - {own}
         if (words := (former_words(path.read_text(encoding="utf-8")) | former_words(path.stem)) - meant_otherwise(path))
     }
-    assert found == {}, "docs/glossary.md has the words to use"
+    assert former == {}, "docs/glossary.md has the words to use"
 
 
 def test_the_glossary_says_each_word_once() -> None:

@@ -24,7 +24,7 @@ def test_actions_are_pinned_by_their_commit(path: Path) -> None:
     """A tag can be moved to another commit; the comment says the version."""
     used = re.findall(r"uses: (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
     assert used
-    assert [one for one in used if not PINNED.fullmatch(one) and one not in BY_TAG] == []
+    assert [action for action in used if not PINNED.fullmatch(action) and action not in BY_TAG] == []
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)

@@ -155,8 +155,8 @@ def probability_of_change(p: Floats, hazard: float, changed: Floats, same: Float
     """
     before = p + (1.0 - p) * hazard
     after = before * changed
-    found: Floats = after / (after + (1.0 - before) * same)
-    return found
+    posterior: Floats = after / (after + (1.0 - before) * same)
+    return posterior
 
 
 @final
@@ -179,7 +179,7 @@ class ShiryaevTest:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        inside = all(0.0 < one < 1.0 for one in (self.normal, self.raised, self.hazard, self.risk))
+        inside = all(0.0 < probability < 1.0 for probability in (self.normal, self.raised, self.hazard, self.risk))
         if not inside or self.raised <= self.normal:
             raise ValueError(
                 f"loss rates {self.normal:g} and {self.raised:g}, hazard {self.hazard:g}, risk {self.risk:g}; expected numbers "

@@ -406,7 +406,7 @@ def modulated_streaks(
 def _slot_distributions_of(
     process: Process, link: LinkDistribution, slots: int, outcomes_at: OutcomesAt, slots_at: SlotOutcomes | None
 ) -> _SlotDistributions:
-    starts = [*(one.start for one in link.segments[1:]), slots]
+    starts = [*(segment.start for segment in link.segments[1:]), slots]
     shape = (slots, len(link.last.stationary))
     transitions, stationary, quality = np.empty((*shape, shape[1])), np.empty(shape), np.empty(shape)
     for segment, stop in zip(link.segments, starts, strict=True):
@@ -417,8 +417,8 @@ def _slot_distributions_of(
     odds = SlotOdds.of(outcomes_at).at(quality)
     if slots_at is not None:
         for k in range(slots):
-            for name, one in SlotOdds.of(slots_at(k)).at(quality[k]).items():
-                odds[name][k] = one
+            for name, value in SlotOdds.of(slots_at(k)).at(quality[k]).items():
+                odds[name][k] = value
     noise = odds["predicted"][:, :, None] * process.Q.reshape(-1)
     if odds["leaked"].any():
         remaining = RemainingCovariances(process)

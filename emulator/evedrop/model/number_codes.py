@@ -75,21 +75,21 @@ class DitheredQuantiser:
 
     def centres(self, k: int, levels: NDArray[np.int64]) -> Floats:
         """The numbers in the middle of the levels, (n, R)."""
-        found: Floats = (levels - 2.0 ** (self._bits - 1) + 0.5) * self.steps(k)[:, None]
-        return found
+        centres_: Floats = (levels - 2.0 ** (self._bits - 1) + 0.5) * self.steps(k)[:, None]
+        return centres_
 
     def levels_of(self, k: int, centres: Floats) -> NDArray[np.int64]:
         """The levels whose middles these are, (n, R)."""
         steps = self.steps(k)[:, None]
-        found: NDArray[np.int64] = np.rint(
+        levels_: NDArray[np.int64] = np.rint(
             centres / np.where(steps > 0.0, steps, 1.0) + (2.0 ** (self._bits - 1) - 0.5)
         ).astype(np.int64)
-        return found
+        return levels_
 
     def read(self, k: int, levels: NDArray[np.int64]) -> Floats:
         """The state as it is read from levels, (n, R)."""
-        found: Floats = self.centres(k, levels) - self._dither.at(k) * self.steps(k)[:, None]
-        return found
+        states: Floats = self.centres(k, levels) - self._dither.at(k) * self.steps(k)[:, None]
+        return states
 
 
 @final

@@ -14,8 +14,8 @@ from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Receiver, Rece
 
 def _use_one(uses_block: Callable[..., Flags | None]) -> Callable[..., Flags | None]:
     def uses(self: PacketUser, k: int) -> Flags | None:
-        found = uses_block(self, range(k, k + 1))
-        return None if found is None else found[0]
+        uses = uses_block(self, range(k, k + 1))
+        return None if uses is None else uses[0]
 
     return uses
 

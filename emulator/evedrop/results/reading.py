@@ -307,13 +307,13 @@ def _no_metrics(folder: Path) -> dict[str, Any]:
     from evedrop.score.run_tally import RunTally  # noqa: PLC0415
     from evedrop.score.scorekeeper import RunOutcome, summary_of  # noqa: PLC0415
 
-    found = recorded(folder)
-    if not found.complete:
+    recording = recorded(folder)
+    if not recording.complete:
         raise UsageError(
             f"{folder} has no metrics yet, and theory needs its classes, which are not built in; looking at results imports "
             "none: look again when the run has metrics, or run the scenario again"
         )
-    scenario = found.scenario
+    scenario = recording.scenario
     nothing = RunTally.nothing(scenario, scenario.trials)
     summary: dict[str, Any] = plain(
         summary_of(scenario, nothing, dict.fromkeys(scenario.digested), RunOutcome(0.0, "slot 0")).as_dict()

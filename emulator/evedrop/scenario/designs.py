@@ -73,7 +73,7 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
         raise UsageError(f"a budget of {budget:g}: expected a finite number of at least 0, an energy in a slot")
     name = scenario.encoding.scheme
     if not SCHEMES[name].meets_energy_budget:
-        able = [one for one in SCHEMES if SCHEMES[one].meets_energy_budget]
+        able = [scheme for scheme in SCHEMES if SCHEMES[scheme].meets_energy_budget]
         raise UsageError(
             f"an energy budget is met by the threshold of the scheme {listed(able)}, and this scenario has {name}; "
             f"evedrop compare SCENARIO --schemes {able[0]} --out DIR writes DIR/scenarios/{able[0]}.toml, which can be designed"
@@ -82,8 +82,8 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
         stated_form(_with(scenario, 1.0), LEGITIMATE),
         conditions_of(scenario, LEGITIMATE).acknowledged,
     )
-    forms = {one: stated_form(_with(scenario, 1.0), one) for one in scenario.eavesdroppers}
-    left_out = {one: scenario.eavesdroppers[one].strategy for one, form in forms.items() if form is None}
+    forms = {eavesdropper: stated_form(_with(scenario, 1.0), eavesdropper) for eavesdropper in scenario.eavesdroppers}
+    left_out = {name: scenario.eavesdroppers[name].strategy for name, form in forms.items() if form is None}
     if legitimate is None or acknowledged is None:
         raise UsageError(
             "the design for a budget is for independent losses that stay the same, without late packets and outages, and for an "
@@ -107,14 +107,14 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
             + ("" if arrives else f"; no acknowledgement arrives, so nothing less than {encrypted:g} is enough")
         )
 
-    def metrics(one: float) -> ThresholdMetrics:
-        fraction = encrypted_fraction(one, arrives)
+    def metrics(threshold: float) -> ThresholdMetrics:
+        fraction = encrypted_fraction(threshold, arrives)
         errors = {}
         for eavesdropper in forms:
-            form = stated_form(_with(scenario, one), eavesdropper)
+            form = stated_form(_with(scenario, threshold), eavesdropper)
             if form is not None:
                 errors[eavesdropper] = form.limit
-        return ThresholdMetrics(one, fraction, model.spent(scheme, 1.0, fraction), errors)
+        return ThresholdMetrics(threshold, fraction, model.spent(scheme, 1.0, fraction), errors)
 
     others = tuple(metrics(float(whole)) for whole in range(1, _SHOWN + 1))
     return BudgetDesign(budget, unencrypted, encrypted, legitimate.limit, metrics(threshold), others, left_out)

@@ -74,13 +74,13 @@ class Evidence:
         direction = direction_metric(name)
         if direction is not None:
             entry = self.directions.get(direction[0], {}).get(direction[1])
-            found = None if entry is None else entry.mean_squared_error
+            value = None if entry is None else entry.mean_squared_error
         elif application in self.scenario.applications:
             summary = self.applications.get(application)
-            found = None if summary is None else APPLICATIONS[application].metric(summary, path)
+            value = None if summary is None else APPLICATIONS[application].metric(summary, path)
         else:
-            found = self._of_link(*link) if link is not None else self._of_receiver(expect, *name.split("."))
-        return found, None if found is None else expect.holds(found)
+            value = self._of_link(*link) if link is not None else self._of_receiver(expect, *name.split("."))
+        return value, None if value is None else expect.holds(value)
 
     def _of_link(self, receiver: str, path: tuple[str, ...]) -> float | None:
         """A metric of a link's account, or of its losses by reason: 0 for a reason that did not occur."""

@@ -31,8 +31,8 @@ class RunTally:
         """The empty tallies of receivers only: of trials without slots, or in a mode without states."""
         watches = watches_of(scenario)
         tallies = {
-            name: Tally(scenario.slots, trials, WatchedTally(one, trials), cuts=scenario.outage_bounds(name))
-            for name, one in watches.items()
+            name: Tally(scenario.slots, trials, WatchedTally(watch, trials), cuts=scenario.outage_bounds(name))
+            for name, watch in watches.items()
         }
         for name, tally in tallies.items():
             tally.conditional = conditional_error_of(scenario, name, trials)

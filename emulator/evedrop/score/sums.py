@@ -322,10 +322,10 @@ class Tally(ReceiverTally):
 
     def metric(self, name: str) -> float | None:
         """A metric of the run by its name; None if it has no value."""
-        found = metric(name)
-        if not issubclass(found, TallyMetric):
+        metric_class = metric(name)
+        if not issubclass(metric_class, TallyMetric):
             return self.watched.tally(WatchedSlots(name, 0, self.slots)).value
-        value = found.of_tally(self) if self.offered else math.nan
+        value = metric_class.of_tally(self) if self.offered else math.nan
         return None if math.isnan(value) else value
 
     @property

@@ -215,6 +215,6 @@ class WatchedTally:
         """The quantities of disjoint sets of trials, in their order."""
         total = cls((), 0)
         total._kept = {
-            watch: type(one).merged([part._kept[watch] for part in parts]) for watch, one in parts[0]._kept.items()
+            watch: type(tally).merged([part._kept[watch] for part in parts]) for watch, tally in parts[0]._kept.items()
         }
         return total

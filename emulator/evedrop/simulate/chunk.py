@@ -60,7 +60,9 @@ class PacketTally:
     @classmethod
     def merged(cls, parts: Sequence[PacketTally]) -> PacketTally:
         """The counts of several sets of trials, at least one, in order."""
-        return cls(np.concatenate([one.sent for one in parts]), np.concatenate([one.encrypted for one in parts]))
+        return cls(
+            np.concatenate([tally.sent for tally in parts]), np.concatenate([tally.encrypted for tally in parts])
+        )
 
     def add_slots(self, encrypted: Flags, sent: Flags | None) -> None:
         """Add some slots: whether each packet is encrypted, and whether it is sent, (c, R) each; None: all are sent."""

@@ -61,8 +61,8 @@ class SplitPopulations:
         self._importance = importance
         product = importance * self.weight
         fraction = product / product.max(axis=1, keepdims=True)
-        found: Floats = fraction.sum(axis=1) ** 2 / (fraction * fraction).sum(axis=1) / fraction.shape[1]
-        return found
+        effective: Floats = fraction.sum(axis=1) ** 2 / (fraction * fraction).sum(axis=1) / fraction.shape[1]
+        return effective
 
     def split(self, uniforms: Floats) -> NDArray[np.intp]:
         """Copy each trial, on average, in proportion to u G within its population; the trials that are copied, (P N,).
@@ -74,7 +74,7 @@ class SplitPopulations:
         total = product.mean(axis=1)
         cumulated = np.cumsum(product, axis=1)
         marks = (np.arange(size) + uniforms[:, None]) / size * cumulated[:, -1:]
-        copied = np.array([np.searchsorted(one, at, side="right") for one, at in zip(cumulated, marks, strict=True)])
+        copied = np.array([np.searchsorted(sums, at, side="right") for sums, at in zip(cumulated, marks, strict=True)])
         copied = np.minimum(copied, size - 1)
         self.weight = total[:, None] / np.take_along_axis(self._importance, copied, axis=1)
         return np.asarray((copied + size * np.arange(populations)[:, None]).reshape(-1), np.intp)

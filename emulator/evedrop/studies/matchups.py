@@ -162,16 +162,16 @@ def _chosen(
         chosen.append(wanted)
     receivers = {name: receiver_name(name) for name in chosen[1]}
     for name, receiver in receivers.items():
-        other = next(one for one, its in receivers.items() if its == receiver)
+        other = next(name for name, its in receivers.items() if its == receiver)
         if other != name:
             mistakes.append(
                 f"{name} and {other} would both be called {receiver} in a scenario; compare them one after the other"
             )
-    entries = {one: SCHEMES[one].parameters for one in (*SCHEMES, *chosen[0]) if one in SCHEMES}
+    entries = {scheme: SCHEMES[scheme].parameters for scheme in (*SCHEMES, *chosen[0]) if scheme in SCHEMES}
     for key in parameters:
         scheme, _, name = key.rpartition(".")
         if name not in entries.get(scheme, ()):
-            parts = [f"{one}.{entry}" for one, available in entries.items() for entry in available]
+            parts = [f"{scheme}.{entry}" for scheme, available in entries.items() for entry in available]
             mistakes.append(f"{key} is not a parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
     if mistakes:
         raise UsageError("\n  ".join(["nothing was compared:", *mistakes]))

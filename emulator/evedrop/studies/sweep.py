@@ -211,7 +211,11 @@ def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[s
             "trials": summary.trials,
             **{metric: peer.metric(metric) for metric in all_metrics()},
             **{error_column(name): peer.standard_errors.get(name) for name in estimated_metrics()},
-            **{z_column(name): peer.z.get(name) for name, one in all_metrics().items() if one.expected is not None},
+            **{
+                z_column(name): peer.z.get(name)
+                for name, metric in all_metrics().items()
+                if metric.expected is not None
+            },
             **{f"error_quantile_{level}": value for level, value in (peer.error_quantiles or {}).items()},
             "infinite_variance": peer.infinite_variance,
             "rare_fraction": None if peer.rare_events is None else peer.rare_events.fraction,

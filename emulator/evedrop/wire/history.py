@@ -129,17 +129,20 @@ class WireHistory:
 
     def expect_settings(self) -> None:
         """Raise UsageError unless each link had settings from which fates, and their distribution, can be computed."""
-        for link, known in self._settings.items():
-            for one in known:
-                mistakes = [(f"loss.{name}", what) for name, what in model_mistakes(one.settings["loss"], LOSS_MODELS)]
-                if "delay" in one.settings:
-                    wrong = model_mistakes(one.settings["delay"], DELAY_MODELS)
-                    mistakes += [(f"delay.{name}", what) for name, what in wrong]
-                corrupt = one.settings.get("corrupt", 0.0)
+        for link, changes in self._settings.items():
+            for change in changes:
+                mistakes = [
+                    (f"loss.{name}", sentence)
+                    for name, sentence in model_mistakes(change.settings["loss"], LOSS_MODELS)
+                ]
+                if "delay" in change.settings:
+                    wrong = model_mistakes(change.settings["delay"], DELAY_MODELS)
+                    mistakes += [(f"delay.{name}", reason) for name, reason in wrong]
+                corrupt = change.settings.get("corrupt", 0.0)
                 if not isinstance(corrupt, float | int) or not 0.0 <= corrupt <= 1.0:
                     mistakes.append(("corrupt", f"is {as_toml(corrupt)}; expected a probability"))
-                for name, what in mistakes:
-                    raise UsageError(f"{self.folder / _FILE} has settings of the link {link} in which {name} {what}")
+                for name, reason in mistakes:
+                    raise UsageError(f"{self.folder / _FILE} has settings of the link {link} in which {name} {reason}")
 
     def expect_seed(self, plan: WirePlan) -> None:
         """Raise UsageError if an earlier start had another seed."""

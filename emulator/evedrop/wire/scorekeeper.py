@@ -348,7 +348,9 @@ def bounds(mean: float, variance: float, count: int) -> tuple[float, float]:
 
 def _parts(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Iterable[range]) -> Iterator[_Part]:
     last = {
-        change.at: change.settings for change in sorted(changes, key=lambda one: one.at) if change.settings is not None
+        change.at: change.settings
+        for change in sorted(changes, key=lambda change: change.at)
+        if change.settings is not None
     }
     stretches: list[tuple[int, int, Mapping[str, Any]]] = [(0, 0, settings)]
     for at, new in last.items():

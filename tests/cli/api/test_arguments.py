@@ -27,7 +27,7 @@ def results() -> RunResults:
 
 
 @pytest.mark.parametrize(
-    ("call", "arguments", "options", "said"),
+    ("call", "arguments", "options", "message"),
     [
         (montecarlo, [{"slots": 3}], {}, rf"scenario=\{{'slots': 3\}}: {A_SCENARIO}"),
         (montecarlo, [None], {}, f"scenario=None: {A_SCENARIO}"),
@@ -77,11 +77,16 @@ def results() -> RunResults:
     ],
 )
 def test_an_argument_of_the_wrong_type_is_refused(
-    call: Callable[..., Any], arguments: list[Any], options: dict[str, Any], said: str, tmp_path: Path, monkeypatch: Any
+    call: Callable[..., Any],
+    arguments: list[Any],
+    options: dict[str, Any],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: Any,
 ) -> None:
     """The message names the argument, its value and what would do; they used to be errors of Python's own, deep inside."""
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(UsageError, match=message):
         call(*arguments, **options)
     assert [*tmp_path.iterdir()] == []
 

@@ -50,11 +50,11 @@ def results() -> RunResults:
 def test_results_without_out_live_as_long_as_their_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without `out`, results are in a private temporary folder, not in the current one."""
     monkeypatch.chdir(tmp_path)
-    found = montecarlo(SMALL, trials=2)
-    folder = found.folder
+    result = montecarlo(SMALL, trials=2)
+    folder = result.folder
     assert (folder.stat().st_mode & 0o777, [*tmp_path.iterdir()]) == (0o700, [])
-    assert found.slots.num_rows == 24
-    del found
+    assert result.slots.num_rows == 24
+    del result
     gc.collect()
     assert not folder.exists()
 
@@ -70,7 +70,7 @@ def test_a_live_run_has_the_digests_of_memory_and_leaves_nothing_behind(tmp_path
     folder, existed, digests = json.loads(done.stdout)
     assert existed
     assert not Path(folder).exists()
-    assert [one.name for one in tmp_path.iterdir()] == ["s.toml"]
+    assert [path.name for path in tmp_path.iterdir()] == ["s.toml"]
     assert digests == digests_of(montecarlo(SMALL, trials=1))
 
 
@@ -124,16 +124,16 @@ def failed(error: BaseException, *files: str) -> tuple[Path, list[str]]:
 
 def test_results_so_far_of_a_failed_call_stay_until_the_program_ends(at_exit: list[Any]) -> None:
     """The error says where the results so far are; an empty folder is removed."""
-    folder, said = failed(RunError("a process died"), "summary.json")
-    assert (folder.exists(), said) == (
+    folder, message = failed(RunError("a process died"), "summary.json")
+    assert (folder.exists(), message) == (
         True,
         [f"Until this program ends, load_results('{folder}') reads the results so far."],
     )
     assert at_exit == [(shutil.rmtree, folder)]
     shutil.rmtree(folder)
     for error in (RunError("at once"), KeyboardInterrupt()):
-        folder, said = failed(error)
-        assert (folder.exists(), said) == (False, [])
+        folder, message = failed(error)
+        assert (folder.exists(), message) == (False, [])
 
 
 def test_metrics_are_attributes_with_types(results: RunResults) -> None:
@@ -145,7 +145,7 @@ def test_metrics_are_attributes_with_types(results: RunResults) -> None:
         assert peer.mean_squared_error == entry["mean_squared_error"] > 0.0
         for metric in all_metrics():
             assert getattr(peer, metric) == peer.metric(metric)
-    written = {name for name, one in vars(BuiltInMetrics).items() if isinstance(one, property)}
+    written = {name for name, member in vars(BuiltInMetrics).items() if isinstance(member, property)}
     assert written == set(all_metrics())
     assert results.links["smart"].offered == 48
     assert results.secrecy["smart"].sentence
@@ -216,25 +216,25 @@ def test_a_sweep_takes_arrays_and_gives_a_table() -> None:
     """A row for each point and receiver, with the numbers of the point's own study; the page has the command that repeats it."""
     over = {"encoding.state_probability": np.array([0.2, 0.6]), "slots": range(5, 8, 2), "title": ["1:2"]}
     link = {"quality": 0.7}
-    found = sweep(SMALL, over, trials=3, legitimate={"link": link})
-    assert (found.points, found.table.num_rows, found.keys) == (4, 8, tuple(over))
-    row = found.table.to_pylist()[-1]
+    result = sweep(SMALL, over, trials=3, legitimate={"link": link})
+    assert (result.points, result.table.num_rows, result.keys) == (4, 8, tuple(over))
+    row = result.table.to_pylist()[-1]
     same = montecarlo(SMALL, trials=3, slots=7, encoding__state_probability=0.6, legitimate__link=link)
     assert (row["peer"], row["mean_squared_error"]) == ("smart", same.peers["smart"].mean_squared_error)
-    assert "4 points" in repr(found)
-    html = found._repr_html_()
+    assert "4 points" in repr(result)
+    html = result._repr_html_()
     assert ("4 points" in html, html.count("<tr>"), "more:" in html) == (True, 9, False)
-    wide = replace(found, table=pa.concat_tables([found.table] * 6))
+    wide = replace(result, table=pa.concat_tables([result.table] * 6))
     assert "and 8 more rows: .table has all of them" in wide._repr_html_()
-    found.report()
-    (command,) = (text for text in checked(found.folder).texts if text.startswith("evedrop sweep"))
+    result.report()
+    (command,) = (text for text in checked(result.folder).texts if text.startswith("evedrop sweep"))
     options = parser_of("sweep").parse_whole(shlex.split(command)[1:])
     assert grid_of(options.over) == {"encoding.state_probability": [0.2, 0.6], "slots": [5, 7], "title": ["1:2"]}
     assert load(options.scenario, changes_of(options)) == SMALL.replace(trials=3, legitimate__link=link)
 
 
 @pytest.mark.parametrize(
-    ("over", "said"),
+    ("over", "message"),
     [
         ({}, "expected 1 to 10000 points"),
         ({"slots": 5}, "slots is 5; expected a list of values"),
@@ -242,17 +242,17 @@ def test_a_sweep_takes_arrays_and_gives_a_table() -> None:
         ({"slots": range(10_001)}, "expected 1 to 10000 points"),
     ],
 )
-def test_a_sweep_over_no_values_is_refused(over: dict[str, Any], said: str) -> None:
+def test_a_sweep_over_no_values_is_refused(over: dict[str, Any], message: str) -> None:
     """The message has the key and what is expected."""
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(UsageError, match=message):
         sweep(SMALL, over)
 
 
 @pytest.mark.long
 def test_a_comparison_takes_a_scenario_of_python() -> None:
     """A comparison needs no folder."""
-    found = compare(SMALL, schemes=["innovation"], adversaries=["naive"], trials=2)
-    assert found.cell("innovation", "naive").eavesdropper is not None
+    result = compare(SMALL, schemes=["innovation"], adversaries=["naive"], trials=2)
+    assert result.cell("innovation", "naive").eavesdropper is not None
 
 
 def test_a_notebook_shows_progress_and_takes_it_away(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -280,6 +280,6 @@ def test_a_notebook_shows_progress_and_takes_it_away(monkeypatch: pytest.MonkeyP
 
 
 def _module(**names: Any) -> ModuleType:
-    found = ModuleType("IPython")
-    vars(found).update(names)
-    return found
+    module = ModuleType("IPython")
+    vars(module).update(names)
+    return module

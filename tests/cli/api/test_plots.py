@@ -53,10 +53,10 @@ def test_the_error_of_the_only_slot_is_a_dot() -> None:
 
 def test_errors_of_rounding_lie_on_the_lower_edge(results: RunResults) -> None:
     """One trial ends far below tr Q where a state was received; a mean over several is shown further down."""
-    one = montecarlo(SCENARIO.replace(record_trials=1), trials=1)
-    (axes,) = one.plot("errors").axes
+    alone = montecarlo(SCENARIO.replace(record_trials=1), trials=1)
+    (axes,) = alone.plot("errors").axes
     floor = 1e-4  # tr Q is 0.002
-    assert min(row["mean_squared_error"] for row in one.slots.to_pylist()) < 1e-20
+    assert min(row["mean_squared_error"] for row in alone.slots.to_pylist()) < 1e-20
     assert axes.get_ylim()[0] == pytest.approx(floor)
     assert "values below 0.0001 lie on the lower edge" in axes.get_title("left")
     assert min(np.min(np.asarray(line.get_ydata())) for line in axes.get_lines()) == pytest.approx(floor)
@@ -80,7 +80,7 @@ def test_lanes_have_the_outcome_of_every_packet(results: RunResults) -> None:
     rows = [row for row in results.trials.to_pylist() if row["trial"] == 1 and 5 <= row["slot"] < 25]
     lost = [[row["action"] == "dropped" for row in rows if row["peer"] == name] for name in results.peers]
     assert np.array_equal((pixels == DROPPED).all(axis=2), lost)
-    assert [one.get_text() for one in axes.get_yticklabels()] == list(results.peers)
+    assert [yticklabel.get_text() for yticklabel in axes.get_yticklabels()] == list(results.peers)
     assert "trial 1, slots 5 to 24" in axes.get_title("left")
 
 
@@ -93,8 +93,8 @@ def test_the_plane_shows_the_truth_and_who_follows_it(results: RunResults) -> No
     assert list(drawn) == ["truth", *results.peers]
     low, high = axes.get_xlim()
     assert low < truth[:, 0].min() <= truth[:, 0].max() < high < truth[:, 0].max() + np.ptp(truth[:, 0])
-    one = {"A": [[0.9]], "Q": [[0.1]], "initial_covariance": [[1.0]]}
-    (axes,) = montecarlo(SCENARIO, trials=2, process=one).plot("plane").axes
+    process = {"A": [[0.9]], "Q": [[0.1]], "initial_covariance": [[1.0]]}
+    (axes,) = montecarlo(SCENARIO, trials=2, process=process).plot("plane").axes
     assert axes.get_xlabel() == "slot"
 
 
@@ -105,11 +105,11 @@ def test_nine_receivers_look_different() -> None:
     errors, _, plane = results.plot().axes
     manners = []
     for axes, kind in ((errors, "get_linestyle"), (plane, "get_marker")):
-        lines = [one for one in axes.get_lines() if str(one.get_label()) in results.peers]
-        assert [one.get_label() for one in lines] == list(results.peers)
-        manners += [{(to_hex(one.get_color()), getattr(one, kind)()) for one in lines}]
-        assert len({to_hex(one.get_color()) for one in lines}) == 7
-    assert [len(one) for one in manners] == [9, 9]
+        lines = [line for line in axes.get_lines() if str(line.get_label()) in results.peers]
+        assert [line.get_label() for line in lines] == list(results.peers)
+        manners += [{(to_hex(line.get_color()), getattr(line, kind)()) for line in lines}]
+        assert len({to_hex(line.get_color()) for line in lines}) == 7
+    assert [len(manner) for manner in manners] == [9, 9]
 
 
 def test_a_figure_shows_itself_in_a_notebook_without_a_display(
@@ -140,9 +140,9 @@ def test_what_cannot_be_drawn_is_refused(results: RunResults) -> None:
 @pytest.mark.long
 def test_a_sweep_is_drawn_as_its_file_is() -> None:
     """Errors against the first entry, a panel for each value of the second."""
-    found: SweepResults = sweep(SCENARIO, {"encoding.state_probability": [0.3, 0.7], "slots": [4, 6]}, trials=3)
-    axes = found.plot().axes
-    assert [one.get_title("left") for one in axes] == ["slots = 4", "slots = 6"]
+    result: SweepResults = sweep(SCENARIO, {"encoding.state_probability": [0.3, 0.7], "slots": [4, 6]}, trials=3)
+    axes = result.plot().axes
+    assert [axis.get_title("left") for axis in axes] == ["slots = 4", "slots = 6"]
     assert axes[0].get_xlabel() == "encoding.state_probability"
 
 
@@ -157,24 +157,24 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 def test_a_comparison_takes_a_class_and_has_a_figure_and_a_page(own: Any) -> None:
     """The figure has a row for each scheme; the page lies in the folder of the results."""
-    found = compare(SCENARIO, schemes=[own.Flipped, "plain"], adversaries=[Naive], trials=2, plan=Plan(workers=1))
-    assert isinstance(found, ComparisonResults)
-    assert list(found.schemes) == ["flipped:Flipped", "plain"]
-    assert found.adversaries == ("naive",)
-    for scheme, adversary, said in (("plane", "naive", "scheme 'plane'; expected one of flipped:Flipped, plain"),
+    result = compare(SCENARIO, schemes=[own.Flipped, "plain"], adversaries=[Naive], trials=2, plan=Plan(workers=1))
+    assert isinstance(result, ComparisonResults)
+    assert list(result.schemes) == ["flipped:Flipped", "plain"]
+    assert result.adversaries == ("naive",)
+    for scheme, adversary, message in (("plane", "naive", "scheme 'plane'; expected one of flipped:Flipped, plain"),
                                     ("plain", "naiv", "adversary 'naiv'; expected one of naive")):  # fmt: skip
-        with pytest.raises(KeyError, match=f"there is no {said}$"):
-            found.cell(scheme, adversary)
-    texts = {one.get_text() for one in found.plot().axes[0].texts}
-    assert {*found.schemes, *found.adversaries} <= texts
-    assert found.report() == found.folder / REPORT
-    assert any("flipped:Flipped" in text for text in checked(found.folder).texts)
-    assert repr(found) == f"<ComparisonResults of {SCENARIO.title!r}: 30 slots, 2 trials, 2 schemes, 1 adversary>"
-    shown = found._repr_html_()
+        with pytest.raises(KeyError, match=f"there is no {message}$"):
+            result.cell(scheme, adversary)
+    texts = {text.get_text() for text in result.plot().axes[0].texts}
+    assert {*result.schemes, *result.adversaries} <= texts
+    assert result.report() == result.folder / REPORT
+    assert any("flipped:Flipped" in text for text in checked(result.folder).texts)
+    assert repr(result) == f"<ComparisonResults of {SCENARIO.title!r}: 30 slots, 2 trials, 2 schemes, 1 adversary>"
+    shown = result._repr_html_()
     cells = Checked(shown).texts[5:]  # after the caption and the heads
     assert cells[::4] == ["flipped:Flipped", "plain"]
-    assert cells[5] == f"{found.schemes['plain'].price:.3g}"
-    assert cells[3::4] == ["no" if name in found.dominant else "yes" for name in found.schemes]
+    assert cells[5] == f"{result.schemes['plain'].price:.3g}"
+    assert cells[3::4] == ["no" if name in result.dominant else "yes" for name in result.schemes]
 
 
 def test_results_write_their_page(results: RunResults) -> None:

@@ -74,10 +74,10 @@ class Ear:
 
     def all(self) -> list[Message]:
         """Everything that has arrived by now."""
-        found = []
+        messages = []
         while not self.messages.empty():
-            found.append(self.messages.get())
-        return found
+            messages.append(self.messages.get())
+        return messages
 
 
 def connect(brief: AnyBrief, **changes: Any) -> zenoh.Session:

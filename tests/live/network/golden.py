@@ -33,9 +33,9 @@ Decode = Callable[[dict[str, Any], dict[str, Any], bytes], dict[str, Any]]
 
 def parts_of(block: str) -> tuple[dict[str, Any], dict[str, Any], bytes]:
     """Shape, value and bytes of a message's golden block."""
-    found = re.fullmatch(r"(?:shape (.*?)\n)?value (.*)\nbytes (.*)", block, re.S)
-    assert found is not None, block
-    shape, value, raw = found.groups()
+    match = re.fullmatch(r"(?:shape (.*?)\n)?value (.*)\nbytes (.*)", block, re.S)
+    assert match is not None, block
+    shape, value, raw = match.groups()
     return json.loads(shape or "{}"), json.loads(value), bytes.fromhex(raw)
 
 
@@ -69,14 +69,14 @@ def extent_of(shape: dict[str, Any]) -> telemetry.Extent:
 def encode_delivery(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the router makes it."""
     mask = packed_flags(flags(value["gamma"])).tobytes()
-    late = tuple(Late(one["k"], heard_of(shape, one["gamma"], one["z"])) for one in value.get("late", ()))
+    late = tuple(Late(entry["k"], heard_of(shape, entry["gamma"], entry["z"])) for entry in value.get("late", ()))
     return packets.delivery(value["k"], mask, np.array(value["z"], float).tobytes(), late)
 
 
 def decode_delivery(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As a receiver reads it."""
     arrival = packets.read_delivery(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]))
-    late = [{"k": one.k, **packets_of(one.heard)} for one in arrival.late]
+    late = [{"k": late_packet.k, **packets_of(late_packet.heard)} for late_packet in arrival.late]
     return {"k": value["k"], **packets_of(arrival.heard), **({"late": late} if late else {})}
 
 
@@ -85,7 +85,7 @@ def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     x_hat, P, trace = (np.array(value[name], float) for name in ("x_hat", "P", "trace"))
     action = np.array(value["action"], np.uint8)
     late, used = (np.array(value[name], np.uint16) if name in value else None for name in ("late", "late_used"))
-    sums = {int(block): np.array(one, float) for block, one in value.get("trace_sums", {}).items()}
+    sums = {int(block): np.array(trace_sum, float) for block, trace_sum in value.get("trace_sums", {}).items()}
     return telemetry.Report(value["k"], x_hat, action, P, trace, late, digests_of(value), used, sums).pack()
 
 
@@ -94,9 +94,9 @@ def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> d
     window = shape.get("window", 0)
     report = telemetry.read_report(wire.Reader(KEY, raw), value["k"], extent_of(shape), Blocks(SLOTS), window)
     columns = {name: getattr(report, name).tolist() for name in ("x_hat", "action", "P", "trace")}
-    digests = {str(block): [bytes(one).hex() for one in rows] for block, rows in report.digests.items()}
+    digests = {str(block): [bytes(digest).hex() for digest in rows] for block, rows in report.digests.items()}
     late = {name: column.tolist() for name in ("late", "late_used") if (column := getattr(report, name)) is not None}
-    sums = {str(block): one.tolist() for block, one in report.trace_sums.items()}
+    sums = {str(block): trace_sum.tolist() for block, trace_sum in report.trace_sums.items()}
     more = {"trace_sums": sums} if sums else {}
     return {"k": report.first, "c": report.count, **columns, **late, "digests": digests, **more}
 
@@ -111,12 +111,12 @@ def decode_truth(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> di
     """As the recorder reads it."""
     inputs = shape.get("inputs", 0)
     truth = telemetry.read_truth(wire.Reader(KEY, raw), value["k"], extent_of(shape))
-    found = {"k": truth.first, "c": truth.count, "x": truth.x.tolist(), "nu": truth.nu.astype(int).tolist()}
+    fields = {"k": truth.first, "c": truth.count, "x": truth.x.tolist(), "nu": truth.nu.astype(int).tolist()}
     if not inputs:
-        return found
+        return fields
     assert truth.u is not None
     assert truth.failed is not None
-    return {**found, "u": truth.u.tolist(), "failed": truth.failed.astype(int).tolist()}
+    return {**fields, "u": truth.u.tolist(), "failed": truth.failed.astype(int).tolist()}
 
 
 def decode_known(name: str) -> Decode:
@@ -154,7 +154,7 @@ def decode_decided(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
 def digests_of(value: dict[str, Any]) -> dict[int, np.ndarray]:
     """Digests of values."""
     return {
-        int(block): np.array([list(bytes.fromhex(one)) for one in rows], np.uint8)
+        int(block): np.array([list(bytes.fromhex(digest)) for digest in rows], np.uint8)
         for block, rows in value["digests"].items()
     }
 
@@ -167,9 +167,9 @@ def encode_decisions(_shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 def decode_decisions(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the recorder reads it."""
     extent = extent_of({"n": 1, **shape})
-    found = loop_wire.read_decisions(wire.Reader(KEY, raw), value["k"], extent, Blocks(SLOTS), shape["period"])
-    digests = {str(block): [bytes(one).hex() for one in rows] for block, rows in found.digests.items()}
-    return {"k": found.first, "c": found.count, "seconds": found.seconds.tolist(), "digests": digests}
+    decisions = loop_wire.read_decisions(wire.Reader(KEY, raw), value["k"], extent, Blocks(SLOTS), shape["period"])
+    digests = {str(block): [bytes(digest).hex() for digest in rows] for block, rows in decisions.digests.items()}
+    return {"k": decisions.first, "c": decisions.count, "seconds": decisions.seconds.tolist(), "digests": digests}
 
 
 def encode_journal(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
@@ -257,7 +257,7 @@ def control_of(value: dict[str, Any]) -> commands.ControlCommand:
     """A command with these fields."""
 
     def changes(of: list[dict[str, Any]]) -> tuple[Change, ...]:
-        return tuple(Change(one["at"], one.get("settings"), one.get("cut")) for one in of)
+        return tuple(Change(change["at"], change.get("settings"), change.get("cut")) for change in of)
 
     match value:
         case {"do": "start"}:
@@ -297,7 +297,7 @@ def decode_acknowledgement(shape: dict[str, Any], value: dict[str, Any], raw: by
 
 def encode_request(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the operator makes it."""
-    return REQUESTS[value["do"]](**{name: found for name, found in value.items() if name != "do"}).pack()
+    return REQUESTS[value["do"]](**{name: field for name, field in value.items() if name != "do"}).pack()
 
 
 def decode_request(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:

@@ -72,11 +72,11 @@ def _accounts() -> dict[str, Account]:
     lost = {reason: np.zeros(2, np.uint32) for reason in REASONS}
     delivered, bursts = np.ones((2, TRIALS), bool), np.zeros(COUNTED_BURSTS, np.uint32)
 
-    def one(window: int) -> Account:
+    def account(window: int) -> Account:
         late = np.zeros((2, TRIALS), np.uint16) if window else None
         return Account(delivered, lost, late, bursts, np.array([6, *[0] * (window + 1)], np.uint32))
 
-    return {"legitimate": one(0), "eve": one(WINDOW)}
+    return {"legitimate": account(0), "eve": account(WINDOW)}
 
 
 _z, _header, _flags = np.arange(6.0).reshape(SHAPE), np.ones((1, TRIALS), np.int64), np.array([True, False, True])
@@ -117,5 +117,5 @@ EXAMPLES: Mapping[str, bytes] = {
 
 def fields_of(name: str) -> dict[str, Any]:
     """The fields of an example."""
-    found: dict[str, Any] = msgpack.unpackb(EXAMPLES[name], strict_map_key=False)
-    return found
+    fields: dict[str, Any] = msgpack.unpackb(EXAMPLES[name], strict_map_key=False)
+    return fields

@@ -36,8 +36,8 @@ LINKS = 10  # attempts at a link between routers
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """One router for all tests of this file: none of them may leave a trace in it."""
-    with bench_of(small_network(slots=100_000), tmp_path_factory.mktemp("access")) as one:
-        yield one
+    with bench_of(small_network(slots=100_000), tmp_path_factory.mktemp("access")) as bench:
+        yield bench
 
 
 def flow(stage: Bench) -> None:
@@ -58,12 +58,12 @@ def flow(stage: Bench) -> None:
 def all_keys(stage: Bench) -> dict[str, str]:
     """Every key of the run, by its kind."""
     keys = stage.keys
-    found = {"uplink": keys.uplink, "journal": keys.journal}
+    all_keys = {"uplink": keys.uplink, "journal": keys.journal}
     for name in (*PROCESSES, "router", "recorder"):
         for kind in ("telemetry", "progress", "control", "alive"):
-            found[f"{kind}/{name}"] = getattr(keys, kind)(name)
-    found |= {f"downlink/{name}": keys.downlink(name) for name in PROCESSES[1:]}
-    return found
+            all_keys[f"{kind}/{name}"] = getattr(keys, kind)(name)
+    all_keys |= {f"downlink/{name}": keys.downlink(name) for name in PROCESSES[1:]}
+    return all_keys
 
 
 def wildcards(stage: Bench) -> list[str]:
@@ -118,7 +118,7 @@ def test_eavesdropper_hears_only_its_own_downlink(mode: str, stage: Bench) -> No
         # A message let through to one subscription of a session reaches its wildcards too: only that may.
         allowed = {own, stage.keys.control(EVE)}
         for key, ear in ears.items():
-            assert {found for found, _ in ear.all()} <= allowed, key
+            assert {heard for heard, _ in ear.all()} <= allowed, key
 
 
 @contextmanager
@@ -147,8 +147,8 @@ def assert_heard(stage: Bench, attacker: zenoh.Session) -> None:
     attacker.put(stage.keys.progress(EVE), enclosed(stage.keys.progress(EVE), b"mine"), congestion_control=block)
     attacker.put(stage.keys.telemetry(EVE), enclosed(stage.keys.telemetry(EVE), b"mine"), congestion_control=block)
     assert stage.progress[EVE].hear() == (stage.keys.progress(EVE), b"mine")
-    while (found := stage.telemetry[EVE].hear()) != (stage.keys.telemetry(EVE), b"mine"):
-        assert found == (stage.keys.telemetry(EVE), b"knock")
+    while (message := stage.telemetry[EVE].hear()) != (stage.keys.telemetry(EVE), b"mine"):
+        assert message == (stage.keys.telemetry(EVE), b"knock")
 
 
 @pytest.mark.parametrize("key", ["**", "evedrop/**"])
@@ -179,7 +179,7 @@ def test_eavesdropper_gets_nothing_by_asking(stage: Bench) -> None:
         for key in [*all_keys(stage).values(), *wildcards(stage)]:
             replies = [str(reply.ok.key_expr) for reply in attacker.get(key, timeout=5.0) if reply.ok is not None]
             # A session may look at itself: its own part of Zenoh's administration tells of no other process.
-            assert [found for found in replies if not found.startswith(f"@/{attacker.zid()}/")] == [], key
+            assert [reply for reply in replies if not reply.startswith(f"@/{attacker.zid()}/")] == [], key
     talk(stage)
     assert asked == []
 
@@ -201,8 +201,8 @@ def test_eavesdropper_sees_nobody_alive(stage: Bench) -> None:
             if key.startswith("@"):
                 continue
             attacker.liveliness().declare_subscriber(key, ear, history=True)
-            found = [key_of(reply) for reply in attacker.liveliness().get(key, timeout=5.0)]
-            assert found == ([key] if key == alive[EVE] else [])
+            keys = [key_of(reply) for reply in attacker.liveliness().get(key, timeout=5.0)]
+            assert keys == ([key] if key == alive[EVE] else [])
         seen = {stage.tokens.hear()[0] for _ in PROCESSES}
         assert seen == set(alive.values())
         attacker.declare_subscriber(stage.keys.downlink(EVE), control)
@@ -320,9 +320,9 @@ def test_eavesdropper_has_no_part_in_the_loop(acts_on: str, tmp_path: Path) -> N
         for name in inputs:
             bench.settle(name)
         assert not any(ear.all() for ear in heard.values())
-        said = {payload for ear in ears.values() for _, payload in ear.all()}
-        assert said <= {b"mine", b"false"}, "a session hears what it puts itself, and this one nothing else"
-        assert {found for found, _ in inputs["legitimate"].all()} <= ({keys.input} if link["knows_input"] else set())
+        payloads = {payload for ear in ears.values() for _, payload in ear.all()}
+        assert payloads <= {b"mine", b"false"}, "a session hears what it puts itself, and this one nothing else"
+        assert {heard for heard, _ in inputs["legitimate"].all()} <= ({keys.input} if link["knows_input"] else set())
         stack.close()
 
 

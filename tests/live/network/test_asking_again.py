@@ -55,18 +55,18 @@ def test_a_request_that_may_be_repeated_is_asked_again(tmp_path: Path, capsys: p
 
 
 @pytest.mark.parametrize(
-    ("words", "unanswered", "said"),
+    ("words", "unanswered", "message"),
     [
         (["step", "4"], 2, "it ended before it answered"),  # steps are counted: a second request would be another step
         (["pause"], 1, "no run is going on"),
     ],
 )
 def test_a_request_is_asked_once(
-    words: list[str], unanswered: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], unanswered: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """If it may not be repeated, or the run is over."""
     recorder = Recorder(tmp_path, unanswered)
     with recorder.session:
         assert main([words[0], str(tmp_path), *words[1:]]) == 2
     assert recorder.asked == 1
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err

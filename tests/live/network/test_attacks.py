@@ -85,20 +85,20 @@ LIES = {
 FEW = ("x_hat = 7, P = 0, no digests", "the last packet")
 
 
-@pytest.mark.parametrize("what", [one if one in FEW else pytest.param(one, marks=pytest.mark.long) for one in LIES])
-def test_a_receiver_that_lies_is_found_out(evedrop: Evedrop, what: str) -> None:
+@pytest.mark.parametrize("case", [lie if lie in FEW else pytest.param(lie, marks=pytest.mark.long) for lie in LIES])
+def test_a_receiver_that_lies_is_found_out(evedrop: Evedrop, case: str) -> None:
     """Whatever a receiver claims, against its own reports or against the journal, the run ends with its name and both values."""
-    does, said = LIES[what]
+    does, message = LIES[case]
     live = evedrop.live("eavesdroppers", *SMALL, env=with_rogue(evedrop, "smart", does))
-    found = refused(live, "smart")
-    assert re.search(said, found), found
+    result = refused(live, "smart")
+    assert re.search(message, result), result
     checked = live.results.summary["verification"]
     assert checked["smart"]["verified"] == []
     assert "received_fraction" in checked["naive"]["verified"]
 
 
 @pytest.mark.parametrize(
-    ("does", "said"),
+    ("does", "message"),
     [
         ("dict(digests={2**63: np.zeros((3, 16), np.uint8)})", "digests of block 9223372036854775808"),
         (
@@ -114,14 +114,14 @@ def test_a_receiver_that_lies_is_found_out(evedrop: Evedrop, what: str) -> None:
     ],
     ids=["block of no run", "asymmetric covariances", "another shape", "more slots than the run has"],
 )
-def test_a_report_that_no_run_has_is_refused(evedrop: Evedrop, does: str, said: str) -> None:
+def test_a_report_that_no_run_has_is_refused(evedrop: Evedrop, does: str, message: str) -> None:
     """Blocks, slots and shapes of no run end it as soon as they are read, with key, sender and values; no table is broken."""
     rogue = with_rogue(evedrop, "smart", f"import numpy as np\nchange(lambda self: {does})")
-    found = refused(evedrop.live("eavesdroppers", *SMALL, env=rogue), "smart")
-    assert found.startswith("evedrop: smart broke the protocol: malformed message on evedrop/"), found
-    assert "telemetry/smart: " in found
-    assert re.search(said, found), found
-    assert "Check that smart speaks docs/protocol.md" in found
+    result = refused(evedrop.live("eavesdroppers", *SMALL, env=rogue), "smart")
+    assert result.startswith("evedrop: smart broke the protocol: malformed message on evedrop/"), result
+    assert "telemetry/smart: " in result
+    assert re.search(message, result), result
+    assert "Check that smart speaks docs/protocol.md" in result
 
 
 def test_what_is_verified_and_what_is_not(evedrop: Evedrop) -> None:
@@ -180,11 +180,12 @@ SILENT = {
 
 
 @pytest.mark.parametrize(
-    "what", [one if one == "a receiver in the middle" else pytest.param(one, marks=pytest.mark.long) for one in SILENT]
+    "case",
+    [name if name == "a receiver in the middle" else pytest.param(name, marks=pytest.mark.long) for name in SILENT],
 )
-def test_a_process_that_is_alive_and_silent_is_named(evedrop: Evedrop, what: str) -> None:
+def test_a_process_that_is_alive_and_silent_is_named(evedrop: Evedrop, case: str) -> None:
     """Its connection and its token stay, and its loop stands still: the run ends, and names the process that all waited for."""
-    scenario, name, does = SILENT[what]
+    scenario, name, does = SILENT[case]
     rogue = with_rogue(evedrop, name, HANG + does)
     live = evedrop.live(scenario, "--pace", "0", "--set", "longest_outage=2", env=rogue)
     done = live.end()
@@ -234,16 +235,16 @@ PROGRESS = {
 """What a receiver says about its progress → how it says that, and the expected message."""
 
 
-@pytest.mark.parametrize("what", ["beyond what was sent", pytest.param("no message", marks=pytest.mark.long)])
-def test_malformed_progress_is_its_senders(evedrop: Evedrop, what: str) -> None:
+@pytest.mark.parametrize("case", ["beyond what was sent", pytest.param("no message", marks=pytest.mark.long)])
+def test_malformed_progress_is_its_senders(evedrop: Evedrop, case: str) -> None:
     """The sensor refuses it, and the run ends with the name of the receiver that sent it, not with the sensor's."""
-    does, said = PROGRESS[what]
+    does, message = PROGRESS[case]
     rogue = with_rogue(evedrop, "naive", f"reporting.progress = lambda k: {does}")
     done = evedrop.live("eavesdroppers", "--slots", "100000", env=rogue).end()
     assert done.status == 3
     first = done.err.splitlines()[0]
     assert re.match(
-        rf"evedrop: naive broke the protocol: malformed message on evedrop/\w+/progress/naive: {said}", first
+        rf"evedrop: naive broke the protocol: malformed message on evedrop/\w+/progress/naive: {message}", first
     ), first
     assert "logs/naive.log" in done.err
 
@@ -260,11 +261,11 @@ def test_the_sender_is_named_where_everybody_is_started_by_hand(
         run.write()
         run.start()
         assert run.statuses()["recorder"] == 3
-        said = run.summary["ended"]
+        ended = run.summary["ended"]
     assert re.match(
-        r"malformed message on evedrop/\w+/progress/naive: k = 1000000000; .*Check that naive speaks", said
-    ), said
-    assert said.endswith("(refused by sensor)")
+        r"malformed message on evedrop/\w+/progress/naive: k = 1000000000; .*Check that naive speaks", ended
+    ), ended
+    assert ended.endswith("(refused by sensor)")
 
 
 def test_nobody_is_accused_of_keys_that_are_not_its_own() -> None:
@@ -276,9 +277,9 @@ def test_nobody_is_accused_of_keys_that_are_not_its_own() -> None:
     with pytest.raises(MalformedMessage, match="a key that sensor reads"):
         read_refusal(reader, "sensor")
     reader = Reader("evedrop/r1/telemetry/sensor", refusal("evedrop/r1/progress/naive", "\x1b[2Jx\n"))
-    found = read_refusal(reader, "sensor")
-    assert found.at_fault == ("naive",)
-    assert str(found) == "malformed message on evedrop/r1/progress/naive: ?[2Jx? (refused by sensor)"
+    result = read_refusal(reader, "sensor")
+    assert result.at_fault == ("naive",)
+    assert str(result) == "malformed message on evedrop/r1/progress/naive: ?[2Jx? (refused by sensor)"
 
 
 BOMB = """

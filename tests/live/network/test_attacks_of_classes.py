@@ -148,19 +148,22 @@ def test_an_eavesdroppers_class_runs_in_its_own_process_alone(evedrop: Evedrop) 
     command = ["-P", "-m", "evedrop"]  # as the script `evedrop` does, not looking for modules where it was typed
     typed = ("run", "spy.toml", "--view", "off", "--pace", "0.005", "--out", "run")
     live = Live(evedrop.start(command, typed, {}), evedrop.temporary, evedrop.folder / "run")
-    children = wait_until(lambda: len(found := live.children()) == 5 and found, "five processes")
+    children = wait_until(lambda: len(children := live.children()) == 5 and children, "five processes")
     assert live.end().status == 0
     reports = spied(evedrop.folder)
-    assert {one["when"] for one in reports} == {"imported", "made", "asked"}
+    assert {report["when"] for report in reports} == {"imported", "made", "asked"}
     by_pid = {pid: name for name, pid in children.items()} | {live.process.pid: "launcher"}
-    for one in reports:
-        assert by_pid.get(one["pid"], "asked alone") in {"eve", "asked alone"}, one
-        assert one["seen"] == [], one
-        assert one["ours"] == [], one
-        if one["pid"] not in by_pid:
-            assert set(one["environ"]) <= {"LC_CTYPE", "LD_LIBRARY_PATH"}, one
-            assert not any(str(evedrop.folder) in word for word in one["words"]), one
-    assert by_pid[next(one["pid"] for one in reports if one["when"] == "made" and one["pid"] in by_pid)] == "eve"
+    for report in reports:
+        assert by_pid.get(report["pid"], "asked alone") in {"eve", "asked alone"}, report
+        assert report["seen"] == [], report
+        assert report["ours"] == [], report
+        if report["pid"] not in by_pid:
+            assert set(report["environ"]) <= {"LC_CTYPE", "LD_LIBRARY_PATH"}, report
+            assert not any(str(evedrop.folder) in word for word in report["words"]), report
+    assert (
+        by_pid[next(report["pid"] for report in reports if report["when"] == "made" and report["pid"] in by_pid)]
+        == "eve"
+    )
     summary = Results.read(live.folder).summary
     assert summary["peers"]["eve"]["theoretical_trace_covariance"] > 0.0, "theory knows the class all the same"
 
@@ -174,7 +177,7 @@ def test_no_process_finds_it_where_it_only_asks(evedrop: Evedrop) -> None:
             shadow.unlink()
     assert evedrop("check", "spy.toml").status == 0
     assert evedrop("brief", "spy.toml", "--out", "briefs").status == 0
-    pids = {one["pid"] for one in spied(evedrop.folder)}
+    pids = {report["pid"] for report in spied(evedrop.folder)}
     assert pids
     assert os.getpid() not in pids
     told = json.loads((evedrop.folder / "briefs" / "recorder.json").read_text())["part"]["classes"]
@@ -190,13 +193,13 @@ def test_what_a_class_says_of_itself_is_checked(evedrop: Evedrop) -> None:
         "return 0.5, float('nan')": "expected a probability",
         "raise OSError('no way')": "OSError: no way, spy.py line",
     }
-    for body, said in wrong.items():
+    for body, message in wrong.items():
         REMOTE_CALLS.forget()
         text = "import os\nfrom evedrop.model.eavesdroppers.fixed_rules import Naive\n\n\nclass Spy(Naive):\n    @classmethod\n"
         (evedrop.folder / "spy.py").write_text(f"{text}    def use_probabilities(cls, parameters):\n        {body}\n")
         done = evedrop("run", "spy.toml", "--view", "off", "--out", "run")
         assert done.status == 2, (body, done.err)
-        assert said in done.err
+        assert message in done.err
         assert not (evedrop.folder / "run").exists()
     REMOTE_CALLS.forget()
 
@@ -217,17 +220,17 @@ def said_by(lies: dict[str, Any]) -> Any:
     """The remote class of a class that gives these answers, right or wrong."""
     calls = RemoteCalls()
     truth = {"mistakes": [], "streams": [], "betrayed": None, "follows_gamma": True, "use_probabilities": [1.0, 1.0]}
-    said = {**truth, "outcomes": True, "outcomes_at": FRACTIONS, **lies}
+    facts = {**truth, "outcomes": True, "outcomes_at": FRACTIONS, **lies}
     given: dict[str, list[Any]] = {
         "class": ["STRATEGIES"],
         "outcomes": ["STRATEGIES", {}, 0.5],
         "outcomes_at": ["STRATEGIES", {}, 0.5, 0.5],
     }
-    known = {
+    answers = {
         json.dumps(["spy:Spy", do, *given.get(do, ["STRATEGIES", {}])]): {"is": answer}
-        for do, answer in {"class": FACTS, **said}.items()
+        for do, answer in {"class": FACTS, **facts}.items()
     }
-    calls.learn(known)
+    calls.learn(answers)
     return RemoteClasses(calls, "STRATEGIES")("spy:Spy")
 
 

@@ -40,8 +40,8 @@ ONCE = {"timeout_ms": 0, "exit_on_failure": True}
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """One router for all tests of this file."""
-    with bench_of(small_network(slots=100_000), tmp_path_factory.mktemp("tls"), "tls") as one:
-        yield one
+    with bench_of(small_network(slots=100_000), tmp_path_factory.mktemp("tls"), "tls") as bench:
+        yield bench
 
 
 def flow(stage: Bench) -> None:
@@ -162,8 +162,8 @@ def test_an_eavesdropper_cannot_pose_as_the_router(stage: Bench) -> None:
     port = free_port()
     config = client_config(eve)
     tls = config["transport"]["link"]["tls"]
-    for what in ("certificate", "private_key"):
-        tls[f"listen_{what}_base64"] = tls[f"connect_{what}_base64"]
+    for kind in ("certificate", "private_key"):
+        tls[f"listen_{kind}_base64"] = tls[f"connect_{kind}_base64"]
     del config["connect"], config["transport"]["auth"]
     config |= {"mode": "router", "listen": {"endpoints": [f"tls/127.0.0.1:{port}"], "exit_on_failure": True}}
     lured = replace(sensor, router=f"tls/127.0.0.1:{port}")
@@ -199,11 +199,11 @@ def test_the_operator_has_a_certificate_too(stage: Bench, tmp_path: Path) -> Non
     control = Control(stage.keys.run, stage.briefs[EVE].router, "operator", part.operator, part.operator_identity)
     control.write(tmp_path)
     assert (tmp_path / "control.json").stat().st_mode & 0o777 == 0o600
-    found = read_control(tmp_path)
-    assert found == control
-    zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(found)))).close()
+    result = read_control(tmp_path)
+    assert result == control
+    zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(result)))).close()
     with pytest.raises(zenoh.ZError):
-        zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(replace(found, identity=None))))).close()
+        zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(replace(result, identity=None))))).close()
     path = tmp_path / "control.json"
     path.write_text(json.dumps({**asdict(control), "identity": {"key": 3}}))
     with pytest.raises(UsageError, match=r"control\.json is not a control file"):
@@ -241,16 +241,16 @@ def test_certificates_say_what_they_are_for(tmp_path: Path) -> None:
     )
     names = certificate_of(made["router"]).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert names.get_values_for_type(x509.DNSName) == ["router.lan"]
-    assert [str(one) for one in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.7"]
+    assert [str(address) for address in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.7"]
     for name, brief in made.items():
-        found = certificate_of(brief)
-        assert found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value == name
-        uses = set(found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
+        certificate = certificate_of(brief)
+        assert certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value == name
+        uses = set(certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
         servers = {ExtendedKeyUsageOID.SERVER_AUTH} if name == "router" else set()
         assert uses == {ExtendedKeyUsageOID.CLIENT_AUTH, *servers}
         if name != "router":
             with pytest.raises(x509.ExtensionNotFound):
-                found.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+                certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
 
 
 AUTHORITY = Authority("r01", NOW)
@@ -259,7 +259,7 @@ DAY = datetime.timedelta(days=1)
 
 
 @pytest.mark.parametrize(
-    ("identity", "now", "said"),
+    ("identity", "now", "message"),
     [
         (EVES, NOW - 2 * DAY, r"not valid before 2026-05-03 12:00 UTC.*clock says 2026-05-02 12:00 UTC; set the clock"),
         (EVES, NOW + 31 * DAY, r"expired 2026-06-03 12:00 UTC.*says 2026-06-04 12:00 UTC; write the briefs again"),
@@ -270,9 +270,11 @@ DAY = datetime.timedelta(days=1)
         (replace(EVES, key=EVES.certificate), NOW, r"identity cannot be read \(.*\); write the briefs again"),
     ],
 )  # fmt: skip
-def test_an_identity_that_does_not_fit_is_seen_at_once(identity: Identity, now: datetime.datetime, said: str) -> None:
+def test_an_identity_that_does_not_fit_is_seen_at_once(
+    identity: Identity, now: datetime.datetime, message: str
+) -> None:
     """Too early, too late, another's key, another's authority, another's name, nonsense: each is one line with the remedy."""
-    with pytest.raises(BriefError, match=said) as caught:
+    with pytest.raises(BriefError, match=message) as caught:
         check_identity(identity, EVE, now)
     assert "\n" not in str(caught.value)
 
@@ -291,8 +293,8 @@ def test_a_router_whose_clock_is_wrong_is_told_apart(stage: Bench) -> None:
     config = client_config(replace(stage.briefs[EVE], router=endpoint, identity=eve))
     tls = {**config["transport"]["link"]["tls"]}
     listening = client_config(replace(stage.briefs[EVE], identity=router))["transport"]["link"]["tls"]
-    for what in ("certificate", "private_key"):
-        tls[f"listen_{what}_base64"] = listening[f"connect_{what}_base64"]
+    for kind in ("certificate", "private_key"):
+        tls[f"listen_{kind}_base64"] = listening[f"connect_{kind}_base64"]
     server = {
         "mode": "router",
         "listen": {"endpoints": [endpoint]},
@@ -321,12 +323,12 @@ def test_a_router_that_is_not_there_is_waited_for() -> None:
 
 def test_briefs_that_fit_no_endpoint_are_refused() -> None:
     """Certificates for a router without TLS, none for a router that requires them, and malformed endpoints."""
-    for address, said in (
+    for address, message in (
         (RouterAddress("tls/127.0.0.1:7447", "r01", {}), "there is no identity"),
         (RouterAddress("tcp/127.0.0.1:7447", "r01", {}, EVES), "takes no identity"),
         (RouterAddress("7447", "r01", {}), "7447 is not an endpoint"),
     ):
-        with pytest.raises(BriefError, match=said):
+        with pytest.raises(BriefError, match=message):
             connected(address, 1.0)
 
 

@@ -17,6 +17,6 @@ def test_messages_go_out_when_they_are_due_and_in_order() -> None:
     slow(b"1", 0.3)
     slow(b"2", 0.0)
     quick(b"3", 0.0)
-    found = [out.get(timeout=20) for _ in range(3)]
-    assert [(name, payload) for name, payload, _ in found] == [("quick", b"3"), ("slow", b"1"), ("slow", b"2")]
-    assert all(at - began >= 0.3 for name, _, at in found if name == "slow")
+    sent = [out.get(timeout=20) for _ in range(3)]
+    assert [(name, payload) for name, payload, _ in sent] == [("quick", b"3"), ("slow", b"1"), ("slow", b"2")]
+    assert all(at - began >= 0.3 for name, _, at in sent if name == "slow")

@@ -135,9 +135,9 @@ def test_what_waits_is_bounded_by_sender() -> None:
         mailbox.get(timeout=0.0)
     for _ in range(100):
         mailbox.put("eve", bytes(2000))
-    with pytest.raises(MalformedMessage, match="telemetry/eve: more than 10000 unread bytes") as found:
+    with pytest.raises(MalformedMessage, match="telemetry/eve: more than 10000 unread bytes") as raised:
         mailbox.get()
-    assert found.value.at_fault == ("eve",)
+    assert raised.value.at_fault == ("eve",)
     assert len(mailbox) < 10
 
 

@@ -124,8 +124,8 @@ def ask(eve: AnyBrief, keys: RunKeys) -> dict[str, set[str]]:
         own = f"@/{attacker.zid()}/"
         answers = {}
         for key in (*asked_for(keys), "@/**"):
-            found = {str(reply.ok.key_expr) for reply in attacker.get(key, timeout=5.0) if reply.ok is not None}
-            answers[f"asked for {key}"] = {key for key in found if not key.startswith(own)}
+            heard = {str(reply.ok.key_expr) for reply in attacker.get(key, timeout=5.0) if reply.ok is not None}
+            answers[f"asked for {key}"] = {key for key in heard if not key.startswith(own)}
             if not key.startswith("@"):
                 replies = attacker.liveliness().get(key, timeout=5.0)
                 answers[f"asked who is alive at {key}"] = {str(reply.ok.key_expr) for reply in replies if reply.ok}
@@ -149,16 +149,16 @@ def disturb(eve: AnyBrief, keys: RunKeys) -> None:
 
 def processes_of(pid: int) -> dict[str, int]:
     """Process name → pid, of the processes that a launcher has started, and of its fork servers."""
-    found = {}
+    processes = {}
     for child in descendants(pid):
         *options, last = words_of(child)
         if "evedrop" in options and last.endswith(".json"):
-            found[Path(last).stem] = child
+            processes[Path(last).stem] = child
         elif "evedrop.fork_server" in options:
-            found[SERVERS["evedrop.fork_server" not in words_of(parent_of(child))]] = (
+            processes[SERVERS["evedrop.fork_server" not in words_of(parent_of(child))]] = (
                 child  # that of recorders is a fork
             )
-    return found
+    return processes
 
 
 def attack(folder: Path) -> Evidence:
@@ -182,10 +182,10 @@ def attack(folder: Path) -> Evidence:
             )
         )
         stack.callback(run.kill)
-        found = wait_until(
+        result = wait_until(
             lambda: (here := processes_of(run.pid)).keys() == {*EVERYBODY, *SERVERS} and here, "all processes"
         )
-        servers = [found.pop(server) for server in SERVERS]
+        servers = [result.pop(server) for server in SERVERS]
         briefs = {name: read_brief(kept / f"{name}.json") for name in EVERYBODY}
         keys, eve = RunKeys(briefs["eve"].run), briefs["eve"]
         meant = {keys.downlink(name): name for name in PROCESSES[1:]}
@@ -219,7 +219,7 @@ def attack(folder: Path) -> Evidence:
                 "environment": Path(f"/proc/{servers[name != RECORDER]}/environ").read_bytes(),
                 "arguments": Path(f"/proc/{pid}/cmdline").read_bytes(),
             }
-            for name, pid in found.items()
+            for name, pid in result.items()
         }
         run.send_signal(signal.SIGTERM)
         output, _ = run.communicate(timeout=LIMIT)
@@ -264,18 +264,18 @@ def test_the_attack_left_no_trace_in_the_run(evidence: Evidence, tmp_path: Path)
     assert slots > 5 * ENOUGH
     memory = montecarlo(evidence.scenario, trials=3, slots=slots, out=tmp_path / "memory").trials.to_pylist()
     expected = {(row["peer"], row["slot"]): row["x_hat"] for row in memory}
-    found = {(row["peer"], row["slot"]): row["x_hat"] for row in rows}
+    estimates = {(row["peer"], row["slot"]): row["x_hat"] for row in rows}
     assert len(expected) == 4 * slots
-    assert found == expected
+    assert estimates == expected
 
 
 def secrets_of(scenario: Scenario) -> dict[str, bytes]:
     """Every piece of key material of a scenario, by name."""
     keys = StreamKeys.from_scenario(scenario)
-    found = {"seed's root": keys.seed_root, "secret's root": keys.secret_root, "process": keys.process}
-    found |= keys.links({name: scenario.schedule(name) for name in scenario.receivers})
-    found |= {f"coin/{name}": stream_key(keys.seed_root, f"coin/{name}") for name in scenario.eavesdroppers}
-    return found | keys.secret(("schedule", "noise"))
+    secrets = {"seed's root": keys.seed_root, "secret's root": keys.secret_root, "process": keys.process}
+    secrets |= keys.links({name: scenario.schedule(name) for name in scenario.receivers})
+    secrets |= {f"coin/{name}": stream_key(keys.seed_root, f"coin/{name}") for name in scenario.eavesdroppers}
+    return secrets | keys.secret(("schedule", "noise"))
 
 
 MAY_KNOW = {
@@ -309,8 +309,8 @@ def test_a_process_is_told_neither_seed_nor_others_passwords(name: str, evidence
     assert str(seed).encode() not in everything
     assert f"{seed:x}".encode() not in everything
     others = {other: brief.password for other, brief in evidence.briefs.items() if other not in {name, "router"}}
-    known = {other for other, password in others.items() if password.encode() in everything}
-    assert known == (set(others) if name == "router" else set())
+    readable = {other for other, password in others.items() if password.encode() in everything}
+    assert readable == (set(others) if name == "router" else set())
 
 
 @pytest.mark.parametrize("name", EVERYBODY)

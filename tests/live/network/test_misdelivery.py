@@ -47,7 +47,9 @@ class Stage:
         self.cable: Cable = stack.enter_context(cable(port))
         task = RecorderTask(folder / "results", False)
         self.briefs = briefs_of(small_network(), self.cable.endpoint, task, ends_with_stdin=False)
-        with users_file({"operator": "password", **{one.user: one.password for one in self.briefs.values()}}) as users:
+        with users_file(
+            {"operator": "password", **{brief.user: brief.password for brief in self.briefs.values()}}
+        ) as users:
             config = {
                 "mode": "router",
                 "listen": {"endpoints": [f"tcp/127.0.0.1:{port}"]},
@@ -97,8 +99,8 @@ def test_a_subscription_drops_what_names_another_key(stage: Stage, capfd: pytest
         stage.put(key, [*foreign(stage.keys, key), enclosed(key, GOOD)])
         assert subscription.recv() == GOOD
         assert session.dropped == len(foreign(stage.keys, key))
-    said = capfd.readouterr().err
-    assert f"eve: dropped a message that came on {key} and names {stage.keys.control('smart')} (number 1)" in said
+    errors = capfd.readouterr().err
+    assert f"eve: dropped a message that came on {key} and names {stage.keys.control('smart')} (number 1)" in errors
 
 
 def test_a_callback_subscription_drops_what_names_another_key(stage: Stage) -> None:
@@ -253,4 +255,4 @@ def test_zenoh_reconnects_no_session(stage: Stage) -> None:
         wait_until(lambda: session.connection.openings > 1, "another session")
     assert len(seen) > 1
     day = 24 * 3600 * 1000
-    assert all(one["period_init_ms"] >= day and one["period_max_ms"] >= day for one in seen), seen
+    assert all(settings["period_init_ms"] >= day and settings["period_max_ms"] >= day for settings in seen), seen

@@ -30,8 +30,8 @@ PATIENCE = 5.0
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """One router for all tests of this file, and a recorder that answers."""
-    with bench_of(small_network(), tmp_path_factory.mktemp("operator")) as one:
-        yield one
+    with bench_of(small_network(), tmp_path_factory.mktemp("operator")) as bench:
+        yield bench
 
 
 def operator(stage: Bench) -> AnyBrief:
@@ -75,8 +75,8 @@ def attempts(stage: Bench) -> list[str]:
 def replies(session: zenoh.Session, key: str) -> list[bytes]:
     """What a question at a key brings, but for what a session says of itself."""
     question = enclosed(key, PauseRequest().pack())
-    found = [reply.ok for reply in session.get(key, payload=question, timeout=PATIENCE) if reply.ok]
-    answers = [(str(one.key_expr), one.payload.to_bytes()) for one in found]
+    samples = [reply.ok for reply in session.get(key, payload=question, timeout=PATIENCE) if reply.ok]
+    answers = [(str(sample.key_expr), sample.payload.to_bytes()) for sample in samples]
     return [payload_of(key, message) or message for key, message in answers if not key.startswith("@/")]
 
 
@@ -171,7 +171,7 @@ def test_the_operator_may_do_nothing_else(stage: Bench) -> None:
         assert len(asked) == 3
     assert ear.all() == []
     for ears in (stage.downlinks, stage.controls, stage.progress, stage.telemetry):
-        assert {name: one.all() for name, one in ears.items()} == {name: [] for name in ears}
+        assert {name: ear.all() for name, ear in ears.items()} == {name: [] for name in ears}
     assert (stage.journal.all(), stage.tokens.all()) == ([], [])
     assert stage.router.poll() is None
 

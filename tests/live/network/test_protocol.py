@@ -65,10 +65,10 @@ def test_keys_of_streams() -> None:
     golden = json.loads(GOLDEN["keys"])
     root = root_of_seed(golden["seed"])
     secret = stream_key(root, "secret")
-    found = {"seed": golden["seed"], "root": root.hex(), "secret": secret.hex()}
-    found |= {name: stream_key(root, name).hex() for name in ("process", "link/legitimate", "coin/eve")}
-    found |= {name: stream_key(secret, name).hex() for name in ("schedule", "noise")}
-    assert found == golden
+    streams = {"seed": golden["seed"], "root": root.hex(), "secret": secret.hex()}
+    streams |= {name: stream_key(root, name).hex() for name in ("process", "link/legitimate", "coin/eve")}
+    streams |= {name: stream_key(secret, name).hex() for name in ("schedule", "noise")}
+    assert streams == golden
 
 
 def golden_words() -> dict[str, np.ndarray]:
@@ -110,11 +110,11 @@ def test_digest() -> None:
     golden = json.loads(GOLDEN["digest"])
     gamma, x_hat = np.array(golden["gamma"], np.uint8), np.array(golden["x_hat"])
     P = np.array(golden["P"]).reshape(3, 2, 2, 2)
-    found = BlockDigests(2, 3).add(range(3), Beliefs(x_hat, P, gamma))
-    assert list(found) == [0]
-    assert [bytes(row).hex() for row in found[0]] == golden["blocks"]
+    digests = BlockDigests(2, 3).add(range(3), Beliefs(x_hat, P, gamma))
+    assert list(digests) == [0]
+    assert [bytes(row).hex() for row in digests[0]] == golden["blocks"]
     whole = RunDigest()
-    whole.add(found)
+    whole.add(digests)
     assert whole.hexadecimal == golden["receiver"]
 
 
@@ -132,16 +132,16 @@ def test_table_of_keys_is_the_access_table() -> None:
             names = [*receivers, "sensor", "router", "recorder", "controller"] if "<process>" in path else receivers
             for name in names if "<" in path else [""]:
                 key = prefix + re.sub(r"<\w+>", name, path)
-                for what, who in (("writes", writers), ("reads", readers)):
+                for right, who in (("writes", writers), ("reads", readers)):
                     own = "that" in who and ("receiver" in who or "process" in who)
                     users = {name or path.split("/")[-1]} if own else {u for u in everybody if re.search(u, who)}
-                    documented.setdefault((what, key), set()).update(users - {"router"})
+                    documented.setdefault((right, key), set()).update(users - {"router"})
     granted: dict[tuple[str, str], set[str]] = {}
     loops = [Wiring("estimate", True), Wiring("truth", True)]
     for grant in (grant for loop in loops for grant in grants("r", receivers, loop)):
-        for what, given in (("writes", (*grant.writes, grant.token)), ("reads", (*grant.reads, *grant.watches))):
+        for right, given in (("writes", (*grant.writes, grant.token)), ("reads", (*grant.reads, *grant.watches))):
             for key in filter(None, given):
-                granted.setdefault((what, key), set()).add(grant.process)
+                granted.setdefault((right, key), set()).add(grant.process)
     keys = RunKeys("r")
     no_row = {
         ("writes", keys.control("recorder")),

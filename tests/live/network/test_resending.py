@@ -42,11 +42,11 @@ def test_a_round_announces_the_slot_that_follows(
     del sent[:]
     kept.again(7, asked)
     announced, *messages = [msgpack.unpackb(payload) for payload in sent]
-    found = [message["k"] for message in messages]
+    ks = [message["k"] for message in messages]
     assert announced["round"] == 7
     assert announced["from"] >= min(done, slots)
     wanted = list(range(announced["first"], slots))
-    assert found == wanted or (not wanted and found in ([], [slots - 1]))
+    assert ks == wanted or (not wanted and ks in ([], [slots - 1]))
     assert announced["first"] <= max(asked, announced["from"])
 
 
@@ -100,9 +100,9 @@ def test_a_slot_that_is_missing_is_waited_for() -> None:
     gap.missed(7, 10)
     clock.now += 0.5
     gap.missed(7, 6)
-    with pytest.raises(Gap) as found:
+    with pytest.raises(Gap) as raised:
         gap.missed(7, 8)
-    assert str(found.value) == str(Gap(KEY, 7, 8))
+    assert str(raised.value) == str(Gap(KEY, 7, 8))
 
 
 def test_another_slot_that_is_missing_is_waited_for_as_long() -> None:

@@ -174,10 +174,10 @@ def test_bad_packet_is_refused(name: str) -> None:
     bench = MemoryBench(longest_outage=0.0)
     loop = RouterLoop(bench.brief, bench.stage.session(bench.brief))
     bench.stage.fill(bench.keys.uplink, messages)
-    with pytest.raises(RunError, match=line) as found:
+    with pytest.raises(RunError, match=line) as raised:
         loop.carry_on()
     bench.stage.commands.put(EndRun().pack())  # ends the thread that reads commands
-    assert found.value.exit_status == 3
+    assert raised.value.exit_status == 3
 
 
 @pytest.mark.long

@@ -37,8 +37,8 @@ ONCE = {"timeout_ms": 0, "exit_on_failure": True}
 def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """A router and a relay for all tests of this file, without certificates and with them."""
     scenario = small_network(slots=100_000, network={"routers": 2})
-    with bench_of(scenario, tmp_path_factory.mktemp("linked"), request.param) as one:
-        yield one
+    with bench_of(scenario, tmp_path_factory.mktemp("linked"), request.param) as bench:
+        yield bench
 
 
 def flow(stage: Bench) -> None:
@@ -87,8 +87,8 @@ def test_an_eavesdropper_at_the_relay_hears_its_own_alone(stage: Bench) -> None:
         assert {key for ear in ears.values() for key, _ in ear.all()} == {keys.downlink(EVE)}
         assert watching.all() == []
         for key in asked:
-            found = [str(reply.ok.key_expr) for reply in attacker.get(key, timeout=5.0) if reply.ok is not None]
-            assert [one for one in found if not one.startswith(f"@/{attacker.zid()}/")] == []
+            answers = [str(reply.ok.key_expr) for reply in attacker.get(key, timeout=5.0) if reply.ok is not None]
+            assert [answer for answer in answers if not answer.startswith(f"@/{attacker.zid()}/")] == []
 
 
 def test_an_eavesdropper_at_the_relay_cannot_write_for_others(stage: Bench) -> None:
@@ -167,8 +167,8 @@ def test_each_process_has_its_own_place(stage: Bench) -> None:
 def test_what_crosses_is_no_more_than_it_must_be() -> None:
     """Uplink and acknowledgements to the sensor stay at the sensor's site, telemetry of receivers and requests at theirs."""
     keys, table = RunKeys("r"), grants("r", ("legitimate", "eve"), relayed=True)
-    (relay,) = [one for one in at_router("r", table) if one.process == RELAY]
-    (router,) = [one for one in at_relay("r", table, "abc") if one.process == "router"]
+    (relay,) = [grant for grant in at_router("r", table) if grant.process == RELAY]
+    (router,) = [grant for grant in at_relay("r", table, "abc") if grant.process == "router"]
     assert set(relay.reads) == {
         keys.downlink("legitimate"),
         keys.downlink("eve"),
@@ -187,7 +187,7 @@ def test_what_crosses_is_no_more_than_it_must_be() -> None:
         assert not [
             key for rule in access_control(site)["rules"] for key in rule["key_exprs"] if "*" in key or "$" in key
         ]
-    assert [one.process for one in at_router("r", table)] == ["sensor", "router", RELAY]
+    assert [grant.process for grant in at_router("r", table)] == ["sensor", "router", RELAY]
 
 
 def test_the_router_is_known_at_the_relay_by_id_and_certificate() -> None:
@@ -201,16 +201,16 @@ def test_the_router_is_known_at_the_relay_by_id_and_certificate() -> None:
 
 def test_a_run_of_two_routers_takes_certificates_unless_it_is_told_otherwise() -> None:
     """On loopback, with free ports of their own, or with those that are given."""
-    found = loopback_endpoints(None, None, relayed=True)
-    assert found.relay is not None
-    assert (found.router.secure, found.relay.secure) == (True, True)
-    assert str(found.router.listen) != str(found.relay.listen)
-    clear = loopback_endpoints(str(found.router.listen).replace("tls/", "tcp/"), None, relayed=True)
+    result = loopback_endpoints(None, None, relayed=True)
+    assert result.relay is not None
+    assert (result.router.secure, result.relay.secure) == (True, True)
+    assert str(result.router.listen) != str(result.relay.listen)
+    clear = loopback_endpoints(str(result.router.listen).replace("tls/", "tcp/"), None, relayed=True)
     assert (clear.router.secure, clear.far.secure) == (False, False)
 
 
 @pytest.mark.parametrize(
-    ("options", "relayed", "said"),
+    ("options", "relayed", "message"),
     [
         (("tls/a:1",), True, "has two routers; add --relay"),
         (("tls/a:1", None, "tls/b:1"), False, "has one router; leave it out, or add --set network.routers=2"),
@@ -226,7 +226,7 @@ def test_a_run_of_two_routers_takes_certificates_unless_it_is_told_otherwise() -
         (("tls/a:1", None, "b"), True, "--relay b is not an endpoint"),
     ],
 )
-def test_places_that_do_not_fit_are_refused(options: tuple[str | None, ...], relayed: bool, said: str) -> None:
+def test_places_that_do_not_fit_are_refused(options: tuple[str | None, ...], relayed: bool, message: str) -> None:
     """Too few, too many, of two kinds, the same place twice: each with the option that mends it."""
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(UsageError, match=message):
         endpoints_at(*options).check(relayed)  # type: ignore[arg-type]

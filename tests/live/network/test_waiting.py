@@ -29,10 +29,10 @@ def test_a_process_says_that_it_waits_for_its_router(tmp_path: Path, capfd: pyte
     brief = briefs_of(small_network(), endpoint, RecorderTask(tmp_path, False), ends_with_stdin=False)["eve"]
     with pytest.raises(RunError, match="no router answered"):
         Session(replace(brief, patience=10), clock=TestClock())
-    said = capfd.readouterr().err.splitlines()
+    lines = capfd.readouterr().err.splitlines()
     line = rf"evedrop: eve: waiting for the router at {endpoint}: no answer yet \((3|6|9) s; Connection refused\)"
-    assert [bool(re.fullmatch(line, one)) for one in said] == [True] * len(said)
-    assert len(said) == 3
+    assert [bool(re.fullmatch(line, text)) for text in lines] == [True] * len(lines)
+    assert len(lines) == 3
 
 
 @contextlib.contextmanager

@@ -77,14 +77,14 @@ def test_delivery_with_late_packets(data: st.DataObject, k: int, n: int, trials:
         for _ in range(min(count, 2 * (k + 1)))
     )
     raw = packets.delivery(k, bytes((trials + 7) // 8), b"", late)
-    heard, found = packets.read_delivery(Reader("d", raw), k, (n, trials))
+    heard, arrived = packets.read_delivery(Reader("d", raw), k, (n, trials))
     assert not heard.gamma.any()
-    assert [one.k for one in found] == [one.k for one in late]
-    for one, sent in zip(found, late, strict=True):
-        assert np.array_equal(one.heard.gamma, sent.heard.gamma)
-        assert one.heard.z.tobytes() == np.where(sent.heard.gamma, sent.heard.z, 0.0).tobytes()
-    sizes = [len(one["z"]) for one in msgpack.unpackb(raw).get("late", [])]
-    assert sizes == [8 * n * one.heard.gamma.sum() for one in late]
+    assert [packet.k for packet in arrived] == [packet.k for packet in late]
+    for packet, sent in zip(arrived, late, strict=True):
+        assert np.array_equal(packet.heard.gamma, sent.heard.gamma)
+        assert packet.heard.z.tobytes() == np.where(sent.heard.gamma, sent.heard.z, 0.0).tobytes()
+    sizes = [len(entry["z"]) for entry in msgpack.unpackb(raw).get("late", [])]
+    assert sizes == [8 * n * packet.heard.gamma.sum() for packet in late]
 
 
 def test_a_late_packet_from_the_future_is_refused() -> None:
@@ -115,8 +115,8 @@ def test_leaving(data: st.DataObject, k: int, n: int, trials: int) -> None:
     P = mirrored(data.draw(arrays(float, (n, n, trials), elements=FINITE)))
     message = Reader("t", telemetry.leaving(k, Belief(x_hat, P, np.ones(trials, np.uint8))))
     assert telemetry.is_leaving(message)
-    found, belief = telemetry.read_leaving(message, extent(n, trials))
-    assert (found, belief.x_hat.tobytes(), belief.P.tobytes()) == (k, x_hat.tobytes(), P.tobytes())
+    slot, belief = telemetry.read_leaving(message, extent(n, trials))
+    assert (slot, belief.x_hat.tobytes(), belief.P.tobytes()) == (k, x_hat.tobytes(), P.tobytes())
     assert not belief.action.any()
 
 
@@ -126,9 +126,9 @@ def test_truth(data: st.DataObject, k: int, n: int, trials: int, count: int) -> 
     """Truth reads back."""
     x = data.draw(arrays(float, (count, n, trials), elements=FINITE))
     nu = data.draw(arrays(bool, (count, trials)))
-    found = telemetry.read_truth(Reader("t", telemetry.Truth(k, x, nu).pack()), k, extent(n, trials))
-    assert (found.first, found.count, found.x.tobytes()) == (k, count, x.tobytes())
-    assert np.array_equal(found.nu, nu)
+    truth = telemetry.read_truth(Reader("t", telemetry.Truth(k, x, nu).pack()), k, extent(n, trials))
+    assert (truth.first, truth.count, truth.x.tobytes()) == (k, count, x.tobytes())
+    assert np.array_equal(truth.nu, nu)
 
 
 @settings(deadline=None)
@@ -153,16 +153,16 @@ def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) ->
         else {},
     )
     of_run = replace(extent(n, trials, recorded), slots=slots)
-    found = telemetry.read_report(Reader("r", report.pack()), k, of_run, blocks, window)
+    result = telemetry.read_report(Reader("r", report.pack()), k, of_run, blocks, window)
     for name in ("x_hat", "action", "P", "trace"):
-        assert getattr(found, name).tobytes() == getattr(report, name).tobytes()
-    assert {b: d.tobytes() for b, d in found.digests.items()} == {b: d.tobytes() for b, d in report.digests.items()}
-    assert {b: s.tobytes() for b, s in found.trace_sums.items()} == {
+        assert getattr(result, name).tobytes() == getattr(report, name).tobytes()
+    assert {b: d.tobytes() for b, d in result.digests.items()} == {b: d.tobytes() for b, d in report.digests.items()}
+    assert {b: s.tobytes() for b, s in result.trace_sums.items()} == {
         b: s.tobytes() for b, s in report.trace_sums.items()
     }
-    assert found.count == count
+    assert result.count == count
     for name in ("late", "late_used"):
-        assert np.array_equal(getattr(found, name), getattr(report, name))
+        assert np.array_equal(getattr(result, name), getattr(report, name))
 
 
 def account_of(delivered: np.ndarray, window: int = 0, **changes: Any) -> Account:
@@ -195,15 +195,15 @@ def test_journal(data: st.DataObject, k: int, trials: int, count: int) -> None:
             unsent,
         )
     raw = telemetry.Journal(k, count, links).pack()
-    found = telemetry.read_journal(Reader("j", raw), k, windows, extent(1, trials))
-    assert (found.first, found.count, set(found.links)) == (k, count, set(links))
+    journal = telemetry.read_journal(Reader("j", raw), k, windows, extent(1, trials))
+    assert (journal.first, journal.count, set(journal.links)) == (k, count, set(links))
     for name, link in links.items():
         for column in ("delivered", "bursts", "delays"):
-            assert np.array_equal(getattr(found.links[name], column), getattr(link, column))
-        assert {reason: counts.tolist() for reason, counts in found.links[name].lost.items()} == {
+            assert np.array_equal(getattr(journal.links[name], column), getattr(link, column))
+        assert {reason: counts.tolist() for reason, counts in journal.links[name].lost.items()} == {
             reason: counts.tolist() for reason, counts in link.lost.items()
         }
-        late = found.links[name].late
+        late = journal.links[name].late
         assert (late is None) == (link.late is None)
         assert late is None or link.late is None or np.array_equal(late, link.late)
 
@@ -275,17 +275,17 @@ BOMBS = {
 """Messages of some megabytes that are much larger once they are read."""
 
 
-@pytest.mark.parametrize("what", BOMBS)
-def test_a_large_message_is_refused_before_it_is_larger(what: str) -> None:
+@pytest.mark.parametrize("case", BOMBS)
+def test_a_large_message_is_refused_before_it_is_larger(case: str) -> None:
     """However it is made, reading it takes some megabytes more than it has at most, and the error shows a part of it alone."""
     tracemalloc.start()
     try:
-        with pytest.raises(MalformedMessage, match="not msgpack") as found:
-            Reader("evedrop/r1/telemetry/eve", BOMBS[what])
-        assert tracemalloc.get_traced_memory()[1] < 4e6 + (len(BOMBS[what]) if "after" in what else 0)
+        with pytest.raises(MalformedMessage, match="not msgpack") as raised:
+            Reader("evedrop/r1/telemetry/eve", BOMBS[case])
+        assert tracemalloc.get_traced_memory()[1] < 4e6 + (len(BOMBS[case]) if "after" in case else 0)
     finally:
         tracemalloc.stop()
-    assert len(str(found.value)) < 1000
+    assert len(str(raised.value)) < 1000
 
 
 def test_errors_say_what_was_found_where_and_what_to_do() -> None:
@@ -314,7 +314,7 @@ def test_unknown_actions_are_refused(value: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("sums", "recorded", "said"),
+    ("sums", "recorded", "message"),
     [
         ({}, 1, "trace_sums of blocks []; expected those of [0]"),
         ({0: np.ones(2)}, 2, "trace_sums of blocks [0]; expected those of []"),
@@ -324,13 +324,13 @@ def test_unknown_actions_are_refused(value: int) -> None:
         ({0: np.array([1.0, np.inf])}, 1, "with a number below 0, or not finite; expected sums of traces"),
     ],
 )
-def test_wrong_sums_of_traces_are_refused(sums: dict[int, np.ndarray], recorded: int, said: str) -> None:
+def test_wrong_sums_of_traces_are_refused(sums: dict[int, np.ndarray], recorded: int, message: str) -> None:
     """They are of the blocks that end in the slots, if not all trials are recorded, and of every trial."""
     P, digests = np.zeros((1, 1, 1, recorded)), {0: np.zeros((2, 16), np.uint8)}
     report = telemetry.Report(
         0, np.zeros((1, 1, 2)), np.zeros((1, 2), np.uint8), P, np.zeros((1, 2)), None, digests, trace_sums=sums
     )
-    with pytest.raises(MalformedMessage, match=re.escape(said)):
+    with pytest.raises(MalformedMessage, match=re.escape(message)):
         telemetry.read_report(Reader("key", report.pack()), 0, replace(extent(1, 2, recorded), slots=1), Blocks(1))
 
 
@@ -362,8 +362,8 @@ TELEMETRY = {
 
 
 @pytest.mark.parametrize("second", [0, 1, 3, 4])
-@pytest.mark.parametrize("what", TELEMETRY)
-def test_recorder_notices_gaps_and_doubles(what: str, second: int) -> None:
+@pytest.mark.parametrize("case", TELEMETRY)
+def test_recorder_notices_gaps_and_doubles(case: str, second: int) -> None:
     """Truth, report or journal that does not begin where the last one ended is a gap."""
     joiner = Joiner(extent(1, 3), {"a": 0}, {"a": Blocks(9)})
     takes: dict[str, Callable[[bytes], object]] = {
@@ -371,8 +371,8 @@ def test_recorder_notices_gaps_and_doubles(what: str, second: int) -> None:
         "report": lambda raw: joiner.add_report("a", Reader("key", raw)),
         "journal": lambda raw: joiner.add_journal(Reader("key", raw)),
     }
-    take = takes[what]
-    take(TELEMETRY[what](0))
+    take = takes[case]
+    take(TELEMETRY[case](0))
     with pytest.raises(Gap, match=f"gap on key: slot {second} arrived where slot 2 was due"):
-        take(TELEMETRY[what](second))
-    take(TELEMETRY[what](2))
+        take(TELEMETRY[case](second))
+    take(TELEMETRY[case](2))

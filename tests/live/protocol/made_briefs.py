@@ -64,19 +64,19 @@ KINDS = {
 
 def every_brief() -> dict[str, dict[str, Any]]:
     """Briefs of scenarios of many kinds, as JSON, by scenario and process."""
-    found = {}
+    briefs = {}
     for name, changes in KINDS.items():
         scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": [], **changes})
         for process, brief in made(scenario).items():
-            found[f"{name}/{process}"] = json.loads(brief.text)
-    return found
+            briefs[f"{name}/{process}"] = json.loads(brief.text)
+    return briefs
 
 
-def refusal(found: dict[str, Any], folder: Path) -> str | None:
+def refusal(brief: dict[str, Any], folder: Path) -> str | None:
     """The message about a brief; None if it can be used."""
     path = folder / "brief.json"
     path.unlink(missing_ok=True)  # a new file: to write over the old one takes ten times as long
-    path.write_text(json.dumps(found))
+    path.write_text(json.dumps(brief))
     path.chmod(0o600)
     try:
         expect_usable(read_brief(path))

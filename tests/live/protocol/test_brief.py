@@ -76,7 +76,7 @@ def without(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    "found",
+    "value",
     [
         [],
         "text",
@@ -91,10 +91,10 @@ def without(name: str) -> dict[str, Any]:
         without("role"),
     ],
 )
-def test_refuses_what_is_no_brief(found: object, tmp_path: Path) -> None:
+def test_refuses_what_is_no_brief(value: object, tmp_path: Path) -> None:
     """Missing and unknown entries, unknown roles and other JSON are one line with the remedy, status 2."""
     path = tmp_path / "brief.json"
-    path.write_text(json.dumps(found))
+    path.write_text(json.dumps(value))
     path.chmod(0o600)
     with pytest.raises(
         BriefError, match=r"is not a brief of this version .*; write it again with `evedrop brief`"
@@ -116,11 +116,11 @@ def test_refuses_what_is_not_there(tmp_path: Path) -> None:
 
 def test_who_is_given_which_keys() -> None:
     """Each process has the keys of the streams it owns by definition, and no others."""
-    found = {name: set(brief.keys) for name, brief in made(briefed()).items()}
-    assert found == {
+    keys = {name: set(brief.keys) for name, brief in made(briefed()).items()}
+    assert keys == {
         "router": {
-            f"{what}/{name}"
-            for what in ("link", "delay", "fate")
+            f"{kind}/{name}"
+            for kind in ("link", "delay", "fate")
             for name in ("legitimate", "naive", "smart", "doubtful")
         },
         "sensor": {"process", "schedule", "noise"},
@@ -156,7 +156,7 @@ def test_a_secret_file_replaces_the_seed_where_it_must(tmp_path: Path) -> None:
     for name, brief in plain.items():
         for stream, key in brief.keys.items():
             assert (own[name].keys[stream] == key) == (stream not in {"schedule", "noise"})
-    keys = [StreamKeys.from_scenario(one) for one in (briefed(secret_file=str(secret)), briefed())]
+    keys = [StreamKeys.from_scenario(scenario) for scenario in (briefed(secret_file=str(secret)), briefed())]
     assert keys[0].seed_root == keys[1].seed_root
 
 
@@ -202,15 +202,15 @@ def test_no_secret_is_in_what_python_shows_of_a_brief() -> None:
     """Neither keys, passwords, private keys nor the seed: they would be in a traceback, and so in a log."""
     made_for = endpoints_at("tls/0.0.0.0:7447", "tls/router.lan:7447")
     for brief in briefs_of(briefed(seed=987_654_321), made_for, RecorderTask(Path("nowhere"), False)).values():
-        shown, found = repr(brief), json.loads(brief.text)
-        secrets = [brief.password, *brief.keys.values(), *found["part"].get("users", {}).values()]
-        secrets += [found["part"].get("operator"), found["identity"]["key"], "PRIVATE KEY", "987654321"]
+        shown, entries = repr(brief), json.loads(brief.text)
+        secrets = [brief.password, *brief.keys.values(), *entries["part"].get("users", {}).values()]
+        secrets += [entries["part"].get("operator"), entries["identity"]["key"], "PRIVATE KEY", "987654321"]
         assert [secret for secret in secrets if secret and secret in shown] == []
 
 
 @pytest.mark.parametrize("role", ["legitimate", "smart"])
 @pytest.mark.parametrize(
-    ("outage", "said"),
+    ("outage", "message"),
     [
         ([[], 3, True], "part.outages.0.0 is list of 0, expected a whole number"),
         ([2, 3, 1], "part.outages.0.2 is 1, expected true or false"),
@@ -218,29 +218,29 @@ def test_no_secret_is_in_what_python_shows_of_a_brief() -> None:
         ([2, 3, True, 4], "part.outages.0 is list of 4, expected a list of 3 entries"),
     ],
 )
-def test_a_malformed_outage_is_refused(role: str, outage: list[Any], said: str, tmp_path: Path) -> None:
+def test_a_malformed_outage_is_refused(role: str, outage: list[Any], message: str, tmp_path: Path) -> None:
     """It is refused before the receiver joins the run."""
-    found = json.loads(made(briefed())[role].text)
-    found["part"]["outages"] = [outage]
-    assert said in str(refusal(found, tmp_path))
+    brief = json.loads(made(briefed())[role].text)
+    brief["part"]["outages"] = [outage]
+    assert message in str(refusal(brief, tmp_path))
 
 
 @pytest.mark.parametrize("wrong", [[0.5] * 3, [1.5], [-0.1]])
 def test_probabilities_that_are_not_one_for_each_slot_are_refused(wrong: list[float], tmp_path: Path) -> None:
     """A list of μ_d(k) has one number from 0 to 1 for each slot."""
-    found = json.loads(made(briefed())["smart"].text)
-    found["model"]["state_probabilities"] = wrong if len(wrong) > 1 else wrong * found["slots"]
-    assert "model.state_probabilities are not" in str(refusal(found, tmp_path))
-    found["model"]["state_probabilities"] = [0.5] * found["slots"]
-    assert refusal(found, tmp_path) is None
+    brief = json.loads(made(briefed())["smart"].text)
+    brief["model"]["state_probabilities"] = wrong if len(wrong) > 1 else wrong * brief["slots"]
+    assert "model.state_probabilities are not" in str(refusal(brief, tmp_path))
+    brief["model"]["state_probabilities"] = [0.5] * brief["slots"]
+    assert refusal(brief, tmp_path) is None
 
 
 @pytest.mark.parametrize("role", ["router", "sensor", "legitimate", "smart", "recorder"])
 def test_unknown_entries_of_a_part_are_refused(role: str, tmp_path: Path) -> None:
     """As those of the brief itself."""
-    found = json.loads(made(briefed())[role].text)
-    found["part"]["seed"] = 3
-    assert "(part.seed is an unknown entry)" in str(refusal(found, tmp_path))
+    brief = json.loads(made(briefed())[role].text)
+    brief["part"]["seed"] = 3
+    assert "(part.seed is an unknown entry)" in str(refusal(brief, tmp_path))
 
 
 OPTIONAL = {
@@ -296,11 +296,11 @@ USUAL = [
 @pytest.mark.parametrize("name", mostly_long(BRIEFS, USUAL))
 def test_every_brief_lacks_nothing_unnoticed(name: str, tmp_path: Path) -> None:
     """Each of its entries and keys, left out or of another type, is refused and named; the whole brief can be used."""
-    found = BRIEFS[name]
-    assert refusal(found, tmp_path) is None
-    for path, table, entry in list(entries(found)):
+    brief = BRIEFS[name]
+    assert refusal(brief, tmp_path) is None
+    for path, table, entry in list(entries(brief)):
         before = table.pop(entry)
-        without = refusal(found, tmp_path)
+        without = refusal(brief, tmp_path)
         shared = path.split(".")[0] in ("keys",) or path.startswith(("part.users.", "part.leaks.", "part.links."))
         if entry not in OPTIONAL and not shared:
             assert without is not None, path
@@ -308,23 +308,23 @@ def test_every_brief_lacks_nothing_unnoticed(name: str, tmp_path: Path) -> None:
         strange: tuple[Any, ...] = ([["x"]], {"x": {"y": []}}, "\x00", -1.5)
         for other in strange:
             table[entry] = other
-            refused = refusal(found, tmp_path)  # whatever it is, nothing but a BriefError
+            refused = refusal(brief, tmp_path)  # whatever it is, nothing but a BriefError
             if not isinstance(other, type(before)) and before is not None and path not in ("part.modules",):
                 assert refused is not None or isinstance(before, float), (path, other)
         table[entry] = before
 
 
-@pytest.mark.parametrize("name", [one for one in BRIEFS if BRIEFS[one]["keys"]])
+@pytest.mark.parametrize("name", [brief for brief in BRIEFS if BRIEFS[brief]["keys"]])
 def test_a_brief_without_its_key_is_refused(name: str, tmp_path: Path) -> None:
     """The key is named, not what it would have been; a KeyError comes from nowhere."""
-    found = json.loads(json.dumps(BRIEFS[name]))
-    for stream, key in list(found["keys"].items()):
-        del found["keys"][stream]
-        said = refusal(found, tmp_path)
-        assert said is not None, stream
-        assert f"keys.{stream} is missing" in said
-        assert key not in said
-        found["keys"][stream] = key
+    brief = json.loads(json.dumps(BRIEFS[name]))
+    for stream, key in list(brief["keys"].items()):
+        del brief["keys"][stream]
+        reason = refusal(brief, tmp_path)
+        assert reason is not None, stream
+        assert f"keys.{stream} is missing" in reason
+        assert key not in reason
+        brief["keys"][stream] = key
 
 
 def test_a_process_without_its_key_ends_with_status_2(evedrop: Evedrop) -> None:
@@ -356,8 +356,8 @@ def test_a_brief_that_is_no_file_is_refused(kind: str, tmp_path: Path) -> None:
 
 def test_a_monitor_that_does_not_fit_its_plant_is_refused(tmp_path: Path) -> None:
     """Its matrices must have the dimensions of inputs and measurements, and there must be a filter."""
-    found = json.loads(json.dumps(BRIEFS["replay-attack/sensor"]))
-    found["part"]["monitor"]["shift"] = [[1.0, 2.0]]
-    assert "part.monitor cannot be used (ValueError: its matrices are" in str(refusal(found, tmp_path))
-    found["part"]["plant"] = None
-    assert "part.monitor cannot be used (ValueError: there is no filter" in str(refusal(found, tmp_path))
+    brief = json.loads(json.dumps(BRIEFS["replay-attack/sensor"]))
+    brief["part"]["monitor"]["shift"] = [[1.0, 2.0]]
+    assert "part.monitor cannot be used (ValueError: its matrices are" in str(refusal(brief, tmp_path))
+    brief["part"]["plant"] = None
+    assert "part.monitor cannot be used (ValueError: there is no filter" in str(refusal(brief, tmp_path))

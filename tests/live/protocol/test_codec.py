@@ -20,11 +20,11 @@ from tests.live.network.readers import EXAMPLES, READERS, TRIALS, fields_of
 KEY = "evedrop/r1/telemetry/eve"
 
 
-@pytest.mark.parametrize(("found", "said"), [([1], "a list"), (3, "a int"), (None, "a NoneType"), ("x", "a str")])
-def test_a_message_that_is_not_a_map_is_refused(found: object, said: str) -> None:
+@pytest.mark.parametrize(("value", "message"), [([1], "a list"), (3, "a int"), (None, "a NoneType"), ("x", "a str")])
+def test_a_message_that_is_not_a_map_is_refused(value: object, message: str) -> None:
     """Although it is msgpack."""
-    with pytest.raises(MalformedMessage, match=f"{said}; expected a msgpack map"):
-        Reader(KEY, msgpack.packb(found))
+    with pytest.raises(MalformedMessage, match=f"{message}; expected a msgpack map"):
+        Reader(KEY, msgpack.packb(value))
 
 
 WRONG: list[tuple[str, dict[str, Any], str]] = [
@@ -49,27 +49,27 @@ WRONG: list[tuple[str, dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "changes", "said"), WRONG)
-def test_a_field_that_is_out_of_range_is_refused(name: str, changes: dict[str, Any], said: str) -> None:
+@pytest.mark.parametrize(("name", "changes", "message"), WRONG)
+def test_a_field_that_is_out_of_range_is_refused(name: str, changes: dict[str, Any], message: str) -> None:
     """The rest of the message is right."""
     READERS[name][1](EXAMPLES[name])
-    with pytest.raises(MalformedMessage, match=re.escape(f"malformed message on {READERS[name][0]}: {said}")):
+    with pytest.raises(MalformedMessage, match=re.escape(f"malformed message on {READERS[name][0]}: {message}")):
         READERS[name][1](pack({**fields_of(name), **changes}))
 
 
 def test_digests_of_slots_in_which_no_block_ends_are_refused() -> None:
     """The report of one slot in the middle of a block has none."""
     report = fields_of("report")
-    one = {
+    fields = {
         name: report[name][: len(report[name]) // 2] for name in ("x_hat", "action", "P", "trace", "late", "late_used")
     }
     key, read = READERS["report"]
-    one |= {"c": 1, "trace_sums": {}}
-    read(pack({**report, **one, "digests": {}}))
+    fields |= {"c": 1, "trace_sums": {}}
+    read(pack({**report, **fields, "digests": {}}))
     with pytest.raises(
         MalformedMessage, match=f"{key}: digests of block 0; expected none: no block ends in these slots"
     ):
-        read(pack({**report, **one}))
+        read(pack({**report, **fields}))
 
 
 @pytest.mark.parametrize(
@@ -87,13 +87,13 @@ def test_the_reasons_and_the_alarms_of_the_sensor_are_read_as_sent() -> None:
     """Whether it sent, and whether it raised an alarm; each may be absent."""
     sent, alarms = np.array([[True, False, True]]), np.array([[False, False, True]])
     truth = Truth(4, np.ones((1, 2, 3)), np.zeros((1, 3), np.bool_), sent, alarms)
-    found = read_truth(Reader(KEY, truth.pack()), 4, Extent(9, 3, 2, 3))
-    assert found.sent is not None
-    assert found.alarms is not None
-    assert np.array_equal(found.sent, sent)
-    assert np.array_equal(found.alarms, alarms)
-    assert (found.u, found.failed, found.true) == (None, None, None)
-    assert (found.statistic, found.watermark) == (None, None)
+    result = read_truth(Reader(KEY, truth.pack()), 4, Extent(9, 3, 2, 3))
+    assert result.sent is not None
+    assert result.alarms is not None
+    assert np.array_equal(result.sent, sent)
+    assert np.array_equal(result.alarms, alarms)
+    assert (result.u, result.failed, result.true) == (None, None, None)
+    assert (result.statistic, result.watermark) == (None, None)
     bare = read_truth(Reader(KEY, Truth(4, truth.x, truth.nu).pack()), 4, Extent(9, 3, 2, 3))
     assert (bare.sent, bare.alarms) == (None, None)
 
@@ -104,11 +104,11 @@ def test_statistic_and_watermark_of_a_detector_are_read_as_sent() -> None:
     u, failed = np.zeros((1, 1, 3)), np.zeros((1, 3), np.bool_)
     given = (4, np.ones((1, 2, 3)), failed, None, None, u, failed, np.ones((1, 2, 3)))
     extent = Extent(9, 3, 2, 3, inputs=1, measures=True, monitored=True)
-    found = read_truth(Reader(KEY, Truth(*given, statistic, watermark).pack()), 4, extent)
-    assert found.statistic is not None
-    assert found.watermark is not None
-    assert np.array_equal(found.statistic, statistic)
-    assert np.array_equal(found.watermark, watermark)
+    truth = read_truth(Reader(KEY, Truth(*given, statistic, watermark).pack()), 4, extent)
+    assert truth.statistic is not None
+    assert truth.watermark is not None
+    assert np.array_equal(truth.statistic, statistic)
+    assert np.array_equal(truth.watermark, watermark)
     with pytest.raises(MalformedMessage, match="statistic"):
         read_truth(Reader(KEY, Truth(*given).pack()), 4, extent)
 
@@ -148,9 +148,9 @@ def test_what_a_packet_carries_besides_its_payload_is_read_as_sent() -> None:
     message = Reader(KEY, uplink(4, z, header, sent, z + 1.0))
     assert np.array_equal(read_uplink(message, 4, (2, 3)), np.where(sent, z, 0.0))
     extras = read_extras(message, (2, 3), 1)
-    for found, given in zip(extras, (header, sent, z + 1.0), strict=True):
-        assert found is not None
-        assert np.array_equal(found, given)
+    for extra, given in zip(extras, (header, sent, z + 1.0), strict=True):
+        assert extra is not None
+        assert np.array_equal(extra, given)
     assert read_extras(Reader(KEY, uplink(4, z)), (2, 3)) == (None, None, None)
 
 
@@ -159,7 +159,7 @@ def test_the_header_of_a_delivery_is_read_for_the_trials_that_received() -> None
     header, received = np.array([[4, -1, 2**40]]), np.array([True, False, True])
     late = (Late(3, Reception(~received, np.ones((2, 3)), header)),)
     payload = delivery(4, b"\x05", np.ones((2, 2)).tobytes(), late, packed_header(header, received))
-    heard, found = read_delivery(Reader(KEY, payload), 4, (2, 3), header=1)
-    for one, gamma in ((heard, received), (found[0].heard, ~received)):
-        assert one.header is not None
-        assert np.array_equal(one.header, np.where(gamma, header, 0))
+    heard, late_packets = read_delivery(Reader(KEY, payload), 4, (2, 3), header=1)
+    for reception, gamma in ((heard, received), (late_packets[0].heard, ~received)):
+        assert reception.header is not None
+        assert np.array_equal(reception.header, np.where(gamma, header, 0))

@@ -61,7 +61,7 @@ def test_an_unknown_command_is_no_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("process", "fields", "said"),
+    ("process", "fields", "message"),
     [
         ("eve", {}, "do = None; expected a string do"),
         ("eve", {"do": 3}, "do = 3; expected a string do"),
@@ -87,7 +87,9 @@ def test_an_unknown_command_is_no_error() -> None:
         ),
     ],
 )
-def test_a_malformed_command_is_refused(process: str, fields: dict[str, Any], said: str) -> None:
+def test_a_malformed_command_is_refused(process: str, fields: dict[str, Any], message: str) -> None:
     """The error names the key, what was found and what was expected."""
-    with pytest.raises(MalformedMessage, match=re.escape(f"malformed message on evedrop/r/control/{process}: {said}")):
+    with pytest.raises(
+        MalformedMessage, match=re.escape(f"malformed message on evedrop/r/control/{process}: {message}")
+    ):
         read(process, pack(fields))

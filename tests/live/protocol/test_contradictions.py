@@ -57,26 +57,26 @@ CONTRADICTIONS = {
 }
 
 
-@pytest.mark.parametrize("what", CONTRADICTIONS)
-def test_a_message_that_contradicts_itself_is_refused(what: str) -> None:
+@pytest.mark.parametrize("case", CONTRADICTIONS)
+def test_a_message_that_contradicts_itself_is_refused(case: str) -> None:
     """With what was found and what was expected."""
-    change, said = CONTRADICTIONS[what]
-    name = what.partition(" ")[0]
+    change, message = CONTRADICTIONS[case]
+    name = case.partition(" ")[0]
     key, read = READERS[name]
     read(EXAMPLES[name])
     fields = fields_of(name)
     change(fields)
-    with pytest.raises(MalformedMessage) as found:
+    with pytest.raises(MalformedMessage) as raised:
         read(msgpack.packb(fields))
-    assert found.value.key == key
-    assert said in str(found.value)
+    assert raised.value.key == key
+    assert message in str(raised.value)
 
 
 def test_every_key_has_one_writer_and_a_reader() -> None:
     """Acknowledgements go from the legitimate estimator to the router, and from there to the sensor."""
     keys = RunKeys("r1")
-    found = {key: (writer_of(key), reader_of(key)) for key in (keys.acknowledged, keys.acknowledgements, keys.uplink)}
-    assert found == {
+    ends = {key: (writer_of(key), reader_of(key)) for key in (keys.acknowledged, keys.acknowledgements, keys.uplink)}
+    assert ends == {
         keys.acknowledged: ("legitimate", "router"),
         keys.acknowledgements: ("router", "sensor"),
         keys.uplink: ("sensor", "router"),
@@ -97,57 +97,57 @@ def test_a_router_drops_what_is_larger_than_its_kind() -> None:
     assert all(rule["flows"] == ["ingress"] for rule in rules)
 
 
-def without_parameter(found: dict[str, Any]) -> None:
+def without_parameter(brief: dict[str, Any]) -> None:
     """The scheme needs it."""
-    del found["part"]["scheme"]["state_probability"]
+    del brief["part"]["scheme"]["state_probability"]
 
 
-def other_scheme(found: dict[str, Any]) -> None:
+def other_scheme(brief: dict[str, Any]) -> None:
     """The scheme does not know it."""
-    found["part"]["scheme"]["colour"] = 3
+    brief["part"]["scheme"]["colour"] = 3
 
 
-def other_controller(found: dict[str, Any]) -> None:
+def other_controller(brief: dict[str, Any]) -> None:
     """There is none of that name."""
-    found["part"]["strategy"] = "pid"
+    brief["part"]["strategy"] = "pid"
 
 
-def fewer_states(found: dict[str, Any]) -> None:
+def fewer_states(brief: dict[str, Any]) -> None:
     """The plant and the model are not of the same system."""
-    noise = found["part"]["plant"]["noise"]
-    found["part"]["plant"]["noise"] = [row[:-1] for row in noise[:-1]]
+    noise = brief["part"]["plant"]["noise"]
+    brief["part"]["plant"]["noise"] = [row[:-1] for row in noise[:-1]]
 
 
-def no_matrix(found: dict[str, Any]) -> None:
+def no_matrix(brief: dict[str, Any]) -> None:
     """Its rows do not have the same length."""
-    found["model"]["A"] = [[1.0], [0.0, 1.0]]
+    brief["model"]["A"] = [[1.0], [0.0, 1.0]]
 
 
-def no_process(found: dict[str, Any]) -> None:
+def no_process(brief: dict[str, Any]) -> None:
     """Its noise is not a covariance."""
-    found["model"]["Q"][0][0] = -1.0
+    brief["model"]["Q"][0][0] = -1.0
 
 
-def free_input(found: dict[str, Any]) -> None:
+def free_input(brief: dict[str, Any]) -> None:
     """The controller weighs neither an input nor its change."""
-    weights = found["part"]["assignment"]
+    weights = brief["part"]["assignment"]
     weights["input_weights"] = weights["rate_weights"] = [0.0] * len(weights["input_weights"])
 
 
-def many_disturbances(found: dict[str, Any]) -> None:
+def many_disturbances(brief: dict[str, Any]) -> None:
     """One more in each slot than the plant has."""
-    plant = found["part"]["plant"]
+    plant = brief["part"]["plant"]
     plant["disturbance_matrix"] = [[*row, 1.0] for row in plant["disturbance_matrix"]]
 
 
-def one_state(found: dict[str, Any]) -> None:
+def one_state(brief: dict[str, Any]) -> None:
     """The noise and the model are not of the same system."""
-    found["part"]["noise_covariance"] = [[1.0]]
+    brief["part"]["noise_covariance"] = [[1.0]]
 
 
-def no_covariance(found: dict[str, Any]) -> None:
+def no_covariance(brief: dict[str, Any]) -> None:
     """The noise has a direction with a negative variance."""
-    found["part"]["noise_covariance"] = [[1.0, 2.0], [2.0, 1.0]]
+    brief["part"]["noise_covariance"] = [[1.0, 2.0], [2.0, 1.0]]
 
 
 UNUSABLE = {
@@ -173,23 +173,23 @@ UNUSABLE = {
 @pytest.mark.parametrize("name", UNUSABLE)
 def test_a_brief_whose_parts_do_not_fit_together_is_refused(name: str, tmp_path: Path) -> None:
     """With the entry."""
-    for change, said in UNUSABLE[name]:
-        found = copy.deepcopy(BRIEFS[name])
-        assert refusal(found, tmp_path) is None
-        change(found)
-        refused = refusal(found, tmp_path)
+    for change, message in UNUSABLE[name]:
+        brief = copy.deepcopy(BRIEFS[name])
+        assert refusal(brief, tmp_path) is None
+        change(brief)
+        refused = refusal(brief, tmp_path)
         assert refused is not None
-        assert said in refused, json.dumps(refused)
+        assert message in refused, json.dumps(refused)
 
 
 def test_an_estimator_that_knows_the_inputs_has_the_plant_of_its_model(tmp_path: Path) -> None:
     """Without the disturbances, which only sensor and controller know."""
-    found = copy.deepcopy(BRIEFS["microgrid/legitimate"])
+    brief = copy.deepcopy(BRIEFS["microgrid/legitimate"])
     plant = copy.deepcopy(BRIEFS["microgrid/sensor"]["part"]["plant"])
     del plant["disturbances"]
-    found["part"]["controller"] = {"period": 1, "acts_on": "estimate", "plant": plant}
-    assert refusal(found, tmp_path) is None
+    brief["part"]["controller"] = {"period": 1, "acts_on": "estimate", "plant": plant}
+    assert refusal(brief, tmp_path) is None
     plant["noise"] = [[*row, 0.0] for row in plant["noise"]]
-    refused = refusal(found, tmp_path)
+    refused = refusal(brief, tmp_path)
     assert refused is not None
     assert "part.plant cannot be used (ValueError: it does not have " in refused

@@ -35,9 +35,9 @@ def test_dropped_messages_are_counted_and_reported_ever_more_rarely(capsys: pyte
     assert dropped.contents(KEY, head_of(KEY), b"\xc1") is None
     assert dropped.count == 101
     assert confused == list(range(1, 101))
-    said = capsys.readouterr().err.splitlines()
-    assert [line.rpartition("(number ")[2].partition(")")[0] for line in said] == ["1", "10", "100"]
-    assert all(f"eve: dropped a message that came on {KEY} and names {OTHER}" in line for line in said)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.rpartition("(number ")[2].partition(")")[0] for line in lines] == ["1", "10", "100"]
+    assert all(f"eve: dropped a message that came on {KEY} and names {OTHER}" in line for line in lines)
 
 
 def test_a_message_that_names_no_key_is_reported_as_such(capsys: pytest.CaptureFixture[str]) -> None:

@@ -51,7 +51,7 @@ def test_news_is_read_as_it_was_written(event: ProgressEvent) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         (b"", "Expecting value"),
         (b"[" * 100_000, "it is nested too deeply"),
@@ -71,11 +71,11 @@ def test_news_is_read_as_it_was_written(event: ProgressEvent) -> None:
         (b'{"event": "ended", "status": 256, "how": "x"}', "status is 256, expected a whole number from 0 to 255"),
     ],
 )  # fmt: skip
-def test_a_malformed_line_is_refused(line: bytes, said: str) -> None:
+def test_a_malformed_line_is_refused(line: bytes, message: str) -> None:
     """With a ValueError that says what is wrong with it."""
     with pytest.raises(ValueError) as refused:  # noqa: PT011 - the words are compared below
         read_event(line)
-    assert said in str(refused.value)
+    assert message in str(refused.value)
 
 
 @pytest.mark.parametrize(("status", "well"), [(0, True), (1, True), (2, False), (3, False), (130, False)])

@@ -34,19 +34,19 @@ RANDOM = st.builds(np.random.default_rng, st.integers(0, 2**32))
 
 def uplinks(random: np.random.Generator, shape: tuple[int, int], header: int, odd: bool) -> list[bytes]:
     """Packets of some slots; odd: some of them were not sent in every trial, or betray the state."""
-    found = []
+    uplinks = []
     for k in range(FIRST, FIRST + int(random.integers(1, 6))):
         extra = random.integers(0, 5, (header, shape[1])) if header else None
         sent = random.random(shape[1]) < 0.5 if odd and random.random() < 0.5 else None
         truth = random.normal(size=shape) if odd and random.random() < 0.3 else None
-        found.append(uplink(k, random.normal(size=shape), extra, sent, truth))
-    return found
+        uplinks.append(uplink(k, random.normal(size=shape), extra, sent, truth))
+    return uplinks
 
 
 def deliveries(random: np.random.Generator, shape: tuple[int, int], header: int, odd: bool) -> list[bytes]:
     """Deliveries of some slots; odd: with late packets, or a betrayed state."""
     _n, trials = shape
-    found = []
+    deliveries = []
     for k in range(FIRST, FIRST + int(random.integers(1, 6))):
         gamma, z = random.random(trials) < random.choice([0.0, 0.5, 1.0]), random.normal(size=shape)
         extra = random.integers(0, 5, (header, trials))
@@ -55,12 +55,12 @@ def deliveries(random: np.random.Generator, shape: tuple[int, int], header: int,
             late = (Late(k - 2, Reception(~gamma, z, extra if header else None)),)
         truth = random.normal(size=shape).tobytes() if odd and random.random() < 0.3 else b""
         some = z[:, gamma].tobytes()
-        found.append(
+        deliveries.append(
             delivery(
                 k, packed_flags(gamma).tobytes(), some, late, packed_header(extra, gamma) if header else b"", truth
             )
         )
-    return found
+    return deliveries
 
 
 def readers(key: str, payloads: Sequence[bytes]) -> list[Reader]:
@@ -87,20 +87,20 @@ def test_packets_of_many_slots_are_those_of_each_in_some_cases(seed: int, header
 
 def expect_same_packets(payloads: list[bytes], shape: tuple[int, int], header: int) -> None:
     """Packets that are read together are those that are read one by one."""
-    found = read_uplinks(readers(UP, payloads), FIRST, shape, header)
+    uplinks = read_uplinks(readers(UP, payloads), FIRST, shape, header)
     for row, message in enumerate(readers(UP, payloads)):
         z, extras = read_uplink(message, FIRST + row, shape), read_extras(message, shape, header)
-        assert found.z[row].tobytes() == z.tobytes() == found.whole[row]
-        assert (found.header is None) == (extras.header is None)
-        if found.header is not None and extras.header is not None:
-            assert np.array_equal(found.header[row], extras.header)
-        if found.sent is None:
+        assert uplinks.z[row].tobytes() == z.tobytes() == uplinks.whole[row]
+        assert (uplinks.header is None) == (extras.header is None)
+        if uplinks.header is not None and extras.header is not None:
+            assert np.array_equal(uplinks.header[row], extras.header)
+        if uplinks.sent is None:
             assert extras.sent is None
         else:
-            assert np.array_equal(found.sent[row], np.ones(shape[1]) if extras.sent is None else extras.sent)
-        assert (row in found.truth) == (extras.truth is not None)
+            assert np.array_equal(uplinks.sent[row], np.ones(shape[1]) if extras.sent is None else extras.sent)
+        assert (row in uplinks.truth) == (extras.truth is not None)
         if extras.truth is not None:
-            assert np.array_equal(found.truth[row], extras.truth)
+            assert np.array_equal(uplinks.truth[row], extras.truth)
 
 
 @settings(deadline=None, max_examples=examples(60))
@@ -122,15 +122,15 @@ def test_deliveries_of_many_slots_are_those_of_each_in_some_cases(seed: int, hea
 
 def expect_same_deliveries(payloads: list[bytes], shape: tuple[int, int], header: int) -> None:
     """Deliveries that are read together are those that are read one by one."""
-    found = read_deliveries(readers(DOWN, payloads), FIRST, shape, header, WINDOW)
+    deliveries = read_deliveries(readers(DOWN, payloads), FIRST, shape, header, WINDOW)
     for row, message in enumerate(readers(DOWN, payloads)):
-        expected, one = read_delivery(message, FIRST + row, shape, header, WINDOW), found.at(row)
-        for mine, other in zip(one.heard, expected.heard, strict=True):
+        expected, single = read_delivery(message, FIRST + row, shape, header, WINDOW), deliveries.at(row)
+        for mine, other in zip(single.heard, expected.heard, strict=True):
             assert (mine is None) == (other is None)
             if mine is not None and other is not None:
                 assert np.array_equal(mine, other)
-        assert len(one.late) == len(expected.late)
-        for late, like in zip(one.late, expected.late, strict=True):
+        assert len(single.late) == len(expected.late)
+        for late, like in zip(single.late, expected.late, strict=True):
             assert late.k == like.k
             assert np.array_equal(late.heard.z, like.heard.z)
 
@@ -153,12 +153,12 @@ SPOILT_DELIVERIES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("place", [0, 2])
-@pytest.mark.parametrize("what", SPOILT)
-def test_the_malformed_packet_among_many_is_refused(what: str, place: int) -> None:
+@pytest.mark.parametrize("case", SPOILT)
+def test_the_malformed_packet_among_many_is_refused(case: str, place: int) -> None:
     """With the words in which it is refused alone."""
     fields = [{"k": FIRST + row, "z": np.ones((2, 3)).tobytes()} for row in range(4)]
-    fields[place] = SPOILT[what](fields[place])
-    messages = readers(UP, [pack(one) for one in fields])
+    fields[place] = SPOILT[case](fields[place])
+    messages = readers(UP, [pack(field) for field in fields])
     with pytest.raises((MalformedMessage, Gap)) as alone:
         read_uplink(messages[place], FIRST + place, (2, 3))
     with pytest.raises((MalformedMessage, Gap)) as among:
@@ -167,12 +167,12 @@ def test_the_malformed_packet_among_many_is_refused(what: str, place: int) -> No
 
 
 @pytest.mark.parametrize("place", [0, 2])
-@pytest.mark.parametrize("what", SPOILT_DELIVERIES)
-def test_the_malformed_delivery_among_many_is_refused(what: str, place: int) -> None:
+@pytest.mark.parametrize("case", SPOILT_DELIVERIES)
+def test_the_malformed_delivery_among_many_is_refused(case: str, place: int) -> None:
     """With the words in which it is refused alone."""
     fields = [{"k": FIRST + row, "gamma": b"\x07", "z": np.ones((2, 3)).tobytes()} for row in range(4)]
-    fields[place] = SPOILT_DELIVERIES[what](fields[place])
-    messages = readers(DOWN, [pack(one) for one in fields])
+    fields[place] = SPOILT_DELIVERIES[case](fields[place])
+    messages = readers(DOWN, [pack(field) for field in fields])
     with pytest.raises((MalformedMessage, Gap)) as alone:
         read_delivery(messages[place], FIRST + place, (2, 3))
     with pytest.raises((MalformedMessage, Gap)) as among:
@@ -183,6 +183,6 @@ def test_the_malformed_delivery_among_many_is_refused(what: str, place: int) -> 
 def test_the_headers_of_slots_in_which_nothing_arrives_are_0() -> None:
     """The messages have no header then, like those of a scheme without one."""
     messages = readers(DOWN, [pack({"k": FIRST + row, "gamma": b"\x00"}) for row in range(3)])
-    found = read_deliveries(messages, FIRST, (2, 3), 1)
-    assert found.header is not None
-    assert np.array_equal(found.header, np.zeros((3, 1, 3)))
+    deliveries = read_deliveries(messages, FIRST, (2, 3), 1)
+    assert deliveries.header is not None
+    assert np.array_equal(deliveries.header, np.zeros((3, 1, 3)))

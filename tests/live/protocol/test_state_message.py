@@ -36,7 +36,7 @@ def test_states_at_known_bytes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("payload", "entry", "said"),
+    ("payload", "entry", "message"),
     [
         (b"", NAMED, "is empty; expected JSON such as"),
         (b"\xff\xfe", NAMED, "is .*; expected JSON"),
@@ -56,9 +56,9 @@ def test_states_at_known_bytes() -> None:
         (struct.pack("<4sddd", b"", 0.0, 0.0, float("nan")), PLACED, "has y = nan"),
     ],
 )
-def test_what_is_not_a_state_is_refused(payload: bytes, entry: ProgramEntry, said: str) -> None:
+def test_what_is_not_a_state_is_refused(payload: bytes, entry: ProgramEntry, message: str) -> None:
     """With what it is, and what was expected."""
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         read_state(payload, entry)
 
 
@@ -88,13 +88,13 @@ def test_a_brief_has_what_its_sensor_needs(source: str, tmp_path: Path) -> None:
     assert (part.states is None, part.program is None) == (source == "zenoh", source == "file")
     if part.states is not None:
         assert np.array_equal(decoded(part.states, 2), ROWS)
-    found = read_brief(brief.write(tmp_path))
-    assert found.text == brief.text
-    expect_usable(found)
+    result = read_brief(brief.write(tmp_path))
+    assert result.text == brief.text
+    expect_usable(result)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"states": encoded(np.zeros((2, 3)))}, "part.states cannot be used .*it has 3 states, not 2"),
         ({"states": encoded(np.full((2, 2), np.nan))}, "part.states cannot be used .*not finite"),
@@ -105,8 +105,8 @@ def test_a_brief_has_what_its_sensor_needs(source: str, tmp_path: Path) -> None:
         ({"program": replace(NAMED, connect=None)}, "part.program cannot be used .*connect or listen"),
     ],
 )
-def test_a_brief_with_other_states_is_refused(change: dict[str, Any], said: str) -> None:
+def test_a_brief_with_other_states_is_refused(change: dict[str, Any], message: str) -> None:
     """It is refused before the process joins the run."""
     brief = sensor_of("file")
-    with pytest.raises(BriefError, match=said):
+    with pytest.raises(BriefError, match=message):
         expect_usable(replace(brief, part=replace(part_of(brief, SensorPart), **change)))

@@ -31,7 +31,7 @@ def test_a_status_is_read_as_it_was_sent() -> None:
 
 
 @pytest.mark.parametrize(
-    ("entry", "value", "said"),
+    ("entry", "value", "message"),
     [
         ("slot", -1, "status.slot is -1, expected a whole number"),
         ("slots", "80", "status.slots is '80', expected a whole number"),
@@ -45,11 +45,11 @@ def test_a_status_is_read_as_it_was_sent() -> None:
         ("colour", "red", "status.colour is an unknown entry"),
     ],
 )
-def test_a_malformed_status_is_refused(entry: str, value: Any, said: str) -> None:
+def test_a_malformed_status_is_refused(entry: str, value: Any, message: str) -> None:
     """With the place and what was expected there."""
-    with pytest.raises(MalformedMessage) as found:
+    with pytest.raises(MalformedMessage) as raised:
         read_answer(KEY, pack({"status": {**asdict(STATUS), entry: value}}))
-    assert said in str(found.value)
+    assert message in str(raised.value)
 
 
 def test_the_lines_say_where_the_run_is_and_what_is_missing() -> None:
@@ -68,10 +68,10 @@ def test_the_lines_say_where_the_run_is_and_what_is_missing() -> None:
 def test_the_status_of_shards_is_that_of_the_slowest_with_the_packets_of_all() -> None:
     """A process is there if it is there in every shard."""
     ahead = replace(STATUS, slot=60, state="running", processes={"sensor": True, "smart": True}, events=[])
-    found = status_of_shards([ahead, STATUS])
-    assert (found.slot, found.state, found.events) == (40, "held", STATUS.events)
-    assert found.processes == {"sensor": True, "smart": False}
-    assert found.links == {"smart": LinkStatus(80, 60, 0.75), "naive": LinkStatus(0, 0, None)}
+    status = status_of_shards([ahead, STATUS])
+    assert (status.slot, status.state, status.events) == (40, "held", STATUS.events)
+    assert status.processes == {"sensor": True, "smart": False}
+    assert status.links == {"smart": LinkStatus(80, 60, 0.75), "naive": LinkStatus(0, 0, None)}
 
 
 WIRE = WireStatus(

@@ -48,13 +48,13 @@ def test_the_selftest_says_that_nothing_was_built() -> None:
 
 def test_kernels_that_cannot_be_had_are_refused() -> None:
     """An unknown name, and C where it was not built, with a way out."""
-    for code, kernels, said in (
+    for code, kernels, message in (
         (SELFTEST, "fortran", "EVEDROP_KERNELS is 'fortran'; expected one of numpy, baseline"),
         (MISSING + SELFTEST, "avx2", "EVEDROP_KERNELS is avx2, but the C kernels cannot be loaded"),
     ):
         done = python(code, kernels)
         assert done.returncode == 2
-        assert said in done.stderr
+        assert message in done.stderr
 
 
 def test_an_instruction_set_may_be_asked_for() -> None:
@@ -77,8 +77,8 @@ def test_a_run_begins_with_a_warning_if_there_are_no_kernels(
     monkeypatch.setattr(choice, "KERNELS", kernels)
     with ProgressLine(10, "slots"):
         pass
-    said = capsys.readouterr().err
-    assert ("warning: the kernels are numpy, because the C kernels are not built" in said) == warned
+    errors = capsys.readouterr().err
+    assert ("warning: the kernels are numpy, because the C kernels are not built" in errors) == warned
 
 
 def test_without_any_compiler_the_build_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_build_replaces_only_the_kernels_of_its_own_python(tmp_path: Path) -> 
     for name in (own, other):
         (kernels / name).touch()
     hook = runpy.run_path(str(Path(__file__).parents[3] / "tools" / "hatch_build.py"))["KernelsHook"]
-    said = Mock()
-    hook(str(tmp_path), {}, None, None, str(tmp_path), "wheel", said).initialize("editable", {})
+    builder = Mock()
+    hook(str(tmp_path), {}, None, None, str(tmp_path), "wheel", builder).initialize("editable", {})
     assert [path.name for path in kernels.glob("_compiled.*")] == [other]
-    assert "no compiler" in said.display_warning.call_args.args[0]
+    assert "no compiler" in builder.display_warning.call_args.args[0]

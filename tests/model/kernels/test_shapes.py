@@ -66,11 +66,11 @@ FIT: dict[str, tuple[Any, ...]] = {
 
 def others(arguments: tuple[Any, ...]) -> Iterator[tuple[Any, ...]]:
     """The arguments with one array of another shape or, if it holds bytes, of wider numbers."""
-    for i, one in enumerate(arguments):
-        if isinstance(one, tuple):
-            changes: Iterator[Any] = others(one)
-        elif isinstance(one, np.ndarray):
-            changes = misshapen(one)
+    for i, argument in enumerate(arguments):
+        if isinstance(argument, tuple):
+            changes: Iterator[Any] = others(argument)
+        elif isinstance(argument, np.ndarray):
+            changes = misshapen(argument)
         else:
             continue
         for change in changes:
@@ -92,25 +92,29 @@ def outcome(module: Any, name: str, arguments: tuple[Any, ...]) -> Any:
     own = copied(arguments)
     try:
         with np.errstate(all="ignore"):
-            found = getattr(module, name)(*own)
+            result = getattr(module, name)(*own)
     except ValueError:
         return ValueError
-    return contents((found, own))
+    return contents((result, own))
 
 
 def copied(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
     """Copies of all arrays."""
     return tuple(
-        copied(one) if isinstance(one, tuple) else one.copy() if isinstance(one, np.ndarray) else one
-        for one in arguments
+        copied(argument)
+        if isinstance(argument, tuple)
+        else argument.copy()
+        if isinstance(argument, np.ndarray)
+        else argument
+        for argument in arguments
     )
 
 
-def contents(found: Any) -> Any:
+def contents(value: Any) -> Any:
     """Type, shape and bytes of all arrays."""
-    if isinstance(found, tuple):
-        return [contents(one) for one in found]
-    return (found.dtype, found.shape, found.tobytes()) if isinstance(found, np.ndarray) else found
+    if isinstance(value, tuple):
+        return [contents(part) for part in value]
+    return (value.dtype, value.shape, value.tobytes()) if isinstance(value, np.ndarray) else value
 
 
 def test_every_kernel_is_here() -> None:
@@ -138,5 +142,5 @@ def test_twins_refuse_the_same_arguments(name: str) -> None:
 
     for arguments in (FIT[name], *others(FIT[name])):
         expected = outcome(reference, name, arguments)
-        shapes = [one.shape if isinstance(one, np.ndarray) else one for one in arguments]
+        shapes = [argument.shape if isinstance(argument, np.ndarray) else argument for argument in arguments]
         assert outcome(compiled, name, arguments) == expected, shapes

@@ -55,38 +55,38 @@ def instruction_set(request: pytest.FixtureRequest) -> Iterator[None]:
 
 def numbers(random: np.random.Generator, *shape: int) -> Floats:
     """Numbers of all sizes, in one array in two with some odd ones."""
-    found = random.standard_normal(shape) * 10.0 ** random.integers(-5, 6, shape)
+    numbers = random.standard_normal(shape) * 10.0 ** random.integers(-5, 6, shape)
     if random.random() < 0.5:
         odd = random.random(shape) < random.random() ** 2
-        found[odd] = random.choice(ODD, int(odd.sum()))
-    return found
+        numbers[odd] = random.choice(ODD, int(odd.sum()))
+    return numbers
 
 
 def codes(random: np.random.Generator, *shape: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """Codes of actions or fates, in one array in two all alike."""
-    found = random.integers(0, 4, shape, np.uint8)
-    return found if random.random() < 0.7 else np.full(shape, random.integers(0, 4), np.uint8)
+    codes_ = random.integers(0, 4, shape, np.uint8)
+    return codes_ if random.random() < 0.7 else np.full(shape, random.integers(0, 4), np.uint8)
 
 
-def same(one: Any, other: Any) -> None:
+def same(value: Any, other: Any) -> None:
     """Expect equal types, shapes and bits; a NaN equals any NaN, because IEEE 754 leaves open which one a sum returns."""
-    assert one.dtype == other.dtype
-    assert one.shape == other.shape
-    if one.dtype == np.float64:
-        assert np.array_equal(np.isnan(one), np.isnan(other))
-        known = ~np.isnan(one)
-        one, other = one[known].view(np.uint64), other[known].view(np.uint64)
-    assert np.array_equal(one, other)
+    assert value.dtype == other.dtype
+    assert value.shape == other.shape
+    if value.dtype == np.float64:
+        assert np.array_equal(np.isnan(value), np.isnan(other))
+        numeric = ~np.isnan(value)
+        value, other = value[numeric].view(np.uint64), other[numeric].view(np.uint64)
+    assert np.array_equal(value, other)
 
 
 def twins(name: str, *arguments: Any) -> None:
     """Expect a kernel to return the same in C and in numpy."""
     with np.errstate(all="ignore"):
         expected = getattr(reference, name)(*arguments)
-    found = getattr(compiled, name)(*arguments)
-    pairs = zip(found, expected, strict=True) if isinstance(expected, tuple) else [(found, expected)]
-    for one, other in pairs:
-        same(one, other)
+    actual = getattr(compiled, name)(*arguments)
+    pairs = zip(actual, expected, strict=True) if isinstance(expected, tuple) else [(actual, expected)]
+    for value, other in pairs:
+        same(value, other)
 
 
 QUICK = settings(max_examples=examples(60), deadline=None)
@@ -142,10 +142,10 @@ def test_packed_trials_are_the_same(random: np.random.Generator, sizes: tuple[in
     """The numbers of some trials are taken out of all, and put back."""
     slots, n, trials = sizes
     flags, x = random.random((slots, trials)) < share, numbers(random, *sizes)
-    for some, one in zip(flags, x, strict=True):
-        twins("gather", some, one)
+    for some, values in zip(flags, x, strict=True):
+        twins("gather", some, values)
     packed = np.concatenate(
-        [np.zeros(0), *(reference.gather(some, one).ravel() for some, one in zip(flags, x, strict=True))]
+        [np.zeros(0), *(reference.gather(some, values).ravel() for some, values in zip(flags, x, strict=True))]
     )
     twins("scatter", flags, packed, n)
     assert np.array_equal(reference.scatter(flags, packed, n), np.where(flags[:, None, :], x, 0.0), equal_nan=True)
@@ -205,11 +205,11 @@ def test_scores_are_the_same(random: np.random.Generator, sizes: tuple[int, int,
 @given(RANDOM, st.integers(0, 6), st.integers(0, 300), st.integers(1, 5))
 def test_counts_are_the_same(random: np.random.Generator, slots: int, trials: int, most: int) -> None:
     """Codes, bursts with what they leave behind, and histograms of numbers that are not negative."""
-    found = codes(random, slots, trials)
-    twins("count_codes", found, 3)
+    result = codes(random, slots, trials)
+    twins("count_codes", result, 3)
     runs = [random.integers(0, 7, trials)] * 2
     runs = [run.copy() for run in runs]
-    same(compiled.count_bursts(found, 1, runs[0], most), reference.count_bursts(found, 1, runs[1], most))
+    same(compiled.count_bursts(result, 1, runs[0], most), reference.count_bursts(result, 1, runs[1], most))
     same(*runs)
     values, bins = np.abs(numbers(random, slots, trials)), int(random.integers(1, 300))
     counts = [np.full((slots, bins), 3, np.uint32) for _ in range(2)]
@@ -278,8 +278,12 @@ def posterior_arguments(
     z = entries(random, *sizes) * 10.0 ** random.uniform(-1, 2)
     gamma = random.random((slots, trials)) < random.random() * 1.3
     if odd:
-        z, leaks = (np.where(random.random(one.shape) < 0.2, numbers(random, *one.shape), one) for one in (z, leaks))
-        before = tuple(np.where(random.random(one.shape) < 0.1, numbers(random, *one.shape), one) for one in before)
+        z, leaks = (
+            np.where(random.random(array.shape) < 0.2, numbers(random, *array.shape), array) for array in (z, leaks)
+        )
+        before = tuple(
+            np.where(random.random(array.shape) < 0.1, numbers(random, *array.shape), array) for array in before
+        )
     else:
         for L in (G, *leaks):
             np.fill_diagonal(L, np.exp(random.standard_normal(len(L))))

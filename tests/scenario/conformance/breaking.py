@@ -52,7 +52,7 @@ def blocks_of_eavesdropper(kind: type[Eavesdropper]) -> str | None:
 def _first(checks: SchemeChecks | EavesdropperChecks) -> str | None:
     for problem in small():
         assert how_broken(checks.shapes, problem) is None
-        found = how_broken(checks.blocks, problem)
-        if found is not None:
-            return found
+        broken = how_broken(checks.blocks, problem)
+        if broken is not None:
+            return broken
     return None

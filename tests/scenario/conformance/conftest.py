@@ -41,8 +41,8 @@ class AnswersHere:
 
     def answer(self, question: str) -> dict[str, Any]:
         """The class's answer to a question."""
-        found: dict[str, Any] = json.loads(answering._answered(question.encode()))
-        return found
+        answer: dict[str, Any] = json.loads(answering._answered(question.encode()))
+        return answer
 
     def end(self) -> None:
         """There is nothing to end."""

@@ -97,8 +97,8 @@ BLOCKS: dict[str, tuple[Callable[[PacketBlock], Any], tuple[str, ...]]] = {
 def test_an_encoder_whose_blocks_are_wrong_is_told_how(name: str) -> None:
     """Errors, shapes, types and numbers; single slots are right, so that no other rule finds it."""
     spoil, parts = BLOCKS[name]
-    found = str(blocks_of_scheme(plain_with(type(name, (Blocks,), {"spoil": staticmethod(spoil)}))))
-    assert all(said in found for said in parts), found
+    text = str(blocks_of_scheme(plain_with(type(name, (Blocks,), {"spoil": staticmethod(spoil)}))))
+    assert all(part in text for part in parts), text
 
 
 class ByRow(Blocks):
@@ -116,9 +116,9 @@ class ByRow(Blocks):
 
 def test_a_block_that_begins_in_a_later_slot_is_no_other() -> None:
     """One block of all slots would be right, and so would the first of many."""
-    found = str(blocks_of_scheme(plain_with(ByRow)))
-    assert "slot 1, trial 0: Packet.z is " in found
-    assert " by ByRow.encode_block() of slot 1; let a slot's numbers depend neither on its block" in found
+    text = str(blocks_of_scheme(plain_with(ByRow)))
+    assert "slot 1, trial 0: Packet.z is " in text
+    assert " by ByRow.encode_block() of slot 1; let a slot's numbers depend neither on its block" in text
 
 
 def test_the_rule_is_one_of_those_that_are_checked() -> None:
@@ -189,9 +189,9 @@ class Turned(Plain):
 
 def test_sides_that_must_take_turns_are_found() -> None:
     """In memory the sensor encodes many slots before the estimator reads them, though both take slots one by one."""
-    found = str(blocks_of_scheme(Turned))
-    assert "Belief.x_hat is " in found
-    assert " by TurnedEstimator.step() of slots 0 to 8; let a slot's numbers depend neither on its block nor" in found
+    text = str(blocks_of_scheme(Turned))
+    assert "Belief.x_hat is " in text
+    assert " by TurnedEstimator.step() of slots 0 to 8; let a slot's numbers depend neither on its block nor" in text
 
 
 class Waits(Acknowledged):
@@ -199,8 +199,8 @@ class Waits(Acknowledged):
 
     def shared(self, keys: Any, batch: Any) -> Any:
         """With an encoder that takes blocks."""
-        found = super().shared(keys, batch)
-        made = found.encoder
+        shared = super().shared(keys, batch)
+        made = shared.encoder
 
         def encode_block(encoder: Encoder, slots: range, x: Floats, predicted: Floats) -> PacketBlock:
             assert len(slots) == 1, "where packets depend on acknowledgements, blocks have one slot"
@@ -208,15 +208,15 @@ class Waits(Acknowledged):
             return PacketBlock.of([packet._replace(z=packet.z + (slots.start == 5))])
 
         def encoder() -> Encoder:
-            one = made()
-            one.__class__ = type("Waiting", (type(one),), {"encode_block": encode_block})
-            return one
+            encoder = made()
+            encoder.__class__ = type("Waiting", (type(encoder),), {"encode_block": encode_block})
+            return encoder
 
-        return NoInnovations(self.process, batch.trials, encoder, found.estimator)
+        return NoInnovations(self.process, batch.trials, encoder, shared.estimator)
 
 
 def test_blocks_have_one_slot_where_acknowledgements_decide() -> None:
     """Each slot's acknowledgements arrive before the next slot is encoded."""
-    found = str(blocks_of_scheme(Waits))
-    assert "slot 5, trial 0: Packet.z is " in found
-    assert " by Waiting.encode_block() of slot 5; " in found
+    text = str(blocks_of_scheme(Waits))
+    assert "slot 5, trial 0: Packet.z is " in text
+    assert " by Waiting.encode_block() of slot 5; " in text

@@ -26,8 +26,8 @@ class Follows(PlainEstimator):
 
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> Any:
         """The beliefs after consecutive slots."""
-        found, last = super().follow(slots, belief, gamma, z)
-        return (found, last) if len(slots) == 1 else self.spoil((found, last))
+        beliefs, last = super().follow(slots, belief, gamma, z)
+        return (beliefs, last) if len(slots) == 1 else self.spoil((beliefs, last))
 
 
 def times(array: Floats, row: int, factor: float) -> Floats:
@@ -87,8 +87,8 @@ FOLLOWS: dict[str, tuple[Callable[[tuple[Beliefs, Belief]], Any], tuple[str, ...
 def test_an_estimator_whose_blocks_are_wrong_is_told_how(name: str) -> None:
     """As an encoder is; the belief after the last slot is checked, too."""
     spoil, parts = FOLLOWS[name]
-    found = str(blocks_of_scheme(plain_with(estimator=type(name, (Follows,), {"spoil": staticmethod(spoil)}))))
-    assert all(said in found for said in parts), found
+    text = str(blocks_of_scheme(plain_with(estimator=type(name, (Follows,), {"spoil": staticmethod(spoil)}))))
+    assert all(part in text for part in parts), text
 
 
 class Consumes(PlainEstimator):
@@ -107,20 +107,20 @@ class Continues(PlainEstimator):
 
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> Any:
         """From the belief before, if it has one."""
-        found, self.last = super().follow(slots, self.last or belief, gamma, z)
-        return found, self.last
+        beliefs, self.last = super().follow(slots, self.last or belief, gamma, z)
+        return beliefs, self.last
 
 
 @pytest.mark.parametrize(
-    ("kind", "said"),
+    ("kind", "message"),
     [
         (Consumes, "slots 0 to 8: Consumes.follow() changes in place what it is given"),
         (Continues, " by Continues.follow() of slot"),
     ],
 )
-def test_an_estimator_leaves_nothing_behind_in_what_it_is_given_or_in_itself(kind: Any, said: str) -> None:
+def test_an_estimator_leaves_nothing_behind_in_what_it_is_given_or_in_itself(kind: Any, message: str) -> None:
     """Blocks may be asked for again, as slots may."""
-    assert said in str(blocks_of_scheme(plain_with(estimator=kind)))
+    assert message in str(blocks_of_scheme(plain_with(estimator=kind)))
 
 
 class Counts(PacketReader):
@@ -147,11 +147,11 @@ class Counts(PacketReader):
 
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
         """The same, with a memory after the last slot or a new one."""
-        found = Beliefs.empty(z.shape)
+        beliefs = Beliefs.empty(z.shape)
         for row, k in enumerate(slots):
             belief = self.step(k, belief, Reception(gamma[row], z[row]))
-            found.put(row, belief)
-        return found, belief if self.keeps else belief._replace(memory=self.prior().memory)
+            beliefs.put(row, belief)
+        return beliefs, belief if self.keeps else belief._replace(memory=self.prior().memory)
 
 
 class Forgets(Counts):
@@ -163,9 +163,9 @@ class Forgets(Counts):
 def test_the_memory_after_a_block_is_that_of_its_last_slot() -> None:
     """An eavesdropper may take blocks as it may take slots; what it remembers must outlive a block."""
     assert blocks_of_eavesdropper(Counts) is None
-    found = str(blocks_of_eavesdropper(Forgets))
-    assert ": Belief." in found
-    assert " by Forgets.follow() of slot" in found
+    text = str(blocks_of_eavesdropper(Forgets))
+    assert ": Belief." in text
+    assert " by Forgets.follow() of slot" in text
 
 
 class Even(PacketTaker):
@@ -284,8 +284,8 @@ class Told(Naive):
         """Without what it is told."""
         assert 6 not in slots
         action: Codes = gamma.astype(np.uint8)
-        found = update.beliefs(self.process, slots.start, belief, action, z)
-        return found, found.last
+        beliefs = update.beliefs(self.process, slots.start, belief, action, z)
+        return beliefs, beliefs.last
 
 
 def test_a_block_with_a_betrayed_state_is_taken_slot_by_slot() -> None:

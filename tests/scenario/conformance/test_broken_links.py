@@ -52,13 +52,13 @@ class Whole(Bernoulli):
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
         """By how many they are."""
-        found = super().fates(first, uniforms).copy()
-        found[-1] = 1
-        return found
+        codes = super().fates(first, uniforms).copy()
+        codes[-1] = 1
+        return codes
 
 
 @pytest.mark.parametrize(
-    ("kind", "parameters", "rule", "said"),
+    ("kind", "parameters", "rule", "message"),
     [
         (Better, {"quality": 0.8}, "the quality it says", "quality_at() says 0.8"),
         (Unsteady, {"p": 0.05, "r": 0.1}, "the quality it says", "give `chain`"),
@@ -67,10 +67,10 @@ class Whole(Bernoulli):
     ],
 )
 def test_a_loss_model_that_breaks_a_rule_is_told_which(
-    kind: Any, parameters: dict[str, float], rule: str, said: str
+    kind: Any, parameters: dict[str, float], rule: str, message: str
 ) -> None:
     """As a scheme is."""
-    assert said in broken(LossChecks(lambda: kind(**parameters), kind).verdicts())[rule]
+    assert message in broken(LossChecks(lambda: kind(**parameters), kind).verdicts())[rule]
 
 
 class Early(Normal):
@@ -83,5 +83,5 @@ class Early(Normal):
 
 def test_a_delay_model_that_breaks_a_rule_is_told_which() -> None:
     """As a loss model is."""
-    found = broken(DelayChecks(lambda: Early(2.0, 1.0), Early).verdicts())
-    assert "and arrived(" in found["the delays it says"]
+    result = broken(DelayChecks(lambda: Early(2.0, 1.0), Early).verdicts())
+    assert "and arrived(" in result["the delays it says"]

@@ -65,9 +65,9 @@ class Remembers(PlainEstimator):
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """As plain, and a little of the last slot's."""
-        found = super().step(k, belief, heard._replace(z=heard.z + 1e-9 * self.last))
+        step = super().step(k, belief, heard._replace(z=heard.z + 1e-9 * self.last))
         self.last = heard.z[0] * heard.gamma
-        return found
+        return step
 
 
 class Peeks(PlainEstimator):
@@ -75,8 +75,8 @@ class Peeks(PlainEstimator):
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """As plain, and more."""
-        found = super().step(k, belief, heard)
-        return found._replace(x_hat=found.x_hat + 1e-9 * heard.z)
+        step = super().step(k, belief, heard)
+        return step._replace(x_hat=step.x_hat + 1e-9 * heard.z)
 
 
 class Discards(PlainEstimator):
@@ -84,8 +84,8 @@ class Discards(PlainEstimator):
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """Other than `act`."""
-        found = super().step(k, belief, heard)
-        return found._replace(action=3 * found.action)
+        step = super().step(k, belief, heard)
+        return step._replace(action=3 * step.action)
 
 
 class AllInnovations(SharedSecret):  # type: ignore[misc]  # final: nobody should do this
@@ -144,19 +144,19 @@ SCHEME_RULES: dict[str, tuple[type[Scheme], str, str]] = {
 @pytest.mark.parametrize("rule", SCHEME_RULES)
 def test_a_scheme_that_breaks_a_rule_is_told_which(rule: str) -> None:
     """With the slot, the trial, both values and the remedy."""
-    kind, said, remedy = SCHEME_RULES[rule]
+    kind, message, remedy = SCHEME_RULES[rule]
     parameters = kind.parameters
 
     def scheme_of(process: Process) -> Scheme:
         return kind(process, **parameters)
 
-    found = broken(scheme_verdicts(scheme_of, kind))
-    assert said in found[rule]
-    assert remedy in found[rule]
+    result = broken(scheme_verdicts(scheme_of, kind))
+    assert message in result[rule]
+    assert remedy in result[rule]
 
 
 def test_a_scheme_says_of_every_packet_whether_it_is_encrypted() -> None:
     """One flag for each slot and trial; anything else is told."""
     kind = plain_with(encrypted=lambda self, packets: packets.nu[0])  # noqa: ARG005 - a method
-    found = broken(scheme_verdicts(kind, kind))
-    assert "encrypted()" in found["shapes and types"]
+    result = broken(scheme_verdicts(kind, kind))
+    assert "encrypted()" in result["shapes and types"]

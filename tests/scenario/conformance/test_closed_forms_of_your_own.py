@@ -68,8 +68,10 @@ def scenario(tmp_path: Path) -> str:
 
 def test_theory_and_design_take_a_closed_form_of_ones_own(scenario: str) -> None:
     """Its errors are theory's; `design --policy` takes the scheme. A subclass that does not repeat the statements is refused."""
-    found = expectations_of(load(scenario))
-    assert {name: (one.limit, one.traces(7).tolist()) for name, one in found.items()} == {
+    expectations = expectations_of(load(scenario))
+    assert {
+        name: (expectation.limit, expectation.traces(7).tolist()) for name, expectation in expectations.items()
+    } == {
         "legitimate": (2.5, [2.5] * 7),
         "near": (4.0, [4.0] * 7),
     }

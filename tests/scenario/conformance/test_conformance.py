@@ -50,9 +50,9 @@ def keeps_every_rule(option: str, name: str) -> None:
         "selective": {"scheme": "encrypted-schedule"},
         "tracker": {"scheme": "twin-track"},
     }
-    for one in examined({option: name, **(schemes.get(name, {}) if option == "eavesdropper" else {})}, {}):
-        assert [verdict for verdict in one.verdicts if verdict.broken is not None] == [], one.title
-        assert len(one.verdicts) >= 4
+    for examined_ in examined({option: name, **(schemes.get(name, {}) if option == "eavesdropper" else {})}, {}):
+        assert [verdict for verdict in examined_.verdicts if verdict.broken is not None] == [], examined_.title
+        assert len(examined_.verdicts) >= 4
 
 
 USUAL = [
@@ -74,8 +74,8 @@ def test_slow_eavesdroppers_keep_every_rule_for_a_while(name: str, monkeypatch: 
     """On the same problems with fewer slots."""
 
     def shorter(slots: int = 0) -> list[Problem]:
-        found = small(slots)
-        return [replace(one, batch=replace(one.batch, slots=min(one.slots, 12))) for one in found]
+        result = small(slots)
+        return [replace(problem, batch=replace(problem.batch, slots=min(problem.slots, 12))) for problem in result]
 
     monkeypatch.setattr(eavesdroppers, "small", shorter)
     keeps_every_rule("eavesdropper", name)
@@ -103,24 +103,24 @@ class Boastful(Naive):
 
 
 @pytest.mark.parametrize(
-    ("kind", "rule", "said"),
+    ("kind", "rule", "message"),
     [
         (Forgetful, "a slot asked for again", "Belief.memory"),
         (Boastful, "what it says to theory", "correct use_probabilities, which must be the same in every slot"),
     ],
 )
-def test_an_eavesdropper_that_breaks_a_rule_is_told_which(kind: Any, rule: str, said: str) -> None:
+def test_an_eavesdropper_that_breaks_a_rule_is_told_which(kind: Any, rule: str, message: str) -> None:
     """As a scheme is."""
     parameters = dict(kind.parameters)
     name = "suspicious" if kind is Forgetful else "naive"
     setup = EavesdropperSetup(name, kind, parameters, lambda process: Innovation(process, 0.6), Innovation)
     if kind is Boastful:
         setup = replace(setup, name=f"{__name__}:Boastful")
-    assert said in broken(eavesdropper_verdicts(setup))[rule]
+    assert message in broken(eavesdropper_verdicts(setup))[rule]
 
 
 @pytest.mark.parametrize(
-    ("names", "parameters", "said"),
+    ("names", "parameters", "message"),
     [
         ({"scheme": "inovation"}, {}, "--scheme inovation is unknown; expected MODULE:CLASS, or acknowledged, "),
         ({"scheme": "innovation"}, {"state_probability": 2.0}, "--scheme innovation: state_probability: is 2.0"),
@@ -141,11 +141,11 @@ def test_an_eavesdropper_that_breaks_a_rule_is_told_which(kind: Any, rule: str, 
         ),
     ],
 )
-def test_what_cannot_be_checked_is_refused(names: dict[str, str], parameters: dict[str, Any], said: str) -> None:
+def test_what_cannot_be_checked_is_refused(names: dict[str, str], parameters: dict[str, Any], message: str) -> None:
     """Unknown names, unknown or wrong parameters, and keys that the scheme of the same command does not have."""
     with pytest.raises(UsageError) as caught:
         list(examined(names, parameters))
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert caught.value.exit_status == 2
 
 

@@ -49,11 +49,11 @@ def test_another_shape_in_a_later_slot_is_not_sent(evedrop: Evedrop) -> None:
     (evedrop.folder / "mine.toml").write_text(SCENARIO.replace('"plain"', '"turns:Turns"'))
     live = evedrop("run", "mine.toml", "--trials", "4", "--view", "off", "--out", "live")
     assert live.status == 3
-    said = "the scheme turns:Turns failed in slot 30, trials 0 to 3: Packet.z has shape (4, 2); expected (2, 4)"
-    assert said in live.err
+    message = "the scheme turns:Turns failed in slot 30, trials 0 to 3: Packet.z has shape (4, 2); expected (2, 4)"
+    assert message in live.err
     memory = evedrop("montecarlo", "mine.toml", "--trials", "4", "--out", "memory")
     assert memory.status == 3
-    assert said in memory.err
+    assert message in memory.err
 
 
 _BLOCKS = """Blocks(PlainEncoder):
@@ -166,7 +166,7 @@ def test_every_command_in_memory_names_class_slot_and_trials(
         changes = ()
     done = evedrop(words[0], "mine.toml", *words[1:], "--out", "out", *changes)
     assert done.status == 3
-    assert any(LATER[case][2].format(trials=one, first=one.split()[0]) in done.err + done.out for one in trials)
+    assert any(LATER[case][2].format(trials=trial, first=trial.split()[0]) in done.err + done.out for trial in trials)
     assert "Traceback" not in done.err
 
 
@@ -176,6 +176,6 @@ def test_what_breaks_in_a_later_slot_ends_a_live_run(case: str, evedrop: Evedrop
     changes = later(evedrop, case)
     done = evedrop("run", "mine.toml", "--view", "off", "--out", "live", *changes)
     assert done.status == 3
-    said = re.escape(LATER[case][2].format(trials="5 to 7", first=5, slots="SLOTS")).replace("SLOTS", r"\d+ to \d+")
-    assert re.search(said, done.err), done.err
+    message = re.escape(LATER[case][2].format(trials="5 to 7", first=5, slots="SLOTS")).replace("SLOTS", r"\d+ to \d+")
+    assert re.search(message, done.err), done.err
     assert "Traceback" not in done.err

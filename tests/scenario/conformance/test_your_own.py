@@ -193,9 +193,9 @@ def test_classes_of_a_plug_in_are_compared(tutorial: Evedrop) -> None:
     )
     done = tutorial("compare", "three.toml", *words, "--out", "found")
     assert done.status == 0, done.err
-    found = json.loads(done.out)
-    assert [*found["schemes"]] == ["flipped:Flipped", "plain"]
-    for scheme in found["schemes"].values():
+    comparison = json.loads(done.out)
+    assert [*comparison["schemes"]] == ["flipped:Flipped", "plain"]
+    for scheme in comparison["schemes"].values():
         assert scheme["against"]["tracker:Tracker"]["eavesdropper"]["mean"] > 0.0
         assert scheme["against"]["naive"]["eavesdropper"]["mean"] > 0.0
     assert (tutorial.folder / "found" / "scenarios" / "flipped.Flipped.toml").is_file()

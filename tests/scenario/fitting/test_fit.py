@@ -92,9 +92,9 @@ def test_a_step_is_the_textbooks(p: float, r: float, good: float, bad: float, ou
     """Likelihood and all four parameters after a step, for recordings that fill their chunks and such that do not."""
     model, word = TwoStates(p, r, good, bad), np.array(outcomes, np.uint8)
     likelihood, moves, lost = textbook(word, model)
-    following, found = ChunkedOutcomes(word).step(model)
-    assert found == pytest.approx(likelihood, rel=1e-9)
-    assert log_likelihood(word, model) == found
+    following, likelihood_of_word = ChunkedOutcomes(word).step(model)
+    assert likelihood_of_word == pytest.approx(likelihood, rel=1e-9)
+    assert log_likelihood(word, model) == likelihood_of_word
     expected = (
         moves[0, 1] / moves[0].sum(), moves[1, 0] / moves[1].sum(),
         lost[0] / moves[:, 0].sum(), lost[1] / moves[:, 1].sum(),
@@ -127,40 +127,40 @@ def test_the_model_is_found_again(
     spec: dict[str, Any], name: str, bounds: dict[str, float], seed: int, tmp_path: Path
 ) -> None:
     """From 40 000 outcomes: the right model by BIC, every parameter within about four of its standard errors, good fit."""
-    found = fit(save(tmp_path, recorded(spec, 40_000, seed)))
-    assert found.chosen.name == name
+    result = fit(save(tmp_path, recorded(spec, 40_000, seed)))
+    assert result.chosen.name == name
     for parameter, bound in bounds.items():
-        assert found.chosen.spec[parameter] == pytest.approx(spec[parameter], abs=bound)
-    assert "as long as the model predicts" in found.goodness
-    assert found.bursts.mean == pytest.approx(found.bursts.fitted, rel=0.15)
+        assert result.chosen.spec[parameter] == pytest.approx(spec[parameter], abs=bound)
+    assert "as long as the model predicts" in result.goodness
+    assert result.bursts.mean == pytest.approx(result.bursts.fitted, rel=0.15)
 
 
 @pytest.mark.parametrize("spec", mostly_long([GILBERT, SOFT], [SOFT]))
 def test_no_parameters_are_more_likely(spec: dict[str, Any]) -> None:
     """Around the maximum that is found the likelihood is less, by more than where the search stopped short of it."""
     outcomes = recorded(spec, 20_000, 4)
-    found = link_fit.gilbert_elliott(outcomes)
-    assert found.log_likelihood > log_likelihood(
+    gilbert_elliott = link_fit.gilbert_elliott(outcomes)
+    assert gilbert_elliott.log_likelihood > log_likelihood(
         outcomes, TwoStates(spec["p"], spec["r"], spec.get("good", 1e-9), spec.get("bad", 1 - 1e-9))
     )
-    best = [found.spec[name] for name in ("p", "r", "good", "bad")]
+    best = [gilbert_elliott.spec[name] for name in ("p", "r", "good", "bad")]
     for place in range(4):
         for factor in (0.8, 1.25):
             other = [
                 min(1.0 - 1e-9, max(1e-9, value * (factor if i == place else 1.0))) for i, value in enumerate(best)
             ]
-            assert log_likelihood(outcomes, TwoStates(*other)) < found.log_likelihood + 0.05
+            assert log_likelihood(outcomes, TwoStates(*other)) < gilbert_elliott.log_likelihood + 0.05
 
 
 def test_gilbert_counts_transitions() -> None:
     """Estimates and likelihood of a recording that can be done by hand."""
     outcomes = np.array([1, 1, 1, 0, 0, 1, 1, 0, 1, 1], np.uint8)  # from good: 4 stay, 2 go; from bad: 1 stays, 2 go
-    found = link_fit.gilbert(outcomes)
+    gilbert = link_fit.gilbert(outcomes)
     p, r = 2 / 6, 2 / 3
-    assert found.spec["p"] == pytest.approx(p, abs=1e-4)
-    assert found.spec["r"] == pytest.approx(r, abs=1e-4)
+    assert gilbert.spec["p"] == pytest.approx(p, abs=1e-4)
+    assert gilbert.spec["r"] == pytest.approx(r, abs=1e-4)
     by_hand = math.log(r / (p + r)) + 4 * math.log(1 - p) + 2 * math.log(p) + math.log(1 - r) + 2 * math.log(r)
-    assert found.log_likelihood == pytest.approx(by_hand, rel=1e-12)
+    assert gilbert.log_likelihood == pytest.approx(by_hand, rel=1e-12)
 
 
 @pytest.mark.parametrize("word", ["1" * 60 + "0" * 60, "0" * 60 + "1" * 60, "10" * 60])
@@ -168,10 +168,10 @@ def test_extreme_recordings_have_estimates(word: str) -> None:
     """A change that was never seen, and no two alike: parameters are probabilities, likelihoods finite."""
     outcomes = np.array([int(c) for c in word], np.uint8)
     for find in (link_fit.bernoulli, link_fit.gilbert, link_fit.gilbert_elliott):
-        found = find(outcomes)
-        assert math.isfinite(found.log_likelihood)
-        assert all(0.0 <= value <= 1.0 for name, value in found.spec.items() if name != "model")
-        loss_of(dict(found.spec))
+        result = find(outcomes)
+        assert math.isfinite(result.log_likelihood)
+        assert all(0.0 <= value <= 1.0 for name, value in result.spec.items() if name != "model")
+        loss_of(dict(result.spec))
 
 
 @pytest.mark.parametrize(("hits", "count"), [(0, 50), (3, 50), (25, 50), (50, 50)])
@@ -213,9 +213,9 @@ def test_a_link_that_no_model_explains_is_said(tmp_path: Path) -> None:
     outcomes, rng = np.ones(20_000, np.uint8), np.random.default_rng(2)
     for start in rng.integers(0, 19_990, 300):
         outcomes[start : start + 7] = 0
-    found = fit(save(tmp_path, outcomes))
-    assert "does NOT explain" in found.goodness
-    assert 'model = "trace"' in found.goodness
+    result = fit(save(tmp_path, outcomes))
+    assert "does NOT explain" in result.goodness
+    assert 'model = "trace"' in result.goodness
 
 
 def test_few_bursts_tell_nothing_of_the_fit(tmp_path: Path) -> None:
@@ -241,9 +241,9 @@ def test_few_bursts_tell_nothing_of_the_fit(tmp_path: Path) -> None:
 )
 def test_delays_are_found_again(name: str, delays: Any, spec: dict[str, float], bound: float) -> None:
     """The right model by BIC, the parameters within four standard errors."""
-    found = min(delay_candidates(delays), key=lambda one: one.bic(len(delays)))
-    assert found.name == name
-    assert {entry: found.spec[entry] for entry in spec} == pytest.approx(spec, abs=bound + 1e-12)
+    best = min(delay_candidates(delays), key=lambda candidate: candidate.bic(len(delays)))
+    assert best.name == name
+    assert {entry: best.spec[entry] for entry in spec} == pytest.approx(spec, abs=bound + 1e-12)
 
 
 def test_delays_beside_outcomes(tmp_path: Path) -> None:
@@ -251,19 +251,19 @@ def test_delays_beside_outcomes(tmp_path: Path) -> None:
     outcomes = recorded(BERNOULLI, 1000)
     delays = np.where(outcomes == 1, np.round(4.0 + np.random.default_rng(5).random(1000), 3), np.nan)
     path = save(tmp_path, outcomes, delay=delays)
-    found = fit(path)
-    assert found.delays == int(outcomes.sum())
-    assert found.chosen_delay is not None
-    link = tomllib.loads(found.toml)["link"]
-    assert link["loss"] == found.chosen.spec
-    assert link["delay"] == found.chosen_delay.spec
+    result = fit(path)
+    assert result.delays == int(outcomes.sum())
+    assert result.chosen_delay is not None
+    link = tomllib.loads(result.toml)["link"]
+    assert link["loss"] == result.chosen.spec
+    assert link["delay"] == result.chosen_delay.spec
     path.write_text(path.read_text().replace("received,delay", "received,lag"))
     assert fit(path, "received").chosen_delay is None
-    assert fit(path, "received", "lag").chosen_delay == found.chosen_delay
+    assert fit(path, "received", "lag").chosen_delay == result.chosen_delay
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("1\n0\n" * 49, "has 98 outcomes; expected 100 or more, such as a longer recording"),
         ("1\n" * 1000, "has 1000 outcomes, all delivered: the quality is at least 0.9962 with 95 % confidence"),
@@ -281,7 +281,7 @@ def test_delays_beside_outcomes(tmp_path: Path) -> None:
         (None, "cannot be read (No such file or directory)"),
     ],
 )
-def test_what_cannot_be_fitted_is_said(evedrop: Evedrop, text: str | None, said: str) -> None:
+def test_what_cannot_be_fitted_is_said(evedrop: Evedrop, text: str | None, message: str) -> None:
     """One line, exit 2: what was found, what can be concluded, what to do."""
     if text is not None:
         (evedrop.folder / "walk.csv").write_text(text)
@@ -289,7 +289,7 @@ def test_what_cannot_be_fitted_is_said(evedrop: Evedrop, text: str | None, said:
     assert (done.status, done.out) == (2, "")
     (line,) = done.err.splitlines()
     assert line.startswith("evedrop: walk.csv: ")
-    assert said in line
+    assert message in line
 
 
 def test_the_command_prints_what_can_be_pasted(evedrop: Evedrop) -> None:
@@ -300,12 +300,12 @@ def test_the_command_prints_what_can_be_pasted(evedrop: Evedrop) -> None:
     lines = done.out.splitlines()
     assert [line.split()[0] for line in lines[2:5]] == ["bernoulli", "*", "gilbert-elliott"]
     assert lines[5].startswith("taken: gilbert, by BIC; its bursts last ")
-    found = evedrop("links", "fit", "walk.csv", "--json").summary
-    assert found["toml"] == lines[-1]
-    assert found["chosen"] == "gilbert"
-    assert [one["name"] for one in found["candidates"]] == ["bernoulli", "gilbert", "gilbert-elliott"]
-    assert set(found["candidates"][1]["intervals"]) == {"p", "r"}
-    assert found["outcomes"] == 5000
+    fit_ = evedrop("links", "fit", "walk.csv", "--json").summary
+    assert fit_["toml"] == lines[-1]
+    assert fit_["chosen"] == "gilbert"
+    assert [candidate["name"] for candidate in fit_["candidates"]] == ["bernoulli", "gilbert", "gilbert-elliott"]
+    assert set(fit_["candidates"][1]["intervals"]) == {"p", "r"}
+    assert fit_["outcomes"] == 5000
     scenario = scalar_tables(1.0, 0.01, slots=10, legitimate=tomllib.loads(lines[-1]))
     (evedrop.folder / "mine.toml").write_text(tomli_w.dumps(scenario))
     assert load(evedrop.folder / "mine.toml").legitimate.link.model.chain is not None

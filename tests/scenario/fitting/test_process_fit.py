@@ -40,19 +40,19 @@ def test_the_standard_errors_are_those_of_many_fits(tmp_path: Path) -> None:
     """A and Q are found within them, and their scatter is as large as they say."""
     fits = [fitted(tmp_path, path_of(seed)) for seed in range(60)]
     for truth, values, errors in (
-        (A, [one.A for one in fits], [one.A_error for one in fits]),
-        (Q, [one.Q for one in fits], [one.Q_error for one in fits]),
+        (A, [fit.A for fit in fits], [fit.A_error for fit in fits]),
+        (Q, [fit.Q for fit in fits], [fit.Q_error for fit in fits]),
     ):
         z = (np.array(values) - truth) / np.array(errors)
         assert np.all(np.abs(z.mean(axis=0)) < 0.6)
         assert np.all((z.std(axis=0) > 0.7) & (z.std(axis=0) < 1.35))
-    assert sum(bool(one.unexplained) for one in fits) <= 4
+    assert sum(bool(fit.unexplained) for fit in fits) <= 4
 
 
 def test_the_estimates_are_those_of_the_normal_equations(tmp_path: Path) -> None:
     """A, Q and their standard errors, for states of very different sizes, by a regression of each state on its own."""
     rows = path_of(4, 60) * np.array([1e-3, 50.0])
-    found = fitted(tmp_path, rows)
+    result = fitted(tmp_path, rows)
     X, count = rows[:-1], len(rows) - 1
     inverse = np.linalg.inv(X.T @ X)
     residuals = np.empty_like(X)
@@ -60,13 +60,13 @@ def test_the_estimates_are_those_of_the_normal_equations(tmp_path: Path) -> None
         a = inverse @ X.T @ rows[1:, i]
         residuals[:, i] = rows[1:, i] - X @ a
         variance = np.sum(residuals[:, i] ** 2) / (count - 2)
-        assert found.A[i] == pytest.approx(a, rel=1e-8)
-        assert found.A_error[i] == pytest.approx(np.sqrt(variance * np.diag(inverse)), rel=1e-8)
+        assert result.A[i] == pytest.approx(a, rel=1e-8)
+        assert result.A_error[i] == pytest.approx(np.sqrt(variance * np.diag(inverse)), rel=1e-8)
     Q = np.einsum("ki,kj->ij", residuals, residuals) / (count - 2)
-    assert pytest.approx(Q, rel=1e-8) == found.Q
+    assert pytest.approx(Q, rel=1e-8) == result.Q
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
         spread = Q[i, i] * Q[j, j] + Q[i, j] ** 2
-        assert found.Q_error[i, j] == pytest.approx(np.sqrt(spread / (count - 2)), rel=1e-8)
+        assert result.Q_error[i, j] == pytest.approx(np.sqrt(spread / (count - 2)), rel=1e-8)
 
 
 def test_the_fit_is_a_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,46 +84,46 @@ def test_the_fit_is_a_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str
     rest = {"title": "Fitted", "slots": 100, "encoding": {"scheme": "plain"}, "legitimate": {"link": {"quality": 0.9}}}
     assert len(checked({**tables, **rest}, "file").process.state_values or []) == 100
     assert main(["process", "fit", str(tmp_path / "pose.csv"), "--states", "x,y", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found["transitions"], found["slot_seconds"], "reference" in found["process"]) == (
+    fit_ = json.loads(capsys.readouterr().out)
+    assert (fit_["transitions"], fit_["slot_seconds"], "reference" in fit_["process"]) == (
         399,
         pytest.approx(0.1),
         False,
     )
-    assert np.shape(found["standard_errors"]["A"]) == (2, 2)
+    assert np.shape(fit_["standard_errors"]["A"]) == (2, 2)
 
 
 def test_a_state_without_noise_is_found(tmp_path: Path) -> None:
     """A position that sums up a speed: Q is singular, and Σ0 is not."""
     speed = path_of(2)[:, :1]
-    found = fitted(tmp_path, np.hstack([np.vstack([[[0.0]], np.cumsum(0.1 * speed, axis=0)[:-1]]), speed]))
-    assert found.exact == ["x"]
-    assert found.table["singular_noise"] is True
-    assert np.allclose(found.A[0], [1.0, 0.1])
-    assert np.all(np.linalg.eigvalsh(found.initial_covariance) > 0.0)
-    assert "x: without noise, so Q is singular" in found.remarks
-    assert found.as_dict()["residual_correlation"][0] is None
+    result = fitted(tmp_path, np.hstack([np.vstack([[[0.0]], np.cumsum(0.1 * speed, axis=0)[:-1]]), speed]))
+    assert result.exact == ["x"]
+    assert result.table["singular_noise"] is True
+    assert np.allclose(result.A[0], [1.0, 0.1])
+    assert np.all(np.linalg.eigvalsh(result.initial_covariance) > 0.0)
+    assert "x: without noise, so Q is singular" in result.remarks
+    assert result.as_dict()["residual_correlation"][0] is None
 
 
 def test_noise_that_lasts_is_reported(tmp_path: Path) -> None:
     """A process of the first order does not explain a process of the second."""
-    found = fitted(tmp_path, np.cumsum(np.cumsum(path_of(3)[:, :1], axis=0), axis=0), ("x",))
-    assert found.unexplained == ["x"]
-    assert "no process with white noise explains them" in found.remarks[-1]
-    assert found.spectral_radius == pytest.approx(1.0, abs=0.1)
+    result = fitted(tmp_path, np.cumsum(np.cumsum(path_of(3)[:, :1], axis=0), axis=0), ("x",))
+    assert result.unexplained == ["x"]
+    assert "no process with white noise explains them" in result.remarks[-1]
+    assert result.spectral_radius == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize(
-    ("rows", "said"),
+    ("rows", "message"),
     [
         (path_of(1, 20), "has 20 states; expected at least 21, for a process of 2 states"),
         (np.repeat(path_of(1)[:, :1], 2, axis=1), "the states depend on each other"),
         (np.hstack([path_of(1)[:, :1], np.zeros((400, 1))]), "the states depend on each other, or do not move"),
     ],
 )
-def test_what_is_no_recording_of_a_process_is_refused(tmp_path: Path, rows: Floats, said: str) -> None:
+def test_what_is_no_recording_of_a_process_is_refused(tmp_path: Path, rows: Floats, message: str) -> None:
     """With what can be done."""
-    with pytest.raises(UsageError, match=said):
+    with pytest.raises(UsageError, match=message):
         fitted(tmp_path, rows)
 
 
@@ -150,6 +150,6 @@ def test_other_files_and_options_are_refused(tmp_path: Path, capsys: pytest.Capt
     path.write_text(table_text(["x"], None, path_of(1)[:, :1].tolist()))
     assert main(["process", "fit", str(path), "--reference", "1,2"]) == 2
     assert main(["process", "fit", str(path), "--reference", "one"]) == 2
-    said = capsys.readouterr().err
+    errors = capsys.readouterr().err
     for part in ("cannot be read", "is empty; expected a line of names", "a gap of", "has 2 numbers", "such as 55,50"):
-        assert part in said, said
+        assert part in errors, errors

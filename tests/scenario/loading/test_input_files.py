@@ -75,9 +75,11 @@ def test_what_is_no_file_is_read_nowhere(kind: str, tmp_path: Path) -> None:
     trace = f'{{ model = "trace", file = "{path}" }}'
     trace = f"[legitimate]\nlink = {{ loss = {trace}, delay = {trace} }}"
     text = f'secret_file = "{path}"\n' + BASE.replace("[legitimate]\nlink = { quality = 0.9 }", trace)
-    found = mistakes_of(parse, text + PLANT.format(file=path), "scenario.toml")
+    lines = mistakes_of(parse, text + PLANT.format(file=path), "scenario.toml")
     for entry in ("secret_file", "legitimate.link.loss.file", "legitimate.link.delay.file", "plant.disturbance_file"):
-        assert any(one.startswith(f"{entry}: ") and f"cannot be read ({SPECIAL[kind]})" in one for one in found), entry
+        assert any(line.startswith(f"{entry}: ") and f"cannot be read ({SPECIAL[kind]})" in line for line in lines), (
+            entry
+        )
     if kind not in ("folder", "nothing", "long"):
         with pytest.raises(UsageError, match=r"cannot be read \(.*\); a scenario is a TOML file"):
             load(path)
@@ -123,7 +125,7 @@ def measured(folder: Path, *arguments: str) -> tuple[str, float, float]:
 
 
 @pytest.mark.parametrize(
-    ("block", "said"),
+    ("block", "message"),
     [
         (b"0" * MEGABYTES, "line 2 has more than 65536 characters"),
         (b"\n" * MEGABYTES, "it has more than 10100 lines, comments and empty lines included"),
@@ -134,12 +136,12 @@ def measured(folder: Path, *arguments: str) -> tuple[str, float, float]:
     ],
     ids=["one line", "empty lines", "comments"],
 )
-def test_a_compressed_file_is_read_no_further_than_it_can_be_used(block: bytes, said: str, tmp_path: Path) -> None:
+def test_a_compressed_file_is_read_no_further_than_it_can_be_used(block: bytes, message: str, tmp_path: Path) -> None:
     """A gz bomb of 64 MB is refused in little memory and time, with its name and the limit."""
     bomb(tmp_path / "day.csv.gz", 64 * MEGABYTES, block)
     (tmp_path / "bomb.toml").write_text(BASE + PLANT.format(file="day.csv.gz"))
     err, peak, seconds = measured(tmp_path, "check", "bomb.toml")
-    assert f"plant.disturbance_file: day.csv.gz cannot be read ({said})" in err
+    assert f"plant.disturbance_file: day.csv.gz cannot be read ({message})" in err
     assert peak < 300
     assert seconds < 20
 
@@ -159,13 +161,13 @@ def test_a_damaged_gz_file_is_refused(tmp_path: Path) -> None:
     whole = gzip.compress(b"P_load\n" + b"0.5\n" * 100_000)
     for damaged in (whole[:-20], whole[:200], whole[:30] + b"\xff" * 60 + whole[90:], b"\x1f\x8b\x08"):
         (tmp_path / "day.csv.gz").write_bytes(damaged)
-        found = mistakes_of(
+        mistakes = mistakes_of(
             parse,
             BASE.replace("slots = 50", "slots = 100000") + PLANT.format(file="day.csv.gz"),
             "scenario.toml",
             folder=tmp_path,
         )
-        assert any("day.csv.gz cannot be read (" in one for one in found)
+        assert any("day.csv.gz cannot be read (" in mistake for mistake in mistakes)
 
 
 def test_a_parquet_recording_of_one_long_text_is_refused(tmp_path: Path) -> None:
@@ -184,8 +186,8 @@ def test_lines_end_with_the_limit(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("a\n" * 10)
     assert list(lines_of(path, Limit(10, 20))) == ["a\n"] * 10
-    for limit, said in ((Limit(9, 20), "more than 9 lines"), (Limit(10, 19), "more than 19 characters")):
-        with pytest.raises(Unreadable, match=said):
+    for limit, message in ((Limit(9, 20), "more than 9 lines"), (Limit(10, 19), "more than 19 characters")):
+        with pytest.raises(Unreadable, match=message):
             list(lines_of(path, limit))
     assert contents(path, 20) == b"a\n" * 10
     with pytest.raises(Unreadable, match="more than 19 bytes"):

@@ -45,8 +45,8 @@ def test_all_mistyped_models_of_events_are_told_at_once() -> None:
             event('{ loss = { model = "mine:Own" } }'),
         ]
     )
-    found = "\n".join(mistakes_of(parse, text, "scenario.toml"))
-    for said in (
+    told = "\n".join(mistakes_of(parse, text, "scenario.toml"))
+    for message in (
         'event.0.set.loss.model: is "bernouli"; expected bernoulli, distance, gilbert-elliott, markov, pattern or trace; did you',
         'event.1.set.delay.model: is "konstant"; expected constant, normal, pareto or trace; did you mean constant?',
         'event.2.set.loss.model: is missing; expected model = "bernoulli", or another',
@@ -55,7 +55,7 @@ def test_all_mistyped_models_of_events_are_told_at_once() -> None:
         'event.4.set.loss.model: is "pooled"; expected bernoulli',
         'event.5.set.loss.model: is "mine:Own", and the module mine cannot be imported',
     ):
-        assert said in found
+        assert message in told
 
 
 def test_a_change_replaces_the_other_form_of_a_links_losses() -> None:
@@ -71,12 +71,12 @@ def test_a_change_replaces_the_other_form_of_a_links_losses() -> None:
 def test_an_event_on_pooled_links_is_looked_at_too() -> None:
     """It puts one link in place of them all, which needs a quality or a loss model; both are checked."""
     text = BASE + POOLED + event("{ corrupt = 0.1 }", "pool") + event('{ loss = { model = "nope" } }', "pool", 5)
-    found = mistakes_of(parse, text, "scenario.toml")
+    mistakes = mistakes_of(parse, text, "scenario.toml")
     assert (
-        found[0].partition(" (line")[0]
+        mistakes[0].partition(" (line")[0]
         == "event.0.set: pool has several links; expected a quality or a loss, for the one link that replaces them"
     )
-    assert found[1].startswith('event.1.set.loss.model: is "nope"; expected bernoulli')
+    assert mistakes[1].startswith('event.1.set.loss.model: is "nope"; expected bernoulli')
     assert parse(BASE + POOLED + event("{ quality = 0.1 }", "pool"), "scenario.toml").slots == 50
 
 
@@ -147,7 +147,7 @@ def test_the_horizon_is_the_same_slot_by_slot_and_in_halves(n: int, radius: floa
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (".".join("a" * 10_000) + " = 1\n" + BASE, "line 1 has a key of 32 or more parts"),
         ("a = " + "[" * 100_000 + "\n", "not TOML"),
@@ -165,14 +165,14 @@ def test_the_horizon_is_the_same_slot_by_slot_and_in_halves(n: int, radius: floa
         (BASE + f"[plant]\ninputs = {['u'] * 50_000}\n", "plant.inputs: has 50000 names; expected at most 64"),
         ("".join(f"[eavesdroppers.e{i}]\n" for i in range(2000)) + BASE, "has 2000 entries; expected at most 64"),
     ],
-    ids=lambda one: "" if len(one) > 60 else one,
+    ids=lambda case: "" if len(case) > 60 else case,
 )  # fmt: skip
-def test_what_no_entry_can_be_is_refused(text: str, said: str) -> None:
+def test_what_no_entry_can_be_is_refused(text: str, message: str) -> None:
     """Numbers, names, texts and tables beyond all bounds; each in a line of some length."""
-    found = mistakes_of(parse, text, "scenario.toml")
-    assert any(said in one for one in found), found
-    assert all(len(one) < 1000 for one in found)
-    assert len(found) < 200
+    mistakes = mistakes_of(parse, text, "scenario.toml")
+    assert any(message in mistake for mistake in mistakes), mistakes
+    assert all(len(mistake) < 1000 for mistake in mistakes)
+    assert len(mistakes) < 200
 
 
 @pytest.mark.parametrize(
@@ -223,9 +223,9 @@ def test_two_runs_of_one_second_have_a_folder_each(tmp_path: Path, monkeypatch: 
     """The second one gets a number; neither finds the other's folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("time.strftime", lambda _: "20250101-000000")
-    found = [claimed(default_folder("vehicle")) for _ in range(3)]
-    assert [str(one) for one in found] == [f"runs/vehicle-20250101-000000{end}" for end in ("", "-2", "-3")]
-    assert all(one.is_dir() and one.stat().st_mode & 0o777 == 0o700 for one in found)
+    folders = [claimed(default_folder("vehicle")) for _ in range(3)]
+    assert [str(folder) for folder in folders] == [f"runs/vehicle-20250101-000000{end}" for end in ("", "-2", "-3")]
+    assert all(folder.is_dir() and folder.stat().st_mode & 0o777 == 0o700 for folder in folders)
 
 
 def test_a_command_that_fails_leaves_no_empty_folder(evedrop: Evedrop) -> None:

@@ -83,8 +83,8 @@ def test_what_is_inside_a_value_has_the_line_of_the_value() -> None:
 
 def paths(value: Any, path: str) -> set[str]:
     """The paths of all entries that are not tables."""
-    if isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
-        return {place for i, one in enumerate(value) for place in paths(one, f"{path}.{i}")}
+    if isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
+        return {place for i, item in enumerate(value) for place in paths(item, f"{path}.{i}")}
     if not isinstance(value, dict):
         return {path}
     return {place for name, inner in value.items() for place in paths(inner, f"{path}.{name}" if path else name)}
@@ -105,10 +105,10 @@ def test_a_mistake_names_its_line_and_a_changed_entry_none(tmp_path: Path) -> No
     """The line is that of the file; `--set` has no line."""
     path = tmp_path / "mine.toml"
     path.write_text(shipped()["numerical"].read_text(encoding="utf-8").replace('"smart"', '"smrt"'), encoding="utf-8")
-    with pytest.raises(ScenarioError) as found:
+    with pytest.raises(ScenarioError) as raised:
         load(path, {"slots": 0})
     line = path.read_text(encoding="utf-8").splitlines().index('strategy = "smrt"') + 1
-    told = {mistake.partition(":")[0]: mistake for mistake in found.value.mistakes}
+    told = {mistake.partition(":")[0]: mistake for mistake in raised.value.mistakes}
     assert told["eavesdroppers.smart.strategy"].endswith(f" (line {line})")
     assert "(line" not in told["slots"]
 
@@ -127,9 +127,9 @@ def test_a_mistake_names_its_line_and_a_changed_entry_none(tmp_path: Path) -> No
 )
 def test_an_entry_that_is_given_twice_is_named(text: str, told: str) -> None:
     """With the lines of both, so that one of them can be left out."""
-    with pytest.raises(ScenarioError) as found:
+    with pytest.raises(ScenarioError) as raised:
         parse(text, "mine.toml")
-    (mistake,) = found.value.mistakes
+    (mistake,) = raised.value.mistakes
     assert told in mistake
 
 

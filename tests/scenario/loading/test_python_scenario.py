@@ -79,14 +79,14 @@ def test_a_scenario_from_python_has_the_digests_of_its_file(tmp_path: Path) -> N
     plan = Plan(workers=1)
     made = vehicle().replace({"eavesdroppers.smart.link.quality": 0.4}, slots=30)
     (tmp_path / "s.toml").write_text(made.to_toml(), encoding="utf-8")
-    found = [
+    results = [
         montecarlo(made, trials=3, out=tmp_path / "python", plan=plan),
         montecarlo(tmp_path / "s.toml", trials=3, out=tmp_path / "file", plan=plan),
         montecarlo(
             vehicle(), trials=3, slots=30, eavesdroppers__smart__link__quality=0.4, out=tmp_path / "c", plan=plan
         ),
     ]
-    assert digests_of(found[0]) == digests_of(found[1]) == digests_of(found[2])
+    assert digests_of(results[0]) == digests_of(results[1]) == digests_of(results[2])
     assert Scenario.load(tmp_path / "python").replace(trials=1) == made.replace(trials=1)
 
 
@@ -113,9 +113,9 @@ def test_all_mistakes_of_a_new_scenario_are_told_at_once() -> None:
     """Missing entries are named, and a misspelt one gets a hint."""
     with pytest.raises(ScenarioError) as caught:
         Scenario({"title": "x", "slotz": 3})
-    said = caught.value.mistakes
-    assert [line.partition(":")[0] for line in said] == ["slots", "process", "encoding", "legitimate", "slotz"]
-    assert said[-1] == "slotz: is not an entry of this table; did you mean slots?"
+    mistakes = caught.value.mistakes
+    assert [line.partition(":")[0] for line in mistakes] == ["slots", "process", "encoding", "legitimate", "slotz"]
+    assert mistakes[-1] == "slotz: is not an entry of this table; did you mean slots?"
 
 
 @pytest.mark.parametrize(
@@ -144,16 +144,16 @@ def test_a_refusal_shows_no_error_of_another_package(call: Callable[[], object])
 
 
 @pytest.mark.parametrize(
-    ("value", "said"),
+    ("value", "message"),
     [
         (np.eye(2) * 1j, "process.A: is a numpy.ndarray of complex128; expected a number, "),
         ({1.0}, "process.A: is a set; expected a number, a text, a list, a dict, a numpy array of numbers, or a class"),
         (b"", "process.A: is a bytes; expected a number, "),
     ],
 )
-def test_values_that_no_file_can_have_are_refused_with_their_key(value: object, said: str) -> None:
+def test_values_that_no_file_can_have_are_refused_with_their_key(value: object, message: str) -> None:
     """Nothing is guessed."""
-    with pytest.raises(ScenarioError, match=re.escape(said)):
+    with pytest.raises(ScenarioError, match=re.escape(message)):
         vehicle(process={**GOOD["process"], "A": value})
 
 
@@ -171,8 +171,8 @@ def test_a_class_of_a_module_is_named_and_its_folder_known(own: Any, tmp_path: P
     assert made.modules == str(tmp_path)
     assert made == vehicle().replace(encoding={"scheme": own.Flipped}, eavesdroppers=None)
     many = made.replace(slots=2)
-    found = [montecarlo(many, trials=501, out=tmp_path / f"{n}", plan=Plan(workers=n)) for n in (1, 2)]
-    assert digests_of(found[0]) == digests_of(found[1])
+    results = [montecarlo(many, trials=501, out=tmp_path / f"{n}", plan=Plan(workers=n)) for n in (1, 2)]
+    assert digests_of(results[0]) == digests_of(results[1])
 
 
 def test_a_sweep_knows_the_folder_of_the_classes_in_it(

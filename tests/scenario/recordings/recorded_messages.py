@@ -44,11 +44,11 @@ def _write(file: BinaryIO, recorded: Sequence[Recorded], compression: Compressio
     writer.start("ros2", "libmcap")
     schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
     rows = []
-    for one in recorded:
-        channel = writer.register_channel(one.topic, "cdr", schema, dict(one.metadata))
-        for number, sent, heard in one.messages:
+    for topic_ in recorded:
+        channel = writer.register_channel(topic_.topic, "cdr", schema, dict(topic_.metadata))
+        for number, sent, heard in topic_.messages:
             logged = BEGAN + round(heard * SECOND)
-            rows.append((logged, channel, number, BEGAN + round(sent * SECOND) if one.own_times else logged))
+            rows.append((logged, channel, number, BEGAN + round(sent * SECOND) if topic_.own_times else logged))
     for logged, channel, number, published in sorted(rows, key=lambda row: row[0]):
         writer.add_message(channel, logged, b"\x00\x01\x00\x00", published, number % 2**32)
     writer.finish()
@@ -72,5 +72,5 @@ def heard(
 def trimmed(outcomes: Outcomes) -> list[int]:
     """From the first to the last delivered message: losses before and after cannot be seen."""
     places = np.flatnonzero(outcomes)
-    found: list[int] = outcomes[places[0] : places[-1] + 1].tolist()
-    return found
+    trimmed_: list[int] = outcomes[places[0] : places[-1] + 1].tolist()
+    return trimmed_

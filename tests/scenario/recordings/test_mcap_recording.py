@@ -35,13 +35,13 @@ def test_missing_numbers_are_losses(tmp_path: Path, compression: CompressionType
         [Recorded("/scan", heard(outcomes)), Recorded("/odom", heard(lossy(BURSTS, 3000, 2)))],
         compression,
     )
-    found = mcap_recording(path, "/scan")
-    assert found.series.outcomes.tolist() == trimmed(outcomes)
-    assert (found.series.parts, found.series.repeated, found.series.late) == (1, 0, 0)
-    assert found.series.seconds == pytest.approx(0.1)
-    assert found.delays == pytest.approx(0.005, abs=1e-9)
-    assert len(found.delays) == outcomes.sum()
-    assert found.keys == "*/scan/**"
+    result = mcap_recording(path, "/scan")
+    assert result.series.outcomes.tolist() == trimmed(outcomes)
+    assert (result.series.parts, result.series.repeated, result.series.late) == (1, 0, 0)
+    assert result.series.seconds == pytest.approx(0.1)
+    assert result.delays == pytest.approx(0.005, abs=1e-9)
+    assert len(result.delays) == outcomes.sum()
+    assert result.keys == "*/scan/**"
 
 
 def test_a_recording_without_numbers_needs_a_period(tmp_path: Path) -> None:
@@ -51,9 +51,9 @@ def test_a_recording_without_numbers_needs_a_period(tmp_path: Path) -> None:
     path = write(tmp_path / "bag.mcap", [Recorded("/scan", messages)])
     with pytest.raises(TraceError, match=r"numbers no message of /scan .*--period \(the median of /scan is 0.1 s\)"):
         mcap_recording(path)
-    found = mcap_recording(path, period=0.1)
-    assert found.series.outcomes.tolist() == trimmed(outcomes)
-    assert any("a message that the publisher left out counts as lost" in note for note in found.notes)
+    result = mcap_recording(path, period=0.1)
+    assert result.series.outcomes.tolist() == trimmed(outcomes)
+    assert any("a message that the publisher left out counts as lost" in note for note in result.notes)
     with pytest.raises(TraceError, match=r"more than a quarter of 0.07 s away"):
         mcap_recording(path, period=0.07)
 
@@ -62,10 +62,10 @@ def test_a_bag_from_before_jazzy_has_no_delays(tmp_path: Path) -> None:
     """Its recorder wrote one time for both; losses are found all the same."""
     outcomes = lossy(BURSTS, 500)
     path = write(tmp_path / "bag.mcap", [Recorded("/scan", heard(outcomes), own_times=False)])
-    found = mcap_recording(path)
-    assert found.series.outcomes.tolist() == trimmed(outcomes)
-    assert len(found.delays) == 0
-    assert any("before Jazzy" in note for note in found.notes)
+    result = mcap_recording(path)
+    assert result.series.outcomes.tolist() == trimmed(outcomes)
+    assert len(result.delays) == 0
+    assert any("before Jazzy" in note for note in result.notes)
 
 
 @pytest.mark.parametrize("offset", [-5.0, 1.7e9])
@@ -73,27 +73,27 @@ def test_two_clocks_give_no_delays(tmp_path: Path, offset: float) -> None:
     """A log time before the time of sending, or years after it: the reason is said, and losses are found all the same."""
     outcomes = lossy(BURSTS, 500)
     messages = [(number, sent, logged + offset) for number, sent, logged in heard(outcomes)]
-    found = mcap_recording(write(tmp_path / "bag.mcap", [Recorded("/scan", messages)]))
-    assert found.series.outcomes.tolist() == trimmed(outcomes)
-    assert len(found.delays) == 0
-    assert any("did not use one clock" in note for note in found.notes)
+    result = mcap_recording(write(tmp_path / "bag.mcap", [Recorded("/scan", messages)]))
+    assert result.series.outcomes.tolist() == trimmed(outcomes)
+    assert len(result.delays) == 0
+    assert any("did not use one clock" in note for note in result.notes)
 
 
 def test_two_topics_with_counters_of_their_own_are_not_one_counter(tmp_path: Path) -> None:
     """A topic that lost nothing has all numbers that the other one lacks, and most of those that it has."""
     outcomes = lossy(BURSTS, 500)
     topics = [Recorded("/scan", heard(outcomes)), Recorded("/odom", heard(np.ones(500, np.uint8)))]
-    found = mcap_recording(write(tmp_path / "bag.mcap", topics), "/scan")
-    assert found.series.outcomes.tolist() == trimmed(outcomes)
+    result = mcap_recording(write(tmp_path / "bag.mcap", topics), "/scan")
+    assert result.series.outcomes.tolist() == trimmed(outcomes)
 
 
 def test_the_second_copy_of_a_message_has_no_delay(tmp_path: Path) -> None:
     """The delay of a message is that of its first copy."""
     outcomes = lossy(BURSTS, 500)
     copies = [(number, sent, logged + 1.0) for number, sent, logged in heard(outcomes)[::3]]
-    found = mcap_recording(write(tmp_path / "bag.mcap", [Recorded("/scan", [*heard(outcomes), *copies])]))
-    assert (found.series.repeated, len(found.delays)) == (len(copies), outcomes.sum())
-    assert found.delays.max() < 0.01
+    result = mcap_recording(write(tmp_path / "bag.mcap", [Recorded("/scan", [*heard(outcomes), *copies])]))
+    assert (result.series.repeated, len(result.delays)) == (len(copies), outcomes.sum())
+    assert result.delays.max() < 0.01
 
 
 def test_a_recorder_that_counts_by_itself_shows_no_loss(tmp_path: Path) -> None:
@@ -115,16 +115,16 @@ def test_a_recorder_that_counts_by_itself_shows_no_loss(tmp_path: Path) -> None:
 @pytest.mark.parametrize("offset", [0, 1000])
 def test_two_publishers_in_one_channel_are_refused(tmp_path: Path, offset: int) -> None:
     """rosbag2 keeps one channel for a topic, so the numbers of its publishers are mixed and cannot be separated."""
-    one = heard(lossy(BURSTS, 500))
+    first = heard(lossy(BURSTS, 500))
     other = [(number + offset, sent + 0.03, logged + 0.03) for number, sent, logged in heard(lossy(BURSTS, 500, 2))]
-    both = sorted([*one, *other], key=lambda message: message[2])
+    both = sorted([*first, *other], key=lambda message: message[2])
     path = write(tmp_path / "bag.mcap", [Recorded("/tf", both)])
     with pytest.raises(TraceError, match="several share the topic"):
         mcap_recording(path)
     path = write(tmp_path / "old.mcap", [Recorded("/tf", both, own_times=False)])
     with pytest.raises(TraceError, match=r"several share the topic|two publishers that count alike"):
         mcap_recording(path)
-    path = write(tmp_path / "channels.mcap", [Recorded("/tf", one), Recorded("/tf", other)])
+    path = write(tmp_path / "channels.mcap", [Recorded("/tf", first), Recorded("/tf", other)])
     with pytest.raises(TraceError, match="several publishers share it"):
         mcap_recording(path)
 
@@ -132,9 +132,9 @@ def test_two_publishers_in_one_channel_are_refused(tmp_path: Path, offset: int) 
 def test_what_was_kept_for_late_subscribers_is_left_out(tmp_path: Path) -> None:
     """A message of transient-local durability from long before the recording is not taken for losses."""
     messages = [(1, -3600.0, 0.0), *heard(lossy(BURSTS, 500), first=36_001)]
-    found = mcap_recording(write(tmp_path / "bag.mcap", [Recorded("/map", messages)]))
-    assert len(found.series.outcomes) <= 500
-    assert any("kept for late subscribers" in note for note in found.notes)
+    result = mcap_recording(write(tmp_path / "bag.mcap", [Recorded("/map", messages)]))
+    assert len(result.series.outcomes) <= 500
+    assert any("kept for late subscribers" in note for note in result.notes)
 
 
 def test_reliable_delivery_is_told(tmp_path: Path) -> None:
@@ -161,27 +161,27 @@ def test_a_recording_that_breaks_off_is_used_up_to_there(tmp_path: Path, compres
     outcomes = lossy(BURSTS, 3000)
     path = write(tmp_path / "bag.mcap", [Recorded("/scan", heard(outcomes))], compression)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    found = mcap_recording(path)
-    count = len(found.series.outcomes)
+    result = mcap_recording(path)
+    count = len(result.series.outcomes)
     assert 500 < count < 2500
-    assert found.series.outcomes.tolist() == trimmed(outcomes)[:count]
-    assert any("breaks off" in note for note in found.notes)
+    assert result.series.outcomes.tolist() == trimmed(outcomes)[:count]
+    assert any("breaks off" in note for note in result.notes)
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (b"", "does not begin as an MCAP recording does"),
         (b"SQLite format 3\x00" * 20, "does not begin as an MCAP recording does"),
         (None, "No such file"),
     ],
 )
-def test_what_is_no_recording_is_said(tmp_path: Path, content: bytes | None, said: str) -> None:
+def test_what_is_no_recording_is_said(tmp_path: Path, content: bytes | None, message: str) -> None:
     """One reason, and what was expected."""
     path = tmp_path / "walk.mcap"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(TraceError, match=said):
+    with pytest.raises(TraceError, match=message):
         mcap_recording(path)
 
 
@@ -234,9 +234,9 @@ def test_the_command_prints_links_for_both(evedrop: Evedrop) -> None:
     link = tomllib.loads(text.splitlines()[-1])["link"]
     assert link["delay"]["mean"] == pytest.approx(0.3, abs=0.01)
     assert (link["loss"], link["duplicate"]) == (wire["loss"], wire["duplicate"])
-    found = json.loads(evedrop("links", "fit", "tuesday.mcap", "--slot", "0.03", "--json").out)
-    assert found["settings"]["loss"] == wire["loss"]
-    assert found["link"]["delay"]["mean"] == pytest.approx(1.0, abs=0.04)
+    fit_ = json.loads(evedrop("links", "fit", "tuesday.mcap", "--slot", "0.03", "--json").out)
+    assert fit_["settings"]["loss"] == wire["loss"]
+    assert fit_["link"]["delay"]["mean"] == pytest.approx(1.0, abs=0.04)
 
 
 def test_the_outcomes_are_saved_as_a_trace(evedrop: Evedrop) -> None:
@@ -255,7 +255,7 @@ def test_the_outcomes_are_saved_as_a_trace(evedrop: Evedrop) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--column", "a"), "--column is for a table of outcomes, and tuesday.mcap is an MCAP recording"),
         (("--topic", "/odom"), 'has no topic "/odom"; it has /scan (2 messages), /map (2 messages)'),
@@ -264,14 +264,14 @@ def test_the_outcomes_are_saved_as_a_trace(evedrop: Evedrop) -> None:
         (("--slot", "0"), "--slot 0: expected seconds, more than 0"),
     ],
 )
-def test_mistakes_of_the_command_are_said(evedrop: Evedrop, arguments: tuple[str, ...], said: str) -> None:
+def test_mistakes_of_the_command_are_said(evedrop: Evedrop, arguments: tuple[str, ...], message: str) -> None:
     """One line, exit 2."""
     messages = [(1, 0.0, 0.01), (3, 0.2, 0.21)]
     write(evedrop.folder / "tuesday.mcap", [Recorded("/scan", messages), Recorded("/map", messages)])
     done = evedrop("links", "fit", "tuesday.mcap", *arguments)
     assert (done.status, done.out) == (2, "")
     (line,) = done.err.splitlines()
-    assert said in line
+    assert message in line
 
 
 def test_without_the_library_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

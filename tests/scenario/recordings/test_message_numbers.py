@@ -25,13 +25,13 @@ def test_late_and_repeated_messages_are_no_losses(word: list[int], first: int, r
     arrived.sort(key=lambda place: place + random.random() * 5.0)
     numbers = np.array([(first + place) % 2**32 for place in arrived], np.int64)
     sent = np.array(arrived, np.float64)
-    found = series_of(MessageArrivals(numbers, np.arange(len(arrived), dtype=np.float64), sent), wrap=2**32)
-    assert found.outcomes.tolist() == trimmed(np.array(word, np.uint8))
-    assert found.repeated == len(arrived) - len(places)
+    series = series_of(MessageArrivals(numbers, np.arange(len(arrived), dtype=np.float64), sent), wrap=2**32)
+    assert series.outcomes.tolist() == trimmed(np.array(word, np.uint8))
+    assert series.repeated == len(arrived) - len(places)
     firsts = list(dict.fromkeys(arrived))
-    assert found.late == sum(place < max(firsts[: i + 1]) for i, place in enumerate(firsts))
-    assert found.parts == 1
-    assert found.kept.sum() == len(places)
+    assert series.late == sum(place < max(firsts[: i + 1]) for i, place in enumerate(firsts))
+    assert series.parts == 1
+    assert series.kept.sum() == len(places)
 
 
 @pytest.mark.parametrize("times_known", [True, False])
@@ -44,9 +44,9 @@ def test_a_sender_that_starts_again_loses_nothing(before: int, times_known: bool
     sent = np.arange(len(numbers), dtype=np.float64)
     sent[10], sent[11] = sent[11], sent[10]
     clock = np.arange(len(numbers), dtype=np.float64)
-    found = series_of(MessageArrivals(np.array(numbers), clock, sent if times_known else None), wrap=2**32)
-    assert (found.parts, found.restarts, found.late, found.repeated) == (2, 1, 1, 0)
-    assert found.outcomes.tolist() == trimmed(first) + trimmed(second)
+    series = series_of(MessageArrivals(np.array(numbers), clock, sent if times_known else None), wrap=2**32)
+    assert (series.parts, series.restarts, series.late, series.repeated) == (2, 1, 1, 0)
+    assert series.outcomes.tolist() == trimmed(first) + trimmed(second)
 
 
 @pytest.mark.parametrize(("behind", "restarts"), [(50, 0), (80, 1)])
@@ -54,8 +54,8 @@ def test_a_number_far_behind_is_a_restart(behind: int, restarts: int) -> None:
     """Without times of sending, even if the number that was due follows: what is 64 numbers behind or less is late."""
     numbers = np.delete(np.arange(300), 200 - behind).tolist()
     numbers.insert(199, 200 - behind)
-    found = series_of(MessageArrivals(np.array(numbers), np.arange(300.0)))
-    assert (found.restarts, found.late) == (restarts, 1 - restarts)
+    series = series_of(MessageArrivals(np.array(numbers), np.arange(300.0)))
+    assert (series.restarts, series.late) == (restarts, 1 - restarts)
 
 
 def test_a_counter_that_leaps_is_no_loss() -> None:
@@ -72,9 +72,9 @@ def test_a_long_silence_can_be_left_out() -> None:
     numbers = np.concatenate([np.arange(0, 100, 2), 700 + np.arange(0, 100, 2)])
     arrivals = MessageArrivals(numbers, numbers / 10.0)
     assert series_of(arrivals).outcomes.sum() == len(numbers)
-    found = series_of(arrivals, longest=30.0)
-    assert found.outages == pytest.approx((60.2,))
-    assert found.outcomes.tolist() == ([1, 0] * 49 + [1]) * 2
+    series = series_of(arrivals, longest=30.0)
+    assert series.outages == pytest.approx((60.2,))
+    assert series.outcomes.tolist() == ([1, 0] * 49 + [1]) * 2
 
 
 def test_too_many_outcomes_are_refused() -> None:

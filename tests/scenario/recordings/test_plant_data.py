@@ -42,8 +42,8 @@ def read(path: Path, slots: int = 3, slot_seconds: float = 1.0) -> object:
 @pytest.mark.parametrize("name", ["day.csv", "day.csv.gz"])
 def test_a_day_is_read(tmp_path: Path, text: str, name: str) -> None:
     """Watts and kilowatts, columns in any order and more than are asked for, more lines than slots, compressed or not."""
-    found = np.array(read_disturbances(write(tmp_path, text, name), NAMES, UNITS, 3))
-    assert np.allclose(found[:3], [[0.5, 0.2], [0.6, 0.2], [0.7, 1.25]], rtol=1e-15)
+    values = np.array(read_disturbances(write(tmp_path, text, name), NAMES, UNITS, 3))
+    assert np.allclose(values[:3], [[0.5, 0.2], [0.6, 0.2], [0.7, 1.25]], rtol=1e-15)
 
 
 def test_slots_may_last_longer(tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ def test_slots_may_last_longer(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "is empty; expected a line of names such as time [s]"),
         ("time [s],P_solar [kW],P_load [kW]\n", "has 0 rows; expected slots, which is 3, or more"),
@@ -75,10 +75,10 @@ def test_slots_may_last_longer(tmp_path: Path) -> None:
         (GOOD.replace("2,0.7,1.25\n", ""), "has 2 rows; expected slots, which is 3, or more: a longer file, or slots = 2"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_a_day_is_said(tmp_path: Path, text: str, said: str) -> None:
+def test_what_is_wrong_with_a_day_is_said(tmp_path: Path, text: str, message: str) -> None:
     """With the line, what was found there, and what was expected."""
-    found = mistakes_of(read, write(tmp_path, text))
-    assert any(line.startswith(said) for line in found), found
+    mistakes = mistakes_of(read, write(tmp_path, text))
+    assert any(line.startswith(message) for line in mistakes), mistakes
 
 
 def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
@@ -90,13 +90,13 @@ def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
         'line 1: the column "P_load" has no unit',
     ]
     rows = "".join(f"{k},x,{'y' if k == 1 else 1}\n" for k in range(20))
-    found = mistakes_of(read, write(tmp_path, f"time [s],P_solar [kW],P_load [kW]\n{rows}"), 20)
-    assert found[1:3] == [
+    mistakes = mistakes_of(read, write(tmp_path, f"time [s],P_solar [kW],P_load [kW]\n{rows}"), 20)
+    assert mistakes[1:3] == [
         'line 3: P_solar is "x"; expected a finite number',
         'line 3: P_load is "y"; expected a finite number',
     ]
-    assert found[-1] == "and more such mistakes, in 20 of 20 lines"
-    assert len(found) == plant_data.MOST_REPORTED + 1
+    assert mistakes[-1] == "and more such mistakes, in 20 of 20 lines"
+    assert len(mistakes) == plant_data.MOST_REPORTED + 1
 
 
 @pytest.mark.parametrize(

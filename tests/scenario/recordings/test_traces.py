@@ -68,7 +68,7 @@ def test_delays_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "column", "entry", "said"),
+    ("name", "text", "column", "entry", "message"),
     [
         ("walk.csv", None, None, "file", "cannot be read (No such file or directory); expected a CSV or Parquet file"),
         ("walk.csv", "", None, "file", "is empty; expected"),
@@ -110,7 +110,7 @@ def test_what_is_no_recording_is_said(
     text: str | bytes | None,
     column: str | None,
     entry: str,
-    said: str,
+    message: str,
 ) -> None:
     """What is wrong and where, what was expected; a scenario says it at the path of the entry."""
     monkeypatch.setattr(traces, "MOST_OUTCOMES", 20)
@@ -119,11 +119,11 @@ def test_what_is_no_recording_is_said(
     with pytest.raises(TraceError) as caught:
         LinkRecording(tmp_path / name).outcomes(column)
     assert (caught.value.entry, caught.value.exit_status) == (entry, 2)
-    assert said in caught.value.what
+    assert message in caught.value.what
     loss = {"model": "trace", "file": name, **({} if column is None else {"column": column})}
     (line,) = mistakes_of(with_trace, tmp_path, loss)
     assert line.startswith(f"legitimate.link.loss.{entry}: ")
-    assert said in line
+    assert message in line
 
 
 def test_a_column_of_lists_does_not_hide_the_others(tmp_path: Path) -> None:
@@ -139,9 +139,9 @@ def test_a_column_of_lists_does_not_hide_the_others(tmp_path: Path) -> None:
 
 def test_parquet_says_row_and_gap(tmp_path: Path) -> None:
     """A row that is neither 0 nor 1, and one without a value."""
-    for values, said in (([1, 7], 'row 2 is "7"'), ([1, 0, None], "row 3 is empty"), (["1", "x"], 'row 2 is "x"')):
+    for values, message in (([1, 7], 'row 2 is "7"'), ([1, 0, None], "row 3 is empty"), (["1", "x"], 'row 2 is "x"')):
         pq.write_table(pa.table({"received": values}), tmp_path / "walk.parquet")
-        with pytest.raises(TraceError, match=said):
+        with pytest.raises(TraceError, match=message):
             LinkRecording(tmp_path / "walk.parquet").outcomes()
 
 
@@ -160,7 +160,7 @@ def with_trace(folder: Path, loss: dict[str, Any], **more: Any) -> Scenario:
 
 
 @pytest.mark.parametrize(
-    ("loss", "said"),
+    ("loss", "message"),
     [
         ({}, 'file: is missing; expected file = "walk.csv", or outcomes'),
         ({"fiel": "walk.csv"}, "fiel: is not a parameter of trace; expected file, once, outcomes or random_start"),
@@ -175,21 +175,21 @@ def with_trace(folder: Path, loss: dict[str, Any], **more: Any) -> Scenario:
         ({"file": "walk.csv", "once": True}, "file: has 4 outcomes and is read once; expected slots, which is 6, or more"),
     ],
 )  # fmt: skip
-def test_a_mistake_of_a_scenarios_trace_is_named(tmp_path: Path, loss: dict[str, Any], said: str) -> None:
+def test_a_mistake_of_a_scenarios_trace_is_named(tmp_path: Path, loss: dict[str, Any], message: str) -> None:
     """One line each, with its path."""
     write(tmp_path, "walk.csv", "1\n0\n1\n1\n")
     (line,) = mistakes_of(with_trace, tmp_path, {"model": "trace", **loss})
     assert line.startswith("legitimate.link.loss.")
-    assert said in line
+    assert message in line
 
 
 def test_mistakes_of_recordings_hide_no_others(tmp_path: Path) -> None:
     """Two files that are not recordings and a wrong entry: three lines."""
     eve = {"strategy": "smart", "link": {"loss": {"model": "trace", "file": "other.csv", "once": True}}}
-    found = mistakes_of(
+    mistakes = mistakes_of(
         with_trace, tmp_path, {"model": "trace", "file": "walk.csv"}, eavesdroppers={"eve": eve}, slots=0
     )
-    assert sorted(line.partition(":")[0] for line in found) == [
+    assert sorted(line.partition(":")[0] for line in mistakes) == [
         "eavesdroppers.eve.link.loss.file", "legitimate.link.loss.file", "slots",
     ]  # fmt: skip
 

@@ -75,7 +75,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -> None:
     """Outcome and verdicts first, every cell of the table, links, spans, the command that repeats it; the title is only text."""
     page, summary = checked(study), Results.read(study).typed_summary
-    said = "".join(page.texts)
+    text = "".join(page.texts)
     assert page.headings == [
         HOSTILE,
         "Verdicts", "Expectations", "Metrics", "Errors", "Lost synchronisation", "Links", "Repeat it",
@@ -83,11 +83,11 @@ def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -
     assert "1 of 2 expectations FAILED" in page.texts
     cells = [cell for row in closing.receivers_table(summary).rows for cell in row]
     assert Counter(cells) <= Counter(page.texts)
-    for line in (*closing.verdicts(summary), *(one.sentence for one in summary.expectations)):
+    for line in (*closing.verdicts(summary), *(expectation.sentence for expectation in summary.expectations)):
         assert line in page.texts
     for name, link in summary.links.items():
         assert {name, f"{link.offered:,}", f"{link.rate:.4f}", f"{link.expected_rate:.4f}"} <= set(page.texts)
-    assert f"evedrop montecarlo {study} --trials 20" in said
+    assert f"evedrop montecarlo {study} --trials 20" in text
     assert {str(summary.seed), summary.peers["smart"].digest} <= set(page.texts)
     assert page.tags["svg"] == 1
     assert page.tags["img"] == 8
@@ -149,7 +149,7 @@ def test_a_page_has_cautions_events_and_outages_and_does_not_depend_on_the_order
     assert {"1,234", "the link of smart is cut", "smart cut off from the network, the run did not continue"} <= set(
         page.texts
     )
-    (failed,) = (one for one in Results.read(study).typed_summary.expectations if not one.held)
+    (failed,) = (expectation for expectation in Results.read(study).typed_summary.expectations if not expectation.held)
     assert before.texts[before.texts.index(failed.sentence) + 1] == failed.replay
     for name in ("d", "src"):  # the curves and the lanes
         assert page.values(name) == before.values(name)
@@ -226,8 +226,8 @@ def test_the_longest_spans_are_listed_in_the_order_of_time() -> None:
     trial.add(pa.table(rows))
     source: Any = SimpleNamespace(summary=SimpleNamespace(first_trial=0), trial={"smart": trial})
     (listed,) = (node for node in RUN_SECTIONS["Lost synchronisation"](source) if "<details>" in node)
-    said = [text.partition(":")[0] for text in Checked(listed).texts if text.startswith("slots ")]
-    assert said == [f"slots {one.first:,} to {one.last:,}" for one in spans if one.slots > 2]
+    spans_shown = [text.partition(":")[0] for text in Checked(listed).texts if text.startswith("slots ")]
+    assert spans_shown == [f"slots {span.first:,} to {span.last:,}" for span in spans if span.slots > 2]
 
 
 @pytest.mark.parametrize("mode", [Mode.COVARIANCE_ONLY, Mode.ERROR_COORDINATES])
@@ -271,8 +271,8 @@ def test_spans_cover_exactly_the_slots_off_the_track(
         off = [k for k in range(span.first - first, span.last - first + 1) if words[k] != "synchronised"]
         assert all(after - before <= 3 for before, after in pairwise(off))
         assert span.overconfident == words[span.first - first : span.last - first + 1].count("overconfident")
-    for one, other in pairwise(spans):
-        assert other.first - one.last > 3
+    for earlier, other in pairwise(spans):
+        assert other.first - earlier.last > 3
 
 
 codes_of_pieces = st.lists(st.lists(st.sampled_from([0, 0, 0, 1, 2]), max_size=12), max_size=12)
@@ -411,14 +411,14 @@ def test_texts_are_escaped_wherever_they_stand() -> None:
     assert page.values("aria-label").count(texts[2]) == 3
 
 
-def with_other_values(found: Any, others: tuple[Any, ...]) -> Iterator[Any]:
+def with_other_values(content: Any, others: tuple[Any, ...]) -> Iterator[Any]:
     """The contents of a JSON file with one value replaced, for every value (of lists: the first) and every other one."""
-    if isinstance(found, dict):
-        for name, inner in found.items():
-            yield {key: value for key, value in found.items() if key != name}
-            yield from ({**found, name: one} for one in (*others, *with_other_values(inner, others)))
-    elif isinstance(found, list) and found:
-        yield from ([one, *found[1:]] for one in (*others, *with_other_values(found[0], others)))
+    if isinstance(content, dict):
+        for name, inner in content.items():
+            yield {key: value for key, value in content.items() if key != name}
+            yield from ({**content, name: other} for other in (*others, *with_other_values(inner, others)))
+    elif isinstance(content, list) and content:
+        yield from ([other, *content[1:]] for other in (*others, *with_other_values(content[0], others)))
 
 
 OTHERS: tuple[Any, ...] = ("nonsense", None, -1, [], {}, math.inf)

@@ -10,11 +10,11 @@ from evedrop.show.view.column import TIMELINE
 
 def rows(rrd: Path, entity: str, component: str) -> dict[int, Any]:
     """The component's values of one entity, by slot."""
-    found: dict[int, Any] = {}
+    rows: dict[int, Any] = {}
     for chunk in RrdReader(rrd).stream().filter(content=f"/{entity}", is_static=False):
         columns = chunk.to_record_batch().to_pydict()
-        found |= dict(zip(columns[TIMELINE], columns[component], strict=True))
-    return found
+        rows |= dict(zip(columns[TIMELINE], columns[component], strict=True))
+    return rows
 
 
 def lane(rrd: Path, entity: str, slots: int) -> list[str]:

@@ -72,18 +72,18 @@ def test_slots_may_come_in_any_pieces() -> None:
     rng = np.random.default_rng(5)
     u = 5.0 * rng.standard_normal((SLOTS, 2))
     estimates = {name: 0.1 * rng.standard_normal((SLOTS, 2)) for name in scenario.receivers}
-    found = []
+    results = []
     for cuts in ([0, SLOTS], [0, 1, 60, 61, 130, SLOTS]):
         loop_values = LoopValues.of(scenario)
         assert loop_values is not None
         pieces = [slice(first, end) for first, end in pairwise(cuts)]
         moves = [loop_values.take(u[rows], {name: x[rows] for name, x in estimates.items()}) for rows in pieces]
-        curves = {path: np.concatenate([one.curves[path] for one in moves], axis=1) for path in moves[0].curves}
+        curves = {path: np.concatenate([move.curves[path] for move in moves], axis=1) for path in moves[0].curves}
         energies = np.stack([curves["energy/bought"][1], curves["energy/sold"][1]], axis=1)
-        found.append((np.concatenate([one.values for one in moves]), energies, curves["guesses/naive"]))
-    for whole, pieces_of_it in zip(*found, strict=True):
+        results.append((np.concatenate([move.values for move in moves]), energies, curves["guesses/naive"]))
+    for whole, pieces_of_it in zip(*results, strict=True):
         assert np.allclose(whole, pieces_of_it, rtol=1e-12)
-    values, energies, guesses = found[0]
+    values, energies, guesses = results[0]
     assert np.abs(values[:, 2]).max() == 1.5
     assert np.allclose(
         energies[-1], [np.maximum(values[:, 3], 0).sum() / 3600, np.maximum(-values[:, 3], 0).sum() / 3600]

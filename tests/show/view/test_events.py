@@ -15,12 +15,12 @@ def watch(codes: list[int], cuts: list[int], slots: int = 1000, role: str = "eav
     """Events of a lane that is handed over in pieces."""
     shown = Shown("eve", role, "naive", 0.9)
     watcher = Watcher(shown, Scene("", "r", slots, 1, 2, 0.0, (shown,), 1.0))
-    found: list[Event] = []
+    events: list[Event] = []
     bounds = [0, *sorted(cuts), len(codes)]
     for start, end in pairwise(bounds):
         part: Codes = np.array(codes[start:end], np.uint8)
-        found += watcher.watch(start, part)
-    return found
+        events += watcher.watch(start, part)
+    return events
 
 
 def test_stretch_is_told_when_long_and_when_over() -> None:

@@ -36,9 +36,9 @@ COLOURS = {
 """Word → its colour: blue for what was used, amber for what misleads, red for what is lost, green for what is known."""
 
 
-def coloured(found: int) -> Colour:
+def coloured(rgba: int) -> Colour:
     """A colour as it is in a recording, in bytes of red, green, blue and opacity."""
-    red, green, blue, _ = found.to_bytes(4)
+    red, green, blue, _ = rgba.to_bytes(4)
     return red, green, blue
 
 
@@ -55,17 +55,17 @@ def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], t
     receivers, nothing = run.scene.receivers, 1e-3 * np.sqrt(run.scene.noise)
     for k, shown in labels.items():
         assert shown[:2] == [f"sensor: {'innovation' if run.slots.nu[k] else 'state'}", "router"]
-        assert [coloured(one) for one in colours[k][:2]] == [TRUTH, TRUTH]
-        for i, one in enumerate(receivers):
-            peer = run.slots.peers[one.name]
-            word = lanes.lane_of(one).words[int(lanes.received(one, run.slots)[k])]
+        assert [coloured(code) for code in colours[k][:2]] == [TRUTH, TRUTH]
+        for i, receiver in enumerate(receivers):
+            peer = run.slots.peers[receiver.name]
+            word = lanes.lane_of(receiver).words[int(lanes.received(receiver, run.slots)[k])]
             assert shown[2 + i] == word
             status = Synchronisation(knowledge(run.scene, run.slots.x, peer)[k])
             name, _, rest = shown[2 + len(receivers) + i].partition(": ")
-            what, _, off = rest.partition(", ")
-            assert (name, what) == (one.name, status.word)
+            label, _, off = rest.partition(", ")
+            assert (name, label) == (receiver.name, status.word)
             inks = [coloured(colours[k][at + i]) for at in (2, 2 + len(receivers))]
-            assert inks == [COLOURS[word], COLOURS[what]]
+            assert inks == [COLOURS[word], COLOURS[label]]
             distance = float(off.removesuffix(" off").replace(",", ""))
             assert np.isclose(distance, np.linalg.norm(run.slots.x[k] - peer.x_hat[k]), rtol=0.05, atol=nothing)
 

@@ -86,7 +86,7 @@ def test_numbers_are_judged(report: Path) -> None:
     assert verdicts[("legitimate stability bound", "0.5342")] == "agrees"
     assert verdicts[("upper end of perfect secrecy, μ_e = 0.85", "0.5656")] == "agrees"
     assert verdicts[("slots in a day of one-second slots", "86400")] == "agrees"
-    errata = {what: verdict for what, verdict in verdicts.items() if verdict.startswith("erratum: ")}
+    errata = {name: verdict for name, verdict in verdicts.items() if verdict.startswith("erratum: ")}
     assert len(errata) == 7
     assert all(len(verdict) > 30 for verdict in errata.values())
     assert sum(verdict == "agrees" for verdict in verdicts.values()) == 5

@@ -62,7 +62,7 @@ def test_a_right_covariance_is_hardly_ever_called_overconfident() -> None:
 
 def walk(errors: list[float], levels: list[int], distance: ErrorDistance) -> list[str]:
     """The words for distances along the first state."""
-    x: Floats = np.array([[one, 0.0] for one in errors])
+    x: Floats = np.array([[error, 0.0] for error in errors])
     codes = distance.codes(np.array(levels, np.uint8), distance.of(x, np.zeros_like(x)))
     return [distance.lane.words[code] for code in codes]
 
@@ -97,15 +97,19 @@ def test_distances_have_a_unit() -> None:
     x: Floats = np.array([[3.0, 4.0, 12.0]])
     assert ErrorDistance(moving).of(x, np.zeros((1, 3)))[0] == 5.0
     assert ErrorDistance(replace(moving, units=())).of(x, np.zeros((1, 3)))[0] == 13.0
-    texts = [ErrorDistance(moving).text(one) for one in (0.0, 0.316, 12.34, 4567.0, 1e9, np.inf)]
+    texts = [ErrorDistance(moving).text(distance_) for distance_ in (0.0, 0.316, 12.34, 4567.0, 1e9, np.inf)]
     assert texts == ["0 m", "0.32 m", "12 m", "4,600 m", "1e+09 m", "everything"]
 
 
 def test_distances_of_rounding_are_none() -> None:
     """√(tr Q) is 0.22 m here: less than a thousandth of it is 0, and the finest distance that is said has two digits."""
-    assert [ErrorDistance(SCENE).text(one) for one in (2e-15, 2.2e-4, 2.3e-4)] == ["0 m", "0 m", "0.00023 m"]
+    assert [ErrorDistance(SCENE).text(distance_) for distance_ in (2e-15, 2.2e-4, 2.3e-4)] == [
+        "0 m",
+        "0 m",
+        "0.00023 m",
+    ]
     finer = ErrorDistance(replace(SCENE, noise=1e-20))
-    assert [finer.text(one) for one in (9e-14, 2e-13)] == ["0 m", "2e-13 m"]
+    assert [finer.text(distance_) for distance_ in (9e-14, 2e-13)] == ["0 m", "2e-13 m"]
 
 
 def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
@@ -124,7 +128,7 @@ def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp
         assert [word for _, (word,) in sorted(changes.items())] == [word for word, _ in groupby(lanes[shown.name, 7])]
         expected = knowledge(run.scene, run.slots.x, run.slots.peers[shown.name])
         assert [word.split(",")[0] for word in lanes[shown.name, 7]] == [KNOWLEDGE.words[code] for code in expected]
-    words = {name: " ".join(found) for (name, _), found in lanes.items()}
+    words = {name: " ".join(words_) for (name, _), words_ in lanes.items()}
     assert "overconfident" in words["naive"]
     assert "overconfident" not in words["smart"]
     assert "uncertain" in words["smart"]
@@ -145,8 +149,8 @@ def title_of(scene: Scene) -> str:
     """The text in the first line of a view, in Markdown."""
     text = Title(scene).styles()["title"].text
     assert text is not None
-    (found,) = text.as_arrow_array().to_pylist()
-    return str(found)
+    (title,) = text.as_arrow_array().to_pylist()
+    return str(title)
 
 
 def test_the_title_says_which_trials_are_shown() -> None:

@@ -17,8 +17,8 @@ _LEAST = 15.0  # CIEDE2000; 1 is just noticeable side by side
 _VISIONS = (None, "deutan", "protan", "tritan")
 
 
-def _seen(one: Colour, vision: str | None) -> Color:
-    full = Color(hexadecimal(one))
+def _seen(colour: Colour, vision: str | None) -> Color:
+    full = Color(hexadecimal(colour))
     return full if vision is None else full.filter(vision)
 
 
@@ -26,15 +26,15 @@ def _seen(one: Colour, vision: str | None) -> Color:
 @pytest.mark.parametrize("vision", _VISIONS)
 def test_colours_that_share_a_panel_differ(panel: str, vision: str | None) -> None:
     """By CIEDE2000 of at least 15, with full colour vision and with each kind of dichromacy."""
-    for one, other in combinations(PANELS[panel], 2):
-        found = _seen(one, vision).delta_e(_seen(other, vision), method="2000")
-        assert found >= _LEAST, f"{hexadecimal(one)} and {hexadecimal(other)} differ by {found:.1f}"
+    for colour, other in combinations(PANELS[panel], 2):
+        difference = _seen(colour, vision).delta_e(_seen(other, vision), method="2000")
+        assert difference >= _LEAST, f"{hexadecimal(colour)} and {hexadecimal(other)} differ by {difference:.1f}"
 
 
 @pytest.mark.parametrize("colours", [LANES, WIRE_LANES])
 def test_lanes_differ_in_brightness(colours: tuple[Colour, ...]) -> None:
     """By at least 6 of 100 in CIE lightness, so that a grey print shows them too."""
-    lightness = sorted(Color(hexadecimal(one)).convert("lab-d65")["l"] for one in colours)
+    lightness = sorted(Color(hexadecimal(colour)).convert("lab-d65")["l"] for colour in colours)
     assert min(after - before for before, after in pairwise(lightness)) >= 6.0
 
 
@@ -52,7 +52,7 @@ def test_panels_of_applications_use_the_colours_of_the_table(name: str) -> None:
     scenario = load(name)
     loop = controlled_plant(scenario)
     assert loop is not None
-    panels = [one for key, table in scenario.applications.items() for one in APPLICATIONS[key].panels(loop, table)]
+    panels = [panel for key, table in scenario.applications.items() for panel in APPLICATIONS[key].panels(loop, table)]
     assert panels
     for panel in panels:
         colours = [curve.colour for curve in panel.curves if curve.colour is not None]

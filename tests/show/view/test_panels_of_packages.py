@@ -42,9 +42,9 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.fixture
 def tutorial(site: Path) -> Path:
     """The package of the tutorial."""
-    found = SECTION.search(PAGE.read_text(encoding="utf-8"))
-    assert found is not None
-    blocks = dict(BLOCK.findall(found[0]))
+    match = SECTION.search(PAGE.read_text(encoding="utf-8"))
+    assert match is not None
+    blocks = dict(BLOCK.findall(match[0]))
     entries = tomllib.loads(blocks["pyproject.toml"])["project"]["entry-points"]
     install(site, {"ratio.py": blocks["ratio.py"]}, entries)
     return site
@@ -142,9 +142,9 @@ def install_broken(site: Path) -> None:
 def check_warnings(text: str, prefix: str) -> None:
     """One line for every broken panel, and none besides."""
     lines = [line for line in text.splitlines() if "lacks" in line]
-    for case, (_, said) in BROKEN.items():
+    for case, (_, message) in BROKEN.items():
         (line,) = [line for line in lines if re.match(f"{prefix}the view lacks the panel {case}[,:]", line)]
-        assert said in line
+        assert message in line
     assert len(lines) == len(BROKEN)
 
 

@@ -52,22 +52,22 @@ def test_nobody_can_connect_to_who_draws(simulated: Callable[..., Simulated], tm
     look = [sys.executable, "-c", "import os; print(os.readlink('/proc/self/ns/net'))"]
     allowed = subprocess.run(guarded(look, apart=True), capture_output=True, text=True, check=True)
     apart = allowed.stdout.strip() != os.readlink("/proc/self/ns/net")
-    found: list[UsageError | list[str]] = []
+    outcomes: list[UsageError | list[str]] = []
 
     def draw() -> None:
         try:
-            found.append(picture_apart(rrd, tmp_path / "r.png", 7))
+            outcomes.append(picture_apart(rrd, tmp_path / "r.png", 7))
         except UsageError as error:
-            found.append(error)
+            outcomes.append(error)
 
     thread = threading.Thread(target=draw)
     thread.start()
-    pid = wait_until(lambda: drawing(rrd) or bool(found), "a viewer that draws")
-    network = None if found else os.readlink(f"/proc/{pid}/ns/net")
+    pid = wait_until(lambda: drawing(rrd) or bool(outcomes), "a viewer that draws")
+    network = None if outcomes else os.readlink(f"/proc/{pid}/ns/net")
     thread.join()
     with skipped_without_driver():
-        if isinstance(found[0], UsageError):
-            raise found[0]
+        if isinstance(outcomes[0], UsageError):
+            raise outcomes[0]
     assert (network != os.readlink("/proc/self/ns/net")) == apart
     assert np.asarray(matplotlib.image.imread(tmp_path / "r.png")).shape[:2] == (950, 1600)
 
@@ -191,14 +191,14 @@ BROKEN: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
-@pytest.mark.parametrize("what", BROKEN)
+@pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_recording_is_said_before_a_viewer_is_started(
-    what: str, simulated: Callable[..., Simulated], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    case: str, simulated: Callable[..., Simulated], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One line with the file, what is wrong and a remedy; the viewer would wait forever."""
     monkeypatch.setattr("evedrop.show.view.picture.subprocess", None)  # no process is started
     rrd = recorded(simulated(60), tmp_path / "r.rrd")
-    rrd.write_bytes(BROKEN[what](rrd.read_bytes()))
+    rrd.write_bytes(BROKEN[case](rrd.read_bytes()))
     with pytest.raises(UsageError, match="is broken") as told:
         picture_apart(rrd, tmp_path / "r.png")
     assert str(told.value).startswith(f"{rrd} is broken (")

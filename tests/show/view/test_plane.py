@@ -56,8 +56,8 @@ def test_what_is_inside_stays() -> None:
 )
 def test_a_label_is_beyond_the_tip_and_in_the_frame(tip: tuple[float, float], centre: tuple[float, float]) -> None:
     """The letters do not cover the arrow, which points away from the truth; Rerun's y axis points down."""
-    found = labels_of(TRUTH, np.array([tip], np.float32), LOW, HIGH)
-    np.testing.assert_allclose(found, [centre], rtol=1e-6)
+    labels = labels_of(TRUTH, np.array([tip], np.float32), LOW, HIGH)
+    np.testing.assert_allclose(labels, [centre], rtol=1e-6)
 
 
 @pytest.mark.parametrize("tip", [(9.0, -4.0), (9.0, 4.0), (2.0, -4.5), (-8.0, 1.0)])
@@ -68,10 +68,10 @@ def test_labels_of_estimates_at_one_place_are_below_each_other(tip: tuple[float,
     np.testing.assert_array_equal(placed[0], first)
     for _ in range(3):
         placed.append(apart(first, placed, LOW, HIGH))
-    heights = np.sort([one[0, 1] for one in placed])
+    heights = np.sort([place[0, 1] for place in placed])
     np.testing.assert_allclose(np.diff(heights), 0.11 * 10.0, rtol=1e-5)
-    assert {float(one[0, 0]) for one in placed} == {float(first[0, 0])}
-    assert all(inside(one, LOW, HIGH)[0] for one in placed)
+    assert {float(place[0, 0]) for place in placed} == {float(first[0, 0])}
+    assert all(inside(place, LOW, HIGH)[0] for place in placed)
     beside = first + np.array([[8.0, 0.0]], np.float32)
     np.testing.assert_array_equal(apart(beside, placed, LOW, HIGH), beside)
     nowhere = np.full((1, 2), np.nan, np.float32)
@@ -87,8 +87,8 @@ def test_two_that_are_far_have_labels_apart(simulated: Callable[..., Simulated],
     for name, first in (("both", slice(30, 40)), ("one", slice(35, 40))):
         near = run.slots.x.copy()
         near[first] = far[first]
-        found = {"naive": near, "suspicious": far, "smart": run.slots.x}
-        peers = {who: replace(run.slots.peers[who], x_hat=x_hat) for who, x_hat in found.items()}
+        estimates = {"naive": near, "suspicious": far, "smart": run.slots.x}
+        peers = {who: replace(run.slots.peers[who], x_hat=x_hat) for who, x_hat in estimates.items()}
         recording = ViewRecording(tmp_path / f"{name}.rrd", run.scene)
         recording.add(replace(run.slots, peers={**run.slots.peers, **peers}))
         assert recording.close()
@@ -117,8 +117,8 @@ def test_the_plane_follows_truth_and_legitimate(simulated: Callable[..., Simulat
     labels = rows(tmp_path / "far.rrd", "plane/naive/away", "Points2D:labels")
     assert {k: text for k, text in labels.items() if text} == {k: ["naive: 5,000 m"] for k in range(30, 40)}
     shown = {
-        what: rows(tmp_path / "far.rrd", f"plane/naive/{what}", component)
-        for what, component in (
+        part: rows(tmp_path / "far.rrd", f"plane/naive/{part}", component)
+        for part, component in (
             ("at", "Points2D:positions"),
             ("trail", "LineStrips2D:strips"),
             ("cov", "LineStrips2D:strips"),
@@ -126,11 +126,11 @@ def test_the_plane_follows_truth_and_legitimate(simulated: Callable[..., Simulat
     }
     for k in range(60):
         corners = np.array(frames["far"][k][0])
-        for what, found in shown.items():
-            points = np.array(found[k]).reshape(-1, 2)
+        for part, drawn in shown.items():
+            points = np.array(drawn[k]).reshape(-1, 2)
             assert (points >= corners.min(axis=0)).all()
             assert (points <= corners.max(axis=0)).all()
-            if what == "cov" and 30 <= k < 40:  # no ellipse is where it is far away
+            if part == "cov" and 30 <= k < 40:  # no ellipse is where it is far away
                 np.testing.assert_allclose(points, np.broadcast_to(run.slots.x[k] * [1, -1], points.shape), rtol=1e-5)
 
 
@@ -145,9 +145,9 @@ def test_the_plane_shows_a_legitimate_estimate_wherever_it_is(
     recording = ViewRecording(tmp_path / "r.rrd", run.scene)
     recording.add(replace(run.slots, peers=peers))
     assert recording.close()
-    found = rows(tmp_path / "r.rrd", "plane/frame", "LineStrips2D:strips")
+    result = rows(tmp_path / "r.rrd", "plane/frame", "LineStrips2D:strips")
     for k in range(30, 40):
-        corners = np.array(found[k][0])
+        corners = np.array(result[k][0])
         for state in (run.slots.x[k], x_hat[k]):
             assert (corners.min(axis=0) < state * [1, -1]).all()
             assert (corners.max(axis=0) > state * [1, -1]).all()

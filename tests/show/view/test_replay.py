@@ -93,14 +93,14 @@ OTHER: dict[str, tuple[str, Callable[[pa.Table], pa.Table], str]] = {
 }
 
 
-@pytest.mark.parametrize("what", OTHER)
-def test_tables_that_do_not_fit_are_refused(what: str, study: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("case", OTHER)
+def test_tables_that_do_not_fit_are_refused(case: str, study: Path, tmp_path: Path) -> None:
     """A table of another version, one cut short, and unknown words: one line, and no recording is left."""
-    name, change, said = OTHER[what]
+    name, change, message = OTHER[case]
     folder = tmp_path / "run"
     shutil.copytree(study, folder, ignore=shutil.ignore_patterns("*.rrd"))
     pq.write_table(change(pq.read_table(folder / f"{name}.parquet")), folder / f"{name}.parquet")
-    with pytest.raises(UsageError, match=said) as told:
+    with pytest.raises(UsageError, match=message) as told:
         replay(folder)
     assert "\n" not in str(told.value)
     assert not (folder / "recording.rrd").exists()
@@ -108,8 +108,8 @@ def test_tables_that_do_not_fit_are_refused(what: str, study: Path, tmp_path: Pa
 
 def test_another_process_is_refused(study: Path, tmp_path: Path) -> None:
     """Tables of two states with a scenario of one: the message comes at once; a recording would never be finished."""
-    one: dict[str, Any] = {"process__A": [[1.0]], "process__Q": [[1e-3]], "process__initial_covariance": [[1.0]]}
-    folder = montecarlo("eavesdroppers", trials=2, slots=SLOTS, out=tmp_path / "run", **one).folder
+    changes: dict[str, Any] = {"process__A": [[1.0]], "process__Q": [[1e-3]], "process__initial_covariance": [[1.0]]}
+    folder = montecarlo("eavesdroppers", trials=2, slots=SLOTS, out=tmp_path / "run", **changes).folder
     shutil.copy(study / "trials.parquet", folder)
     with pytest.raises(UsageError, match=r"trials\.parquet has 2 states and scenario\.toml 1; run the scenario again"):
         replay(folder)

@@ -25,15 +25,15 @@ def lines(rrd: Path) -> dict[int, list[str]]:
 def test_a_run_in_memory_shows_what_its_scenario_had_happen(tmp_path: Path) -> None:
     """A line at its slot for every event and for its end, from the summary."""
     results = montecarlo("eavesdroppers", trials=1, slots=30, out=tmp_path / "run", event=EVENTS)
-    assert [(one["slot"], [one["event"]]) for one in results.summary["events"]] == list(LINES.items())
-    assert {one["by"] for one in results.summary["events"]} == {"scenario"}
+    assert [(event["slot"], [event["event"]]) for event in results.summary["events"]] == list(LINES.items())
+    assert {event["by"] for event in results.summary["events"]} == {"scenario"}
     assert lines(replay(tmp_path / "run")) == LINES
 
 
 def test_what_comes_after_the_last_slot_did_not_happen(tmp_path: Path) -> None:
     """An event that lasts to the end of the run ends in none of its slots."""
     results = montecarlo("eavesdroppers", trials=1, slots=9, out=tmp_path / "run", event=EVENTS)
-    assert [one["slot"] for one in results.summary["events"]] == [3, 5]
+    assert [event["slot"] for event in results.summary["events"]] == [3, 5]
 
 
 @pytest.mark.long
@@ -50,10 +50,10 @@ def test_a_live_run_shows_what_was_done_to_it(evedrop: Any) -> None:
     assert live.end().status == 0
     events = load_results(live.folder).summary["events"]
     shown = lines(live.folder / "recording.rrd")
-    assert [one["event"] for one in events if one["by"] == "scenario"] == ["cut legitimate"]
-    assert [one["slot"] for one in events if one["event"] == "cut legitimate"] == [3]
-    assert any(one["event"].startswith("link") for one in events)
+    assert [event["event"] for event in events if event["by"] == "scenario"] == ["cut legitimate"]
+    assert [event["slot"] for event in events if event["event"] == "cut legitimate"] == [3]
+    assert any(event["event"].startswith("link") for event in events)
     last = {
-        one["slot"]: RunEvent(**one).line for one in events if one["slot"]
+        event["slot"]: RunEvent(**event).line for event in events if event["slot"]
     }  # the recording has the last line of a slot
     assert shown == {slot: [line] for slot, line in last.items()}

@@ -60,21 +60,21 @@ def test_the_slots_around_it_fill_the_panels() -> None:
 
 def test_the_first_recorded_trial_decides(tmp_path: Path) -> None:
     """It is the one that the view shows; the covariances are those that receivers report."""
-    found = []
+    slots = []
     for trials in (1, 3):
         montecarlo("vehicle", slots=400, record_trials=trials, trials=trials, out=tmp_path / str(trials))
-        found.append(telling_slot(Results.read(tmp_path / str(trials))))
-    assert found[0] == found[1]
+        slots.append(telling_slot(Results.read(tmp_path / str(trials))))
+    assert slots[0] == slots[1]
     results = Results.read(tmp_path / "3")
     rows = [row for row in results.trials.to_pylist() if row["trial"] == 0]
     errors: dict[str, list[float]] = {}
     traces: dict[str, list[float]] = {}
-    for row in sorted(rows, key=lambda one: one["slot"]):
+    for row in sorted(rows, key=lambda row: row["slot"]):
         errors.setdefault(row["peer"], []).append(row["squared_error"])
         traces.setdefault(row["peer"], []).append(np.trace(np.array(row["P"]).reshape(len(row["x"]), -1)))
     noise = float(np.trace(load("vehicle").process.process.Q))
-    seen, claimed = ({name: np.array(one) for name, one in by.items()} for by in (errors, traces))
-    assert found[1] == most_telling(seen, claimed, noise)
+    seen, claimed = ({name: np.array(values) for name, values in by.items()} for by in (errors, traces))
+    assert slots[1] == most_telling(seen, claimed, noise)
 
 
 def test_a_closed_loop_is_shown_to_its_end(tmp_path: Path) -> None:

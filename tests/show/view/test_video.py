@@ -20,12 +20,12 @@ COLOURS = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
 
 def pictures(moments: Sequence[float]) -> list[bytes]:
     """A picture of one colour for each moment."""
-    found = []
+    pictures = []
     for moment in moments:
         file = BytesIO()
         Image.new("RGB", SIZE, COLOURS[int(moment) % 3]).save(file, "PNG")
-        found.append(file.getvalue())
-    return found
+        pictures.append(file.getvalue())
+    return pictures
 
 
 @pytest.fixture
@@ -49,8 +49,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def ffmpeg() -> str:
     """The ffmpeg of the extra."""
-    found: ModuleType = pytest.importorskip("imageio_ffmpeg")
-    return str(found.get_ffmpeg_exe())
+    importorskip: ModuleType = pytest.importorskip("imageio_ffmpeg")
+    return str(importorskip.get_ffmpeg_exe())
 
 
 @pytest.mark.usefixtures("drawn")
@@ -80,8 +80,8 @@ def test_an_mp4_has_all_frames_in_order(tmp_path: Path) -> None:
     frame = 3 * SIZE[0] * SIZE[1]
     assert len(raw) == 7 * frame
     for number in range(7):
-        found = raw[number * frame : number * frame + 3]
-        assert max(abs(a - b) for a, b in zip(found, COLOURS[number % 3], strict=True)) < 40
+        pixel = raw[number * frame : number * frame + 3]
+        assert max(abs(a - b) for a, b in zip(pixel, COLOURS[number % 3], strict=True)) < 40
     assert list(tmp_path.iterdir()) == [path]
 
 

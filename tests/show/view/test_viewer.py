@@ -41,14 +41,14 @@ def places(pid: int, port: int | None = None) -> list[str]:
     for link in Path(f"/proc/{pid}/fd").iterdir():
         with contextlib.suppress(FileNotFoundError):  # closed meanwhile, as that of the folder is
             inodes.add(os.readlink(link).removeprefix("socket:[").removesuffix("]"))
-    found = []
+    addresses = []
     for table in ("tcp", "tcp6"):
         for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
             fields = line.split()
             address, _, number = fields[1].partition(":")
             if fields[3] == "0A" and fields[9] in inodes and port in {None, int(number, 16)}:
-                found.append(address)
-    return found
+                addresses.append(address)
+    return addresses
 
 
 @pytest.fixture
@@ -112,7 +112,11 @@ def test_the_page_can_ask_no_other_host(viewer: Viewer) -> None:
     inline = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
     digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in inline]
     assert inline
-    assert rules["script-src"].split() == ["'self'", "'wasm-unsafe-eval'", *(f"'sha256-{one}'" for one in digests)]
+    assert rules["script-src"].split() == [
+        "'self'",
+        "'wasm-unsafe-eval'",
+        *(f"'sha256-{digest}'" for digest in digests),
+    ]
     for words in rules.values():
         assert not {"*", "http:", "https:", "'unsafe-eval'"} & {*words.split()}
     origin = f"http://127.0.0.1:{port}"
@@ -172,9 +176,9 @@ def test_those_who_only_connect_keep_nobody_out_for_long(viewer: Viewer, tmp_pat
     viewer.complete()
     assert data.hostname is not None
     idle = [socket.create_connection((data.hostname, data.port or 0), LIMIT) for _ in range(3)]
-    assert any(one.recv(1) == b"" for one in idle[-1:]), "one too many is turned away"
-    for one in idle:
-        one.close()
+    assert any(connection.recv(1) == b"" for connection in idle[-1:]), "one too many is turned away"
+    for connection in idle:
+        connection.close()
 
     def served() -> bytes:
         try:
@@ -256,7 +260,7 @@ def test_a_pipe_gets_the_recording_as_it_grows(tmp_path: Path) -> None:
     reading, writing = os.pipe()
     feed(followed, os.fdopen(writing, "wb", buffering=0))
     os.close(reading)
-    wait_until(lambda: not [one for one in threading.enumerate() if one.name == "view"], "no thread left")
+    wait_until(lambda: not [thread for thread in threading.enumerate() if thread.name == "view"], "no thread left")
 
 
 def test_stop_ends_it_and_may_be_repeated(viewer: Viewer) -> None:

@@ -32,25 +32,25 @@ def test_its_metrics_are_sums_over_slots(tmp_path: Path) -> None:
     states = [row["x"] for row in trials if row["peer"] == "legitimate"]
     power = [row["u"] for row in results.inputs.to_pylist()]
     outside = [max(20.5 - room, room - 22.5, 0.0) for room, _ in states]
-    found = results.summary["comfort"]
-    assert found["discomfort"] == pytest.approx(sum(outside) / 60)
+    comfort = results.summary["comfort"]
+    assert comfort["discomfort"] == pytest.approx(sum(outside) / 60)
     assert sum(outside) > 0
-    assert found["heating_energy"] == pytest.approx(sum(min(max(u, -1.0), 3.0) for (u,) in power) / 60)
+    assert comfort["heating_energy"] == pytest.approx(sum(min(max(u, -1.0), 3.0) for (u,) in power) / 60)
     for name in scenario.receivers:
         estimated = [row["x_hat"][0] for row in trials if row["peer"] == name]
-        known = [
+        right = [
             (20.5 <= room <= 22.5) == (20.5 <= (guess) <= 22.5)
             for guess, (room, _) in zip(estimated, states, strict=True)
         ]
-        assert found["receivers"][name]["known_fraction"] == pytest.approx(np.mean(known))
+        assert comfort["receivers"][name]["known_fraction"] == pytest.approx(np.mean(right))
 
 
 @pytest.mark.long
 def test_totals_of_parts_are_the_totals(tmp_path: Path) -> None:
     """Two workers or one: the same bits. And they are the means of the trials' parts, weighted by their trials."""
     scenario = load("heated-room", {**SHORT, "slots": 90})
-    one = montecarlo(scenario, trials=600, out=tmp_path / "one", plan=Plan(workers=1)).summary["comfort"]
-    assert montecarlo(scenario, trials=600, out=tmp_path / "two", plan=Plan(workers=2)).summary["comfort"] == one
+    whole = montecarlo(scenario, trials=600, out=tmp_path / "one", plan=Plan(workers=1)).summary["comfort"]
+    assert montecarlo(scenario, trials=600, out=tmp_path / "two", plan=Plan(workers=2)).summary["comfort"] == whole
     first, rest = (
         montecarlo(scenario, trials=trials, first_trial=at, out=tmp_path / str(at), plan=Plan(workers=1)).summary[
             "comfort"
@@ -58,10 +58,12 @@ def test_totals_of_parts_are_the_totals(tmp_path: Path) -> None:
         for at, trials in ((0, 450), (450, 150))
     )
     for name in ("discomfort", "heating_energy"):
-        assert one[name] == pytest.approx(0.75 * first[name] + 0.25 * rest[name], rel=1e-12)
-    for receiver, found in one["receivers"].items():
-        known = [part["receivers"][receiver]["known_fraction"] for part in (first, rest)]
-        assert found["known_fraction"] == pytest.approx(0.75 * known[0] + 0.25 * known[1], rel=1e-12)
+        assert whole[name] == pytest.approx(0.75 * first[name] + 0.25 * rest[name], rel=1e-12)
+    for receiver, entries in whole["receivers"].items():
+        known_fractions = [part["receivers"][receiver]["known_fraction"] for part in (first, rest)]
+        assert entries["known_fraction"] == pytest.approx(
+            0.75 * known_fractions[0] + 0.25 * known_fractions[1], rel=1e-12
+        )
 
 
 def test_the_view_is_given_every_curve_of_its_panels() -> None:
@@ -75,7 +77,7 @@ def test_the_view_is_given_every_curve_of_its_panels() -> None:
     assert parts is not None
     at_once = whole.take(u, estimates).curves
     blocks = [
-        parts.take(u[rows], {name: one[rows] for name, one in estimates.items()}).curves
+        parts.take(u[rows], {name: estimate[rows] for name, estimate in estimates.items()}).curves
         for rows in (slice(0, 7), slice(7, 40))
     ]
     wanted = {f"{panel.path}/{curve.name}" for panel in driven_scene(scenario)["panels"] for curve in panel.curves}
@@ -85,7 +87,7 @@ def test_the_view_is_given_every_curve_of_its_panels() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"comfort.heater": "P_grid"}, 'comfort.heater: is "P_grid", which is not among plant.inputs; expected one of P_heat'),
         ({"comfort.temperature": "T"}, 'comfort.temperature: is "T", which is not among process.states; expected one of T_room'),
@@ -99,11 +101,11 @@ def test_the_view_is_given_every_curve_of_its_panels() -> None:
         ({"expect": [{"metric": "comfort.discomfort", "below": 1.0, "quantile": 0.5}]}, "expect.0.quantile: is set, but the com"),
     ],
 )  # fmt: skip
-def test_mistakes_are_named(changes: dict[str, Any], said: str) -> None:
+def test_mistakes_are_named(changes: dict[str, Any], message: str) -> None:
     """Mistakes in the table, in names and in expectations each get a line that says what is expected."""
     with pytest.raises(ScenarioError) as caught:
         load("heated-room", changes)
-    assert any(line.startswith(said) for line in caught.value.mistakes), caught.value.mistakes
+    assert any(line.startswith(message) for line in caught.value.mistakes), caught.value.mistakes
 
 
 def test_a_table_without_a_plant_is_refused() -> None:
@@ -137,14 +139,14 @@ def test_an_application_of_another_package_needs_nothing_here(evedrop: Evedrop) 
     install(evedrop.folder, {"platooning.py": page.partition("# platooning.py\n")[2].partition("```")[0]}, PLATOON)
     (evedrop.folder / "two.toml").write_text(SCENARIO)
     environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
-    said = []
+    lines = []
     for arguments in (["montecarlo", "two.toml", "--trials", "1"], ["run", "two.toml", "--view", "off"]):
         done = evedrop.process(*arguments, "--out", arguments[0], env=environment)
         assert done.status == 0, done.err
-        said += [line for line in done.out.splitlines() if line.startswith("the smallest gap is ")]
+        lines += [line for line in done.out.splitlines() if line.startswith("the smallest gap is ")]
         assert "expected platoon.smallest_gap below 0: held" in done.out
-    assert len(said) == 2
-    assert said[0] == said[1]
+    assert len(lines) == 2
+    assert lines[0] == lines[1]
     done = evedrop.process(
         "sweep", "two.toml", "--over", "slots=50,100", "--trials", "2", "--out", "swept", env=environment
     )

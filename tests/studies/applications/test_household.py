@@ -107,8 +107,8 @@ def test_appliances_follow_the_profile() -> None:
 
 def test_draws_are_in_order() -> None:
     """Numbers of a stream do not depend on how many are asked for at once; waiting times have their mean."""
-    one, two = Draws(5, "a"), Draws(5, "a")
-    assert np.array_equal(one.uniforms(7), [two.uniform() for _ in range(7)])
+    first, two = Draws(5, "a"), Draws(5, "a")
+    assert np.array_equal(first.uniforms(7), [two.uniform() for _ in range(7)])
     times = Draws(5, "b").times(np.full(100_000, 0.01))
     assert abs(len(times) - 1000) < 4 * 1000**0.5
     assert times == sorted(times)

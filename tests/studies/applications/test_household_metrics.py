@@ -35,7 +35,7 @@ HOUSE: dict[str, Any] = {
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"household__grid": "P_net"}, 'household.grid: is "P_net", which is not among plant.inputs; expected one of P_H'),
         ({"household__load": "P_H"}, 'household.load: is "P_H", which is not among plant.disturbances; expected one of P_so'),
@@ -50,11 +50,11 @@ HOUSE: dict[str, Any] = {
         ({"household": None, "expect": [{"metric": "household.sold_energy", "below": 1.0}]}, "expect.0.metric: is "),
     ],
 )  # fmt: skip
-def test_a_mistake_about_the_house_is_named(changes: dict[str, Any], said: str) -> None:
+def test_a_mistake_about_the_house_is_named(changes: dict[str, Any], message: str) -> None:
     """With its path, what was found and what there is."""
     with pytest.raises(ScenarioError) as caught:
         checked(changed(HOUSE, **changes), "file")
-    assert [line for line in caught.value.mistakes if line.startswith(said)], caught.value.mistakes
+    assert [line for line in caught.value.mistakes if line.startswith(message)], caught.value.mistakes
 
 
 def test_without_the_solver_one_line_says_what_to_install(
@@ -76,7 +76,7 @@ def test_without_the_solver_one_line_says_what_to_install(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("raise ImportError('libosqp.so: cannot open')", "importing osqp raised ImportError: libosqp.so: cannot open"),
         ("raise OSError('wrong ELF class')", "importing osqp raised OSError: wrong ELF class"),
@@ -89,7 +89,7 @@ def test_without_the_solver_one_line_says_what_to_install(
     ],
 )
 def test_a_broken_solver_is_told_in_one_line(
-    text: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It is there and cannot be used: why, and what to do; status 2."""
     (tmp_path / "osqp.py").write_text(text)
@@ -100,7 +100,7 @@ def test_a_broken_solver_is_told_in_one_line(
     finally:
         sys.modules.pop("osqp", None)  # the broken one, which other tests must not find
     told = capsys.readouterr().err
-    assert f"controller.strategy: is mpc, whose solver is broken ({said}" in told
+    assert f"controller.strategy: is mpc, whose solver is broken ({message}" in told
     assert "expected pip install --force-reinstall osqp first, or the strategy lqr" in told
     assert "Traceback" not in told
 
@@ -126,14 +126,14 @@ def test_the_metrics_are_those_of_the_tables(tmp_path: Path) -> None:
         u = np.array(results.inputs["u"].to_pylist()).reshape(SLOTS, 3, 2)
         power[acts_on] = u[:, :, 1]
     meter = Meter.over(power["estimate"], power["truth"])
-    found = made["estimate"].summary["household"]
-    assert found["bought_energy"] == pytest.approx(energy(meter.bought, 1.0).mean())
-    assert found["sold_energy"] == pytest.approx(energy(meter.sold, 1.0).mean())
-    assert found["knowing_truth"]["bought_energy"] == pytest.approx(energy(meter.other_bought, 1.0).mean())
+    household = made["estimate"].summary["household"]
+    assert household["bought_energy"] == pytest.approx(energy(meter.bought, 1.0).mean())
+    assert household["sold_energy"] == pytest.approx(energy(meter.sold, 1.0).mean())
+    assert household["knowing_truth"]["bought_energy"] == pytest.approx(energy(meter.other_bought, 1.0).mean())
     for name in ("net", "total", "summed"):
-        assert found[f"{name}_difference"] == pytest.approx(getattr(meter.difference, name).mean(), rel=1e-9)
+        assert household[f"{name}_difference"] == pytest.approx(getattr(meter.difference, name).mean(), rel=1e-9)
         assert made["truth"].summary["household"][f"{name}_difference"] == 0.0
-    assert found["summed_difference"] > 1e-4
+    assert household["summed_difference"] > 1e-4
 
 
 @pytest.mark.long
@@ -154,10 +154,10 @@ def test_active_windows_are_the_days(tmp_path: Path) -> None:
 def test_blocks_and_workers_change_nothing(tmp_path: Path) -> None:
     """The same metrics from one process and from two."""
     options: dict[str, Any] = {"trials": 501, "slots": 130, "eavesdroppers__bayesian__strategy": "smart"}
-    one = montecarlo("microgrid", out=tmp_path / "one", plan=Plan(workers=1), **options)
+    single = montecarlo("microgrid", out=tmp_path / "one", plan=Plan(workers=1), **options)
     two = montecarlo("microgrid", out=tmp_path / "two", plan=Plan(workers=2), **options)
-    assert one.summary["household"] == two.summary["household"]
-    assert one.summary["household"]["windows"] == 2
+    assert single.summary["household"] == two.summary["household"]
+    assert single.summary["household"]["windows"] == 2
     first, rest = (
         montecarlo(
             "microgrid",
@@ -169,7 +169,7 @@ def test_blocks_and_workers_change_nothing(tmp_path: Path) -> None:
     )
     for name in ("bought_energy", "sold_energy", "net_difference", "summed_difference"):
         mean = (400 * first[name] + 101 * rest[name]) / 501
-        assert one.summary["household"][name] == pytest.approx(mean, rel=1e-9)
+        assert single.summary["household"][name] == pytest.approx(mean, rel=1e-9)
 
 
 def test_expectations_of_a_house_are_judged(tmp_path: Path) -> None:
@@ -180,7 +180,7 @@ def test_expectations_of_a_house_are_judged(tmp_path: Path) -> None:
         {"metric": "household.naive.activity_area", "below": 0.9},
     ]
     results = montecarlo("microgrid", trials=1, slots=200, out=tmp_path / "x", expect=expect)
-    assert [one["held"] for one in results.summary["expectations"]] == [True, False, None]
+    assert [expectation["held"] for expectation in results.summary["expectations"]] == [True, False, None]
 
 
 @pytest.mark.long

@@ -50,9 +50,9 @@ def test_the_other_loop_is_the_one_that_sees_the_truth() -> None:
     x, u = loop(noise, 10.0 * seen, d)
     _, wanted = loop(noise, 0.0 * seen, d)
     other = PerfectLoop(GIVEN.process, PLANT, CONTROLLERS["lqr"](GIVEN, 3), PERIOD, d)
-    found = np.array([other.follow(state, inputs) for state, inputs in zip(x, u, strict=True)])
+    inputs_ = np.array([other.follow(state, inputs) for state, inputs in zip(x, u, strict=True)])
     assert np.abs(u - wanted).max() > 0.1
-    assert np.allclose(found, wanted, atol=1e-10)
+    assert np.allclose(inputs_, wanted, atol=1e-10)
 
 
 def test_a_loop_that_sees_the_truth_is_its_own_other() -> None:
@@ -74,9 +74,9 @@ def test_who_knows_the_level_knows_the_load(sun: int | None) -> None:
     nothing = np.zeros((SLOTS, 2, 2))
     x, _ = loop(nothing, nothing, d)
     guess = LoadGuess(GIVEN, CONTROLLERS["lqr"](GIVEN, 2), HousePlaces(0, 1, sun), d[:, 0])
-    found = [guess.take(k, x[k]) for k in range(0, SLOTS, PERIOD)]
-    assert found[0] is None
-    for period, load in enumerate(found[1:]):
+    loads = [guess.take(k, x[k]) for k in range(0, SLOTS, PERIOD)]
+    assert loads[0] is None
+    for period, load in enumerate(loads[1:]):
         assert load is not None
         assert np.allclose(load, d[period * PERIOD, 1], atol=1e-9)
 
@@ -93,8 +93,8 @@ def test_what_is_not_known_is_taken_for_load() -> None:
             u = PLANT.limited(controller.decide(k, x[k], d[k]))
         x[k + 1] = x[k] + B @ u + (B_D @ d[k])[:, None] + nothing[k]
     blind = LoadGuess(straight, CONTROLLERS["lqr"](straight, 1), HousePlaces(0, 1, None), d[:, 0])
-    found = [blind.take(k, x[k]) for k in range(0, SLOTS, PERIOD)]
-    for load in found[1:]:
+    loads = [blind.take(k, x[k]) for k in range(0, SLOTS, PERIOD)]
+    for load in loads[1:]:
         assert load is not None
         assert np.allclose(load, -1.0)
     off = LoadGuess(straight, CONTROLLERS["lqr"](straight, 1), HousePlaces(0, 1, 0), d[:, 0])

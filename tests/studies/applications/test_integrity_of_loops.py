@@ -28,7 +28,7 @@ ATTACK = {"model": "replace", "matrix": [[0.8]]}
 def test_its_metrics_are_those_of_the_recorded_trials(tmp_path: Path) -> None:
     """Alarms, delays, and the watermark's cost, from the tables of forty trials, slot by slot."""
     results = montecarlo("replay-attack", trials=40, record_trials=40, out=tmp_path / "run", **SHORT)
-    found, table = results.summary["integrity"], results.inputs
+    integrity, table = results.summary["integrity"], results.inputs
     assert table is not None
     by_trial = {
         name: np.array(table[name].to_pylist(), float).reshape(260, 40) for name in ("u", "watermark", "statistic")
@@ -37,21 +37,21 @@ def test_its_metrics_are_those_of_the_recorded_trials(tmp_path: Path) -> None:
     alarms = by_trial["statistic"] >= 8.0
     first = np.where(alarms.any(axis=0), alarms.argmax(axis=0), -1)
     sound = first[(first < 0) | (first >= 160)]
-    assert found["false_alarm_fraction"] == np.mean((first >= 0) & (first < 160))
-    assert found["detected_fraction"] == np.mean(sound >= 0)
-    assert found["mean_delay"] == pytest.approx(np.mean(sound[sound >= 0] - 159))
-    assert found["watermark_fraction"] == pytest.approx(np.mean(by_trial["watermark"] != 0.0))
-    assert found["standard_errors"]["mean_delay"] == pytest.approx(
+    assert integrity["false_alarm_fraction"] == np.mean((first >= 0) & (first < 160))
+    assert integrity["detected_fraction"] == np.mean(sound >= 0)
+    assert integrity["mean_delay"] == pytest.approx(np.mean(sound[sound >= 0] - 159))
+    assert integrity["watermark_fraction"] == pytest.approx(np.mean(by_trial["watermark"] != 0.0))
+    assert integrity["standard_errors"]["mean_delay"] == pytest.approx(
         np.std(sound[sound >= 0], ddof=1) / np.sqrt(len(sound))
     )
     # x is the filter's estimate here, whose error is independent of the watermark.
     e, L, M = by_trial["watermark"][:160], 0.962578, 1.201071
     cost = (M * e * (2.0 * (by_trial["u"] + L * x)[:160] + e)).mean(axis=0)
-    assert found["watermark_cost"] == pytest.approx(cost.mean(), abs=4.0 * cost.std() / np.sqrt(40))
-    assert found["expected_watermark_cost"] == pytest.approx(0.3 * M, rel=1e-2)
-    assert abs(found["watermark_cost_z"]) < 4.0
-    assert found["divergence"] == pytest.approx(0.74, rel=1e-2)
-    assert found["expected_delay"] == pytest.approx(8.0 / found["divergence"])
+    assert integrity["watermark_cost"] == pytest.approx(cost.mean(), abs=4.0 * cost.std() / np.sqrt(40))
+    assert integrity["expected_watermark_cost"] == pytest.approx(0.3 * M, rel=1e-2)
+    assert abs(integrity["watermark_cost_z"]) < 4.0
+    assert integrity["divergence"] == pytest.approx(0.74, rel=1e-2)
+    assert integrity["expected_delay"] == pytest.approx(8.0 / integrity["divergence"])
 
 
 @pytest.mark.long
@@ -84,7 +84,7 @@ def test_live_and_memory_have_the_same_digest(policy: str, tmp_path: Path) -> No
     assert live["integrity"] == memory["integrity"]
     assert live["controller"]["digest"] == memory["controller"]["digest"]
     assert memory["integrity"]["expected_watermark_cost"] is None
-    assert [(one["slot"], one["event"]) for one in live["events"]] == [
+    assert [(event["slot"], event["event"]) for event in live["events"]] == [
         (20, "measurements are attacked"),
         (40, "measurements are no longer attacked"),
     ]
@@ -116,7 +116,7 @@ def test_the_view_is_given_every_curve_of_its_panels() -> None:
     assert parts is not None
     at_once = whole.take(u, estimates, monitored).curves
     blocks = [
-        parts.take(u[some], {name: one[some] for name, one in estimates.items()}, monitored.rows(some)).curves
+        parts.take(u[some], {name: estimate[some] for name, estimate in estimates.items()}, monitored.rows(some)).curves
         for some in (slice(0, 3), slice(3, 6))
     ]
     panels = driven_scene(scenario)["panels"]
@@ -145,17 +145,17 @@ def test_an_attack_without_events_lasts_all_run() -> None:
 
 def test_the_closing_report_has_its_lines() -> None:
     """With bound, delay and theory where there are any."""
-    known = {
+    entries = {
         "false_alarm_fraction": 0.01, "false_alarm_bound": 0.05, "detected_fraction": 1.0, "mean_delay": 12.0,
         "expected_delay": 11.5, "watermark_cost": 0.36, "expected_watermark_cost": 0.35, "watermark_cost_z": 1.5,
         "watermark_fraction": 0.5, "standard_errors": {"mean_delay": 0.5},
     }  # fmt: skip
-    assert Integrity.lines(known) == [
+    assert Integrity.lines(entries) == [
         "false alarms in 0.01 of the trials, by theory at most 0.05",
         "the attack is detected in 1 of the other trials, after 12.0 ± 0.5 slots; h/D is 11.5",
         "the watermark costs 0.36 a slot before the attack, by theory 0.35 (z 1.5); it is on in 0.5 of all slots",
     ]
-    bare = {**dict.fromkeys(known), "false_alarm_fraction": 0.0, "detected_fraction": 0.0, "watermark_cost": 0.1}
+    bare = {**dict.fromkeys(entries), "false_alarm_fraction": 0.0, "detected_fraction": 0.0, "watermark_cost": 0.1}
     bare |= {"standard_errors": {}, "watermark_fraction": 1.0}
     assert Integrity.lines(bare) == [
         "false alarms in 0 of the trials",
@@ -169,7 +169,7 @@ BASE = {"policy": "always", "threshold": 8.0, "watermark": [[0.3]]}
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"integrity.threshold": -1.0}, "integrity.threshold: is -1.0; expected a number above 0"),
         ({"integrity.threshold": "high"}, 'integrity.threshold: is "high"; expected a number, such as threshold = 8.0'),
@@ -199,11 +199,11 @@ BASE = {"policy": "always", "threshold": 8.0, "watermark": [[0.3]]}
         ({"event": [{"at": 150, "spoof": "measurements"}, {"at": 170, "spoof": "measurements"}]}, "event.1.spoof: begins in"),
     ],
 )  # fmt: skip
-def test_mistakes_are_named(changes: dict[str, Any], said: str) -> None:
+def test_mistakes_are_named(changes: dict[str, Any], message: str) -> None:
     """Mistakes in the table, and in its use with plant, controller and events, say what is expected."""
     with pytest.raises(ScenarioError) as caught:
         load("replay-attack", {"expect": [], **changes})
-    assert any(line.startswith(said) for line in caught.value.mistakes), caught.value.mistakes
+    assert any(line.startswith(message) for line in caught.value.mistakes), caught.value.mistakes
 
 
 UNSEEN: dict[str, Any] = {
@@ -246,10 +246,10 @@ def test_what_integrity_needs_is_named() -> None:
             "plant.output_matrix: shows only 1 of 2 directions",
         ),
     ]
-    for name, changes, said in cases:
+    for name, changes, message in cases:
         with pytest.raises(ScenarioError) as caught:
             load(name, changes)
-        assert any(line.startswith(said) for line in caught.value.mistakes), caught.value.mistakes
+        assert any(line.startswith(message) for line in caught.value.mistakes), caught.value.mistakes
 
 
 def test_a_distribution_that_does_not_exist_is_refused() -> None:

@@ -45,10 +45,10 @@ def test_secrecy_costs_little_energy(name: str, tmp_path: Path) -> None:
     if name == "microgrid-mpc":
         pytest.importorskip("osqp", reason="model predictive control needs the extra `microgrid`")
     scenario = part_of_day(name, 40_800, 2400, **NO_PACKETS)
-    found = energies(montecarlo(scenario, trials=1, out=tmp_path / "x", plan=Plan(workers=1)))
-    assert found["net"] < PAPER
-    assert found["total"] < PAPER
-    assert found["summed"] > max(found["net"], found["total"])
+    result = energies(montecarlo(scenario, trials=1, out=tmp_path / "x", plan=Plan(workers=1)))
+    assert result["net"] < PAPER
+    assert result["total"] < PAPER
+    assert result["summed"] > max(result["net"], result["total"])
 
 
 @pytest.mark.long
@@ -60,8 +60,8 @@ def test_what_is_summed_slot_by_slot_depends_on_the_weights(tmp_path: Path) -> N
         "controller__period": 5,
     }
     scenario = part_of_day("microgrid", 40_800, 2400, **NO_PACKETS, **eager)
-    found = energies(montecarlo(scenario, trials=1, out=tmp_path / "x", plan=Plan(workers=1)))
-    assert found["net"] < PAPER < found["summed"]
+    result = energies(montecarlo(scenario, trials=1, out=tmp_path / "x", plan=Plan(workers=1)))
+    assert result["net"] < PAPER < result["summed"]
 
 
 def test_covariances_are_those_of_the_table(tmp_path: Path) -> None:
@@ -94,7 +94,9 @@ def test_a_day_costs_little_energy(name: str, tmp_path: Path) -> None:
     if name == "microgrid-mpc":
         pytest.importorskip("osqp", reason="model predictive control needs the extra `microgrid`")
     results = montecarlo(name, trials=2, out=tmp_path / "x", plan=Plan(workers=1))
-    found = energies(results)
-    assert found["net"] < PAPER
-    assert found["total"] < PAPER
-    assert [one["held"] for one in results.summary["expectations"]] == [True] * len(results.summary["expectations"])
+    result = energies(results)
+    assert result["net"] < PAPER
+    assert result["total"] < PAPER
+    assert [verdict["held"] for verdict in results.summary["expectations"]] == [True] * len(
+        results.summary["expectations"]
+    )

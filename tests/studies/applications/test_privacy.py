@@ -36,11 +36,11 @@ def test_area_by_hand(score: list[float], truth: list[int], expected: float) -> 
 @given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), min_size=2, max_size=30))
 def test_area_is_the_chance_to_be_right_about_a_pair(windows: list[tuple[int, bool]]) -> None:
     """Over all pairs of an active and a quiet window, ties counted half."""
-    score = np.array([one for one, _ in windows], np.float64)
-    truth = np.array([one for _, one in windows])
+    score = np.array([score_ for score_, _ in windows], np.float64)
+    truth = np.array([pair for _, pair in windows])
     pairs = [(a > b) + 0.5 * (a == b) for a in score[truth] for b in score[~truth]]
-    found = area(score, truth)
-    assert np.isclose(found, np.mean(pairs)) if pairs else np.isnan(found)
+    result = area(score, truth)
+    assert np.isclose(result, np.mean(pairs)) if pairs else np.isnan(result)
 
 
 def test_detection_at_a_rate_of_false_alarms() -> None:

@@ -34,10 +34,10 @@ def studies(scenario: str, tmp_path: Path, **changes: Any) -> tuple[Mapping[str,
     return together, alone
 
 
-def leaves(found: Mapping[str, Any], place: tuple[str, ...] = ()) -> dict[tuple[str, ...], Any]:
+def leaves(entries: Mapping[str, Any], place: tuple[str, ...] = ()) -> dict[tuple[str, ...], Any]:
     """Place → value, for all values of nested entries."""
     whole: dict[tuple[str, ...], Any] = {}
-    for name, value in found.items():
+    for name, value in entries.items():
         whole |= leaves(value, (*place, name)) if isinstance(value, Mapping) else {(*place, name): value}
     return whole
 
@@ -45,12 +45,14 @@ def leaves(found: Mapping[str, Any], place: tuple[str, ...] = ()) -> dict[tuple[
 def check(together: Mapping[str, Any], alone: list[Mapping[str, Any]], ignored: tuple[str, ...] = ()) -> None:
     """Each standard error is that of the values of the single trials; every metric that differs has one."""
     errors = leaves(together[STANDARD_ERRORS])
-    singles = [leaves({name: value for name, value in one.items() if name != STANDARD_ERRORS}) for one in alone]
-    differ = {place for place in singles[0] if len({one[place] for one in singles}) > 1 and place[0] not in ignored}
+    singles = [leaves({name: value for name, value in entries.items() if name != STANDARD_ERRORS}) for entries in alone]
+    differ = {
+        place for place in singles[0] if len({single[place] for single in singles}) > 1 and place[0] not in ignored
+    }
     assert differ
     assert differ <= set(errors)
     for place, error in errors.items():
-        values = np.array([one[place] for one in singles], dtype=object)
+        values = np.array([single[place] for single in singles], dtype=object)
         if any(value is None for value in values):
             assert error is None
             continue
@@ -66,9 +68,9 @@ def test_applications_have_the_standard_errors_of_single_trials(
 ) -> None:
     """And so do their closed loops; an error that is not the model's has no z."""
     together, alone = studies(scenario, tmp_path, slots=600)
-    check(together[application], [one[application] for one in alone], ("windows", "active_windows"))
+    check(together[application], [entries[application] for entries in alone], ("windows", "active_windows"))
     timed = ("mean_solve_seconds", "longest_solve_seconds", "digest")
-    check(together["controller"], [one["controller"] for one in alone], timed)
+    check(together["controller"], [entry["controller"] for entry in alone], timed)
     assert all(set(peer["z"].values()) == {None} and peer["rare_events"] is None for peer in together["peers"].values())
     assert leaves(alone[0][application][STANDARD_ERRORS])
     assert {*leaves(alone[0][application][STANDARD_ERRORS]).values()} == {None}
@@ -97,8 +99,8 @@ def test_a_sweep_has_the_standard_errors_of_an_application(tmp_path: Path) -> No
     summary = montecarlo("heated-room", **changes, seed=1, out=tmp_path / "alone", plan=ALONE).summary["comfort"]
     for row in table.to_pylist():
         assert row["heating_energy_standard_error"] == summary[STANDARD_ERRORS]["heating_energy"]
-        known = summary[STANDARD_ERRORS]["receivers"][row["peer"]]["known_fraction"]
-        assert row["known_fraction_standard_error"] == known
+        error = summary[STANDARD_ERRORS]["receivers"][row["peer"]]["known_fraction"]
+        assert row["known_fraction_standard_error"] == error
 
 
 def test_an_application_without_trials_has_no_standard_errors() -> None:

@@ -21,7 +21,7 @@ def published_filter(
     """
     A, Q, H = process.A, process.Q, process.A - L
     P = S = Z = np.zeros_like(Q)
-    found = [P]
+    covariances = [P]
     for k in range(1, len(plain)):
         xx, xz, zz = A @ P @ A.T + Q, A @ P @ H.T + Q, H @ P @ H.T + Q
         if not acks[k - 1] and k > 1:
@@ -34,8 +34,8 @@ def published_filter(
             P, S, Z = none, none, zz - xz.T @ np.linalg.solve(xx, xz)
         else:
             P, S, Z = xx - xz @ np.linalg.solve(zz, xz.T), none, none
-        found.append(P)
-    return np.array(found)
+        covariances.append(P)
+    return np.array(covariances)
 
 
 @pytest.mark.parametrize(("process", "open_loop"), [(STABLE, False), (UNSTABLE, True)])

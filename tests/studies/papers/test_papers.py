@@ -20,11 +20,11 @@ from tests.examples import mostly_long
 DOCS = Path(__file__).parents[3] / "docs"
 
 
-def judged(found: Reproduction) -> None:
+def judged(reproduction: Reproduction) -> None:
     """No number differs without an explanation, and each explanation is a sentence."""
-    assert found.rows
-    assert found.differing == ()
-    for row in found.rows:
+    assert reproduction.rows
+    assert reproduction.differing == ()
+    for row in reproduction.rows:
         assert row.where, row
         assert row.what, row
         assert row.verdict is not NumberVerdict.AGREES or row.printed, row
@@ -119,14 +119,14 @@ def test_a_paper_is_printed_and_written(evedrop: Evedrop, tmp_path: Path) -> Non
     assert "numerical illustration" in done.err
     assert "1.3878 exact" in done.out
     assert "erratum [1]" in done.out
-    said = "12 published numbers were compared."
-    assert f"agrees: 5, erratum: 7, not comparable: 2. {said}" in done.out
+    message = "12 published numbers were compared."
+    assert f"agrees: 5, erratum: 7, not comparable: 2. {message}" in done.out
     written = json.loads((folder / "kennedy2022.json").read_text(encoding="utf-8"))
     assert len(written["rows"]) == 14
     assert written["counts"] == {"agrees": 5, "erratum": 7, "not comparable": 2}
     markdown = (folder / "kennedy2022.md").read_text(encoding="utf-8")
     assert written["printed_compared"] == 12
-    assert said in markdown
+    assert message in markdown
     assert markdown.count("\n| numerical illustration | ") == 10
     assert json.loads(evedrop("paper", "kennedy2022", "--json").out) == written
 

@@ -102,7 +102,7 @@ def _ask(run: Path, request: OperatorRequest, subject: str, patience: float = _P
     return 0
 
 
-def _answer(run: Path, control: Control, request: OperatorRequest, what: str, patience: float) -> Answer:
+def _answer(run: Path, control: Control, request: OperatorRequest, subject: str, patience: float) -> Answer:
     """The answer of the recorder of a run or a shard. Raises UsageError if it does not answer, or refuses."""
     import zenoh
 
@@ -129,12 +129,14 @@ def _answer(run: Path, control: Control, request: OperatorRequest, what: str, pa
             run, f"no router answers at {control.router}: it was killed, or it lost its router and is restarting it"
         ) from error
     if answer is None and time.monotonic() - began >= patience:
-        raise UsageError(f"{what}: no answer from the run in {run}; look at its logs, or end it")
+        raise UsageError(f"{subject}: no answer from the run in {run}; look at its logs, or end it")
     if answer is None:
         raise no_run(run, "it ended before it answered, or its router did, which is then restarted")
     if answer.refused:
         count = "1 mistake" if len(answer.refused) == 1 else f"{len(answer.refused)} mistakes"
-        raise UsageError("\n".join([f"{what}: {count}, nothing was changed", *(f"  {one}" for one in answer.refused)]))
+        raise UsageError(
+            "\n".join([f"{subject}: {count}, nothing was changed", *(f"  {line}" for line in answer.refused)])
+        )
     return answer
 
 

@@ -188,8 +188,8 @@ def _events(summaries: Mapping[int, Summary]) -> list[RunEvent]:
 
 def _outages(summaries: Mapping[int, Summary]) -> list[ConnectionOutage]:
     """The outages of all shards, each with its shard, in order of slots."""
-    found = [replace(outage, shard=shard) for shard, summary in summaries.items() for outage in summary.outages]
-    return sorted(found, key=lambda outage: outage.slot)
+    outages = [replace(outage, shard=shard) for shard, summary in summaries.items() for outage in summary.outages]
+    return sorted(outages, key=lambda outage: outage.slot)
 
 
 def _misdelivered(summaries: Mapping[int, Summary]) -> dict[str, int]:

@@ -184,15 +184,15 @@ def launch_shards(
 
 def _endpoints(shards: int) -> list[RouterEndpoints | None]:
     """The endpoints of two routers for each shard; free ports may coincide as long as no router listens on them."""
-    found: list[RouterEndpoints | None] = []
+    every_end: list[RouterEndpoints | None] = []
     taken = set[str]()
-    while len(found) < shards:
+    while len(every_end) < shards:
         endpoints = loopback_endpoints(None, None, relayed=True)
-        ports = {str(one.listen) for one in (endpoints.router, endpoints.relay) if one is not None}
+        ports = {str(endpoint.listen) for endpoint in (endpoints.router, endpoints.relay) if endpoint is not None}
         if not ports & taken:
-            found.append(endpoints)
+            every_end.append(endpoints)
             taken |= ports
-    return found
+    return every_end
 
 
 def _made_one(

@@ -666,6 +666,6 @@ def brief_from(entries: Any) -> AnyBrief:
         raise ValueError(f"model.state_probability is {model.state_probability}, expected a number from 0 to 1")
     if model.state_probabilities is not None:
         wrong_number = len(model.state_probabilities) != brief.slots
-        if wrong_number or not all(0.0 <= one <= 1.0 for one in model.state_probabilities):
+        if wrong_number or not all(0.0 <= probability <= 1.0 for probability in model.state_probabilities):
             raise ValueError(f"model.state_probabilities are not {brief.slots} numbers from 0 to 1, one for each slot")
     return brief

@@ -86,11 +86,11 @@ _KINDS: Mapping[str, type[ProgressEvent]] = {
 def read_event(line: bytes) -> ProgressEvent:
     """Read a line of the recorder or a router. Raises ValueError if it is malformed."""
     try:
-        found = json.loads(line)
+        entries = json.loads(line)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
-    if not isinstance(found, dict) or not isinstance(event := found.pop("event", None), str) or event not in _KINDS:
+    if not isinstance(entries, dict) or not isinstance(event := entries.pop("event", None), str) or event not in _KINDS:
         raise ValueError(f"it is not an object with an event of {', '.join(_KINDS)}")
     kind = _KINDS[event]
-    expect(table_of(kind), "", found)
-    return read(kind, found)
+    expect(table_of(kind), "", entries)
+    return read(kind, entries)

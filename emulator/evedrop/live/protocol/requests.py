@@ -192,8 +192,8 @@ class WireLinkStatus:
         return f"{self.delivered} of {self.heard} messages delivered, {fraction}" + (", cut" if self.cut else "")
 
 
-def _wire_links(found: Mapping[str, Any]) -> dict[str, WireLinkStatus]:
-    return {name: read(WireLinkStatus, one) for name, one in found.items()}
+def _wire_links(entries: Mapping[str, Any]) -> dict[str, WireLinkStatus]:
+    return {name: read(WireLinkStatus, entry) for name, entry in entries.items()}
 
 
 @dataclass(frozen=True)

@@ -355,20 +355,20 @@ class RecordedRun:
 
     def _is_due(self, source: str, message: Reader) -> bool:
         """Whether a message is the next one from its source; after losses, earlier and later ones arrive, too."""
-        found = message.integer("k")
+        slot = message.integer("k")
         if source not in (ROUTER, SENSOR) and is_leaving(message):  # comes before the reports of the slots before it
-            return not self._steering.has_left(source, found)
+            return not self._steering.has_left(source, slot)
         joiner = self._joiner
         due = {ROUTER: joiner.journaled, SENSOR: joiner.sent}.get(source)
         due = joiner.reported(source) if due is None else due
-        if found != due:
-            self._due[source].missed(due, found)
-        return found == due
+        if slot != due:
+            self._due[source].missed(due, slot)
+        return slot == due
 
     def _leave(self, name: str, message: Reader) -> None:
         """Report on behalf of a receiver until it is back."""
         k, left = read_leaving(message, self._extent)
-        away = next((one for one in self._scenario.timeline.outages[name] if one.start == k), None)
+        away = next((outage for outage in self._scenario.timeline.outages[name] if outage.start == k), None)
         if away is None:
             raise message.malformed(
                 f"a leave before slot {k}", "a leave at a slot where an event makes the receiver leave"
@@ -389,7 +389,7 @@ class RecordedRun:
         before, done = self._recent
         rate = (self._joiner.done - done) / (now - before)
         self._told, self._recent = now, (now, self._joiner.done)
-        errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
+        errors = {name: float(score.squared_error.mean()) for name, score in scored.items()}
         emit(RunProgress(self._joiner.done, rate, "slots/s", errors))
 
     @property

@@ -155,12 +155,12 @@ def _state_probability(mu_d: Floats, ratio: Floats, gamma: Flags) -> Floats:
 def _carried(A: Floats, P: Factors) -> list[list[Entry]]:
     """A U as rows of entries, from the factors U D Uᵀ of many matrices; A (n, n, R)."""
     n, U = len(A), P.unit()
-    found: list[list[Entry]] = [[A[i, j] for j in range(n)] for i in range(n)]  # U's diagonal is 1
-    for i, row in enumerate(found):
+    product: list[list[Entry]] = [[A[i, j] for j in range(n)] for i in range(n)]  # U's diagonal is 1
+    for i, row in enumerate(product):
         for j in range(n):
             for c in range(j + 1, n):
                 row[j] = row[j] + A[i, c] * U[c][j]
-    return found
+    return product
 
 
 def _parts(joint: Factors) -> tuple[Factors, list[list[Floats]], Factors]:
@@ -178,18 +178,18 @@ def _parts(joint: Factors) -> tuple[Factors, list[list[Floats]], Factors]:
 
 def _whitened(P: Factors, z: Floats) -> Floats:
     """U⁻¹ z, (n, …)."""
-    found: list[Floats] = []
+    whitened: list[Floats] = []
     for row, value in zip(P.unit(), z, strict=True):
         rest = value
-        for factor, earlier in zip(row, found, strict=False):
+        for factor, earlier in zip(row, whitened, strict=False):
             rest = rest - factor * earlier
-        found.append(rest)
-    return np.stack(found)
+        whitened.append(rest)
+    return np.stack(whitened)
 
 
 def _beside(left: list[list[Entry]], right: list[list[Entry]]) -> list[list[Entry]]:
     """The rows of [left right]."""
-    return [[*one, *other] for one, other in zip(left, right, strict=True)]
+    return [[*row, *other] for row, other in zip(left, right, strict=True)]
 
 
 def _zero(n: int) -> list[list[Entry]]:
@@ -204,21 +204,21 @@ def _over(values: Floats, weight: Floats) -> Floats:
 
 def _times(A: Floats, x: Floats) -> Floats:
     """A x of the components of every trial: A (n, n, R), x (n, C, R)."""
-    found: Floats = A[:, 0, None, :] * x[0]
+    product: Floats = A[:, 0, None, :] * x[0]
     for j in range(1, len(x)):
-        found = found + A[:, j, None, :] * x[j]
-    return found
+        product = product + A[:, j, None, :] * x[j]
+    return product
 
 
 def _entries(M: list[list[Floats]], x: Floats) -> Floats:
     """M x, from the entries of M, each of the shape that x has after its first axis."""
-    found = []
+    totals = []
     for row in M:
         total = row[0] * x[0]
         for entry, value in zip(row[1:], x[1:], strict=True):
             total = total + entry * value
-        found.append(total)
-    return np.stack(found)
+        totals.append(total)
+    return np.stack(totals)
 
 
 KNOWABLE = ("A", "Q", "mu_d", "initial_covariance")
@@ -339,17 +339,17 @@ class Advanced(NamedTuple):
     """The transition to the slot; of no component in slot 0."""
 
 
-def unheard(known: Known, scale: Floats) -> LearnerPosterior:
+def unheard(given: Known, scale: Floats) -> LearnerPosterior:
     """The posterior before the first packet; scale: a variance, (R,), for want of Σ0."""
-    n, trials = len(known.A), len(scale)
-    sigma = Factors(*(np.repeat(part, trials, axis=-1) for part in known.initial))
-    if "initial_covariance" not in known.names:
+    n, trials = len(given.A), len(scale)
+    sigma = Factors(*(np.repeat(part, trials, axis=-1) for part in given.initial))
+    if "initial_covariance" not in given.names:
         sigma = Factors(np.zeros_like(sigma.lower), np.repeat(scale[None], n, axis=0))
     mixture = Mixture(np.ones((1, trials)), np.zeros((n, 1, trials)), *(part[:, None, :].copy() for part in sigma))
     return LearnerPosterior(*mixture, *sigma, np.zeros(trials))
 
 
-def advanced(k: int, known: Known, theta: Parameters, posterior: LearnerPosterior, gamma: Flags, z: Floats) -> Advanced:
+def advanced(k: int, given: Known, theta: Parameters, posterior: LearnerPosterior, gamma: Flags, z: Floats) -> Advanced:
     """The posterior after slot k; gamma (R,); z (n, R), 0 where nothing was received."""
     mixture, sigma, packets = posterior.mixture, posterior.sigma, posterior.packets
     evidence, last = np.zeros(len(gamma)), nothing(*z.shape)
@@ -357,7 +357,7 @@ def advanced(k: int, known: Known, theta: Parameters, posterior: LearnerPosterio
         mixture, sigma, evidence, state, last = weighed(theta, sigma, mixture, gamma, z, CAPACITY)
     else:
         mixture, state = begun(mixture, gamma, z, CAPACITY)
-    if not known.sigma:
+    if not given.sigma:
         sigma = _corrected(sigma, packets, gamma, z)
     return Advanced(LearnerPosterior(*mixture, *sigma, packets + gamma), state, evidence, last)
 
@@ -558,10 +558,10 @@ def outer(M: Floats, N: Floats) -> Floats:
 
 def applied(M: Floats, x: Floats) -> Floats:
     """M x of every trial, (n, R)."""
-    found: Floats = M[:, 0] * x[0]
+    product: Floats = M[:, 0] * x[0]
     for j in range(1, len(x)):
-        found = found + M[:, j] * x[j]
-    return found
+        product = product + M[:, j] * x[j]
+    return product
 
 
 class Learner(PacketReader):

@@ -47,24 +47,24 @@ class Learned(NamedTuple):
     """(R,)."""
 
 
-def climbed(known: Known, first: int, gamma: Flags, z: Floats, so_far: Parameters | None) -> Learned:
+def climbed(given: Known, first: int, gamma: Flags, z: Floats, so_far: Parameters | None) -> Learned:
     """The most likely parameters for slots from `first` on, gamma (c, R) and z (c, n, R), 0 where nothing was received.
 
     so_far: the parameters that were found from fewer slots, which are one more start.
     """
     scale = scale_of(gamma, z)
     # The regression that takes every packet for the state: its A has the right direction, and is too small.
-    start = known.start(scale)
+    start = given.start(scale)
     every = start._replace(mu_d=np.ones_like(scale))
-    _, moments, _ = _passed(known, every, first, gamma, z, scale)
-    regression = moments.most_likely(every, scale, known.names)[1]._replace(mu_d=start.mu_d)
-    starts = [regression, *(known.start(fraction * scale) for fraction in NARROW), *([so_far] if so_far else [])]
+    _, moments, _ = _passed(given, every, first, gamma, z, scale)
+    regression = moments.most_likely(every, scale, given.names)[1]._replace(mu_d=start.mu_d)
+    starts = [regression, *(given.start(fraction * scale) for fraction in NARROW), *([so_far] if so_far else [])]
     several, trials = len(starts), len(scale)
     theta = Parameters(*(np.concatenate(parts, axis=-1) for parts in zip(*starts, strict=True)))
     gamma, z, scales = (np.concatenate([part] * several, axis=-1) for part in (gamma, z, scale))
     for _ in range(PASSES):
-        posterior, moments, evidence = _passed(known, theta, first, gamma, z, scales)
-        moments, theta = moments.most_likely(theta, scales, known.names)
+        posterior, moments, evidence = _passed(given, theta, first, gamma, z, scales)
+        moments, theta = moments.most_likely(theta, scales, given.names)
     best = np.argmax(evidence.reshape(several, trials), axis=0) * trials + np.arange(trials)
     return Learned(
         LearnerPosterior(*(part[..., best] for part in posterior)),
@@ -75,13 +75,13 @@ def climbed(known: Known, first: int, gamma: Flags, z: Floats, so_far: Parameter
 
 
 def _passed(
-    known: Known, theta: Parameters, first: int, gamma: Flags, z: Floats, scale: Floats
+    given: Known, theta: Parameters, first: int, gamma: Flags, z: Floats, scale: Floats
 ) -> tuple[LearnerPosterior, Moments, Floats]:
     """The posterior after the slots from `first` on, the moments of their transitions, and the logarithm of their density."""
-    posterior, moments = unheard(known, scale), Moments.imagined(theta.A, scale)
+    posterior, moments = unheard(given, scale), Moments.imagined(theta.A, scale)
     evidence = np.zeros(len(scale))
     for k, (heard, packet) in enumerate(zip(gamma, z, strict=True), first):
-        posterior, _, density, last = advanced(k, known, theta, posterior, heard, packet)
+        posterior, _, density, last = advanced(k, given, theta, posterior, heard, packet)
         evidence = evidence + density
         if k:
             moments = moments.added(theta.A, packet, heard.astype(np.float64), last)

@@ -47,21 +47,21 @@ def numbers_of(n: int) -> int:
     return n * n + n * (n - 1) // 2 + n + 1
 
 
-def lattice(known: Known, particles: int) -> Parameters:
+def lattice(given: Known, particles: int) -> Parameters:
     """The first particles, in units of the packets' variance: A around I, Q over decades, every μ_d; (…, N).
 
     Fractional parts of multiples of square roots of primes: evenly spread, and the same in all trials.
     """
-    n = len(known.A)
+    n = len(given.A)
     place = np.arange(1.0, particles + 1.0)
     spread: list[Floats] = [(place * math.sqrt(prime)) % 1.0 for prime in _primes(n * n + 2)]
-    theta = known.start(np.ones(particles))
-    if "A" not in known.names:
+    theta = given.start(np.ones(particles))
+    if "A" not in given.names:
         normals = normal_quantile(np.clip(np.array(spread[: n * n]), 1e-6, 1.0 - 1e-6))
         theta = theta._replace(A=theta.A + _SPREAD * normals.reshape(n, n, particles))
-    if "Q" not in known.names:
+    if "Q" not in given.names:
         theta = theta._replace(diagonal=theta.diagonal * exp(_LEAST_LOG * spread[-2]))
-    if "mu_d" not in known.names:
+    if "mu_d" not in given.names:
         theta = theta._replace(mu_d=np.clip(spread[-1], 0.02, 0.98))
     return theta
 
@@ -77,7 +77,7 @@ def _primes(count: int) -> list[int]:
 
 
 def drawn(
-    moments: Moments, theta: Parameters, scale: Floats, known: Known, normals: Floats
+    moments: Moments, theta: Parameters, scale: Floats, given: Known, normals: Floats
 ) -> tuple[Moments, Parameters]:
     """Parameters given the moments, and the moments about the new A; normals: (numbers_of(n), R).
 
@@ -85,10 +85,10 @@ def drawn(
     means, and μ_d by a normal change of its logit.
     """
     n = len(theta.A)
-    fitted, best = moments.most_likely(theta, scale, known.names)
+    fitted, best = moments.most_likely(theta, scale, given.names)
     lower, diagonal, mu_d = best.lower, best.diagonal, best.mu_d
     freedom = moments.transitions + 1.0
-    if "Q" not in known.names:
+    if "Q" not in given.names:
         root = 1.0 - 2.0 / (9.0 * freedom) + normals[n * n : n * n + n] * np.sqrt(2.0 / (9.0 * freedom))
         root = np.maximum(root, _LEAST_ROOT)
         pairs = [(i, j) for i in range(n) for j in range(i)]
@@ -97,10 +97,10 @@ def drawn(
             lower = lower + np.stack(ratios) * normals[n * n + n : -1]
         diagonal = diagonal / (root * root * root)
     A = best.A
-    if "A" not in known.names:
+    if "A" not in given.names:
         white = normals[: n * n].reshape(n, n, -1) / np.sqrt(fitted.diagonal)
         A = A + backwards(applied_factors(Factors(lower, diagonal), white), fitted.information)
-    if "mu_d" not in known.names:
+    if "mu_d" not in given.names:
         counts = moments.packets * mu_d * (1.0 - mu_d)
         logit = log(mu_d / (1.0 - mu_d)) + normals[-1] / np.sqrt(counts)
         mu_d = 1.0 / (1.0 + exp(-np.clip(logit, -30.0, 30.0)))

@@ -92,12 +92,12 @@ class GilbertElliott(LossModel):
 
 def _two_in_turn(states: list[bool], differs: list[bool]) -> list[bool]:
     """The same loop for a single trial, for which numpy's calls would take ten times as long."""
-    found = states[:1]
+    merged = states[:1]
     before = states[0]
     for after, differ in zip(states[1:], differs[1:], strict=True):
         before = after != (differ and before)
-        found.append(before)
-    return found
+        merged.append(before)
+    return merged
 
 
 _SUM = 1e-9  # how far the sum of a row may be from 1

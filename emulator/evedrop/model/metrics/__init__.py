@@ -58,28 +58,28 @@ def all_metrics() -> dict[str, type[Metric]]:
 
 def unloadable_metrics() -> dict[str, str]:
     """Name → why it cannot be loaded, in words that follow the name, for metrics of installed packages."""
-    found = {}
+    reasons = {}
     for name in _names():
         try:
             metric(name)
         except NotRegistered as error:
-            found[name] = error.why
-    return found
+            reasons[name] = error.why
+    return reasons
 
 
 def metrics_of(receiver: str) -> dict[str, type[Metric]]:
     """Name → metric, for all that the receiver of this name has."""
-    return {name: one for name, one in all_metrics().items() if one.of == "receiver" or receiver != LEGITIMATE}
+    return {name: metric for name, metric in all_metrics().items() if metric.of == "receiver" or receiver != LEGITIMATE}
 
 
 def estimated_metrics() -> dict[str, type[Metric]]:
     """Name → metric, for all that a run estimates: all but those of theory."""
-    return {name: one for name, one in all_metrics().items() if one.rests_on != "theory"}
+    return {name: metric for name, metric in all_metrics().items() if metric.rests_on != "theory"}
 
 
 def expectable_metrics() -> dict[str, type[Metric]]:
     """Name → metric, for all that an expectation can name."""
-    return {name: one for name, one in all_metrics().items() if one.only_in_mode is None}
+    return {name: metric for name, metric in all_metrics().items() if metric.only_in_mode is None}
 
 
 def columns(where: Literal["column", "sweep_column"], mode: str | None = None) -> dict[MetricColumn, list[str]]:

@@ -285,7 +285,7 @@ def _joined(parts: list[Fates]) -> Fates:
         if all(value is None for value in values):
             return None
         blank = [np.zeros(shape[:axes], dtype) for shape in shapes]
-        return np.concatenate([one if one is not None else zero for one, zero in zip(values, blank, strict=True)])
+        return np.concatenate([value if value is not None else zero for value, zero in zip(values, blank, strict=True)])
 
     codes = np.concatenate([part.codes for part in parts])
     return Fates(codes, column("delays", np.uint32), column("again", np.bool_), column("rests", np.float64, 1))

@@ -61,7 +61,7 @@ class LinkDistribution:
 
     def rates(self, slots: range) -> Floats:
         """Probability that the packet of each slot arrives in that slot, (c,)."""
-        found = np.zeros(len(slots))
+        rates = np.zeros(len(slots))
         starts = [segment.start for segment in self.segments]
         for segment, stop in zip(self.segments, [*starts[1:], slots.stop], strict=True):
             some = range(max(segment.start, slots.start), min(stop, slots.stop))
@@ -70,10 +70,10 @@ class LinkDistribution:
                 # State by state, so that the bits do not depend on how many slots are asked for at a time.
                 for quality, odds in zip(segment.quality(some).T, segment.chain.stationary.tolist(), strict=True):
                     rate += quality * odds
-                found[some.start - slots.start : some.stop - slots.start] = segment.arrived[0] * rate
+                rates[some.start - slots.start : some.stop - slots.start] = segment.arrived[0] * rate
         for start, stop, _ in self.outages:
-            found[max(start - slots.start, 0) : max(stop - slots.start, 0)] = 0.0
-        return found
+            rates[max(start - slots.start, 0) : max(stop - slots.start, 0)] = 0.0
+        return rates
 
     @property
     def last(self) -> Chain:
@@ -86,8 +86,12 @@ class LinkDistribution:
     @property
     def alike(self) -> Chain | None:
         """A single state, if all fates are independent and identically distributed and no packet is late, as in the paper."""
-        one = len(self.segments) == 1 and not self.outages and self.window == 0
-        return self.last if one and self.segments[0].quality_at is None and self.segments[0].chain.independent else None
+        unchanging = len(self.segments) == 1 and not self.outages and self.window == 0
+        return (
+            self.last
+            if unchanging and self.segments[0].quality_at is None and self.segments[0].chain.independent
+            else None
+        )
 
 
 def distribution_of(schedule: LinkSchedule) -> LinkDistribution | None:
@@ -106,8 +110,8 @@ def distribution_of(schedule: LinkSchedule) -> LinkDistribution | None:
     if late and schedule.outages:
         return None
     if not late:
-        segments = [replace(one, arrived=one.arrived[-1:]) for one in segments]
-    outages = tuple((one.start, one.stop, getattr(one, "keeps_state", True)) for one in schedule.outages)
+        segments = [replace(segment, arrived=segment.arrived[-1:]) for segment in segments]
+    outages = tuple((outage.start, outage.stop, getattr(outage, "keeps_state", True)) for outage in schedule.outages)
     return LinkDistribution(tuple(segments), outages)
 
 

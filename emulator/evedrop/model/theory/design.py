@@ -69,8 +69,8 @@ class Against:
     def as_dict(self) -> dict[str, Any]:
         """The JSON of `evedrop design`; inf is null."""
         before = ("bound", "perfect", "relative", "best_difference", "best_ratio", "ratio")
-        found = {name: json_value(getattr(self, name)) for name in before}
-        return {**found, "largest_ratio": json_value(self.largest), "trace": json_value(self.trace)}
+        values = {name: json_value(getattr(self, name)) for name in before}
+        return {**values, "largest_ratio": json_value(self.largest), "trace": json_value(self.trace)}
 
 
 @dataclass(frozen=True)

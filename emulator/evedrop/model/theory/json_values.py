@@ -11,7 +11,7 @@ from typing import Any
 def json_value(value: Any) -> Any:
     """A value as JSON has it: dataclasses and tables entry by entry, tuples as lists, null for inf and nan."""
     if is_dataclass(value):
-        return {one.name: json_value(getattr(value, one.name)) for one in fields(value)}
+        return {field.name: json_value(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):
         return {name: json_value(inner) for name, inner in value.items()}
     if isinstance(value, (list, tuple)):

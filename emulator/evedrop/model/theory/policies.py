@@ -153,7 +153,7 @@ class PolicyMetrics(JsonFields):
     def to_lower(self) -> tuple[float, float, float]:
         """What a good policy has low, to ten digits: the rest is rounding."""
         metrics = (self.legitimate, -self.eavesdropper, self.transmissions)
-        legitimate, eavesdropper, transmissions = (float(f"{one:.10g}") for one in metrics)
+        legitimate, eavesdropper, transmissions = (float(f"{value:.10g}") for value in metrics)
         return legitimate, eavesdropper, transmissions
 
     def cost(self, weight: float, price: float) -> float:

@@ -127,9 +127,9 @@ def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Flo
         member[block, i] = 1.0
 
     def schedule(of: Floats) -> Floats:
-        found: Floats = member @ np.clip(of, 0.0, 1.0)
-        found[0] = 1.0
-        return found
+        probabilities: Floats = member @ np.clip(of, 0.0, 1.0)
+        probabilities[0] = 1.0
+        return probabilities
 
     def derivatives(recursion: SlotRecursion, of: Floats) -> Floats:
         """Of the trace of each slot by the μ_d of each block, (N, B)."""
@@ -139,8 +139,8 @@ def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Flo
         ends[index, index + 1], ends[index + slots - 1, index + 1] = 0.0, 1.0
         traces = recursion.traces(ends)
         by_slot = np.vstack([np.zeros(slots), traces[slots - 1 :] - traces[: slots - 1]])
-        found: Floats = by_slot.T @ member
-        return found
+        gradient: Floats = by_slot.T @ member
+        return gradient
 
     def loss(of: Floats) -> float:
         ours, theirs = (each.traces(schedule(of)[None])[0] for each in (problem.legitimate, problem.eavesdropper))
@@ -148,15 +148,15 @@ def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Flo
 
     def slope(of: Floats) -> Floats:
         ours, theirs = (derivatives(each, of) for each in (problem.legitimate, problem.eavesdropper))
-        found: Floats = (problem.weight * ours - (1.0 - problem.weight) * theirs).sum(axis=0) / scale
-        return found
+        gradient: Floats = (problem.weight * ours - (1.0 - problem.weight) * theirs).sum(axis=0) / scale
+        return gradient
 
     constraint: Any = {
         "type": "ineq",
         "fun": lambda of: 1.0 - problem.legitimate.traces(schedule(of)[None])[0, 1:] / bound,
         "jac": lambda of: -derivatives(problem.legitimate, of)[1:] / bound,
     }
-    found = minimize(
+    minimum = minimize(
         loss,
         np.array([start[block.start] for block in blocks]),
         jac=slope,
@@ -165,7 +165,7 @@ def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Flo
         method="SLSQP",
         options={"maxiter": 100, "ftol": 1e-10},
     )
-    mu_d = schedule(np.nan_to_num(found.x, nan=1.0))
+    mu_d = schedule(np.nan_to_num(minimum.x, nan=1.0))
     mu_d[mu_d < _SNAP], mu_d[mu_d > 1.0 - _SNAP] = 0.0, 1.0
     return _repaired(problem, mu_d)
 

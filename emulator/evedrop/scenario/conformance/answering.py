@@ -71,8 +71,8 @@ def _answered(question: bytes) -> bytes:
 
 
 def _registry(name: str) -> Registry[Eavesdropper]:
-    found: Registry[Eavesdropper] = {"READERS": eavesdroppers.READERS, "STRATEGIES": eavesdroppers.STRATEGIES}[name]
-    return found
+    registry: Registry[Eavesdropper] = {"READERS": eavesdroppers.READERS, "STRATEGIES": eavesdroppers.STRATEGIES}[name]
+    return registry
 
 
 def _class(kind: type[Eavesdropper]) -> dict[str, Any]:
@@ -136,7 +136,7 @@ _ASKED: Mapping[str, Callable[..., Any]] = {
 }
 
 
-def _streams(found: Any) -> list[Any]:
-    if isinstance(found, str):
-        raise TypeError(f"streams() is {found!r}; expected a tuple of names of streams")
-    return list(found)
+def _streams(streams: Any) -> list[Any]:
+    if isinstance(streams, str):
+        raise TypeError(f"streams() is {streams!r}; expected a tuple of names of streams")
+    return list(streams)

@@ -33,16 +33,16 @@ from evedrop.scenario.conformance.problems import (
 from evedrop.scenario.conformance.rules import Broken
 
 
-def failed(what: str, slots: range, batch: Batch, how: str) -> RunError:
+def failed(subject: str, slots: range, batch: Batch, how: str) -> RunError:
     """The error of a class that failed in consecutive slots; what: such as `the scheme mine:Mine`."""
     first = batch.first_trial
     trials = f"trial {first}" if batch.trials == 1 else f"trials {first} to {first + batch.trials - 1}"
-    said = how.removeprefix(f"{slots_text(slots)}: ")
-    return RunError(f"{what} failed in {slots_text(slots)}, {trials}: {said}; run `evedrop check` on the class")
+    reason = how.removeprefix(f"{slots_text(slots)}: ")
+    return RunError(f"{subject} failed in {slots_text(slots)}, {trials}: {reason}; run `evedrop check` on the class")
 
 
 @contextlib.contextmanager
-def asking(what: str, slots: range, batch: Batch, one: object = None) -> Iterator[None]:
+def asking(subject: str, slots: range, batch: Batch, instance: object = None) -> Iterator[None]:
     """Turn an error in consecutive slots into a RunError that names the class, the slots and the trials.
 
     what: as for `failed`; one: the object that is called, whose module the message quotes a line of.
@@ -52,9 +52,9 @@ def asking(what: str, slots: range, batch: Batch, one: object = None) -> Iterato
     except (EvedropError, OSError):
         raise
     except Broken as error:
-        raise failed(what, slots, batch, str(error)) from error
+        raise failed(subject, slots, batch, str(error)) from error
     except Exception as error:
-        raise failed(what, slots, batch, place_of(error, _file_of(type(one)))) from error
+        raise failed(subject, slots, batch, place_of(error, _file_of(type(instance)))) from error
 
 
 def _file_of(kind: type) -> str | None:
@@ -68,8 +68,8 @@ def _file_of(kind: type) -> str | None:
 class CheckedEncoder(Encoder):
     """An encoder whose packets are all checked. Raises RunError for a wrong one, and for any error of the encoder's class."""
 
-    def __init__(self, encoder: Encoder, what: str, scheme: Scheme, problem: Problem) -> None:
-        self._encoder, self._what, self._scheme, self._problem = encoder, what, scheme, problem
+    def __init__(self, encoder: Encoder, subject: str, scheme: Scheme, problem: Problem) -> None:
+        self._encoder, self._what, self._scheme, self._problem = encoder, subject, scheme, problem
 
     def _asking(self, slots: range) -> contextlib.AbstractContextManager[None]:
         return asking(self._what, slots, self._problem.batch, self._encoder)
@@ -100,9 +100,9 @@ class CheckedEncoder(Encoder):
 class CheckedReceiver(Receiver):
     """A receiver whose beliefs are all checked. Raises RunError for a wrong one, and for any error of the receiver's class."""
 
-    def __init__(self, receiver: Receiver, what: str, problem: Problem) -> None:
+    def __init__(self, receiver: Receiver, subject: str, problem: Problem) -> None:
         super().__init__(problem.process, problem.batch.trials)
-        self._receiver, self._what, self._problem = receiver, what, problem
+        self._receiver, self._what, self._problem = receiver, subject, problem
 
     def _asking(self, slots: range) -> contextlib.AbstractContextManager[None]:
         return asking(self._what, slots, self._problem.batch, self._receiver)
@@ -130,9 +130,9 @@ class CheckedReceiver(Receiver):
         if _takes_single_slots(type(self._receiver)):
             return super().follow(slots, belief, gamma, z)
         with self._asking(slots):
-            found = self._receiver.follow(slots, belief, gamma, z)
-            expect_beliefs(slots, found, self._problem)
-        return found
+            followed = self._receiver.follow(slots, belief, gamma, z)
+            expect_beliefs(slots, followed, self._problem)
+        return followed
 
 
 def _takes_single_slots(kind: type[Receiver]) -> bool:

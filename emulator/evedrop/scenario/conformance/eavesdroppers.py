@@ -159,12 +159,12 @@ class EavesdropperChecks(ReceiverChecks):
             )
         for mu_e in (0.0, 0.5, 1.0) if outcomes_at is not None else ():
             with calling("what outcomes() returned", kind):
-                found = outcomes_at(mu_e)  # type: ignore[misc]
-            if found is None:
+                outcomes = outcomes_at(mu_e)  # type: ignore[misc]
+            if outcomes is None:
                 raise Broken(
                     f"outcomes() gives None for the quality {mu_e}; expected Outcomes, or None in its own place"
                 )
-            expect_outcomes(f"outcomes() of the quality {mu_e}", found)
+            expect_outcomes(f"outcomes() of the quality {mu_e}", outcomes)
         expect_bool("follows_gamma()", follows)
 
     def again(self, problem: Problem) -> None:
@@ -191,8 +191,8 @@ class EavesdropperChecks(ReceiverChecks):
             outcomes_at = eavesdropper_outcomes(scheme, setup.name, setup.parameters)
         if outcomes_at is not None:
             errors = [((slot.x - step[2].x_hat) ** 2).sum(axis=0) for slot, step in setup.steps(problem)]
-            found = [np.asarray(one) for one in errors]
+            values = [np.asarray(error) for error in errors]
             if issubclass(setup.kind, PacketTaker):
-                expect_expected(problem, outcomes_at, found, _TAKES_OTHERWISE)
+                expect_expected(problem, outcomes_at, values, _TAKES_OTHERWISE)
             else:
-                expect_expected(problem, outcomes_at, found)
+                expect_expected(problem, outcomes_at, values)

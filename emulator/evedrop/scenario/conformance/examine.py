@@ -58,18 +58,20 @@ def examined(names: Mapping[str, str], parameters: Mapping[str, Any]) -> Iterato
     """
     look_in(str(Path.cwd()))
     classes = {option: _named(option, name, parameters) for option, name in names.items()}
-    known = [entry for one in classes.values() for entry in (*one.kind.parameters, *one.parameters)]
+    accepted = [entry for named in classes.values() for entry in (*named.kind.parameters, *named.parameters)]
     for entry in parameters:
-        if entry not in known:
-            said = f"expected {', '.join(dict.fromkeys(known))}" if known else "they have no parameters; remove it"
-            raise UsageError(f"--set {entry}: is not a parameter of {', '.join(names.values())}; {said}")
-    for option, one in classes.items():
-        title = f"{one.name}, {'an' if option[0] == 'e' else 'a'} {_REGISTRIES[option].kind}"
+        if entry not in accepted:
+            advice = (
+                f"expected {', '.join(dict.fromkeys(accepted))}" if accepted else "they have no parameters; remove it"
+            )
+            raise UsageError(f"--set {entry}: is not a parameter of {', '.join(names.values())}; {advice}")
+    for option, named in classes.items():
+        title = f"{named.name}, {'an' if option[0] == 'e' else 'a'} {_REGISTRIES[option].kind}"
         if option == "eavesdropper":
-            scheme = classes.get("scheme") or _scheme_for(one)
-            yield Examined(f"{title}, with the scheme {scheme.name}", _listened(one, scheme))
+            scheme = classes.get("scheme") or _scheme_for(named)
+            yield Examined(f"{title}, with the scheme {scheme.name}", _listened(named, scheme))
         else:
-            yield Examined(title, _verdicts(option, one))
+            yield Examined(title, _verdicts(option, named))
 
 
 def _named(option: str, name: str, parameters: Mapping[str, Any]) -> _Named:
@@ -82,7 +84,7 @@ def _named(option: str, name: str, parameters: Mapping[str, Any]) -> _Named:
     except NotRegistered as error:
         why = error.why or f" is unknown; expected MODULE:CLASS, or {', '.join(registry.names)}"
         raise UsageError(f"--{option} {error.name}{why}") from error
-    wrong = [f"{entry}: {what}" for entry, what in asked(kind, given)]
+    wrong = [f"{entry}: {sentence}" for entry, sentence in asked(kind, given)]
     if wrong:
         raise UsageError(f"--{option} {name}: {'; '.join(wrong)}; give others by --set")
     return _Named(name, kind, given)
@@ -95,34 +97,42 @@ def _given(kind: Any, parameters: Mapping[str, Any]) -> dict[str, Any]:
     return examples | {entry: value for entry, value in parameters.items() if entry in kind.parameters}
 
 
-def _verdicts(option: str, one: _Named) -> list[RuleVerdict]:
+def _verdicts(option: str, named: _Named) -> list[RuleVerdict]:
     if option == "scheme":
-        return scheme_verdicts(lambda process: scheme_of(process, {"scheme": one.name, **one.parameters}), one.kind)
+        return scheme_verdicts(
+            lambda process: scheme_of(process, {"scheme": named.name, **named.parameters}), named.kind
+        )
     checks = LossChecks if option == "link" else DelayChecks
-    return checks(lambda: one.kind(**one.parameters), one.kind).verdicts()
+    return checks(lambda: named.kind(**named.parameters), named.kind).verdicts()
 
 
-def _listened(one: _Named, scheme: _Named) -> list[RuleVerdict]:
-    lacking = sorted({*_streams(one)} - {*scheme.kind.secret_streams})
+def _listened(eavesdropper: _Named, scheme: _Named) -> list[RuleVerdict]:
+    lacking = sorted({*_streams(eavesdropper)} - {*scheme.kind.secret_streams})
     if lacking:
         raise UsageError(
-            f"--eavesdropper {one.name}: asks for the key of {' and '.join(lacking)}, and the scheme {scheme.name} has "
+            f"--eavesdropper {eavesdropper.name}: asks for the key of {' and '.join(lacking)}, and the scheme {scheme.name} has "
             f"{', '.join(scheme.kind.secret_streams) or 'no keys'}; give another --scheme, or take it out of streams()"
         )
     spec = {"scheme": scheme.name, **scheme.parameters}
-    setup = EavesdropperSetup(one.name, one.kind, one.parameters, lambda process: scheme_of(process, spec), scheme.kind)
+    setup = EavesdropperSetup(
+        eavesdropper.name,
+        eavesdropper.kind,
+        eavesdropper.parameters,
+        lambda process: scheme_of(process, spec),
+        scheme.kind,
+    )
     try:
         return eavesdropper_verdicts(setup)
     except Broken as error:
         return [RuleVerdict("facts on the class", str(error))]
 
 
-def _streams(one: _Named) -> list[str]:
+def _streams(named: _Named) -> list[str]:
     try:
-        with calling("streams()", one.kind):
-            return [stream for stream in one.kind.streams(one.parameters) if stream != _OWN_COIN]
+        with calling("streams()", named.kind):
+            return [stream for stream in named.kind.streams(named.parameters) if stream != _OWN_COIN]
     except Broken as error:
-        raise UsageError(f"--eavesdropper {one.name}: {error}") from error
+        raise UsageError(f"--eavesdropper {named.name}: {error}") from error
 
 
 def _scheme_for(named: _Named) -> _Named:

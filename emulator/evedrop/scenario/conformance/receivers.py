@@ -183,7 +183,7 @@ def divisions(slots: int) -> list[list[range]]:
 
 def expect_same_in_blocks(scheme: Scheme, slots: Sequence[Slot], problem: Problem, kind: type[Scheme]) -> None:
     """Raise Broken unless both sides of a scheme do in blocks what they do in single slots, made together and apart."""
-    steps = [(one.before, one.heard, one.after) for one in slots]
+    steps = [(slot.before, slot.heard, slot.after) for slot in slots]
     for apart in (False, True):
         for blocks in divisions(problem.slots):
             encoder, estimator = sides(scheme, problem, kind, apart)
@@ -211,8 +211,8 @@ def expect_same_followed(make: Callable[[], Receiver], steps: Sequence[Step], pr
         receiver = make()
         if type(receiver).follow is Receiver.follow:
             return  # which takes slot by slot
-        found = list(_in_order(receiver, blocks, every, steps, problem, kind))
-        _expect_same_beliefs(receiver, found, steps, problem)
+        followed = list(_in_order(receiver, blocks, every, steps, problem, kind))
+        _expect_same_beliefs(receiver, followed, steps, problem)
         _expect_same_uses(receiver, blocks, problem, kind)
     receiver = make()
     plain = [block for block in reversed(uneven) if _plain(block, steps)]
@@ -232,8 +232,8 @@ def _in_order(
     belief = steps[0][0]
     for number, block in enumerate(blocks):
         if number % every == 0 and _plain(block, steps):
-            yield (found := _followed(receiver, block, belief, steps, problem, kind))
-            belief = frozen_belief(found[2])
+            yield (followed := _followed(receiver, block, belief, steps, problem, kind))
+            belief = frozen_belief(followed[2])
         else:
             for k in block:
                 with calling(f"slot {k}: {_method_name(receiver, 'step')} after a block of slots", kind):
@@ -259,25 +259,25 @@ def _followed(
 ) -> _Followed:
     gamma, z = (frozen(np.array([getattr(steps[k][1], name) for k in some])) for name in ("gamma", "z"))
     with calling(f"{slots_text(some)}: {_method_name(receiver, 'follow')}", kind):
-        found: Any = receiver.follow(some, belief, gamma, z)
-    expect_beliefs(some, found, problem)
-    return some, *found
+        result: Any = receiver.follow(some, belief, gamma, z)
+    expect_beliefs(some, result, problem)
+    return some, *result
 
 
 def _expect_same_packets(
-    encoder: Encoder, found: Sequence[tuple[range, PacketBlock]], slots: Sequence[Slot], problem: Problem
+    encoder: Encoder, coded: Sequence[tuple[range, PacketBlock]], slots: Sequence[Slot], problem: Problem
 ) -> None:
-    for some, packets in found:
+    for some, packets in coded:
         rows = [sent_of(packets.at(row)) for row in range(len(some))]
         once = [slots[k].sent for k in some]
         _expect_same(once, rows, some, problem, _method_name(encoder, "encode_block"))
 
 
 def _expect_same_beliefs(
-    receiver: Receiver, found: Sequence[_Followed], steps: Sequence[Step], problem: Problem
+    receiver: Receiver, followed: Sequence[_Followed], steps: Sequence[Step], problem: Problem
 ) -> None:
     name = _method_name(receiver, "follow")
-    for some, beliefs, after in found:
+    for some, beliefs, after in followed:
         rows = [row_of(Belief(*(column[row] for column in beliefs))) for row in range(len(some))]
         _expect_same([row_of(steps[k][2]) for k in some], rows, some, problem, name)
         last = f"the last Belief of {name}"
@@ -292,23 +292,23 @@ def _expect_same_uses(receiver: Receiver, blocks: list[range], problem: Problem,
     for some in blocks:
         name = _method_name(receiver, "uses_block")
         with calling(f"{slots_text(some)}: {name}", kind):
-            found, single = receiver.uses_block(some), [receiver.uses(k) for k in some]
-        if found is not None:
+            uses, single = receiver.uses_block(some), [receiver.uses(k) for k in some]
+        if uses is not None:
             shape = (len(some), problem.batch.trials)
-            expect_array(f"{slots_text(some)}: {name}", found, np.bool_, shape, "slots, R trials; or None: always")
-        rows = [{"whether a packet is used": every if found is None else found[row]} for row in range(len(some))]
-        once = [{"whether a packet is used": every if one is None else one} for one in single]
+            expect_array(f"{slots_text(some)}: {name}", uses, np.bool_, shape, "slots, R trials; or None: always")
+        rows = [{"whether a packet is used": every if uses is None else uses[row]} for row in range(len(some))]
+        once = [{"whether a packet is used": every if use is None else use} for use in single]
         _expect_same(once, rows, some, problem, name)
 
 
 def _expect_same(once: Sequence[Row], rows: Sequence[Row], some: range, problem: Problem, name: str) -> None:
-    said = f"{{0!r}} in a single slot and {{1!r}} by {name} of {slots_text(some)}"
-    expect_same(once, rows, slice(None), problem.batch.first_trial, said, _REMEDY, some.start)
+    message = f"{{0!r}} in a single slot and {{1!r}} by {name} of {slots_text(some)}"
+    expect_same(once, rows, slice(None), problem.batch.first_trial, message, _REMEDY, some.start)
 
 
-def _method_name(one: object, method: str) -> str:
+def _method_name(instance: object, method: str) -> str:
     """A method of a class that takes many slots at once; if the class has only the inherited one, its method for one slot."""
     for base, block, single in ((Encoder, "encode_block", "encode"), (Receiver, "follow", "step")):
-        if method == block and getattr(type(one), block) is getattr(base, block):
-            return f"{type(one).__name__}.{single}()"
-    return f"{type(one).__name__}.{method}()"
+        if method == block and getattr(type(instance), block) is getattr(base, block):
+            return f"{type(instance).__name__}.{single}()"
+    return f"{type(instance).__name__}.{method}()"

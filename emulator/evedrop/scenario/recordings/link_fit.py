@@ -567,7 +567,7 @@ def fit_outcomes(name: str, outcomes: Outcomes, delays: Floats) -> Fit:
     """
     _check(name, outcomes)
     candidates = [bernoulli(outcomes), gilbert(outcomes), gilbert_elliott(outcomes)]
-    chosen = min(candidates, key=lambda one: one.bic(len(outcomes)))
+    chosen = min(candidates, key=lambda candidate: candidate.bic(len(outcomes)))
     return Fit(
         name,
         len(outcomes),

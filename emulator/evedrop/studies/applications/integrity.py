@@ -469,8 +469,8 @@ def _objections(loop: ControlledPlant, table: IntegrityTable) -> Iterator[str]:
 def _theory_mistakes(watermarked: WatermarkedLoop, table: IntegrityTable, inputs: int) -> Iterator[str]:
     covariance = table.covariance(inputs)
     try:
-        for one in (covariance, np.zeros_like(covariance)):
-            _theory(watermarked, table, one)
+        for assumed in (covariance, np.zeros_like(covariance)):
+            _theory(watermarked, table, assumed)
     except ValueError as error:
         yield (
             f"integrity: the detector's distribution under attack cannot be computed, because {error}; expected another "

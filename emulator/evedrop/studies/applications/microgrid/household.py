@@ -372,12 +372,12 @@ class Household(Application):
         fractions = [summary[f"{name}_difference"] for name in ("net", "total", "summed")]
         if None not in fractions:
             errors = [cls.standard_error(summary, (f"{name}_difference",)) for name in ("net", "total", "summed")]
-            net, total, summed = (_per_cent(*one) for one in zip(fractions, errors, strict=True))
+            net, total, summed = (_per_cent(*pair) for pair in zip(fractions, errors, strict=True))
             lines.append(
                 f"grid power differs from that controller's by {net} in net energy, {total} in total, "
                 f"{summed} summed slot by slot"
             )
-        areas = {name: one["activity_area"] for name, one in summary["receivers"].items()}
+        areas = {name: receiver["activity_area"] for name, receiver in summary["receivers"].items()}
         if None not in areas.values():
             told = ", ".join(f"{name} {cls.text(summary, (name, 'activity_area'), '.3f')}" for name in areas)
             windows = f"{summary['active_windows']} active windows of {summary['windows']}"
