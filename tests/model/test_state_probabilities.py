@@ -109,9 +109,8 @@ def test_expectations_are_those_of_the_design(reader: str) -> None:
         return eavesdropper_outcomes(innovation, reader, PARAMETERS.get(reader, {}))
 
     distribution = LinkDistribution.steady(loss_of({"model": "bernoulli", "quality": MU}).chain)  # type: ignore[arg-type]
-    covariance = ModulatedCovariance(
-        UNSTABLE, distribution, outcomes_in(scheme), lambda k: outcomes_in(scheme.in_slot(k))
-    )  # type: ignore[arg-type]
+    in_slot: Any = scheme.in_slot
+    covariance = ModulatedCovariance(UNSTABLE, distribution, outcomes_in(scheme), lambda k: outcomes_in(in_slot(k)))
     expected = SlotRecursion(UNSTABLE, lambda mu_d: outcomes_in(Innovation(UNSTABLE, mu_d))(MU), SLOTS)
     assert np.allclose(covariance.next_traces(SLOTS), expected.traces(np.array([MU_D]))[0], rtol=1e-12)
 

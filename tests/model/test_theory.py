@@ -170,12 +170,12 @@ def test_expectation_is_the_mean_over_all_words(k: int) -> None:
     """E P_k is the probability-weighted mean over every sequence of events."""
     mu, mu_d, b0, b1 = 0.7, 0.6, 0.8, 0.3
     ours = {"L": 1 - mu, "S": mu * mu_d, "D": mu * (1 - mu_d)}
-    expected_covariance = theoretical_covariances(UNSTABLE, Outcomes.legitimate(mu, mu_d), k + 1)[k]
-    assert expected_covariance == pytest.approx(enumerated(UNSTABLE, k, ours, 1 - mu), rel=1e-12)
+    theoretical_covariance = theoretical_covariances(UNSTABLE, Outcomes.legitimate(mu, mu_d), k + 1)[k]
+    assert theoretical_covariance == pytest.approx(enumerated(UNSTABLE, k, ours, 1 - mu), rel=1e-12)
     theirs = {"S": mu * mu_d * b0, "M": mu * (1 - mu_d) * b1}
     theirs["L"] = 1 - sum(theirs.values())
-    expected_covariance = theoretical_covariances(UNSTABLE, Outcomes.eavesdropper(mu, mu_d, b0, b1), k + 1)[k]
-    assert expected_covariance == pytest.approx(enumerated(UNSTABLE, k, theirs, 1 - mu * b0), rel=1e-12)
+    theoretical_covariance = theoretical_covariances(UNSTABLE, Outcomes.eavesdropper(mu, mu_d, b0, b1), k + 1)[k]
+    assert theoretical_covariance == pytest.approx(enumerated(UNSTABLE, k, theirs, 1 - mu * b0), rel=1e-12)
 
 
 def test_belief_ignores_being_misled() -> None:

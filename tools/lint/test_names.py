@@ -180,6 +180,7 @@ MEANT_OTHERWISE = {
         "tests/cli/test_design_command.py",
         "tests/cli/test_output.py",
         "tests/cli/test_results_are_data.py",
+        "tests/commands.py",
         "tests/notebooks/*",
         "tests/show/report/test_report.py",
         "tests/show/view/*",

@@ -141,15 +141,15 @@ class ExactSimulation:
         whole = Sent.joined(sent)
         with self._guard.asking(LEGITIMATE, chunk):
             self._packets.add_slots(self._roles.scheme.encrypted(whole.packets), whole.packets.sent)
-        followed = {
+        followed_by_receiver = {
             name: FollowedSlots.joined(followed)
             if followed and name == LEGITIMATE
             else self._follow(name, chunk, link, whole)
             for name, link in links.items()
         }
-        for name, followed_slots in followed.items():
+        for name, followed_slots in followed_by_receiver.items():
             self._digests[name].update(self._logs[name].add(chunk, followed_slots.beliefs))
-        return self._chunk(chunk, whole, followed, links, np.array(alarms) if alarms else None, inputs)
+        return self._chunk(chunk, whole, followed_by_receiver, links, np.array(alarms) if alarms else None, inputs)
 
     def _acknowledge(
         self, ack_channel: AckChannel, k: int, sent: Flags | None, links: Mapping[str, LinkCore]
