@@ -269,7 +269,7 @@ def test_the_selftest_passes(evedrop: Evedrop) -> None:
 def test_a_wrong_golden_digest_is_reported(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Exit 3, and the receiver whose digest is not the golden one is marked."""
     from evedrop.cli import main as cli
-    from evedrop.cli.commands import selftest
+    from evedrop.cli import selftest
 
     monkeypatch.setattr(selftest, "GOLDEN", {**selftest.GOLDEN, "smart": "0" * 64})
     assert cli.main(["selftest"]) == 3

@@ -25,7 +25,7 @@ SOME: dict[str, Any] = {"slots": 150, "trials": 40, "record_trials": 40}
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> Results:
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     """The shipped scenario in memory, all trials recorded."""
     return montecarlo("partial-encryption", out=tmp_path_factory.mktemp("run"), plan=Plan(workers=1), **SOME)
 

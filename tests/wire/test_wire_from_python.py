@@ -200,7 +200,7 @@ def test_a_wire_that_cannot_begin_says_why(tmp_path: Path) -> None:
     ("arguments", "entries", "error", "message"),
     [
         (("missing.toml",), {}, UsageError, "cannot be read"),
-        ((), {"side": ["robot"], "link": [LINK]}, ScenarioError, 'link.0.to: is "base"'),
+        ((), {"side": ["robot", "desk"], "link": [LINK]}, ScenarioError, 'link.0.to: is "base"'),
         ((wire_plan(),), {"seed": 3}, UsageError, "expected no entries with a plan"),
     ],
 )

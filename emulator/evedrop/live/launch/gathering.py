@@ -310,7 +310,7 @@ class Statistics(Gathered):
     """Merges statistics of slots: means are weighted by the number of trials, and standard errors pooled."""
 
     # Taken from any shard: theory, which is the same in all, and quantiles, which a live run does not have.
-    _TAKEN = ("expected", "error_quantile", "trace_quantile")
+    _TAKEN = ("theoretical", "error_quantile", "trace_quantile")
 
     def __init__(self, receivers: Sequence[str]) -> None:
         super().__init__(receivers, 200.0)
