@@ -1,4 +1,4 @@
-"""Strategies of eavesdroppers by their name in a scenario: one file each, and those of other modules."""
+"""Strategies of eavesdroppers by their name in a scenario, and those of other modules."""
 
 from __future__ import annotations
 

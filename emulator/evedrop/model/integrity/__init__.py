@@ -1,6 +1,6 @@
 """Integrity of a closed loop: attacks on the sensor's measurements, the watermark of the inputs, and the detector.
 
-Attacks and policies are registered here by their names in a scenario: one file each.
+Attacks and policies are registered here by their names in a scenario.
 
 Source: docs/mathematics.md, integrity.
 """

@@ -1,4 +1,4 @@
-"""Loss models of links by their name in a scenario: one file each, and those of other modules."""
+"""Loss models of links by their name in a scenario, and those of other modules."""
 
 from __future__ import annotations
 

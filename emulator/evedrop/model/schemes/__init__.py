@@ -1,4 +1,4 @@
-"""Schemes by their name in a scenario: one file each, and those of other modules."""
+"""Schemes by their name in a scenario, and those of other modules."""
 
 from __future__ import annotations
 
