@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 
 from evedrop.results.reading import Results
-from evedrop.scenario.loading import load, shipped
+from evedrop.scenario.loading import load
+from evedrop.scenarios import shipped
 from tests.conftest import Done, Evedrop
 from tests.examples import mostly_long
 

@@ -16,11 +16,12 @@ from evedrop.errors import RunError
 from evedrop.live.protocol.brief import ProgramEntry
 from evedrop.live.protocol.state_message import read_state
 from evedrop.scenario.estimates import warnings_of
-from evedrop.scenario.loading import load, parse, shipped, value_of
+from evedrop.scenario.loading import load, parse, value_of
 from evedrop.scenario.plugins import named_in
 from evedrop.scenario.recordings.disturbance_file import read_disturbances
 from evedrop.scenario.recordings.link_recording import LinkRecording
 from evedrop.scenario.recordings.process_fit import fit_process
+from evedrop.scenarios import shipped
 from evedrop.wire.file import example_wire, key_lines, load_wire, resolved_wire, warnings_of_wire, wire_lines, wire_of
 from evedrop.wire.link_state import KeyFates
 from evedrop.wire.scorekeeper import expected

@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
 from evedrop.scenario.estimates import warnings_of
-from evedrop.scenario.loading import parse, shipped
+from evedrop.scenario.loading import parse
+from evedrop.scenarios import shipped
 from tests.examples import examples
 from tests.fuzz.fuzzing import CORPUS, broken_by, campaign
 from tests.fuzz.message_readers import MESSAGES

@@ -8,8 +8,9 @@ from pathlib import Path
 from evedrop.cli.api import run
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
-from evedrop.scenario.loading import checked, shipped
+from evedrop.scenario.loading import checked
 from evedrop.scenario.progress_events import silent
+from evedrop.scenarios import shipped
 from evedrop.simulate.montecarlo import Plan, simulate
 from tests.builders import digests_of
 

@@ -15,7 +15,8 @@ import pytest
 from evedrop import montecarlo
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.scenario.estimates import warnings_of
-from evedrop.scenario.loading import load, shipped
+from evedrop.scenario.loading import load
+from evedrop.scenarios import shipped
 from evedrop.wire.scorekeeper import expected
 from tests.examples import mostly_long
 

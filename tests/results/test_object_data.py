@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.results.shard_score import NotData, packed, unpacked
-from evedrop.scenario.loading import load, shipped
+from evedrop.scenario.loading import load
+from evedrop.scenarios import shipped
 from evedrop.simulate.montecarlo import check_mode
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import tasks_of

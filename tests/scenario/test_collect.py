@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.scenario.discovery import is_scenario, scenarios_in
-from evedrop.scenario.loading import shipped
+from evedrop.scenarios import shipped
 from evedrop.studies.scenario_tests import scenarios_of
 
 SCENARIO = shipped()["eavesdroppers"].read_text(encoding="utf-8")

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from evedrop.model.local_filter import settled
-from evedrop.scenario.loading import checked, shipped
+from evedrop.scenario.loading import checked
+from evedrop.scenarios import shipped
 from tests.builders import changed, mistakes_of, places_of
 from tests.golden.pages import Golden
 

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario.estimates import warnings_of
-from evedrop.scenario.loading import load, parse, shipped, value_of
+from evedrop.scenario.loading import load, parse, value_of
 from evedrop.scenario.tables import Scenario
-from evedrop.scenarios import write_new
+from evedrop.scenarios import shipped, write_new
 from tests.builders import GOOD, mistakes_in_good, places_of
 from tests.golden.pages import Golden
 

@@ -12,7 +12,8 @@ import pytest
 
 from evedrop.cli.api import montecarlo, run
 from evedrop.results.reading import Results
-from evedrop.scenario.loading import load, shipped
+from evedrop.scenario.loading import load
+from evedrop.scenarios import shipped
 from tests.builders import digests_of
 from tests.examples import mostly_long
 

@@ -21,7 +21,7 @@ import pytest
 from evedrop.cli.api import compare, cost, learned, montecarlo, sweep
 from evedrop.errors import RunError, UsageError
 from evedrop.results.reading import Results
-from evedrop.scenario.loading import shipped
+from evedrop.scenarios import shipped
 from evedrop.simulate.cluster import Cluster
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.tasks import Task

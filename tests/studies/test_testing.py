@@ -18,7 +18,7 @@ import pytest
 from evedrop.cli import main as cli
 from evedrop.errors import RunError
 from evedrop.results.reading import Results
-from evedrop.scenario.loading import shipped
+from evedrop.scenarios import shipped
 from evedrop.studies import scenario_tests as testing
 from evedrop.studies.junit import junit_of
 from evedrop.studies.scenario_tests import Finding, Manner, Outcome

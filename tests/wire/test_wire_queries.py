@@ -167,8 +167,8 @@ def test_the_asker_of_a_query_or_reply_without_room_waits(full: str, fates: list
         offer(server, "map", b"x")
         wait_until(lambda: answers(asker, "map"), "the queryable is there")
         before = len(wire.fates())
-        outlet = wire.relay._queries._outlets[full]
-        outlet._most, outlet._stopped = -1, True
+        send_queue = wire.relay._queries._send_queues[full]
+        send_queue._most, send_queue._stopped = -1, True
         asked = time.monotonic()
         assert not list(asker.get("map", timeout=60.0))
         assert time.monotonic() - asked >= WAIT

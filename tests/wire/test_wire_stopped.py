@@ -22,11 +22,11 @@ from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest, WireStatus
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.on_disk import scorekeeper_on_disk
-from evedrop.wire.outlet import SideOutlet
 from evedrop.wire.publications import Message
 from evedrop.wire.records import WireFate
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.scorekeeper import WireScorekeeper
+from evedrop.wire.send_queue import SendQueue
 from evedrop.wire.side import ZenohConfig, side_config
 from tests.conftest import LIMIT, Evedrop, wait_until
 from tests.wire.test_wire_publications import reader
@@ -165,7 +165,7 @@ def test_no_message_overtakes_those_that_wait_for_their_turn(tmp_path: Path) -> 
 
 def test_each_message_to_a_side_that_has_stopped_has_a_fate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those that find no room are congested; the summary of the wire is that of its journal, also at its end."""
-    monkeypatch.setattr("evedrop.wire.relay.SideOutlet", partial(SideOutlet, most=8, patience=0.1))
+    monkeypatch.setattr("evedrop.wire.relay.SendQueue", partial(SendQueue, most=8, patience=0.1))
     monkeypatch.setattr("evedrop.wire.relay.LAST_SECONDS", 0.1)
     plan, takes, publish = plan_of(link("robot", "base"), link("robot", "third")), threading.Event(), Message.__call__
     with at_work(plan, tmp_path) as wire, wire.program("robot") as robot:

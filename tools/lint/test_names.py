@@ -134,6 +134,7 @@ FORMER = {
     "look_seconds": "poll_seconds",
     "lost track": "lost synchronisation",
     "observer": "recorder",
+    "outlet": "send queue",
     "rare_share": "rare_fraction",
     "read_news": "read_event",
     "ReceiverTotals": "ReceiverTally",

@@ -38,7 +38,7 @@ EXCEPTIONS = {
     "emulator/evedrop/simulate/workers.py work pipe.recv": "the end of the study closes the pipe",
     "emulator/evedrop/studies/scenario_tests.py results future.result": "the future is done",
     "emulator/evedrop/studies/scenario_tests.py carry_out process.wait": "the process has closed its output, or is killed",
-    "emulator/evedrop/wire/outlet.py _wait self._bell.acquire": WORK,
+    "emulator/evedrop/wire/send_queue.py _wait self._bell.acquire": WORK,
     "emulator/evedrop/wire/queries.py _run self._heard.get": WORK,
     "peers/closed_loop.py of self._subscription.recv": PROCESS,
     "peers/controller.py steer subscription.recv": PROCESS,

@@ -43,22 +43,6 @@ from evedrop.scenarios import shipped
 from evedrop.system.files import Unreadable, is_folder, is_there, shown, text_of
 from evedrop.system.hints import near
 
-__all__ = [
-    "Scenario",
-    "checked",
-    "load",
-    "located",
-    "parse",
-    "plain_tables",
-    "prepared",
-    "read",
-    "set_entry",
-    "shipped",
-    "tables_in",
-    "value_of",
-    "with_event",
-]
-
 MOST_BYTES = 2**28
 """The largest scenario file: room for the outcomes of millions of packets."""
 MOST_VALUES = 1_000_000
@@ -117,12 +101,12 @@ def parse(
     tables = tables_in(text, source)
     if not tables and not changes:
         raise ScenarioError(source, ["has no entries; `evedrop new FILE` writes a scenario to start from"])
-    located(tables, folder)
+    locate_files(tables, folder)
     with with_line_numbers(text, changes or ()):
         return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
 
 
-def located(tables: dict[str, Any], folder: Path) -> None:
+def locate_files(tables: dict[str, Any], folder: Path) -> None:
     """Replace the names of files in tables with their paths, in place; folder: that of the scenario."""
     locate_recordings(tables, folder)
     locate_tables(tables, folder)
@@ -419,7 +403,7 @@ def built(values: Mapping[str, Any]) -> Scenario:
     tables = plain_tables(values, _SOURCE)
     if mistakes := list(unusable(tables)):
         raise ScenarioError(_SOURCE, mistakes)
-    located(tables, Path())
+    locate_files(tables, Path())
     return checked(tables, _SOURCE, beyond_horizon=True)
 
 

@@ -24,7 +24,7 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario.across import horizon_mistakes
 from evedrop.scenario.dry_run import foreign
 from evedrop.scenario.input_files import read_recordings, read_tables
-from evedrop.scenario.loading import checked, located, read, tables_in
+from evedrop.scenario.loading import checked, locate_files, read, tables_in
 from evedrop.scenario.process_noise import replace_filter_noise
 from evedrop.scenario.table import sentences
 from evedrop.scenario.tables import Scenario
@@ -65,7 +65,7 @@ def recorded(folder: Path, *, beyond_horizon: bool = True) -> RecordedScenario:
     source = shown(path)
     tables = tables_in(read(path), source)
     tables.pop("modules", None)
-    located(tables, folder)
+    locate_files(tables, folder)
     with no_modules():
         if not foreign(tables):
             scenario = checked(tables, source, beyond_horizon=beyond_horizon, folder=folder)

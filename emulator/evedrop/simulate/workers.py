@@ -67,11 +67,11 @@ def in_processes(
     if a process dies, or is suspended for good.
     """
     crew = list[_Worker]()
-    inbox: _Inbox = SimpleQueue()
+    messages: _Messages = SimpleQueue()
     try:
         for _ in range(workers):
-            crew.append(_Worker(inbox))
-        yield from _results(tasks, crew, inbox, on_progress, stopped)
+            crew.append(_Worker(messages))
+        yield from _results(tasks, crew, messages, on_progress, stopped)
     finally:
         kill(*(worker.process for worker in crew))
         for worker in crew:
@@ -82,9 +82,9 @@ def in_processes(
 class _Worker:
     """A worker process, and the thread that talks with it."""
 
-    def __init__(self, inbox: _Inbox) -> None:
-        """inbox: gets the worker's counts of trial-slots done, reasons for failures and results, and the error that ends it."""
-        self._inbox = inbox
+    def __init__(self, messages: _Messages) -> None:
+        """messages: gets counts of trial-slots done, reasons for failures, results, and the error that ends the worker."""
+        self._messages = messages
         self._tasks: SimpleQueue[Task[Any] | None] = SimpleQueue()
         self.pipe, theirs = Pipe()
         self.number: int | None = None
@@ -128,10 +128,10 @@ class _Worker:
                 while (task := self._tasks.get()) is not None:
                     self.pipe.send(task)
                     while isinstance(message := self.pipe.recv(), int):
-                        self._inbox.put((self, message))
-                    self._inbox.put((self, message))
+                        self._messages.put((self, message))
+                    self._messages.put((self, message))
         except Exception as error:
-            self._inbox.put((self, error))
+            self._messages.put((self, error))
 
     def stop(self) -> None:
         """Ask for the results so far of the current task, also from a suspended worker."""
@@ -153,11 +153,11 @@ class _Worker:
         return RunError(f"a worker process {how}; was it killed, or out of memory? try fewer workers")
 
 
-_Inbox = SimpleQueue[tuple[_Worker, Any]]
+_Messages = SimpleQueue[tuple[_Worker, Any]]
 
 
 def _results(
-    tasks: Sequence[Task[R]], crew: list[_Worker], inbox: _Inbox, on_progress: OnProgress, stopped: Stopped
+    tasks: Sequence[Task[R]], crew: list[_Worker], messages: _Messages, on_progress: OnProgress, stopped: Stopped
 ) -> Iterator[tuple[int, R]]:
     waiting = iter(enumerate(tasks))
     for worker, (number, task) in zip(crew, waiting, strict=False):
@@ -174,7 +174,7 @@ def _results(
         if (pid := watch.suspended_for_good(busy)) is not None:
             raise _suspended(busy[pid])
         try:
-            worker, message = inbox.get(timeout=_POLL_SECONDS)
+            worker, message = messages.get(timeout=_POLL_SECONDS)
         except Empty:
             continue
         message = _unfailed(worker, message)

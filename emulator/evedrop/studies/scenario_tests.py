@@ -29,9 +29,10 @@ from evedrop.results.folder import claimed, default_folder
 from evedrop.results.reading import Results
 from evedrop.results.resolved_scenario import resolved
 from evedrop.scenario.discovery import scenarios_in
-from evedrop.scenario.loading import load, shipped
+from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import silent
 from evedrop.scenario.tables import Scenario
+from evedrop.scenarios import shipped
 from evedrop.score.summary import Judged, failed
 from evedrop.show.report.writing import has_results, try_report
 from evedrop.simulate.kept_tasks import KEPT

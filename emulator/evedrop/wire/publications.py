@@ -21,10 +21,10 @@ from evedrop.system.waiting import wait_for_thread
 from evedrop.wire.departures import Backlog
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.link_state import Lane, LinkState
-from evedrop.wire.outlet import LONG_SECONDS, SideOutlet, waiting_bytes
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.records import AGAIN, HELD, UNLINKED, Kind, WireFate
 from evedrop.wire.ros2 import SourceReader
+from evedrop.wire.send_queue import LONG_SECONDS, SendQueue, waiting_bytes
 from evedrop.wire.side import SideSession, expressions_of
 from evedrop.wire.watchdog import Duty
 
@@ -40,17 +40,28 @@ class _Way:
     """The way of a key's messages over one link. Only the thread that takes the key's messages uses it."""
 
     __slots__ = (
-        "_count", "_key", "_last", "_publishers", "_session", "_state", "alone", "decide", "link", "order", "outlet", "patient",
+        "_count",
+        "_key",
+        "_last",
+        "_publishers",
+        "_session",
+        "_state",
+        "alone",
+        "decide",
+        "link",
+        "order",
+        "patient",
+        "send_queue",
         "used",
     )  # fmt: skip
 
     def __init__(
-        self, state: LinkState, key: str, publishers: Publishers, outlet: SideOutlet, decide: Lane, only: bool
+        self, state: LinkState, key: str, publishers: Publishers, send_queue: SendQueue, decide: Lane, only: bool
     ) -> None:
         """only: whether all links from its side lead to the same other side, apart from taps."""
         self.decide = decide
         self.link = state.link.number
-        self.outlet = outlet
+        self.send_queue = send_queue
         self.patient = not state.link.tap
         """Whether its messages wait for room at the other side."""
         self.order = state.order("put", key)
@@ -109,7 +120,7 @@ class _Way:
     def _release(self) -> None:
         """Undeclare the publisher after the messages that still wait for their turn with it."""
         if self._last is not None:
-            self.outlet.follow(partial(self._publishers.release, self._last[0]))
+            self.send_queue.follow(partial(self._publishers.release, self._last[0]))
             self._last = None
 
 
@@ -126,13 +137,13 @@ class PublicationRelay:
         side: SideSession,
         links: Mapping[str, LinkState],
         publishers: Mapping[str, Publishers],
-        outlets: Mapping[str, SideOutlet],
+        send_queues: Mapping[str, SendQueue],
         plan: WirePlan,
         journal: WireJournal,
         tell: Callable[[str], None],
     ) -> None:
-        """links, publishers, outlets: by the names of links and of sides; tell: for what the user must know."""
-        self._links, self._publishers, self._outlets = links, publishers, outlets
+        """links, publishers, send_queues: by the names of links and of sides; tell: for what the user must know."""
+        self._links, self._publishers, self._send_queues = links, publishers, send_queues
         self._plan, self._journal = plan, journal
         links_away = [link for link in plan.links if link.source == side.name]
         self._targets = [name for name in publishers if name in {link.target for link in links_away}]
@@ -222,8 +233,8 @@ class PublicationRelay:
                 n, fate, delay, again = way.decide(heard, size)
                 if heard > self._until and not fate:
                     fate, delay, again = underway, 0.0, False
-                outlet = way.outlet
-                at_once = not delay and way.order is None and outlet.is_free and (way.alone or way.drops(sample))
+                send_queue = way.send_queue
+                at_once = not delay and way.order is None and send_queue.is_free and (way.alone or way.drops(sample))
                 row = record(
                     heard,
                     n,
@@ -244,12 +255,12 @@ class PublicationRelay:
                     message = way.message(sample, 2 if again else 1, publisher)
                     if not at_once:
                         room = waiting_bytes(size, key)
-                        outlet.send(delay, room, row, message, patient=way.patient, order=way.order)
+                        send_queue.send(delay, room, row, message, patient=way.patient, order=way.order)
                         continue
                     begun = clock()
                     message()
                     if clock() - begun > LONG_SECONDS:
-                        outlet.took(clock() - begun, way.alone)
+                        send_queue.took(clock() - begun, way.alone)
                 except zenoh_error:
                     amend(row, refused)
 
@@ -281,7 +292,7 @@ class PublicationRelay:
                 state,
                 key,
                 self._publishers[state.link.target],
-                self._outlets[state.link.target],
+                self._send_queues[state.link.target],
                 decide,
                 self._has_one_target,
             )

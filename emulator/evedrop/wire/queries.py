@@ -21,11 +21,11 @@ import zenoh
 from evedrop.system.waiting import wait_for_thread
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.link_state import Decision, Lane, LinkState, Scheduler
-from evedrop.wire.outlet import SideOutlet, waiting_bytes
 from evedrop.wire.plan import LOST_HISTORY_SECONDS, WirePlan, published_key
 from evedrop.wire.publications import READY_KEYS
 from evedrop.wire.records import AGAIN, HELD, UNLINKED, Kind, WireFate
 from evedrop.wire.ros2 import SourceReader, reply_seconds
+from evedrop.wire.send_queue import SendQueue, waiting_bytes
 from evedrop.wire.side import SideSession, expressions_of
 from evedrop.wire.watchdog import Duty
 
@@ -37,9 +37,9 @@ _MOST_WAITING = 100_000
 class _Asked:
     """A query that was heard, until all its replies have arrived: then the asker is told that there are no more."""
 
-    def __init__(self, query: zenoh.Query, side: str, outlet: SideOutlet, query_seconds: float) -> None:
-        """outlet: of the side at which it was asked."""
-        self.query, self.side, self._outlet = query, side, outlet
+    def __init__(self, query: zenoh.Query, side: str, send_queue: SendQueue, query_seconds: float) -> None:
+        """send_queue: of the side at which it was asked."""
+        self.query, self.side, self._send_queue = query, side, send_queue
         self.key = str(query.key_expr)
         self._over = time.monotonic() + reply_seconds(self.key, query_seconds)
         self._open = 1
@@ -62,7 +62,7 @@ class _Asked:
             self._open -= 1
             over = self._open == 0
         if over:
-            self._outlet.follow(self.query.drop)
+            self._send_queue.follow(self.query.drop)
 
 
 @final
@@ -73,15 +73,15 @@ class QueryRelay:
         self,
         sides: Mapping[str, SideSession],
         links: Mapping[str, LinkState],
-        outlets: Mapping[str, SideOutlet],
+        send_queues: Mapping[str, SendQueue],
         plan: WirePlan,
         journal: WireJournal,
         tell: Callable[[str], None],
     ) -> None:
-        """links, outlets: by the names of links and of sides; tell: for what the user must know."""
+        """links, send_queues: by the names of links and of sides; tell: for what the user must know."""
         self._tell = tell
         self._sides, self._plan, self._journal = sides, plan, journal
-        self._links, self._outlets = links, outlets
+        self._links, self._send_queues = links, send_queues
         self._states = [state for state in links.values() if not state.link.tap]
         self._lanes: dict[tuple[str, str, str], tuple[Lane, LinkState]] = {}
         self._queriers: dict[tuple[str, str, bool, bool], zenoh.Querier] = {}
@@ -164,7 +164,7 @@ class QueryRelay:
         while (heard := self._heard.get()) is not None:
             self.duty.in_hand = heard
             name, key, query = heard
-            asked = _Asked(query, name, self._outlets[name], self._plan.query_seconds)
+            asked = _Asked(query, name, self._send_queues[name], self._plan.query_seconds)
             try:
                 if self._responsible(name, query.key_expr) == key:
                     self._ask(asked)
@@ -283,7 +283,7 @@ class QueryRelay:
         # Replies wait for room: one query may have many.
         order = state.order(kind.stream, key)
         room = waiting_bytes(size, key)
-        self._outlets[way[1]].send(delay, room, row, send, patient=kind == Kind.REPLY, order=order, lost=lost)
+        self._send_queues[way[1]].send(delay, room, row, send, patient=kind == Kind.REPLY, order=order, lost=lost)
 
     def _wait_in_vain(self, asked: _Asked) -> None:
         """Let an asker wait for its query, or for a reply, that is lost: nothing tells it so."""

@@ -23,11 +23,11 @@ from evedrop.wire.journal import WireJournal
 from evedrop.wire.link_state import LinkState
 from evedrop.wire.liveliness import LivelinessRelay
 from evedrop.wire.neighbours import Bypasses, Neighbours
-from evedrop.wire.outlet import LAST_SECONDS, SideOutlet
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.publications import PublicationRelay, Publishers
 from evedrop.wire.queries import QueryRelay
 from evedrop.wire.ros2 import EntityLog, service_key
+from evedrop.wire.send_queue import LAST_SECONDS, SendQueue
 from evedrop.wire.side import SideSession
 from evedrop.wire.timeline import Moment
 from evedrop.wire.watchdog import Duty
@@ -104,22 +104,22 @@ class WireRelay:
     def _open(self, stack: contextlib.ExitStack) -> None:
         plan, journal, links = self.plan, self._journal, self.links
         self.sides = {name: stack.enter_context(SideSession(side, plan.largest)) for name, side in plan.sides.items()}
-        outlets = {name: SideOutlet(name, plan, journal, self._tell) for name in plan.sides}
-        stack.callback(self._end_outlets, [*outlets.values()])
+        send_queues = {name: SendQueue(name, plan, journal, self._tell) for name in plan.sides}
+        stack.callback(self._end_send_queues, [*send_queues.values()])
         publishers = {name: Publishers(side.session) for name, side in self.sides.items()}
-        self._queries = QueryRelay(self.sides, links, outlets, plan, journal, self._tell)
+        self._queries = QueryRelay(self.sides, links, send_queues, plan, journal, self._tell)
         stack.callback(self._queries.close)
         relays = [
-            PublicationRelay(side, links, publishers, outlets, plan, journal, self._tell)
+            PublicationRelay(side, links, publishers, send_queues, plan, journal, self._tell)
             for side in self.sides.values()
         ]
         for relay in relays:
             stack.callback(relay.close)
         stack.callback(self._leave, relays)
         of_sides = [side.duty for side in self.sides.values()]
-        of_outlets = [duty for outlet in outlets.values() for duty in outlet.duties]
+        of_send_queues = [duty for send_queue in send_queues.values() for duty in send_queue.duties]
         of_relays = [duty for relay in relays for duty in relay.duties]
-        self.duties = [*of_sides, *of_relays, *of_outlets, self._queries.duty, self._duty]
+        self.duties = [*of_sides, *of_relays, *of_send_queues, self._queries.duty, self._duty]
         self._bypasses = Bypasses(self._note_bypass)
         self._neighbours = Neighbours(self.sides, [*links.values()], self._tell, self._bypasses)
         self._liveliness = LivelinessRelay(self.sides, plan, self._woken.set, EntityLog(journal.folder).add)
@@ -131,7 +131,7 @@ class WireRelay:
         self._bypasses.watch(self.sides.values())
         stack.callback(self._bypasses.close)
         backlogs = {name: relay.backlogs for name, relay in zip(self.sides, relays, strict=True)}
-        departures = Departures(backlogs, lambda side: outlets[side].waiting, self._note_departure)
+        departures = Departures(backlogs, lambda side: send_queues[side].waiting, self._note_departure)
         departures.watch(self.sides.values())
         thread = threading.Thread(target=self._keep_up, name="wire", daemon=True)
         thread.start()
@@ -154,13 +154,13 @@ class WireRelay:
         for relay in relays:
             relay.leave(until)
 
-    def _end_outlets(self, outlets: Sequence[SideOutlet]) -> None:
+    def _end_send_queues(self, send_queues: Sequence[SendQueue]) -> None:
         """End what sends to the sides, all at once: each may have to wait for its programs."""
-        for outlet in outlets:
-            outlet.end()
+        for send_queue in send_queues:
+            send_queue.end()
         deadline = time.monotonic() + LAST_SECONDS
-        for outlet in outlets:
-            outlet.close(deadline)
+        for send_queue in send_queues:
+            send_queue.close(deadline)
 
     def _poll(self) -> None:
         """Follow what programs declare.

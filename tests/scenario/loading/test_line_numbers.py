@@ -11,7 +11,8 @@ import pytest
 
 from evedrop.errors import ScenarioError
 from evedrop.scenario.line_numbers import line_of, lines_of_entries
-from evedrop.scenario.loading import load, parse, shipped
+from evedrop.scenario.loading import load, parse
+from evedrop.scenarios import shipped
 
 TEXT = '''# a comment with [brackets]
 a = 1

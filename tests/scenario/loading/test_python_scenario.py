@@ -18,8 +18,9 @@ from evedrop import Scenario, montecarlo, sweep
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.model.schemes.innovation import Innovation
-from evedrop.scenario.loading import load, parse, shipped, tables_in, with_event
+from evedrop.scenario.loading import load, parse, tables_in, with_event
 from evedrop.scenario.tables import ScenarioEntries
+from evedrop.scenarios import shipped
 from evedrop.simulate.montecarlo import Plan
 from evedrop.wire.file import example_wire, wire_of
 from evedrop.wire.timeline import with_change

@@ -16,8 +16,8 @@ from evedrop.errors import UsageError
 from evedrop.names import CONTROLLER, LEGITIMATE, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import make_private, write_private
 from evedrop.results.resolved_scenario import input_texts, resolved
-from evedrop.scenario.loading import shipped
 from evedrop.scenario.tables import Scenario
+from evedrop.scenarios import shipped
 
 COMPOSE_FILE = "docker-compose.yml"
 MOST_NETWORKS = 30

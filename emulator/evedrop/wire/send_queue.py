@@ -50,7 +50,7 @@ def waiting_bytes(size: int, key: str) -> int:
 
 
 @final
-class SideOutlet:
+class SendQueue:
     """Sends at a side, in the order in which it is given messages. Threads may call its methods at the same time."""
 
     def __init__(

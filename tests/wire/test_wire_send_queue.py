@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.outlet import SideOutlet
 from evedrop.wire.records import HELD, Kind, WireFate, records_in
+from evedrop.wire.send_queue import SendQueue
 from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_at_work import both_ways
 
@@ -29,7 +29,7 @@ class Queue:
         self.told: list[str] = []
         self.sent: list[int] = []
         self.lost: list[int] = []
-        self.outlet = SideOutlet("base", plan, self.journal, self.told.append, **limits)
+        self.send_queue = SendQueue("base", plan, self.journal, self.told.append, **limits)
         self._takes = threading.Semaphore(0)
         self._count = 0
 
@@ -44,7 +44,7 @@ class Queue:
                 raise TimeoutError
             self.sent.append(n)
 
-        self.outlet.send(delay, size, row, task, patient=patient, lost=lambda: self.lost.append(n))
+        self.send_queue.send(delay, size, row, task, patient=patient, lost=lambda: self.lost.append(n))
         return row
 
     def takes(self, count: int) -> None:
@@ -64,15 +64,15 @@ def queue(tmp_path: Path) -> Iterator[Queue]:
     made = Queue(tmp_path, most=3, most_bytes=100, patience=0.05)
     yield made
     made.takes(100)
-    made.outlet.end()
-    made.outlet.close(time.monotonic() + LIMIT)
+    made.send_queue.end()
+    made.send_queue.close(time.monotonic() + LIMIT)
     made.journal.close()
 
 
 def busy(queue: Queue) -> None:
     """Return when the side's thread has a message in its hands."""
     queue.give()
-    wait_until(lambda: queue.outlet._duty.in_hand is not None, "a message is being sent")
+    wait_until(lambda: queue.send_queue._duty.in_hand is not None, "a message is being sent")
 
 
 def test_messages_are_sent_in_order_and_a_killed_wire_knows_which_were(queue: Queue) -> None:
@@ -86,18 +86,18 @@ def test_messages_are_sent_in_order_and_a_killed_wire_knows_which_were(queue: Qu
     wait_until(lambda: queue.fates(killed=True)[1] is WireFate.DELIVERED, "two are sent")
     assert queue.fates(killed=True) == [WireFate.DELIVERED] * 2 + [WireFate.UNDERWAY] * 2
     queue.takes(2)
-    wait_until(lambda: queue.outlet.is_free, "all are sent")
+    wait_until(lambda: queue.send_queue.is_free, "all are sent")
     assert queue.sent == [0, 1, 2, 3]
     assert queue.fates(killed=True) == [WireFate.DELIVERED] * 4
 
 
 def test_no_message_goes_past_a_message_that_is_being_sent(queue: Queue) -> None:
     """Or else it would overtake it: nothing else waits any more."""
-    assert queue.outlet.is_free
+    assert queue.send_queue.is_free
     busy(queue)
-    assert not queue.outlet.is_free
+    assert not queue.send_queue.is_free
     queue.takes(1)
-    wait_until(lambda: queue.outlet.is_free, "it is sent")
+    wait_until(lambda: queue.send_queue.is_free, "it is sent")
     assert queue.sent == [0]
 
 
@@ -109,7 +109,7 @@ def test_a_message_that_does_not_wait_is_congested_when_there_is_no_room(queue: 
     assert queue.fates() == [WireFate.DELIVERED] * 4 + [WireFate.CONGESTED]
     assert queue.lost == [4]
     queue.takes(4)
-    wait_until(lambda: queue.outlet.is_free, "all are sent")
+    wait_until(lambda: queue.send_queue.is_free, "all are sent")
     queue.give(size=1000)
     queue.give(size=1)
     assert queue.lost == [4, 6]
@@ -124,7 +124,7 @@ def test_a_message_that_waits_gets_the_room_that_is_made(tmp_path: Path) -> None
         queue.give()
     sender = threading.Thread(target=queue.give, kwargs={"patient": True})
     sender.start()
-    wait_until(lambda: queue.outlet._watched, "it waits")
+    wait_until(lambda: queue.send_queue._watched, "it waits")
     assert sender.is_alive()
     queue.takes(1)
     sender.join(LIMIT)
@@ -132,8 +132,8 @@ def test_a_message_that_waits_gets_the_room_that_is_made(tmp_path: Path) -> None
     queue.takes(4)
     wait_until(lambda: queue.sent == [0, 1, 2, 3, 4], "all are sent")
     assert queue.told == []
-    queue.outlet.end()
-    queue.outlet.close(time.monotonic() + LIMIT)
+    queue.send_queue.end()
+    queue.send_queue.close(time.monotonic() + LIMIT)
     queue.journal.close()
 
 
@@ -146,15 +146,15 @@ def test_nobody_waits_for_a_side_that_has_stopped(queue: Queue) -> None:
     assert len(queue.told) == 1
     assert "programs at the side base have stopped reading, or read very slowly" in queue.told[0]
     queue.takes(1)
-    wait_until(lambda: len(queue.outlet._queue) == 3, "one is taken")
+    wait_until(lambda: len(queue.send_queue._queue) == 3, "one is taken")
     queue.give(patient=True)
     queue.give(patient=True)
     assert queue.lost == [4, 5, 6, 8]
     queue.takes(4)
     wait_until(lambda: len(queue.told) == 2, "it takes messages again")
     assert queue.told[1] == "the side base takes messages again"
-    assert queue.outlet._trust == 0.5
-    wait_until(lambda: queue.outlet.is_free, "all are sent")
+    assert queue.send_queue._trust == 0.5
+    wait_until(lambda: queue.send_queue.is_free, "all are sent")
     assert queue.sent == [0, 1, 2, 3, 7]
 
 
@@ -170,8 +170,8 @@ def test_a_delayed_message_is_held_up_or_congested(tmp_path: Path) -> None:
     assert queue.lost == [2, 5]
     assert queue.fates()[2:] == [WireFate.CONGESTED, WireFate.DELIVERED, WireFate.DELIVERED, WireFate.HELD_UP]
     queue.takes(2)
-    queue.outlet.end()
-    queue.outlet.close(time.monotonic() + LIMIT)
+    queue.send_queue.end()
+    queue.send_queue.close(time.monotonic() + LIMIT)
     assert queue.fates() == [WireFate.DELIVERED] * 2 + [
         WireFate.CONGESTED, WireFate.UNDERWAY, WireFate.UNDERWAY, WireFate.HELD_UP
     ]  # fmt: skip
@@ -182,10 +182,10 @@ def test_an_error_stops_one_message_only(queue: Queue) -> None:
     """What must follow is carried out in its turn."""
     code, order = queue.journal.key_code("scan"), list[str]()
     row = queue.journal.record(time.time(), 0, -1, 0.0, code, 0, 1, 0, Kind.PUT, WireFate.DELIVERED | HELD)
-    queue.outlet.send(0.0, 1, row, lambda: 1 / 0, patient=False)
-    queue.outlet.follow(lambda: 1 / 0)
+    queue.send_queue.send(0.0, 1, row, lambda: 1 / 0, patient=False)
+    queue.send_queue.follow(lambda: 1 / 0)
     queue.give()
-    queue.outlet.follow(lambda: order.append("last"))
+    queue.send_queue.follow(lambda: order.append("last"))
     queue.takes(1)
     wait_until(lambda: order, "it is carried out")
     assert queue.sent == [0]
@@ -200,35 +200,35 @@ def test_the_end_does_not_wait_for_a_side_that_takes_nothing(tmp_path: Path) -> 
     queue.give()
     sender = threading.Thread(target=queue.give, kwargs={"patient": True})
     sender.start()
-    wait_until(lambda: queue.outlet._watched, "it waits")
-    queue.outlet.end()
+    wait_until(lambda: queue.send_queue._watched, "it waits")
+    queue.send_queue.end()
     sender.join(LIMIT)
     assert queue.lost == [3]
-    queue.outlet.close(time.monotonic())
+    queue.send_queue.close(time.monotonic())
     assert queue.fates() == [WireFate.UNDERWAY] * 4
     queue.takes(10)
-    queue.outlet._thread.join(LIMIT)
-    assert not queue.outlet._thread.is_alive()
+    queue.send_queue._thread.join(LIMIT)
+    assert not queue.send_queue._thread.is_alive()
     assert queue.sent == [0]
     queue.journal.close()
 
 
 def test_the_end_is_not_missed_by_a_message_that_is_about_to_wait(queue: Queue) -> None:
     """Room is made, and the end told, only while no message looks for room: between its look and its wait it would miss it."""
-    outlet, safe = queue.outlet, list[bool]()
+    send_queue, safe = queue.send_queue, list[bool]()
 
     class Room(threading.Event):
         def set(self) -> None:
-            safe.append(outlet._lock.locked())
+            safe.append(send_queue._lock.locked())
             super().set()
 
-    outlet._room = Room()
+    send_queue._room = Room()
     busy(queue)
     for _ in range(4):
         queue.give(patient=True)
     queue.takes(4)
     wait_until(lambda: len(safe) == 1, "room is made")
-    outlet.end()
+    send_queue.end()
     assert safe == [True, True]
 
 
@@ -244,17 +244,17 @@ def test_two_senders_that_wait_are_told_once(queue: Queue) -> None:
         sender.join(LIMIT)
     assert sorted(queue.lost) == [4, 5]
     assert len(queue.told) == 1
-    assert queue.outlet._trust == 0.5
+    assert queue.send_queue._trust == 0.5
 
 
 def test_a_message_that_comes_after_the_end_is_under_way(tmp_path: Path) -> None:
     """Such as a reply to a query, which Zenoh may bring until the sessions are closed."""
     queue = Queue(tmp_path)
-    queue.outlet.end()
-    queue.outlet.close(time.monotonic() + LIMIT)
+    queue.send_queue.end()
+    queue.send_queue.close(time.monotonic() + LIMIT)
     queue.give(patient=True)
     queue.give(delay=LONG)
-    queue.outlet.follow(lambda: queue.sent.append(-1))
+    queue.send_queue.follow(lambda: queue.sent.append(-1))
     assert queue.lost == [0, 1]
     assert queue.fates() == [WireFate.UNDERWAY, WireFate.UNDERWAY]
     assert queue.sent == []
@@ -276,29 +276,29 @@ def test_a_side_that_lets_others_wait_has_no_messages_past_the_queue(
 ) -> None:
     """A long wait of a sender that sends to no other side, or waits for more than a tenth of the time; None is a pause."""
     now = [1000.0]
-    monkeypatch.setattr("evedrop.wire.outlet.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr("evedrop.wire.send_queue.time", SimpleNamespace(monotonic=lambda: now[0]))
     for seconds in waits:
         if seconds is None:
             now[0] += 10.0
         else:
             now[0] += seconds
-            queue.outlet.took(seconds, alone)
-    assert queue.outlet.is_free == free
+            queue.send_queue.took(seconds, alone)
+    assert queue.send_queue.is_free == free
 
 
 def test_a_side_that_was_slow_has_messages_past_the_queue_again(queue: Queue, monkeypatch: pytest.MonkeyPatch) -> None:
     """After some seconds, and each time after twice as many."""
     now = [1000.0]
-    monkeypatch.setattr("evedrop.wire.outlet.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr("evedrop.wire.send_queue.time", SimpleNamespace(monotonic=lambda: now[0]))
 
     def is_free_after(seconds: float) -> bool:
         now[0] += seconds
         queue.give()
         queue.takes(1)
-        wait_until(lambda: queue.outlet._sleeps, "it is sent")
-        return queue.outlet.is_free
+        wait_until(lambda: queue.send_queue._sleeps, "it is sent")
+        return queue.send_queue.is_free
 
-    queue.outlet.took(2.0, alone=True)
+    queue.send_queue.took(2.0, alone=True)
     assert [is_free_after(seconds) for seconds in (9.0, 2.0)] == [False, True]
-    queue.outlet.took(2.0, alone=True)
+    queue.send_queue.took(2.0, alone=True)
     assert [is_free_after(seconds) for seconds in (19.0, 2.0)] == [False, True]
