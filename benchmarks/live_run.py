@@ -14,7 +14,7 @@ from typing import Any
 
 import tomli_w
 
-from evedrop.scenario.loading import shipped
+from evedrop.scenarios import shipped
 
 _COMMAND = (sys.executable, "-m", "evedrop", "run")
 _MEASURED = (0, 1)  # 1: the scenario did not meet an expectation of its own, but its performance metrics are right
