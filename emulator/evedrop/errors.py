@@ -63,14 +63,14 @@ class ScenarioError(UsageError):
 
 
 class TraceError(UsageError):
-    """An unusable recording of a link: `entry` says which entry must change, `file` or `column`; `what` says why.
+    """An unusable recording of a link: `entry` says which entry must change, `file` or `column`; `reason` says why.
 
-    The message itself is for the command line: `typed` is `what` with options in place of entries, where the two differ.
+    The message itself is for the command line: `typed` is `reason` with options in place of entries, where the two differ.
     """
 
     def __init__(self, path: str, entry: str, reason: str, typed: str | None = None) -> None:
         self.entry = entry
-        self.what = reason
+        self.reason = reason
         super().__init__(f"{path}: {reason if typed is None else typed}")
 
 
@@ -153,7 +153,7 @@ class MissingProcesses(RunError):
     """Processes that did not appear on the network: `missing`."""
 
     def __init__(self, process: str, missing: tuple[str, ...], when: str) -> None:
-        """process: that waited for them; what: the rest of the sentence."""
+        """process: that waited for them; when: the rest of the sentence."""
         self.missing = missing
         super().__init__(f"{process}: {', '.join(missing)} did not appear {when}")
 
@@ -180,14 +180,14 @@ class UnknownName(KeyError):
     """A name that results do not have; the message says which they have."""
 
     def __init__(self, kind: str, name: object, choices: Iterable[str]) -> None:
-        """what: the kind of thing, such as "receiver"."""
+        """kind: that of the thing, such as "receiver"."""
         names = [*choices]
         super().__init__(kind, name, names)  # what a copy is made from in another process
         expected = f"expected one of {', '.join(names)}" if names else "these results have none"
-        self._said = f"there is no {kind} {name!r}; {expected}"
+        self._message = f"there is no {kind} {name!r}; {expected}"
 
     def __str__(self) -> str:
-        return self._said
+        return self._message
 
 
 class NotRegistered(KeyError):

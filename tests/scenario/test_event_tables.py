@@ -224,7 +224,7 @@ def test_what_events_come_to() -> None:
         "eve": [(70, 80, Fate.DOWN, False), (90, NEVER, Fate.PAUSED, True)],
     }
     assert sorted(scenario.timeline.holds) == [5, 10, 20, 25, 30, 40, 50, 60, 70, 80, 90]
-    assert scenario.timeline.holds[20][0].said == "cut legitimate, eve"
+    assert scenario.timeline.holds[20][0].text == "cut legitimate, eve"
 
 
 def test_a_restart_keeps_the_state_that_it_says() -> None:

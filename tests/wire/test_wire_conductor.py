@@ -23,7 +23,7 @@ class Applied:
 
     def apply(self, moment: Moment) -> None:
         """Note the seconds since the start, the links that are cut, and the lines."""
-        self.at.append((self._clock.now - self._start, moment.cut, moment.said))
+        self.at.append((self._clock.now - self._start, moment.cut, moment.lines))
 
 
 def plan_of(*events: dict[str, Any]) -> WirePlan:

@@ -34,7 +34,7 @@ def test_a_wire_without_events() -> None:
     """It has one moment, its start, with the settings of the file."""
     plan = plan_of()
     (moment,) = moments(plan)
-    assert (moment.time, moment.said, moment.cut) == (0.0, (), frozenset())
+    assert (moment.time, moment.lines, moment.cut) == (0.0, (), frozenset())
     assert moment.settings == {link.name: link.settings for link in plan.links}
 
 
@@ -47,7 +47,7 @@ def test_cuts_and_partitions_overlap() -> None:
         {"at": 8, "cut": "robot-listener"},
     )
     both = frozenset({"scan", "robot-base", "base-robot"})
-    assert [(moment.time, moment.cut, moment.said) for moment in moments(plan)] == [
+    assert [(moment.time, moment.cut, moment.lines) for moment in moments(plan)] == [
         (0.0, frozenset(), ()),
         (1.0, {"scan"}, ("cut scan",)),
         (3.0, both, ("partition base, robot",)),
@@ -65,8 +65,8 @@ def test_changes_overlap() -> None:
     )
     assert [quality(plan, time) for time in (0, 1, 2.9, 3, 5.9, 6, 9)] == [0.9, 0.1, 0.1, 0.3, 0.3, 0.1, 0.9]
     assert [moment_at(plan, time).settings["scan"].get("duplicate") for time in (0, 5, 9)] == [None, 0.5, None]
-    assert moment_at(plan, 3.0).said == ('link scan: loss = { model = "bernoulli", quality = 0.3 }',)
-    assert moment_at(plan, 6.0).said == ("link scan: loss as before",)
+    assert moment_at(plan, 3.0).lines == ('link scan: loss = { model = "bernoulli", quality = 0.3 }',)
+    assert moment_at(plan, 6.0).lines == ("link scan: loss as before",)
     assert moment_at(plan, 5.0).settings["robot-base"] == plan.named("robot-base").settings
 
 

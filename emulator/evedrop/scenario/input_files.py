@@ -187,5 +187,5 @@ def _replace(trace: dict[str, Any], model: type[LossModel | DelayModel], of_dela
         else:
             trace[entry] = (recording.outcomes(column, lost) + ord("0")).tobytes().decode()
     except TraceError as error:
-        return [(error.entry, f"{file} {error.what}" if error.entry == "file" else error.what)]
+        return [(error.entry, f"{file} {error.reason}" if error.entry == "file" else error.reason)]
     return []

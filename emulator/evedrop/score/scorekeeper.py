@@ -265,7 +265,7 @@ def digest_of(scenario: Scenario, receiver: str, blocks: Mapping[int, Digests]) 
 
 def events_of(scenario: Scenario, done: int) -> list[RunEvent]:
     """The scenario's events before slot `done`."""
-    return [RunEvent(act.at, act.said, "scenario") for act in scenario.timeline.acts if act.at < done]
+    return [RunEvent(act.at, act.text, "scenario") for act in scenario.timeline.acts if act.at < done]
 
 
 def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[str, Verification]:

@@ -104,7 +104,7 @@ _NEVER = -1
 class WatchedSlots(NamedTuple):
     """A quantity to keep, over the slots from `first` to before `end`."""
 
-    what: str
+    metric: str
     """A metric's name, or `synchronised`."""
     first: int
     end: int
@@ -181,13 +181,13 @@ class WatchedTally:
     """Keeps the tallies of these quantities over R trials."""
 
     def __init__(self, watches: Iterable[WatchedSlots], trials: int) -> None:
-        self._kept = {watch: _tally(watch.what, trials) for watch in watches}
+        self._kept = {watch: _tally(watch.metric, trials) for watch in watches}
 
     def add_slots(self, slots: ScoredSlots) -> None:
         """Add the next slots."""
         for watch, kept in self._kept.items():
             start, stop = max(watch.first - slots.first, 0), min(watch.end - slots.first, len(slots.error))
-            stateless = slots.x is None and watch.what != SYNCHRONISED and metric(watch.what).needs_states
+            stateless = slots.x is None and watch.metric != SYNCHRONISED and metric(watch.metric).needs_states
             if start < stop and not stateless:
                 kept.add(slots if (start, stop) == (0, len(slots.error)) else slots.part(start, stop))
 

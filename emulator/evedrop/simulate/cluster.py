@@ -70,7 +70,7 @@ class Cluster:
         self._workers: frozenset[str] = frozenset()
         self._looked = float("-inf")
         self._lonely_since: float | None = None
-        self._said = False
+        self._is_told = False
 
     def results(self, tasks: Sequence[Task[R]], stopped: Stopped) -> Iterator[tuple[int, R]]:
         """Carry out the tasks; yields the number of a task and its result as they come. After a stop, tasks are cancelled.
@@ -147,12 +147,12 @@ class Cluster:
                 return False
             self._workers = workers
         if self._workers:
-            self._lonely_since, self._said = None, False
+            self._lonely_since, self._is_told = None, False
             return True
         if self._lonely_since is None:
             self._lonely_since = now
-        elif now - self._lonely_since >= _LONELY_SECONDS and not self._said:
-            self._said = True
+        elif now - self._lonely_since >= _LONELY_SECONDS and not self._is_told:
+            self._is_told = True
             say(
                 f"the scheduler {self._scheduler} has no workers; waiting for one: start it with "
                 f"`dask worker {self._scheduler} --nthreads 1`"

@@ -110,7 +110,7 @@ class WireConductor:
                 moment = moment_at(self._plan, due)
                 self._done = due
                 self._relay.apply(moment)
-                for line in moment.said:
+                for line in moment.lines:
                     self._say(f"{due:.1f} s: {line}")
 
     def _run(self) -> None:

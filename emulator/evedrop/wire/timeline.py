@@ -28,7 +28,7 @@ class Moment:
 
     time: float
     """Seconds after the start of the wire."""
-    said: tuple[str, ...]
+    lines: tuple[str, ...]
     """A line for each event that begins or ends."""
     cut: frozenset[str]
     """The names of the links that are cut, or whose sides are partitioned."""

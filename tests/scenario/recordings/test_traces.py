@@ -119,7 +119,7 @@ def test_what_is_no_recording_is_said(
     with pytest.raises(TraceError) as caught:
         LinkRecording(tmp_path / name).outcomes(column)
     assert (caught.value.entry, caught.value.exit_status) == (entry, 2)
-    assert message in caught.value.what
+    assert message in caught.value.reason
     loss = {"model": "trace", "file": name, **({} if column is None else {"column": column})}
     (line,) = mistakes_of(with_trace, tmp_path, loss)
     assert line.startswith(f"legitimate.link.loss.{entry}: ")

@@ -26,7 +26,7 @@ def judged(reproduction: Reproduction) -> None:
     assert reproduction.differing == ()
     for row in reproduction.rows:
         assert row.where, row
-        assert row.what, row
+        assert row.quantity, row
         assert row.verdict is not NumberVerdict.AGREES or row.printed, row
         assert row.verdict is not NumberVerdict.FORMULA or not row.printed, row
         if row.verdict in {NumberVerdict.AGREES, NumberVerdict.FORMULA}:

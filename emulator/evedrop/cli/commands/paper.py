@@ -93,7 +93,7 @@ def _print(reproduction: Reproduction) -> None:
     reasons: dict[str, int] = {}
     for row in reproduction.rows:
         note = f" [{reasons.setdefault(row.reason, len(reasons) + 1)}]" if row.reason else ""
-        table.add(row.where, row.what, row.their_text, row.our_text, row.tolerance or "–", f"{row.verdict}{note}")
+        table.add(row.where, row.quantity, row.their_text, row.our_text, row.tolerance or "–", f"{row.verdict}{note}")
     console.show(table, tight=True)
     for reason, number in reasons.items():
         console.print(f"[{number}] {reason}")

@@ -278,17 +278,17 @@ class SshHost:
         self._processes: dict[int, HostedProcess] = {}
         self._version = ""
         self._answered, self._lost = threading.Event(), threading.Event()
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the connection
+        self._output_file = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the connection
         try:
             self._ssh = subprocess.Popen(
                 _ended_with_us(ssh_command(table, config, longest_outage)),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=self._said,
+                stderr=self._output_file,
                 start_new_session=True,  # Ctrl-C in the terminal must reach only the launcher
             )
         except OSError as error:
-            self._said.close()
+            self._output_file.close()
             raise UsageError(f"ssh cannot be started ({error.strerror}); install OpenSSH's client") from error
         self._reader = threading.Thread(target=self._follow, name=f"host {name}", daemon=True)
         self._reader.start()
@@ -360,7 +360,7 @@ class SshHost:
         self.hang_up()
         kill(*wait_for([self._ssh], deadline - time.monotonic()))
         self._reader.join(_END_SECONDS)  # it reads the end of the connection at once, and may then wait for ssh as long
-        self._said.close()
+        self._output_file.close()
 
     def _follow(self) -> None:
         """Read the host's messages until the connection ends; all processes there have ended then."""
@@ -413,7 +413,7 @@ class SshHost:
     def _reason(self) -> str:
         """The last line that ssh printed, or its exit status."""
         # Not by reading the file: ssh writes at the same position in it.
-        output = os.pread(self._said.fileno(), _MOST_SAID, 0).decode("utf-8", "replace")
+        output = os.pread(self._output_file.fileno(), _MOST_SAID, 0).decode("utf-8", "replace")
         lines = [line.strip() for line in output.splitlines() if line.strip()]
         status = self._ssh.poll()
         if lines:

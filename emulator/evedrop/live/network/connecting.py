@@ -104,14 +104,14 @@ class WaitReporter:
 
     def begin(self, again: bool = False) -> None:
         """Start the clock. again: because a connection was lost."""
-        self._began = self._said = self._clock.monotonic()
+        self._began = self._told_at = self._clock.monotonic()
         self._what = "lost the connection; waiting again" if again else "waiting"
 
     def poll(self, why: object) -> None:
         """Report that the process still waits, if a report is due; why: the result of the last attempt."""
         now = self._clock.monotonic()
-        if now - self._said >= _WAITING_SECONDS:
-            self._said = now
+        if now - self._told_at >= _WAITING_SECONDS:
+            self._told_at = now
             sys.stderr.write(
                 f"evedrop: {self._process}: {self._what} for the router at {self._router}: no answer yet "
                 f"({now - self._began:.0f} s; {why})\n"

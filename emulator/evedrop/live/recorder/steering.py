@@ -174,7 +174,7 @@ class Steering:
                 self._conductor.absent -= set(act.names)
             self._waiting = None
             return True
-        self._fail(f"{act.said}: not done yet; look at logs/{act.names[0]}.log")
+        self._fail(f"{act.text}: not done yet; look at logs/{act.names[0]}.log")
         return False
 
     def _fail(self, problem: str) -> None:
@@ -189,7 +189,7 @@ class Steering:
         return act.effect.present is not False or all(self._left.get(name) == act.at for name in act.names)
 
     def _do(self, k: int, act: Act) -> None:
-        self._note(k, act.said, "scenario")
+        self._note(k, act.text, "scenario")
         if act.effect.present is False:
             self._conductor.absent |= set(act.names)
         action = act.effect.action
@@ -231,13 +231,13 @@ class Steering:
             return
         act = next(changed.event[-1].acts())
         self._scenario = changed
-        self._note(k, act.said, "operator")
+        self._note(k, act.text, "operator")
         self._keep(changed)
         for name in act.names:
             self._changed.add(name)
             changes = tuple(change for change in changed.timeline.changes[name] if change.at >= k)
             self._conductor.send_to(ROUTER, LinkChange(name, changes))
-        order.done(k, f"from slot {k} on: {act.said}")
+        order.done(k, f"from slot {k} on: {act.text}")
 
     def _pause(self, k: int, text: str | None = None) -> None:
         self.paused = True

@@ -151,7 +151,7 @@ class Act:
     """The entry of the event that messages about a mistake in this act name."""
     names: tuple[str, ...]
     """The receivers it concerns."""
-    said: str
+    text: str
     """Its line in the list of events."""
     effect: Effect
 

@@ -32,7 +32,7 @@ class ComparisonSource:
     """The folder of a comparison, read."""
 
     folder: Path
-    found: Comparison
+    comparison: Comparison
 
     @classmethod
     def read(cls, folder: Path) -> ComparisonSource:
@@ -42,7 +42,7 @@ class ComparisonSource:
     @property
     def outcome(self) -> str:
         """How many pairs have each verdict, as a sentence."""
-        verdicts = [cell.verdict for scheme in self.found.schemes.values() for cell in scheme.cells.values()]
+        verdicts = [cell.verdict for scheme in self.comparison.schemes.values() for cell in scheme.cells.values()]
         counts = [(word, verdicts.count(word)) for word in SecrecyKept]
         counted = ", ".join(f"{count:,} {word.value}" for word, count in counts if count)
         return f"Secrecy of {sum(count for _, count in counts):,} pairs of scheme and adversary: {counted}"
@@ -50,7 +50,7 @@ class ComparisonSource:
 
 def _matrix(of: ComparisonSource) -> Iterator[Markup]:
     """The verdict on each scheme against each adversary."""
-    comparison = of.found
+    comparison = of.comparison
     caption = "The adversary's error over the legitimate one, and the verdict on secrecy; ·: not defined"
     rows = [
         (name, [_cell(scheme.cells[adversary]) for adversary in comparison.adversaries])
@@ -74,18 +74,20 @@ def _cell(cell: Cell) -> Mapping[str, str | None]:
 
 def _schemes(of: ComparisonSource) -> Iterator[Markup]:
     """What each scheme costs, and its closest adversary."""
-    yield made("table", schemes_table(of.found), "Cost and secrecy of each scheme; errors ± standard errors")
-    yield made("sentences", list(comparison_lines(of.found)))
+    yield made("table", schemes_table(of.comparison), "Cost and secrecy of each scheme; errors ± standard errors")
+    yield made("sentences", list(comparison_lines(of.comparison)))
 
 
 def _pairs(of: ComparisonSource) -> Iterator[Markup]:
     """The errors of every pair, with theory and z."""
-    yield made("table", pairs_table(of.found), "Errors ± standard errors, with theory; z: the z-score against theory")
+    yield made(
+        "table", pairs_table(of.comparison), "Errors ± standard errors, with theory; z: the z-score against theory"
+    )
 
 
 def _repeat(of: ComparisonSource) -> Iterator[Markup]:
     """How to repeat the simulations."""
-    comparison = of.found
+    comparison = of.comparison
     yield made(
         "paragraph",
         f"Seed {comparison.seed}, trials from {comparison.first_trial:,} on. Each simulation of the comparison again:",

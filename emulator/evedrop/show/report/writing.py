@@ -41,7 +41,7 @@ def sweep_page(folder: Path) -> Page:
 def comparison_page(folder: Path) -> Page:
     """The report of a comparison."""
     source = ComparisonSource.read(folder)
-    about = comparison_heading(source.found)
+    about = comparison_heading(source.comparison)
     return Page("Schemes against adversaries", about, source.outcome, None, parts_of(COMPARISON_SECTIONS, source))
 
 

@@ -70,7 +70,7 @@ class PublishedNumber:
 
     where: str
     """Where in the paper, such as "Fig. 3" or "Table 1"."""
-    what: str
+    quantity: str
     """What the number is, with the parameters."""
     theirs: Value
     ours: Value
@@ -230,6 +230,6 @@ def markdown_table(rows: Iterable[PublishedNumber]) -> str:
     lines = ["| where | what | theirs | ours | tolerance | verdict |", "|---|---|---|---|---|---|"]
     for row in rows:
         verdict = f"{row.verdict}: {row.reason}" if row.reason else str(row.verdict)
-        cells = (row.where, row.what, row.their_text, row.our_text, row.tolerance or "–", verdict)
+        cells = (row.where, row.quantity, row.their_text, row.our_text, row.tolerance or "–", verdict)
         lines.append(f"| {' | '.join(cell.replace('|', '∣') for cell in cells)} |")
     return "\n".join(lines)
