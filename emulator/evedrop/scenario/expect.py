@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Field
 from evedrop.model.metrics import expectable_metrics, metrics_of, unloadable_metrics
 from evedrop.model.metrics.built_in import LINK_METRICS
 from evedrop.scenario.application import APPLICATIONS, Application
-from evedrop.scenario.table import Found, Number, Table, expected, one_of
+from evedrop.scenario.table import Mistake, Number, Table, expected, one_of
 from evedrop.scenario.words import as_toml, listed
 from evedrop.system.hints import near
 
@@ -78,7 +78,7 @@ class ExpectTable(Table):
     by: Annotated[Slot | None, Field(examples=[40])] = None
     since: Annotated[Slot | None, Field(examples=[0])] = None
 
-    def mistakes(self) -> Iterable[Found]:
+    def mistakes(self) -> Iterable[Mistake]:
         """Mistakes unless the table has exactly one subject, all the entries that this subject needs, and no others."""
         given = [name for name, value in self if value is not None]
         kinds = [kind for kind in _ENTRIES if kind in given]
@@ -110,7 +110,7 @@ class ExpectTable(Table):
             mistakes.append(("by", f"is {self.by}, before since, which is {self.since}; expected since ≤ by"))
         return mistakes
 
-    def _bound_mistakes(self) -> Iterator[Found]:
+    def _bound_mistakes(self) -> Iterator[Mistake]:
         """Mistakes unless there is a bound to compare with."""
         distances = [name for name in ("within", "within_relative") if getattr(self, name) is not None]
         if self.near is None and distances:
@@ -126,7 +126,7 @@ class ExpectTable(Table):
         if self.below is not None and self.above is not None and not self.above < self.below:
             yield "above", f"is {as_toml(self.above)}, and below is {as_toml(self.below)}; expected above < below"
 
-    def _metric_mistakes(self, metric: str) -> Iterator[Found]:
+    def _metric_mistakes(self, metric: str) -> Iterator[Mistake]:
         """Slots or a quantile for a metric that does not allow them."""
         link = link_metric(metric)
         for name in ("slots", "quantile"):
@@ -217,9 +217,9 @@ class Around:
     directions: Sequence[str] = ()
     """Names of the process's directions."""
 
-    def mistakes(self, expectation: ExpectTable) -> list[Found]:
+    def mistakes(self, expectation: ExpectTable) -> list[Mistake]:
         """Unknown receivers and metrics, slots beyond the run, and quantiles of too few trials."""
-        mistakes: list[Found] = []
+        mistakes: list[Mistake] = []
         direction = None if expectation.metric is None else direction_metric(expectation.metric)
         if expectation.metric is not None and (direction is None or direction[0] not in self.receivers):
             mistakes += self._metric_mistakes(expectation.metric)
@@ -246,7 +246,7 @@ class Around:
             return f"there are no directions; expected process.directions = {{ {name} = [1.0, 0.0] }}, a number for each state"
         return f"expected {listed(self.directions)}{near(name, self.directions)}"
 
-    def _direction_mistakes(self, expectation: ExpectTable) -> list[Found]:
+    def _direction_mistakes(self, expectation: ExpectTable) -> list[Mistake]:
         """Directions that the process does not have, as the entry `direction` or in a metric."""
         named = [("direction", expectation.direction, "")]
         metric = None if expectation.metric is None else direction_metric(expectation.metric)
@@ -258,7 +258,7 @@ class Around:
             if name is not None and (sentence := self._unknown_direction(name)) is not None
         ]
 
-    def _metric_mistakes(self, metric: str) -> list[Found]:
+    def _metric_mistakes(self, metric: str) -> list[Mistake]:
         link = link_metric(metric)
         if link is not None and link[0] in self.receivers and _LOST_BY.fullmatch(".".join(link[1])):
             return []
@@ -282,7 +282,7 @@ class Around:
             return [("metric", f"is {as_toml(metric)}, but {why}; expected another metric")]
         return []
 
-    def _application_mistakes(self, metric: str, name: str, application: type[Application]) -> list[Found]:
+    def _application_mistakes(self, metric: str, name: str, application: type[Application]) -> list[Mistake]:
         own, of_receivers = application.metrics, application.receiver_metrics
         if name not in self.applications:
             wanted = f"expected a table [{name}], or another metric"
@@ -295,8 +295,8 @@ class Around:
         choice += [f"{name}.RECEIVER.METRIC ({', '.join(of_receivers)})"] if of_receivers else []
         return [("metric", f"is {as_toml(metric)}; expected {' or '.join(choice)}{near(metric, metrics)}")]
 
-    def _slot_mistakes(self, expectation: ExpectTable) -> list[Found]:
-        mistakes: list[Found] = []
+    def _slot_mistakes(self, expectation: ExpectTable) -> list[Mistake]:
+        mistakes: list[Mistake] = []
         span = expectation.slots
         if span is not None and span[1] > self.slots:
             mistakes.append(("slots", f"is {as_toml(span)}; expected from < to ≤ slots, which is {self.slots}"))
@@ -305,7 +305,7 @@ class Around:
                 mistakes.append((name, f"is {slot}; expected a slot of the run, 0 to {self.slots - 1}"))
         return mistakes
 
-    def _quantile_mistakes(self, quantile: float | None) -> list[Found]:
+    def _quantile_mistakes(self, quantile: float | None) -> list[Mistake]:
         if quantile is None:
             return []
         # At least one trial is expected beyond the quantile. The tolerance is for rounding: 1/q is seldom exact in binary.

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field
 from evedrop.model.registry import is_own
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.events.event import Fault, Slot
-from evedrop.scenario.table import Found, Table, expected
+from evedrop.scenario.table import Mistake, Table, expected
 from evedrop.scenario.words import as_toml, listed
 from evedrop.system.hints import near
 
@@ -52,7 +52,7 @@ class NemesisTable(Table):
     state: Annotated[Literal["prior", "last"] | None, Field(examples=["last"])] = None
     set: Annotated[dict[str, Any] | None, Field(min_length=1, examples=[{"quality": 0.2}])] = None
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Entries that a fault lacks or that no fault uses, a span that ends before it begins, and names that appear twice."""
         drawn = {name: fault for name in self.faults if (fault := fault_of(name)) is not None}
         for name, fault in drawn.items():

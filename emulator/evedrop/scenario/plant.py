@@ -17,7 +17,7 @@ from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.plant import Plant
 from evedrop.model.process import MOST_STATES, Floats, Process
-from evedrop.scenario.table import Found, Matrix, Number, Table, one_of, parameter_mistakes
+from evedrop.scenario.table import Matrix, Mistake, Number, Table, one_of, parameter_mistakes
 from evedrop.scenario.words import as_toml
 
 Numbers = list[Number]
@@ -44,7 +44,7 @@ class PlantTable(Table):
     state_lower: Annotated[Numbers | None, Field(examples=[[20.0, 10.0]])] = None
     state_upper: Annotated[Numbers | None, Field(examples=[[90.0, 90.0]])] = None
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Entries that do not fit each other; whether they fit the process is checked later."""
         yield from _named_mistakes("input", self.inputs, self.input_matrix, self.input_units)
         yield from _named_mistakes("disturbance", self.disturbances, self.disturbance_matrix, self.disturbance_units)
@@ -65,7 +65,7 @@ class PlantTable(Table):
 
 def _named_mistakes(
     kind: str, names: list[str], matrix: list[list[float]] | None, units: list[str] | None
-) -> Iterator[Found]:
+) -> Iterator[Mistake]:
     """Mistakes in the inputs, or in the disturbances; kind: the first word of their entries."""
     if len(names) > MOST_STATES:
         yield f"{kind}s", f"has {len(names)} names; expected at most {MOST_STATES}"
@@ -89,7 +89,7 @@ def limit_mistakes(
     count: int,
     why: str,
     within: Mapping[str, Sequence[float]],
-) -> Iterator[Found]:
+) -> Iterator[Mistake]:
     """Mistakes in the lower and upper limits of `kind`, and in values outside them.
 
     count: how many limits there must be; why: the reason for that number; within: name → values that must lie between them.
@@ -126,7 +126,7 @@ class ControllerTable(Table):
     rate_weights: Annotated[Numbers | None, Field(examples=[[1.0, 0.02]])] = None
     rate_limits: Annotated[Numbers | None, Field(examples=[[0.05, 3.0]])] = None
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Weights and limits below 0, and missing, unknown or wrong parameters of the strategy."""
         for name in ("state_weights", "input_weights", "rate_weights", "rate_limits"):
             values = getattr(self, name)

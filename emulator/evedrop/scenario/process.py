@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field
 
 from evedrop.model.process import Process, mistakes_of
 from evedrop.model.slot.cores import LARGEST
-from evedrop.scenario.table import Found, Matrix, Number, ProcessName, Table, expected
+from evedrop.scenario.table import Matrix, Mistake, Number, ProcessName, Table, expected
 from evedrop.scenario.words import as_toml, listed
 
 Source = Literal["model", "file", "zenoh"]
@@ -54,7 +54,7 @@ class ProgramTable(Table):
         list[Annotated[int, Field(strict=True, ge=0, le=_MOST_BYTES)]] | None, Field(examples=[[4, 12]])
     ] = None
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Neither or both of `connect` and `listen`."""
         if (self.connect is None) == (self.listen is None):
             which = "is missing" if self.connect is None else "is given together with listen"
@@ -65,7 +65,7 @@ class ProgramTable(Table):
             )
 
 
-def source_mistakes(table: ProcessTable, n: int) -> Iterator[Found]:
+def source_mistakes(table: ProcessTable, n: int) -> Iterator[Mistake]:
     """Mistakes in the entries of `[process]` that say where states come from; n: the number of states."""
     source = table.source
     if source is None:
@@ -93,7 +93,7 @@ def source_mistakes(table: ProcessTable, n: int) -> Iterator[Found]:
         yield from _row_mistakes(table.state_values, n)
 
 
-def _row_mistakes(rows: list[list[float]], n: int) -> Iterator[Found]:
+def _row_mistakes(rows: list[list[float]], n: int) -> Iterator[Mistake]:
     wrong = next((i for i, row in enumerate(rows) if len(row) != n), None)
     if wrong is not None:
         yield "state_values", f"row {wrong} has {len(rows[wrong])} numbers; expected {n}, one for each state"
@@ -130,7 +130,7 @@ class ProcessTable(Table):
     )
     theory: Annotated[bool | None, Field(strict=True, examples=[True])] = None
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Matrices that are not square or do not fit each other, and lists without an entry for each state.
 
         A matrix that is not square is not compared with the others.

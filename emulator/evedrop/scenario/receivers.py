@@ -22,7 +22,7 @@ from evedrop.model.links import LOSS_MODELS, loss_of, pooled_spec
 from evedrop.model.links.loss_model import LossModel
 from evedrop.model.registry import asked
 from evedrop.model.streams import root_of_seed, stream_key
-from evedrop.scenario.table import Found, Probability, Table, model_mistakes, one_of, refuse, registered
+from evedrop.scenario.table import Mistake, Probability, Table, model_mistakes, one_of, refuse, registered
 from evedrop.scenario.words import as_toml, listed, no_entry
 from evedrop.system.hints import near
 
@@ -70,7 +70,7 @@ class LinkTable(Table):
     rate: Annotated[float | None, Field(strict=True, gt=0.0, le=1e6, examples=[0.9])] = None
     queue: Annotated[int | None, Field(strict=True, ge=0, le=1_000_000, examples=[100])] = None
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Mistakes unless there is one of quality and loss, and no entry is pointless."""
         if self.quality is None and self.loss is None and not self.may_be_perfect:
             yield "quality", "is missing; expected quality = 0.9, or a loss model"
@@ -161,7 +161,7 @@ class AcknowledgementsTable(Table):
     flip: Annotated[Probability | None, Field(examples=[0.1])] = None
     false_alarms: Annotated[float, Field(strict=True, ge=10.0, le=1e9, examples=[1e4])] = 1e4
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Mistakes in the entries of attacks: two need a jammer with a link of its own, `flip` a probability."""
         if self.attack == "flip" and self.flip is None:
             yield (
@@ -245,7 +245,7 @@ class EavesdropperTable(Table):
     use_state: Annotated[Probability | None, Field(examples=[0.8])] = None
     use_innovation: Annotated[Probability | None, Field(examples=[0.2])] = None
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Missing, unknown and wrong parameters of the strategy, and a missing link."""
         strategy, fields = STRATEGIES[self.strategy], type(self).model_fields
         reader = None if self.reads_as is None or "reads_as" not in strategy.parameters else READERS[self.reads_as]

@@ -87,7 +87,7 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Probability = Annotated[float, Field(strict=True), AfterValidator(_probability)]
 ProcessName = Annotated[str, AfterValidator(_process_name)]
 Matrix = list[list[Annotated[float, Field(strict=True)]]]
-Found = tuple[str, str]
+Mistake = tuple[str, str]
 """A mistake in a table: the entry and a description."""
 
 
@@ -107,7 +107,7 @@ class Table(BaseModel):
         field = cls.model_fields.get(entry)
         return None if field is None else _table_in(field.annotation)
 
-    def mistakes(self) -> Iterable[Found]:
+    def mistakes(self) -> Iterable[Mistake]:
         """Mistakes that only show in several entries together; each entry is valid by itself."""
         return ()
 
@@ -124,13 +124,13 @@ def _table_in(annotation: Any) -> type[Table] | None:
     return next((table for argument in get_args(annotation) if (table := _table_in(argument)) is not None), None)
 
 
-def refuse(mistakes: Iterable[Found]) -> None:
+def refuse(mistakes: Iterable[Mistake]) -> None:
     """Raise the error of a check that finds these mistakes below the checked value, if there are any."""
     if given := list(mistakes):
         raise PydanticCustomError("mistakes", "several", {"mistakes": given})
 
 
-def parameter_mistakes(kind: str, name: str, model: Any, given: Mapping[str, Any]) -> Iterator[Found]:
+def parameter_mistakes(kind: str, name: str, model: Any, given: Mapping[str, Any]) -> Iterator[Mistake]:
     """Missing and unknown parameters of a class; kind, name: the class in messages, such as scheme innovation."""
     for entry, example in model.parameters.items():
         if entry not in given and entry not in getattr(model, "optional", ()):
@@ -141,7 +141,7 @@ def parameter_mistakes(kind: str, name: str, model: Any, given: Mapping[str, Any
             yield entry, f"is set, but the {kind} {name} has no such parameter; {choice}"
 
 
-def model_mistakes(table: Mapping[str, Any], models: Registry[Any]) -> list[Found]:
+def model_mistakes(table: Mapping[str, Any], models: Registry[Any]) -> list[Mistake]:
     """Mistakes in `{model = "…", …}`: a missing or unknown model; missing, unknown or wrong parameters.
 
     models: a registry of classes with `parameters`, `optional` and `mistakes`.
@@ -187,7 +187,7 @@ def sentences(error: ValidationError, root: type[Table]) -> list[str]:
     for detail in error.errors(include_url=False):
         path = ".".join(str(part) for part in detail["loc"] if part != "[key]")
         if detail["type"] == "mistakes":
-            inner: list[Found] = detail["ctx"]["mistakes"]
+            inner: list[Mistake] = detail["ctx"]["mistakes"]
             lines += [f"{'.'.join(filter(None, (path, name)))}: {sentence}" for name, sentence in inner]
         else:
             lines.append(f"{path}: {_sentence(detail, root)}")

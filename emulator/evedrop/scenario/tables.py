@@ -45,7 +45,15 @@ from evedrop.scenario.receivers import (
     WireTable,
     changed_link,
 )
-from evedrop.scenario.table import MOST_EAVESDROPPERS, Found, ProcessName, Table, parameter_mistakes, refuse, registered
+from evedrop.scenario.table import (
+    MOST_EAVESDROPPERS,
+    Mistake,
+    ProcessName,
+    Table,
+    parameter_mistakes,
+    refuse,
+    registered,
+)
 from evedrop.scenario.timeline import Timeline
 from evedrop.scenario.words import as_toml, dotted
 
@@ -57,7 +65,7 @@ class EncodingTable(Table):
 
     scheme: Annotated[str, Field(strict=True, examples=["innovation"]), AfterValidator(registered(SCHEMES))]
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Missing, unknown and wrong parameters of the scheme."""
         scheme, given = SCHEMES[self.scheme], self.parameters
         yield from parameter_mistakes("scheme", self.scheme, scheme, given)
@@ -308,7 +316,7 @@ class Scenario(Table):
             return APPLICATIONS[entry].table
         return super().inner(entry)
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Modules that this process would find elsewhere: each process looks, as it may be on another host."""
         if self.modules is not None:
             tables = self.model_dump(exclude_unset=True, exclude=NUMBERS)

@@ -17,7 +17,7 @@ from evedrop.model.links.loss_model import REASONS
 from evedrop.scenario.application import APPLICATIONS, Summary
 from evedrop.scenario.expect import ExpectTable, direction_metric, link_metric
 from evedrop.scenario.tables import Scenario
-from evedrop.score.summary import MODES, DirectionSummary, Found, Judged, LinkSummary, PeerSummary
+from evedrop.score.summary import MODES, DirectionSummary, Judged, JudgedValue, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.score.watched_tally import watch_of
@@ -106,11 +106,11 @@ class Evidence:
         values = tally.of_trials
         return None if values is None else float(np.quantile(values, expect.quantile))
 
-    def _link(self, expect: ExpectTable) -> tuple[Found, bool | None]:
+    def _link(self, expect: ExpectTable) -> tuple[JudgedValue, bool | None]:
         account = self.links[str(expect.link)]
         return account.rate, account.within_interval
 
-    def _secrecy(self, expect: ExpectTable) -> tuple[Found, bool | None]:
+    def _secrecy(self, expect: ExpectTable) -> tuple[JudgedValue, bool | None]:
         """Held if theory promises secrecy and the run shows it, otherwise not; undecided in a run that was cut short."""
         if expect.direction is not None:
             return self._secrecy_in(expect)
@@ -122,7 +122,7 @@ class Evidence:
         complete = all(tally.done == tally.slots for tally in self.tallies.values())
         return verdicts, promised is True and shown is Verdict.HELD if complete else None
 
-    def _secrecy_in(self, expect: ExpectTable) -> tuple[Found, bool | None]:
+    def _secrecy_in(self, expect: ExpectTable) -> tuple[JudgedValue, bool | None]:
         """The same in one direction, where theory only promises perfect secrecy: relative secrecy is what the run shows."""
         verdict = self.directions.get(str(expect.against), {}).get(str(expect.direction))
         if verdict is None:
@@ -135,7 +135,7 @@ class Evidence:
         complete = all(tally.done == tally.slots for tally in self.tallies.values())
         return f"{promise}{run}", held if complete else None
 
-    def _synchronised(self, expect: ExpectTable) -> tuple[Found, bool | None]:
+    def _synchronised(self, expect: ExpectTable) -> tuple[JudgedValue, bool | None]:
         """The slot by which it was synchronised in all trials; undecided if the run was cut short before `by`."""
         wanted = watch_of(self.scenario, expect)
         assert wanted is not None  # noqa: S101 - every such expectation has one

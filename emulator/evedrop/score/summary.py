@@ -64,7 +64,7 @@ class BuiltInMetrics(ABC):
         return self.metric("mean_actual_trace_covariance")
 
 
-Found = float | int | str | None
+JudgedValue = float | int | str | None
 """The value found for an expectation. None: the run does not tell, or a receiver that must be synchronised never was."""
 
 
@@ -309,7 +309,7 @@ class Judged:
     text: str
     held: bool | None
     """None: it cannot be decided, and so it failed (see `failed`)."""
-    found: Found
+    found: JudgedValue
     wanted: str
     replay: str | None = None
     """The command that reproduces a failure; left out of the entry if None."""

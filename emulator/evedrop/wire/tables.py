@@ -20,7 +20,7 @@ from evedrop.model.checks import as_toml
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.scenario.receivers import CorrelationTable, LinkTable
-from evedrop.scenario.table import NAME, Found, Table, expected, model_mistakes, refuse
+from evedrop.scenario.table import NAME, Mistake, Table, expected, model_mistakes, refuse
 from evedrop.scenario.words import listed
 from evedrop.system.hints import near
 from evedrop.wire.tallies import WIRE_METRICS
@@ -171,7 +171,7 @@ class WireExpectTable(Table):
     quantile: Annotated[float | None, Field(strict=True, gt=0.0, lt=1.0, examples=[0.99])] = None
     link: Annotated[str | None, Field(strict=True, examples=["scan"])] = None
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Mistakes unless there is a metric with a bound, or a link alone."""
         if self.link is not None:
             others = [name for name, value in self if name != "link" and value is not None]
@@ -355,7 +355,7 @@ class WireLinkTable(WireSettingsTable):
     tap: Annotated[bool, Field(strict=True)] = False
     ordered: Annotated[bool, Field(strict=True)] = False
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Those of the settings, and messages that are to overtake others, on a link on which none does."""
         yield from super().mistakes()
         if self.ordered and self.reorder:
@@ -383,7 +383,7 @@ class SideTable(Table):
     keys: Annotated[KeyExpressions, Field(default_factory=lambda: ["**"])]
     peers: Annotated[bool, Field(strict=True)] = False
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Certificates without an endpoint that uses them, and encrypted endpoints without certificates."""
         endpoints = [*(self.listen or ()), *self.connect]
         secure = [endpoint for endpoint in endpoints if endpoint.partition("/")[0] in ENCRYPTED]
@@ -414,7 +414,7 @@ class WireEventTable(Table):
         str | None, Field(strict=True, min_length=1, max_length=200, examples=["the robot enters the lift"])
     ] = None
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Mistakes unless one thing happens, and its time is stated in one way."""
         kinds = ("partition", "cut", "set", "note")
         given = [name for name in kinds if getattr(self, name) is not None]

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from evedrop.scenario.application import APPLICATIONS, applications_in
 from evedrop.scenario.events.event import Act, EventKind, Jamming, Spoofing, Surroundings, begun_too_early
-from evedrop.scenario.table import Found
+from evedrop.scenario.table import Mistake
 from evedrop.scenario.words import as_toml
 
 
@@ -35,7 +35,7 @@ class Attack(EventKind):
         if self.to is not None:
             yield Act(self.to, self.kind, (), f"{self.attacked} are no longer attacked", self.does(on=False))
 
-    def compared(self, surroundings: Surroundings) -> Iterator[Found]:
+    def compared(self, surroundings: Surroundings) -> Iterator[Mistake]:
         """A mistake for another value of the main entry, and those of `undescribed`."""
         given = getattr(self, self.kind)
         if given != self.attacked:

@@ -22,7 +22,7 @@ from evedrop.model.registry import answered, place_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.streams import MOST_SLOTS
 from evedrop.names import ProcessAction
-from evedrop.scenario.table import Found, Table, refuse
+from evedrop.scenario.table import Mistake, Table, refuse
 
 
 class Effect:
@@ -233,7 +233,7 @@ class EventKind(When):
             refuse([(self.kind, f"is an event that cannot be carried out: {reason}")])
         return self
 
-    def compared(self, surroundings: Surroundings) -> Iterator[Found]:
+    def compared(self, surroundings: Surroundings) -> Iterator[Mistake]:
         """Mistakes that only show with other tables. Slots, receivers and changed links are checked elsewhere, for every kind."""
         del surroundings
         yield from ()

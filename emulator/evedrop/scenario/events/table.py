@@ -14,7 +14,7 @@ from pydantic import Field, PlainValidator, SerializeAsAny, create_model
 from evedrop.errors import NotRegistered
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.events.event import EventKind, When
-from evedrop.scenario.table import Found
+from evedrop.scenario.table import Mistake
 from evedrop.scenario.words import as_toml, listed
 
 
@@ -25,13 +25,13 @@ class EventTable(When):
     broken: ClassVar[Mapping[str, str]]
     """Kinds of installed packages that cannot be loaded → why, in words that follow the name."""
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """Mistakes unless there is exactly one kind, with its time stated in one way."""
         given = [kind for name, kind in self.kinds.items() if getattr(self, name) is not None]
         yield from self._what_mistakes(given)
         yield from self._when_mistakes(given)
 
-    def _what_mistakes(self, given: list[type[EventKind]]) -> Iterator[Found]:
+    def _what_mistakes(self, given: list[type[EventKind]]) -> Iterator[Mistake]:
         unloadable = [name for name in self.broken if getattr(self, name) is not None]
         yield from ((name, f"is an event{self.broken[name]}") for name in unloadable)
         if len(given) != 1 and not unloadable:
@@ -48,7 +48,7 @@ class EventTable(When):
                 words = f"{field.description}, such as {example}" if field.description else example
                 yield entry, f"is missing; expected {words}"
 
-    def _when_mistakes(self, given: list[type[EventKind]]) -> Iterator[Found]:
+    def _when_mistakes(self, given: list[type[EventKind]]) -> Iterator[Mistake]:
         at, start, to = self.at, self.start, self.to
         if at is not None and start is not None:
             yield "at", "and from are both there"

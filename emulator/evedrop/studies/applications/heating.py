@@ -24,7 +24,7 @@ from evedrop.scenario.application import (
     PanelFeed,
     Summary,
 )
-from evedrop.scenario.table import Found, Number, Table
+from evedrop.scenario.table import Mistake, Number, Table
 from evedrop.show.view.palette import PLANT
 
 _HOUR = 3600.0
@@ -41,7 +41,7 @@ class ComfortTable(Table):
     lowest: Annotated[Number, Field(examples=[20.0])]
     highest: Annotated[Number, Field(examples=[23.0])]
 
-    def mistakes(self) -> Iterator[Found]:
+    def mistakes(self) -> Iterator[Mistake]:
         """A range without temperatures."""
         if self.lowest >= self.highest:
             yield "lowest", f"is {self.lowest}, and highest is {self.highest}; expected lowest < highest"

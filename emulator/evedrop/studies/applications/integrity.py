@@ -39,7 +39,7 @@ from evedrop.scenario.application import (
     PanelFeed,
     Summary,
 )
-from evedrop.scenario.table import Found, Matrix, Table, one_of, parameter_mistakes, refuse
+from evedrop.scenario.table import Matrix, Mistake, Table, one_of, parameter_mistakes, refuse
 from evedrop.scenario.words import as_toml, listed
 from evedrop.show.view.palette import PLANT, TRUTH_CURVE
 from evedrop.system.hints import near
@@ -73,7 +73,7 @@ def _attack(entries: dict[str, Any]) -> dict[str, Any]:
     return entries
 
 
-def _attack_mistakes(entries: Mapping[str, Any]) -> Iterator[Found]:
+def _attack_mistakes(entries: Mapping[str, Any]) -> Iterator[Mistake]:
     name = entries.get(MODEL)
     attack = SENSOR_ATTACKS.get(str(name))
     if attack is None:
@@ -112,7 +112,7 @@ class IntegrityTable(Table):
         Annotated[dict[str, Any], AfterValidator(_attack)] | None, Field(examples=[{MODEL: "replay", "recorded": 100}])
     ] = None
 
-    def mistakes(self) -> list[Found]:
+    def mistakes(self) -> list[Mistake]:
         """Mistakes in the policy's parameters."""
         policy, given = POLICIES[self.policy], self.model_extra or {}
         mistakes = [*parameter_mistakes("policy", self.policy, policy, given)]
