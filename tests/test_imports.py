@@ -30,11 +30,11 @@ def loaded_by(*modules: str) -> dict[str, set[str]]:
     """Module → what a fresh process has loaded besides Python itself once it, and those before it, are imported."""
     code = f"""
 import importlib, json, sys
-bare, found = set(sys.modules), {{}}
+bare, loaded = set(sys.modules), {{}}
 for name in {modules!r}:
     importlib.import_module(name)
-    found.setdefault(name, [one for one in sys.modules if one not in bare])
-print(json.dumps(found))
+    loaded.setdefault(name, [module for module in sys.modules if module not in bare])
+print(json.dumps(loaded))
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return {module: set(names) for module, names in json.loads(ended.stdout).items()}
@@ -66,6 +66,11 @@ def loaded() -> dict[str, set[str]]:
     others = ("live", "simulate", "scenario", "score", "results")
     rest = (module for package in others for module in modules_of(package))
     return loaded_by("evedrop.model.controllers", *model(), *peers, "evedrop.live.recorder.recorder", *rest)
+
+
+def test_a_wire_starts_without_what_only_its_report_needs() -> None:
+    """Neither the templates of the page nor its charts."""
+    assert not packages(loaded_by("evedrop.wire.run")["evedrop.wire.run"]) & {"jinja2", "matplotlib", "rerun"}
 
 
 @pytest.fixture(scope="module")

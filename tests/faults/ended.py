@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from evedrop.results.writer import JOURNAL
+from evedrop.results.tables import JOURNAL
 from tests.faults import judge, ours
 from tests.faults.cases import PATIENT_SECONDS
 from tests.faults.fates import journal_rows

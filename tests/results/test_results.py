@@ -15,7 +15,7 @@ from evedrop.model.receiver import ACTIONS
 from evedrop.results import growing_tables as growing
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish
 from evedrop.results.reading import Results
-from evedrop.results.writer import DIGESTS, JOURNAL
+from evedrop.results.tables import DIGESTS, JOURNAL
 from evedrop.scenario.expect import ExpectTable
 from evedrop.scenario.loading import parse
 from evedrop.scenario.tables import Scenario

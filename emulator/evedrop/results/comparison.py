@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from evedrop.errors import UsageError
 from evedrop.results.reading import ByName
-from evedrop.results.writer import plain
+from evedrop.results.summary_file import plain
 from evedrop.score.summary import RareEvents, SecrecySummary
 from evedrop.score.verdict import Secrecy, SecrecyKept, Verdict
 from evedrop.system.files import Unreadable, text_of

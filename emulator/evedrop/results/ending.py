@@ -13,7 +13,8 @@ from pathlib import Path
 from evedrop.errors import UsageError
 from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished, last_round
 from evedrop.results.reading import Results, age_of_metrics
-from evedrop.results.writer import ResultsWriter, write_summary
+from evedrop.results.summary_file import write_summary
+from evedrop.results.writer import ResultsWriter
 from evedrop.scenario.tables import Scenario
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, summary_of

@@ -26,8 +26,8 @@ from evedrop.names import CONTROLLER
 from evedrop.results.folder import HeldFolder
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish, write_metrics
 from evedrop.results.resolved_scenario import TakenStates
-from evedrop.results.summary_file import plain, summary_text, write_summary
-from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, input_columns, inputs_schema, trials_schema
+from evedrop.results.summary_file import summary_text
+from evedrop.results.tables import DIGESTS, JOURNAL, SLOTS, input_columns, inputs_schema, trials_schema
 from evedrop.scenario.closed_loop import monitor_of
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.process import ProcessTable
@@ -41,10 +41,6 @@ _ROUND_SECONDS = 3.0  # the longest time between rounds, which a killed writer l
 _ROUND_BYTES = (32 * 2**10, 4 * 2**20)  # the most that is held back, at the start of a run and later
 _ROUND_ONE_IN = 8  # at most one in 8 of the bytes on disk is held back
 _METRICS_PAUSE = 50  # after metrics took some time, none are computed for 50 times as long
-
-__all__ = [
-    "DIGESTS", "JOURNAL", "NULLABLE", "SLOTS", "ResultsWriter", "plain", "seen_actions", "write_summary",
-]  # fmt: skip
 
 
 @final

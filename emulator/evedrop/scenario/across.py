@@ -373,13 +373,10 @@ def _no_theory(name: str, scenario: Scenario, sound: bool) -> str | None:
 def _application_objections(scenario: Scenario) -> list[str]:
     """Mistakes that applications find in a scenario that is otherwise valid."""
     loop = controlled_plant(scenario)
-    objecting = [(name, APPLICATIONS[name], table) for name, table in scenario.applications.items() if loop is not None]
-    return [
-        objection
-        for _, application, table in objecting
-        if loop is not None
-        for objection in application.objections(loop, table)
-    ]
+    if loop is None:
+        return []
+    asked = ((APPLICATIONS[name], table) for name, table in scenario.applications.items())
+    return [objection for application, table in asked for objection in application.objections(loop, table)]
 
 
 def horizon_mistakes(process: Process, slots: int) -> list[str]:

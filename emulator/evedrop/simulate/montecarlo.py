@@ -21,7 +21,8 @@ from evedrop.model.outcomes import eavesdropper_outcomes
 from evedrop.model.schemes import scheme_of
 from evedrop.results.folder import HeldFolder, disk_errors
 from evedrop.results.resolved_scenario import write_resolved
-from evedrop.results.writer import ResultsWriter, write_summary
+from evedrop.results.summary_file import write_summary
+from evedrop.results.writer import ResultsWriter
 from evedrop.scenario.arguments import number_argument, refuse_unless
 from evedrop.scenario.input_files import states_of
 from evedrop.scenario.progress_events import FolderMoved, OnEvent, RunProgress

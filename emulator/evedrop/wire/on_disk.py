@@ -22,8 +22,6 @@ from evedrop.model.slot.link import Change
 from evedrop.results.reading import results_of_this_version
 from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, JournalState, WireSummary
 from evedrop.show.report.wire import wire_sentences, wire_table
-from evedrop.show.report.wire_sections import WireSource
-from evedrop.show.report.writing import wire_page, write_page
 from evedrop.show.terminal_tables import rich_table
 from evedrop.system.files import is_locked
 from evedrop.wire.file import load_wire
@@ -137,5 +135,8 @@ def write_wire_report(folder: Path) -> Path:
 
     Raises UsageError if neither can be read, and OSError if the page cannot be written.
     """
+    from evedrop.show.report.wire_sections import WireSource  # noqa: PLC0415 - templates, which a wire at work does not need
+    from evedrop.show.report.writing import wire_page, write_page  # noqa: PLC0415 - as above
+
     with results_of_this_version(folder):
         return write_page(folder, wire_page(WireSource.of(folder, summary_of_wire(folder))))

@@ -19,7 +19,7 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
 from evedrop.model.process import Floats
-from evedrop.show.view.column import ELAPSED
+from evedrop.show.view.column import ELAPSED, laid_out
 from evedrop.show.view.palette import DROPPED_TEXT, TRUTH, TRUTH_CURVE, colour, dim
 from evedrop.show.view.panels.fates import LETTER, LINE, DrawnGraph, StateLanes
 from evedrop.wire.plan import WirePlan
@@ -126,15 +126,7 @@ class WirePanels:
             ),
             row_shares=[1.1, 0.4 + 0.13 * min(links, 10), 1.0],
         )
-        return rrb.Blueprint(
-            rrb.Horizontal(left, right, column_shares=[1.25, 1.0]),
-            rrb.TopPanel(state="hidden"),
-            rrb.BlueprintPanel(state="hidden"),
-            rrb.SelectionPanel(state="hidden"),
-            rrb.TimePanel(state="collapsed", timeline=ELAPSED, play_state="following"),
-            auto_views=False,
-            auto_layout=False,
-        )
+        return laid_out(rrb.Horizontal(left, right, column_shares=[1.25, 1.0]), ELAPSED)
 
     def style(self, to: rr.RecordingStream) -> None:
         """Record names and colours, once."""

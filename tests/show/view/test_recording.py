@@ -11,7 +11,8 @@ from rerun.chunk import RrdReader
 
 from evedrop.show.view.panels.curves import SquaredError
 from evedrop.show.view.panels.plane import frames, stride
-from evedrop.show.view.recording import Scene, ViewRecording
+from evedrop.show.view.recording import ViewRecording
+from evedrop.show.view.scene import Scene
 from tests.conftest import LIMIT
 from tests.examples import mostly_long
 from tests.show.view.read_back import lane, rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -34,7 +35,7 @@ class _InFolder(Protocol):
     def folder(self) -> Path: ...
 
 
-class ReportedResults:
+class ReportedResults(ABC):
     """Results in a folder, which can be shown on one page and whose tables can be written for other programs."""
 
     def to_csv(self, path: str | Path) -> list[Path]:
@@ -57,8 +58,9 @@ class ReportedResults:
 
         return write_latex(self._tables(), Path(path))
 
+    @abstractmethod
     def _tables(self) -> list[TextTable]:
-        raise NotImplementedError
+        """The tables that the command prints."""
 
     def report(self: _InFolder) -> Path:
         """Write report.html into the folder, and return its path. Source: docs/results.md, report.html.

@@ -41,7 +41,9 @@ from evedrop.results.growing_tables import parquet_or_stream
 from evedrop.results.reading import Results, as_of
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.shard_score import load_score
-from evedrop.results.writer import DIGESTS, NULLABLE, ResultsWriter, write_summary
+from evedrop.results.summary_file import write_summary
+from evedrop.results.tables import DIGESTS, NULLABLE
+from evedrop.results.writer import ResultsWriter
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of

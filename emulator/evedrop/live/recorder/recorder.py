@@ -45,8 +45,8 @@ from evedrop.results.ending import note_end
 from evedrop.results.folder import HeldFolder, new_folder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.shard_score import dump_score
-from evedrop.results.summary_file import unwritten
-from evedrop.results.writer import DigestRows, ResultsWriter, write_rows, write_summary
+from evedrop.results.summary_file import unwritten, write_summary
+from evedrop.results.writer import DigestRows, ResultsWriter, write_rows
 from evedrop.scenario.progress_events import ConnectionOutage, RunEnded, RunEvent, RunProgress, Started, ViewOpened
 from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of

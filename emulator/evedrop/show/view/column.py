@@ -1,4 +1,4 @@
-"""The unit in which panels record: values of one entity over some slots, in Rerun's form."""
+"""What views share of Rerun: the unit in which panels record, values of one entity over some slots; and their layout."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
@@ -33,3 +34,16 @@ class Column:
 def scalars(path: str, k: NDArray[np.int64], values: Floats) -> Column:
     """A number in each slot: slots k (c,), and values (c,)."""
     return Column(path, k, rr.Scalars.columns(scalars=values))
+
+
+def laid_out(content: rrb.Container, timeline: str) -> rrb.Blueprint:
+    """A view that shows its content alone, without the viewer's own panels, and follows the newest moment of a time line."""
+    return rrb.Blueprint(
+        content,
+        rrb.TopPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following"),
+        auto_views=False,
+        auto_layout=False,
+    )

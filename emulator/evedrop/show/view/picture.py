@@ -255,8 +255,6 @@ def _end(state: ViewerState) -> tuple[str, int] | None:
     return (lines[0].name, int(lines[0].end)) if lines and lines[0].end is not None else None
 
 
-__all__ = ["SIZE", "check_picture_name", "frames_apart", "opened", "picture_apart"]
-
 SIZE = (1600, 950)
 """Width and height of a picture in pixels."""
 _LENGTH_BYTES = 8

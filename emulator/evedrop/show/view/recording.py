@@ -22,11 +22,11 @@ from evedrop.errors import NotRegistered
 from evedrop.model.registry import place_of
 from evedrop.results.folder import private_file
 from evedrop.scenario.words import listed
-from evedrop.show.view.column import TIMELINE, Column
+from evedrop.show.view.column import TIMELINE, Column, laid_out
 from evedrop.show.view.events import Event, introduction
 from evedrop.show.view.panels import PANELS
 from evedrop.show.view.panels.panel import COLUMNS, ROWS_ABOVE, ROWS_BELOW, PlacedView, ViewPanel
-from evedrop.show.view.scene import PeerSlots, Scene, SceneSlots, Shown
+from evedrop.show.view.scene import Scene, SceneSlots
 from evedrop.system.output import warn
 
 T = TypeVar("T")
@@ -58,15 +58,7 @@ class PanelSet:
             for name, panel in [*self._panels.items()]
             for view in self._tried(name, partial(_views, panel, _drawable if PANELS.foreign(name) else _placed))
         ]
-        return rrb.Blueprint(
-            _arranged(placed),
-            rrb.TopPanel(state="hidden"),
-            rrb.BlueprintPanel(state="hidden"),
-            rrb.SelectionPanel(state="hidden"),
-            rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
-            auto_views=False,
-            auto_layout=False,
-        )
+        return laid_out(_arranged(placed), TIMELINE)
 
     def send_styles(self, to: rr.RecordingStream) -> None:
         """Record every panel's styles."""
@@ -158,8 +150,6 @@ def _send(columns: Iterable[Column], to: rr.RecordingStream) -> tuple[()]:
         column.send(to)
     return ()
 
-
-__all__ = ["PeerSlots", "RecordingThread", "Scene", "SceneSlots", "Shown", "ViewRecording"]
 
 _APPLICATION = "evedrop"
 _PERIOD = 0.1  # seconds between batches at most

@@ -25,7 +25,8 @@ import secrets
 import socket
 import threading
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import IO, final
 
@@ -93,6 +94,16 @@ def feed(followed: Followed, pipe: IO[bytes]) -> None:
     threading.Thread(target=write, name="view", daemon=True).start()
 
 
+def _listening(server_at: Callable[[str, int], BoundedServer], host: str, port: int) -> BoundedServer:
+    """A server that accepts readers at host and port; port 0: any free one. Raises UsageError if the port is not available."""
+    try:
+        server = server_at(host, port)
+    except OSError as error:
+        raise UsageError(f"{host}:{port} cannot be used ({error.strerror}) to show the run; give another") from error
+    server.start()
+    return server
+
+
 @final
 class Served:
     """A recording at an address that cannot be guessed.
@@ -102,14 +113,8 @@ class Served:
 
     def __init__(self, followed: Followed, host: str, port: int) -> None:
         self.path = f"/{secrets.token_urlsafe(24)}/recording.rrd"
-        try:
-            self._server = _RecordingServer(followed, self.path, host, port)
-        except OSError as error:
-            raise UsageError(
-                f"{host}:{port} cannot be used ({error.strerror}) to show the run; give another"
-            ) from error
+        self._server = _listening(partial(_RecordingServer, followed, self.path), host, port)
         self.port = int(self._server.server_address[1])
-        self._server.start()
 
     def stop(self) -> None:
         """Accept no more readers. Those in progress continue by themselves."""
@@ -258,14 +263,8 @@ class WebPage:
 
         recordings: the port of the recording.
         """
-        try:
-            self._server = _PageServer(rerun, (seen, recordings), host, port)
-        except OSError as error:
-            raise UsageError(
-                f"{host}:{port} cannot be used ({error.strerror}) to show the run; give another"
-            ) from error
+        self._server = _listening(partial(_PageServer, rerun, (seen, recordings)), host, port)
         self.port = int(self._server.server_address[1])
-        self._server.start()
 
     def stop(self) -> None:
         """Accept no more browsers."""
