@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
+from evedrop.show.view.column import laid_out
 from evedrop.show.view.panels.curves import SquaredError
 from evedrop.show.view.panels.plane import frames, stride
 from evedrop.show.view.recording import ViewRecording
@@ -216,3 +218,15 @@ def test_close_leaves_no_thread(run: Simulated, tmp_path: Path) -> None:
     record(run, tmp_path / "r.rrd")
     left = set(threading.enumerate()) - before
     assert not [thread for thread in left if thread.name == "recording"]
+
+
+def test_a_view_shows_its_content_alone_and_follows_its_own_time_line() -> None:
+    """The viewer's panels are hidden, and it plays the newest moment of the time line that the view has."""
+    content = rrb.Vertical()
+    layout = laid_out(content, "elapsed")
+    assert layout.root_container is content
+    assert (layout.time_panel.timeline, layout.time_panel.play_state) == ("elapsed", "following")
+    hidden = (layout.top_panel, layout.blueprint_panel, layout.selection_panel)
+    assert [panel.state for panel in hidden] == ["hidden"] * 3
+    assert not (layout.auto_views)
+    assert not (layout.auto_layout)
