@@ -97,6 +97,7 @@ WRONG: dict[str, tuple[list[dict[str, Any]], str]] = {
         [{"at": 1, "link": "eve", "set": {"delay": {"model": "constant", "value": 1.0, "unit": "seconds"}}}],
         "event.0.set.delay.unit",
     ),
+    "leaves in the same slot": ([{"at": 7, "pause": "eve"}, {"at": 7, "resume": "eve"}], "event.1.resume"),
 }
 
 
