@@ -62,9 +62,7 @@ class ReceiverLoop:
         self._put_telemetry = session.replaying_publisher(session.keys.telemetry(name), brief.flow.window + 1)
         cuts = [slot for start, (stop, _) in self._outages.items() for slot in (start, stop)]
         put_progress = session.replaying_publisher(session.keys.progress(name), 0)
-        self._reporter = BeliefReporter(
-            brief, self._put_telemetry, put_progress, cuts, brief.first, brief.part.window > 0
-        )
+        self._reporter = BeliefReporter(brief, self._put_telemetry, put_progress, cuts)
         self._due = GapDetector(key, brief.flow.longest_outage)
         self._k = brief.first
 
@@ -104,7 +102,6 @@ class ReceiverLoop:
     def _return(self) -> None:
         stop, _ = self._outages[self._k]
         self._core.miss(range(self._k, stop))
-        self._reporter.skip(stop)
         self._k = stop
 
     def _take(self) -> None:
@@ -117,7 +114,7 @@ class ReceiverLoop:
         self._replies.before(k, arrivals.gamma[0])
         followed = self._core.take_slots(slots, arrivals)
         self._replies.after(k, self._core.belief)
-        self._reporter.add_slots(slots, *followed)
+        self._reporter.add_slots(followed)
         self._k = slots.stop
 
     @property

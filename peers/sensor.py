@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from functools import partial
 from queue import Empty
 from typing import final
@@ -21,11 +22,11 @@ from evedrop.live.protocol.telemetry import held
 from evedrop.model.detection import CusumBatch
 from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.local_filter import LocalFilter
-from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.cores import GivenStates, PlantCore, SensorCore, Sent, recorded
+from evedrop.model.slot.records import SensorSlots
 from evedrop.names import RECORDER, SENSOR
 from evedrop.peers.closed_loop import Steered
 from evedrop.scenario.conformance.checked import checked_encoder
@@ -118,7 +119,7 @@ class Barriers:
         session: ProcessSession,
         window: Window,
         telemetry: Callable[[int, bytes], None],
-        flush: Callable[[int], None],
+        flush: Callable[[], None],
     ) -> None:
         self._session, self._window = session, window
         self._telemetry, self._flush = telemetry, flush
@@ -133,7 +134,7 @@ class Barriers:
 
     def wait_at(self, k: int) -> None:
         """Report all slots below k, and wait for the conductor's `go`."""
-        self._flush(k)
+        self._flush()
         self._telemetry(k, held(k))
         # The command may arrive more than once, and may belong to an earlier barrier.
         with self._session.status.waiting(self._session.keys.control(SENSOR)):
@@ -186,14 +187,10 @@ class SensorLoop:
         self._window = Window(session, (*part.receivers, RECORDER), brief.flow.window, self._send)
         self._back = Acknowledgements(brief, session) if scheme.needs_acknowledgements else None
         self._steered = None
-        inputs = 0
         if part.plant is not None and part.controller is not None:
-            inputs = part.plant.plant.inputs
-            self._steered = Steered(brief, inputs, part.controller, session)
+            self._steered = Steered(brief, part.plant.plant.inputs, part.controller, session)
         telemetry = session.replaying_publisher(session.keys.telemetry(SENSOR), brief.flow.window + 1)
-        self._reporter = TruthReporter(
-            brief, telemetry, scheme.may_be_silent, self._core.watches, inputs, self._core.filters, self._core.monitors
-        )
+        self._reporter = TruthReporter(brief, telemetry)
         self._barriers = Barriers(brief, session, self._window, telemetry, self._reporter.flush)
         self._betrayed = set(part.leaks.values())
         self._answered = self._back is not None or self._steered is not None
@@ -229,30 +226,30 @@ class SensorLoop:
     def _send_packet(self, k: int) -> None:
         packets, row = self._made.packets, k - self._slots.start
         header, sent = (None if column is None else column[row] for column in (packets.header, packets.sent))
-        self._send(k, uplink(k, packets.z[row], header, sent, self._made.x[row] if k in self._betrayed else None))
+        self._send(k, uplink(k, packets.z[row], header, sent, self._made.slots.x[row] if k in self._betrayed else None))
 
     def _report(self, end: int) -> None:
         """Report the slots below `end` of those that were made at once; all of these have been sent."""
         some = range(self._reported, end)
         if some:
             first = self._slots.start
-            made = self._made.rows(slice(some.start - first, end - first))
-            alarms, steered = self._answers(some.start, made) if self._answered else (None, None)
-            self._reporter.add_slots(some, made, alarms, steered)
+            slots = self._made.slots.rows(slice(some.start - first, end - first))
+            self._reporter.add_slots(self._answers(slots) if self._answered else slots)
             self._reported = end
 
-    def _answers(self, k: int, made: Sent) -> tuple[Flags | None, tuple[Floats, Flags] | None]:
-        """Wait for the answers to slot k, and apply them: alarms (1, R), and the inputs (1, m, R) with their failures (1, R)."""
-        alarms, steered = None, None
+    def _answers(self, slots: SensorSlots) -> SensorSlots:
+        """Wait for the answers to a single slot, and apply them; returns the slot with alarms and inputs."""
+        k = slots.first
         if self._back is not None:
-            sent = made.packets.at(0).sent
+            sent = None if slots.sent is None else slots.sent[0]
             alarms = self._core.acknowledged(k, self._back.wait(k), sent)
+            slots = replace(slots, alarms=None if alarms is None else alarms[None])
         if self._steered is not None:
-            u, failed = self._steered.wait(k, made.true[0])
+            u, failed = self._steered.wait(k, slots.states[0])
             if self._steered.decides(k):
                 self._core.set_inputs(u)
-            steered = u[None], failed[None]
-        return None if alarms is None else alarms[None], steered
+            slots = replace(slots, u=u[None], failed=failed[None])
+        return slots
 
     def _wait(self, k: int) -> None:
         """Wait until slot k may be sent and is due; at a barrier before it, report all slots and wait for the conductor."""

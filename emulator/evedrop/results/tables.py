@@ -14,10 +14,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from evedrop.model.digest import DIGEST_BYTES
-from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
+from evedrop.model.slot.records import SensorSlots
 from evedrop.score.slots import Slots
 from evedrop.score.sums import LEVELS
 from evedrop.system.files import opened
@@ -117,22 +117,22 @@ def inputs_schema_in(path: Path) -> pa.Schema:
 
 def input_columns(slots: Slots, plant: Plant, disturbances: Floats, first_trial: int) -> list[NDArray[Any]]:
     """A row per slot and recorded trial, from first_trial on; disturbances (slots, q) are of the whole run."""
-    assert slots.inputs is not None  # noqa: S101 - asked by the caller
-    recorded = next(iter(slots.receivers.values())).P.shape[3]
-    u, some = slots.inputs.u[:, :, :recorded], slice(slots.first, slots.first + slots.count)
+    sensor, recorded = slots.sensor, slots.recorded
+    assert sensor.u is not None and sensor.failed is not None  # noqa: S101, PT018 - asked by the caller
+    u, some = sensor.u[:, :, :recorded], slice(slots.first, slots.first + slots.count)
     return [
         np.repeat(np.arange(some.start, some.stop), recorded),
         np.tile(np.arange(first_trial, first_trial + recorded), slots.count),
         np.stack([plant.limited(inputs) for inputs in u]).transpose(0, 2, 1).reshape(slots.count * recorded, -1),
         *([np.repeat(disturbances[some], recorded, axis=0)] if disturbances.shape[1] else []),
-        slots.inputs.failed[:, :recorded].reshape(-1),
+        sensor.failed[:, :recorded].reshape(-1),
         plant.clips(u).reshape(-1),
-        *_monitored_columns(slots.inputs.monitored, recorded),
+        *_monitored_columns(sensor, recorded),
     ]
 
 
-def _monitored_columns(monitored: MonitoredSlots | None, recorded: int) -> list[NDArray[Any]]:
-    if monitored is None:
+def _monitored_columns(sensor: SensorSlots, recorded: int) -> list[NDArray[Any]]:
+    if sensor.watermark is None or sensor.statistic is None:
         return []
-    e = monitored.watermark[:, :, :recorded].transpose(0, 2, 1)
-    return [e.reshape(-1, e.shape[2]), monitored.statistic[:, :recorded].reshape(-1)]
+    e = sensor.watermark[:, :, :recorded].transpose(0, 2, 1)
+    return [e.reshape(-1, e.shape[2]), sensor.statistic[:, :recorded].reshape(-1)]

@@ -18,7 +18,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from evedrop.model.digest import DigestLog, Digests
-from evedrop.model.links.loss_model import REASONS
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
 from evedrop.model.receiver import ACTIONS, MISLED, NOTHING, TYPES, Action, Codes, Flags, packed_flags
@@ -248,13 +247,13 @@ class ResultsWriter:
 
     def trial_rows(self, slots: Slots, squared_errors: Mapping[str, Floats], first_trial: int) -> None:
         """A row per slot, receiver and recorded trial, from first_trial on, with all columns."""
-        recorded = next(iter(slots.receivers.values())).P.shape[3]
+        sensor, recorded = slots.sensor, slots.recorded
         count = slots.count * recorded
         k = np.repeat(np.arange(slots.first, slots.first + slots.count), recorded)
         trials = np.tile(np.arange(first_trial, first_trial + recorded), slots.count)
-        nu = slots.nu[:, :recorded]
-        packets = nu if slots.sent is None else np.where(slots.sent[:, :recorded], nu, TYPES.index(NOTHING))
-        x = self._levels(slots.x[:, :, :recorded])
+        nu = sensor.nu[:, :recorded]
+        packets = nu if sensor.sent is None else np.where(sensor.sent[:, :recorded], nu, TYPES.index(NOTHING))
+        x = self._levels(sensor.x[:, :, :recorded])
         for name, receiver in slots.receivers.items():
             self._add(
                 "trials",
@@ -275,7 +274,7 @@ class ResultsWriter:
     def state_rows(self, slots: Slots) -> None:
         """A line per slot: the states that were taken from a program, which all trials share."""
         if self._taken is not None:
-            self._taken.add(slots.x[:, :, 0])
+            self._taken.add(slots.sensor.x[:, :, 0])
 
     def _levels(self, x: Floats) -> Floats:
         """States (c, n, r) as rows, (c r, n), with the reference added, from which they are deviations."""
@@ -284,18 +283,17 @@ class ResultsWriter:
 
     def input_rows(self, slots: Slots, first_trial: int) -> None:
         """A row per slot and recorded trial, from first_trial on: the inputs and disturbances of the plant."""
-        if slots.inputs is None or self._loop is None:
+        if slots.sensor.u is None or self._loop is None:
             return
         self._add("inputs", input_columns(slots, *self._loop, first_trial))
 
     def journal_rows(self, slots: Slots) -> None:
         """A row per slot and link of a live run: counts by reason, and a bit mask of the trials that were delivered."""
-        for name, receiver in slots.receivers.items():
-            silent = 0 if receiver.unsent is None else receiver.unsent.astype(np.int64)
-            offered = np.full(slots.count, slots.trials) - silent
-            delivered = np.count_nonzero(receiver.delivered, axis=1)
-            by_reason = [receiver.lost[reason].astype(np.int64) for reason in REASONS]
-            lost = np.sum(by_reason, axis=0)
+        for name, link in slots.links.items():
+            offered = np.full(slots.count, slots.trials) - link.unsent.astype(np.int64)
+            delivered = np.count_nonzero(link.delivered, axis=1)
+            by_reason = link.lost.astype(np.int64).T
+            lost = by_reason.sum(axis=0)
             self._add(
                 "journal",
                 [
@@ -306,7 +304,7 @@ class ResultsWriter:
                     offered - delivered - lost,
                     lost,
                     *by_reason,
-                    packed_flags(receiver.delivered),
+                    packed_flags(link.delivered),
                 ],
             )
 

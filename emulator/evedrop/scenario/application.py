@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from evedrop.model.controllers import Assignment, Controller
-from evedrop.model.integrity.monitor import MonitoredSlots, MonitorPlan
+from evedrop.model.integrity.monitor import MonitorPlan
 from evedrop.model.metrics import error_column
 from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.metrics.text import estimate
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
 from evedrop.model.registry import Registry
+from evedrop.model.slot.records import SensorSlots
 from evedrop.scenario.table import Table
 
 if TYPE_CHECKING:
@@ -104,9 +105,9 @@ class ApplicationTally(ABC):
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
         """Add the next c slots: true states (c, n, R), inputs as decided (c, m, R), and every receiver's estimates, (c, n, R)."""
 
-    def add_monitored(self, x: Floats, u: Floats, monitored: MonitoredSlots) -> None:
+    def add_monitored(self, x: Floats, u: Floats, sensor: SensorSlots) -> None:
         """Add watermark and detector of the next c slots, before these go to `add`; by default nothing. x and u as there."""
-        del x, u, monitored
+        del x, u, sensor
 
     @classmethod
     @abstractmethod
@@ -172,9 +173,9 @@ class PanelFeed(ABC):
         Returns PATH/CURVE → slots and values of its g new points, (2, g).
         """
 
-    def take_monitored(self, first: int, monitored: MonitoredSlots) -> Mapping[str, Floats]:
+    def take_monitored(self, first: int, sensor: SensorSlots) -> Mapping[str, Floats]:
         """The points of curves from watermark and detector of these slots, of one trial; by default none."""
-        del first, monitored
+        del first, sensor
         return {}
 
 

@@ -16,35 +16,14 @@ from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.plant import Offset, Plant
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Codes
+from evedrop.model.slot.records import SensorSlots
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.application import APPLICATIONS, ApplicationTally
 from evedrop.scenario.closed_loop import controlled_plant
 from evedrop.scenario.tables import Scenario
-from evedrop.score.slots import InputSlots
 from evedrop.score.summary import ControllerSummary, PeerSummary, StandardErrors
 
 ESTIMATORS = ("ignoring_input", "knowing_input")
-
-
-@dataclass(frozen=True)
-class Acted:
-    """A closed loop over c slots of R trials."""
-
-    inputs: InputSlots
-    x: Floats
-    """The states that the sensor sends, (c, n, R)."""
-    estimates: Mapping[str, Floats]
-    """Receiver → x̂, (c, n, R)."""
-    action: Codes
-    """The legitimate estimator's actions, (c, R)."""
-    true: Floats
-    """The true states, (c, n, R); equal to x unless the sensor filters."""
-
-    def part(self, trials: slice) -> Acted:
-        """The same for some of the trials."""
-        inputs = self.inputs.part(trials)
-        estimates = {name: x_hat[..., trials] for name, x_hat in self.estimates.items()}
-        return Acted(inputs, self.x[..., trials], estimates, self.action[:, trials], self.true[..., trials])
 
 
 @final
@@ -110,24 +89,28 @@ class LoopTally:
         }
         return tally
 
-    def add_slots(self, acted: Acted) -> None:
-        """Add the next slots."""
-        inputs = acted.inputs
+    def add_slots(self, sensor: SensorSlots, estimates: Mapping[str, Floats], action: Codes) -> None:
+        """Add the next slots.
+
+        sensor: with the inputs; estimates: receiver → x̂, (c, n, R); action: the legitimate estimator's, (c, R).
+        """
+        u, failed = sensor.u, sensor.failed
+        assert u is not None and failed is not None  # noqa: S101, PT018 - there is a controller
         for application in self.applications.values():
-            if inputs.monitored is not None:
-                application.add_monitored(acted.true, inputs.u, inputs.monitored)
-            application.add(acted.true, inputs.u, acted.estimates)
-        self.trial_slots += inputs.failed.size
-        self.failed += int(np.count_nonzero(inputs.failed))
-        clipped = self._plant.clips(inputs.u)
+            if sensor.watermark is not None:
+                application.add_monitored(sensor.states, u, sensor)
+            application.add(sensor.states, u, estimates)
+        self.trial_slots += failed.size
+        self.failed += int(np.count_nonzero(failed))
+        clipped = self._plant.clips(u)
         self.clipped += int(np.count_nonzero(clipped))
         self.of_trials[0] += len(clipped)
-        self.of_trials[1:3] += np.count_nonzero(inputs.failed, axis=0), np.count_nonzero(clipped, axis=0)
+        self.of_trials[1:3] += np.count_nonzero(failed, axis=0), np.count_nonzero(clipped, axis=0)
         if self._offset is None:
             return
-        error = acted.x - acted.estimates[LEGITIMATE]
-        for row, (action, u) in enumerate(zip(acted.action, inputs.u, strict=True)):
-            error[row] -= self._sign * self._offset.next(action, u)
+        error = sensor.x - estimates[LEGITIMATE]
+        for row, (action_of_slot, u_of_slot) in enumerate(zip(action, u, strict=True)):
+            error[row] -= self._sign * self._offset.next(action_of_slot, u_of_slot)
         error *= error
         self.other_error += float(error.sum(axis=(1, 2)).sum())
         self.of_trials[3] += error.sum(axis=(0, 1))

@@ -20,7 +20,6 @@ from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import Expectation, TheoreticalTraceStream, expectations_of
-from evedrop.score.closed_loop_tally import Acted
 from evedrop.score.directions import directions_of
 from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
@@ -72,9 +71,11 @@ class Scorekeeper:
         scored = {}
         self._add_plant(slots)
         revealed = self._revealed.next(slots.count)
+        sensor = slots.sensor
         for name, receiver in slots.receivers.items():
+            link = slots.links[name]
             if errors_and_traces is None:
-                errors, traces = squared_errors(slots.x, receiver.x_hat), receiver.traces_of_trials
+                errors, traces = squared_errors(sensor.x, receiver.x_hat), receiver.traces_of_trials
             else:
                 errors, traces = errors_and_traces[name]
             values = Scored(
@@ -85,17 +86,17 @@ class Scorekeeper:
             if tally.conditional is not None:
                 tally.conditional.add_actions(receiver.action)
             if tally.leak is not None:
-                tally.leak.add_slots(receiver.action, slots.nu, revealed[name])
+                tally.leak.add_slots(receiver.action, sensor.nu, revealed[name])
             for direction in tally.directions.values():
-                direction.add_slots(slots.first, slots.x, receiver.x_hat)
+                direction.add_slots(slots.first, sensor.x, receiver.x_hat)
             tally.add_traces(slots.first, traces)
-            tally.account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
-            if slots.sent is not None:
-                tally.account_sent(slots.sent, receiver.delivered, receiver.unsent)
+            tally.account(link, receiver.action)
+            if sensor.sent is not None:
+                tally.account_sent(sensor.sent, link)
             late = None
-            if receiver.late is not None and receiver.late_used is not None and receiver.late_delivered is not None:
+            if receiver.late is not None and receiver.late_used is not None and link.late is not None:
                 late = (receiver.late, receiver.late_used)
-                tally.account_late(receiver.late_delivered, *late)
+                tally.account_late(link.late, *late)
             tally.watched.add_slots(
                 ScoredSlots(
                     slots.first,
@@ -104,7 +105,7 @@ class Scorekeeper:
                     values.sums.trace,
                     values.expected,
                     late,
-                    slots.x,
+                    sensor.x,
                     receiver.x_hat,
                 )
             )
@@ -113,14 +114,14 @@ class Scorekeeper:
 
     def _add_plant(self, slots: Slots) -> None:
         """Add the slots' alarms, the controller's decisions, and the true errors of a sensor that filters."""
-        run_tally, estimates = self.run_tally, {name: receiver.x_hat for name, receiver in slots.receivers.items()}
-        if slots.alarms is not None and run_tally.detection is not None:
-            run_tally.detection.add_alarms(slots.first, slots.alarms)
-        if slots.true is not None and run_tally.filter is not None:
-            run_tally.filter.add_errors(true_errors(slots.true, slots.x, estimates))
-        if slots.inputs is not None and run_tally.loop is not None:
-            true = slots.x if slots.true is None else slots.true
-            run_tally.loop.add_slots(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
+        run_tally, sensor = self.run_tally, slots.sensor
+        estimates = {name: receiver.x_hat for name, receiver in slots.receivers.items()}
+        if sensor.alarms is not None and run_tally.detection is not None:
+            run_tally.detection.add_alarms(slots.first, sensor.alarms)
+        if sensor.true is not None and run_tally.filter is not None:
+            run_tally.filter.add_errors(true_errors(sensor.true, sensor.x, estimates))
+        if run_tally.loop is not None:
+            run_tally.loop.add_slots(sensor, estimates, slots.receivers[LEGITIMATE].action)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ ones as infinite.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, final
 
@@ -18,12 +18,14 @@ from numpy.typing import NDArray
 
 from evedrop.model.digest import BlockSums, added_in_order
 from evedrop.model.kernels.current import kernels
+from evedrop.model.links.loss_model import REASONS
 from evedrop.model.metrics import metric
 from evedrop.model.metrics.metric import ReceiverTally, TallyMetric, TrialTally
 from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.slot.link import COUNTED_BURSTS, Account
+from evedrop.model.slot.records import LinkSlots
 from evedrop.score.conditional import ConditionalError
 from evedrop.score.leak import LeakTally
 from evedrop.score.watched_tally import WatchedSlots, WatchedTally
@@ -280,31 +282,25 @@ class Tally(ReceiverTally):
         """Sum of tr P of each trial, (R,); None once slots were added whose tr P is not known trial by trial."""
         return None if self._finished is None else self._finished + self._unfinished.unfinished
 
-    def account(
-        self,
-        delivered: Flags,
-        action: Codes,
-        lost: Mapping[str, NDArray[np.uint32]],
-        unsent: NDArray[np.uint32] | None = None,
-    ) -> None:
-        """Compare the journal with the receiver's action (c, R): delivered in time (c, R), reason → lost (c,), unsent (c,)."""
-        received = action != Action.LOST
+    def account(self, link: LinkSlots, action: Codes) -> None:
+        """Compare the journal of the link with the receiver's action, (c, R)."""
+        received, delivered = action != Action.LOST, link.delivered
         self.unexplained += int(np.count_nonzero(delivered != received))
         self.packets[0] += _counts_of_trials(received)
         self.packets[1] += _counts_of_trials(received & (action != Action.DISCARDED))
         count = delivered.size - int(np.count_nonzero(delivered))
-        for reason, counts in lost.items():
-            self.lost[reason] = self.lost.get(reason, 0) + int(counts.sum())
-            count -= int(counts.sum())
-        silent = 0 if unsent is None else int(unsent.sum())
+        for reason, lost in zip(REASONS, link.lost.sum(axis=0, dtype=np.int64).tolist(), strict=True):
+            self.lost[reason] = self.lost.get(reason, 0) + lost
+            count -= lost
+        silent = int(link.unsent.sum())
         self.unsent += silent
         self.late_sent += count - silent
 
-    def account_sent(self, sent: Flags, delivered: Flags, unsent: NDArray[np.uint32] | None) -> None:
-        """Compare the packets that the sensor reports as sent, (c, R), with the journal's delivered (c, R) and unsent (c,)."""
+    def account_sent(self, sent: Flags, link: LinkSlots) -> None:
+        """Compare the packets that the sensor reports as sent, (c, R), with the journal of the link."""
         silent = np.count_nonzero(~sent, axis=1)
-        self.unexplained += int(np.count_nonzero(delivered & ~sent))
-        self.unexplained += int(np.abs(silent - (0 if unsent is None else unsent.astype(np.int64))).sum())
+        self.unexplained += int(np.count_nonzero(link.delivered & ~sent))
+        self.unexplained += int(np.abs(silent - link.unsent.astype(np.int64)).sum())
 
     def account_late(self, delivered: NDArray[np.uint16], taken: NDArray[np.uint16], used: NDArray[np.uint16]) -> None:
         """Compare the late packets that the router delivered in each slot, (c, R), with those that the receiver took."""

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evedrop.model.acknowledgements import AckChannel
 from evedrop.model.detection import CusumBatch
@@ -24,7 +23,6 @@ from evedrop.model.schemes.scheme import Scheme, Shared
 from evedrop.model.slot.cores import (
     Absence,
     ControllerCore,
-    FollowedSlots,
     GivenStates,
     PlantCore,
     ReceiverCore,
@@ -33,6 +31,7 @@ from evedrop.model.slot.cores import (
     recorded,
 )
 from evedrop.model.slot.link_core import Arrivals, LinkCore
+from evedrop.model.slot.records import ReceiverSlots
 from evedrop.model.streams import Batch
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.closed_loop import monitor_of
@@ -43,7 +42,7 @@ from evedrop.scenario.timeline import Away
 from evedrop.score.closed_loop_tally import SolveTimes
 from evedrop.score.filtering import local_filter_of
 from evedrop.score.links import ack_channel_of, chart_of
-from evedrop.score.slots import InputSlots, ReceiverSlots, Slots
+from evedrop.score.slots import Slots
 from evedrop.score.sums import squared_errors
 from evedrop.simulate.chunk import Chunk, PacketTally, ReceiverChunk
 from evedrop.simulate.guarded_classes import Guard
@@ -121,8 +120,8 @@ class ExactSimulation:
         answered = self._ack_channel is not None or self._control_loop is not None
         sent: list[Sent] = []
         alarms: list[Flags] = []
-        followed: list[FollowedSlots] = []
-        inputs = None if self._control_loop is None else self._control_loop.room(len(chunk))
+        followed: list[ReceiverSlots] = []
+        inputs: list[tuple[Floats, Flags]] = []
         for slots in [range(k, k + 1) for k in chunk] if answered else [chunk]:
             with self._guard.asking(LEGITIMATE, slots):
                 made = self._sensor.send(slots)
@@ -133,23 +132,34 @@ class ExactSimulation:
             if self._ack_channel is not None:
                 alarm = self._acknowledge(self._ack_channel, slots.start, made.packets.sent, links)
                 alarms += [] if alarm is None else [alarm]
-            if self._control_loop is not None and inputs is not None:
+            if self._control_loop is not None:
                 if self._control_loop.awaits_estimate:
                     followed.append(self._follow(LEGITIMATE, slots, links[LEGITIMATE], made))
-                x_hat = followed[-1].beliefs.x_hat[0] if followed else None
-                self._control_loop.act(slots.start, slots.start - chunk.start, made.true[0], x_hat, inputs)
+                x_hat = followed[-1].x_hat[0] if followed else None
+                inputs.append(self._control_loop.act(slots.start, made.slots.states[0], x_hat))
         whole = Sent.joined(sent)
         with self._guard.asking(LEGITIMATE, chunk):
             self._packets.add_slots(self._roles.scheme.encrypted(whole.packets), whole.packets.sent)
-        followed_by_receiver = {
-            name: FollowedSlots.joined(followed)
+        receivers = {
+            name: ReceiverSlots.joined(followed)
             if followed and name == LEGITIMATE
             else self._follow(name, chunk, link, whole)
             for name, link in links.items()
         }
-        for name, followed_slots in followed_by_receiver.items():
-            self._digests[name].update(self._logs[name].add(chunk, followed_slots.beliefs))
-        return self._chunk(chunk, whole, followed_by_receiver, links, np.array(alarms) if alarms else None, inputs)
+        for name, receiver in receivers.items():
+            self._digests[name].update(self._logs[name].add(chunk, receiver.beliefs))
+        u, failed = map(np.array, zip(*inputs, strict=True)) if inputs else (None, None)
+        sensor = replace(whole.slots, alarms=np.array(alarms) if alarms else None, u=u, failed=failed)
+        measured = {
+            name: ReceiverChunk(
+                squared_errors(sensor.x, receiver.x_hat),
+                kernels.traces(receiver.P),
+                receiver.action,
+                links[name].fates,
+            )
+            for name, receiver in receivers.items()
+        }
+        return Chunk(chunk.start, measured, Slots(sensor, receivers, {}))
 
     def _acknowledge(
         self, ack_channel: AckChannel, k: int, sent: Flags | None, links: Mapping[str, LinkCore]
@@ -161,47 +171,14 @@ class ExactSimulation:
         with self._guard.asking(LEGITIMATE, range(k, k + 1)):
             return self._sensor.acknowledged(k, arrived, None if sent is None else sent[0])
 
-    def _follow(self, name: str, slots: range, link: LinkCore, made: Sent) -> FollowedSlots:
+    def _follow(self, name: str, slots: range, link: LinkCore, made: Sent) -> ReceiverSlots:
         arrivals = link.arrivals(slots, made.packets.z, made.packets.header)
         betrayed = self._roles.betrayed.get(name)
         if betrayed is not None and betrayed in slots:
             row = betrayed - slots.start
-            arrivals = arrivals._replace(truth={row: made.x[row]})
+            arrivals = arrivals._replace(truth={row: made.slots.x[row]})
         with self._guard.asking(name, slots):
             return self._receivers[name].take_slots(slots, arrivals)
-
-    def _chunk(
-        self,
-        chunk: range,
-        made: Sent,
-        followed: Mapping[str, FollowedSlots],
-        links: Mapping[str, LinkCore],
-        alarms: Flags | None,
-        inputs: InputSlots | None,
-    ) -> Chunk:
-        """What is measured of the slots."""
-        none_counted: dict[str, NDArray[np.uint32]] = {}
-        no_sums = np.full((len(chunk), 2), np.nan)  # only receivers of a live run report sums over slots
-        receivers, slots = {}, {}
-        for name, (beliefs, late) in followed.items():
-            link = links[name]
-            error = squared_errors(made.x, beliefs.x_hat)
-            receivers[name] = ReceiverChunk(error, kernels.traces(beliefs.P), beliefs.action, link.fates)
-            arrived, used = (None, None) if late is None else late
-            slots[name] = ReceiverSlots(
-                beliefs.x_hat,
-                beliefs.action,
-                beliefs.P,
-                no_sums,
-                link.in_time,
-                none_counted,
-                arrived,
-                used,
-            )
-        true = made.true if self._sensor.filters else None
-        inputs = None if inputs is None else replace(inputs, monitored=made.monitored)
-        whole = Slots(chunk.start, made.x, made.packets.nu, slots, made.packets.sent, alarms, inputs, true)
-        return Chunk(chunk.start, receivers, whole)
 
 
 @final
@@ -231,12 +208,8 @@ class _ControlLoop:
         """Whether the legitimate estimator and the controller wait for each other in every slot."""
         return not self._on_truth or self._estimator is not None
 
-    def room(self, count: int) -> InputSlots:
-        """Room for the inputs of some slots."""
-        return InputSlots(np.empty((count, *self._u.shape)), np.empty((count, len(self._failed)), np.bool_))
-
-    def act(self, k: int, row: int, true: Floats, x_hat: Floats | None, inputs: InputSlots) -> None:
-        """Decide the inputs of slot k, from its true state or the estimate of it, (n, R), and note them in their row."""
+    def act(self, k: int, true: Floats, x_hat: Floats | None) -> tuple[Floats, Flags]:
+        """The inputs of slot k, (m, R), and where their decision failed, (R,), from its true state or the estimate, (n, R)."""
         if k % self._controller.period == 0:
             decision = self._controller.decide(k, true if self._on_truth or x_hat is None else x_hat)
             self._u, self._failed = decision.u, decision.failed
@@ -244,10 +217,10 @@ class _ControlLoop:
             self._sensor.set_inputs(self._u)
         if self._estimator is not None:
             self._estimator.learn(k, self._u)
-        inputs.u[row], inputs.failed[row] = self._u, self._failed
         digests = self._log.add(k, self._u, self._failed)
         if digests is not None:
             self._digests.update([digests])
+        return self._u, self._failed
 
 
 @final
@@ -266,16 +239,15 @@ class LinkedReceiver:
         """Its belief after the last slot in which it was present, or that it passed."""
         return self._core.belief
 
-    def take_slots(self, slots: range, arrivals: Arrivals) -> FollowedSlots:
-        """The beliefs after consecutive slots, at least one. The receiver is present in all of them, or away in all."""
+    def take_slots(self, slots: range, arrivals: Arrivals) -> ReceiverSlots:
+        """The receiver after consecutive slots, at least one. The receiver is present in all of them, or away in all."""
         k = slots.start
         if k in self._outages:
             self._leave(self._outages[k])
         if self._away is not None and k < self._away.stop:
             if self._away.keeps_state:
                 self._core.miss(slots)
-            late = np.zeros((2, len(slots), self._receiver.trials), np.uint16) if self._window else None
-            return FollowedSlots(self._absence.take_slots(slots), late)
+            return self._absence.take_slots(slots)
         if self._away is not None and not self._away.keeps_state:
             self._core = ReceiverCore(self._receiver, self._window, k)
         self._away = None
@@ -284,4 +256,4 @@ class LinkedReceiver:
     def _leave(self, away: Away) -> None:
         process, trials = self._receiver.process, self._receiver.trials
         left = self._core.belief if away.keeps_state else prior(process, trials, away.start)
-        self._away, self._absence = away, Absence(process, left)
+        self._away, self._absence = away, Absence(process, left, self._window)

@@ -358,7 +358,9 @@ class Merger:
             for start in range(0, recorded.trials, BLOCK_TRIALS):  # the order of rows does not depend on the tasks
                 slots = recorded.part(slice(start, start + BLOCK_TRIALS))
                 writer.input_rows(slots, result.start + start)
-                errors = {name: squared_errors(slots.x, receiver.x_hat) for name, receiver in slots.receivers.items()}
+                errors = {
+                    name: squared_errors(slots.sensor.x, receiver.x_hat) for name, receiver in slots.receivers.items()
+                }
                 writer.trial_rows(slots, errors, result.start + start)
 
     def _add_digests(self, start: int, digests: Mapping[str, Mapping[int, Any]], writer: ResultsWriter | None) -> None:

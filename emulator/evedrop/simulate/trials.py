@@ -193,24 +193,17 @@ def _score(block: TrialBlock, keeper: Scorekeeper, rows: slice, chunk: Chunk, sl
     The square of a naive receiver's error may leave double precision; then it is inf, as it should be.
     """
     part = slots.part(rows)
-    receivers = {}
+    receivers, links = {}, {}
     for name, values in part.receivers.items():
-        measured = chunk.receivers[name]
         account = _account(block, name, rows, chunk)
-        trace = measured.trace[:, rows]
-        receivers[name] = replace(
-            values,
-            trace=np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1),
-            delivered=account.delivered,
-            lost=account.lost,
-            late_delivered=account.late,
-            unsent=account.unsent,
-        )
+        trace = chunk.receivers[name].trace[:, rows]
+        receivers[name] = replace(values, trace=np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1))
+        links[name] = account.slots
         keeper.run_tally.tallies[name].count(account)
     errors_and_traces = {
         name: (values.error[:, rows], values.trace[:, rows]) for name, values in chunk.receivers.items()
     }
-    for name, scored in keeper.add_slots(replace(part, receivers=receivers), errors_and_traces).items():
+    for name, scored in keeper.add_slots(Slots(part.sensor, receivers, links), errors_and_traces).items():
         block.sums[name].add_trials(chunk.first, scored.sums)
 
 
@@ -232,7 +225,7 @@ def _add(block: TrialBlock, mode: Mode, rows: slice, chunk: Chunk, expected: Map
             tally.conditional.add_actions(action)
         tally.add_traces(chunk.first, trace)
         account = _account(block, name, rows, chunk)
-        tally.account(account.delivered, action, account.lost, account.unsent)
+        tally.account(account.slots, action)
         tally.count(account)
 
 

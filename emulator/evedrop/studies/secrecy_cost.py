@@ -162,8 +162,8 @@ def _powers(scenario: Scenario, trials: range) -> Iterator[tuple[Floats, Floats]
     for chunk in Simulation(scenario, trials).chunks():
         slots = chunk.slots
         assert slots is not None  # noqa: S101 - there are states in this mode
-        assert slots.inputs is not None  # noqa: S101 - there is a controller
-        yield feed.take(slots.x if slots.true is None else slots.true, slots.inputs.u)
+        assert slots.sensor.u is not None  # noqa: S101 - there is a controller
+        yield feed.take(slots.sensor.states, slots.sensor.u)
 
 
 def _lacking() -> str:

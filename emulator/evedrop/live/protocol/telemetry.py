@@ -9,17 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evedrop.live.protocol.codec import Reader, pack, shown
+from evedrop.live.protocol.record_messages import RecordFormat, packed
 from evedrop.model.digest import DIGEST_BYTES, Blocks, Digests
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Codes, Flags, asymmetry, packed_flags
+from evedrop.model.receiver import Action, Belief, Flags, asymmetry, packed_flags
 from evedrop.model.slot.link import COUNTED_BURSTS, Account
+from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,39 @@ class Extent:
         """Shape of the states of a slot, (n, R)."""
         return self.n, self.trials
 
+    @property
+    def axes(self) -> dict[str, int]:
+        """Axis of a record → its length."""
+        return {"n": self.n, "R": self.trials, "S": self.recorded, "m": self.inputs, "F": len(REASONS)}
+
+
+@cache
+def sensor_format(extent: Extent) -> RecordFormat[SensorSlots]:
+    """How messages carry the sensor's records."""
+    depending = {
+        **dict.fromkeys(("u", "failed"), bool(extent.inputs)),
+        "true": extent.measures,
+        **dict.fromkeys(("statistic", "watermark"), extent.monitored),
+    }
+    absent, present = ([name for name, there in depending.items() if there is kind] for kind in (False, True))
+    return RecordFormat(SensorSlots, extent.axes, absent, present)
+
+
+@cache
+def receiver_format(extent: Extent, window: int) -> RecordFormat[ReceiverSlots]:
+    """How messages carry a receiver's records; window: by how many slots its packets may be late."""
+    late = ("late", "late_used")
+    most = {"action": int(max(Action)), **dict.fromkeys(late, window)}
+    absent, present = ((), (*late, "trace")) if window else (late, ("trace",))
+    return RecordFormat(ReceiverSlots, extent.axes, absent, present, most)
+
+
+@cache
+def link_format(extent: Extent, window: int) -> RecordFormat[LinkSlots]:
+    """How messages carry the records of a receiver's link; window: as for the receiver."""
+    most = {"lost": extent.trials, "unsent": extent.trials, "late": window}
+    return RecordFormat(LinkSlots, extent.axes, () if window else ("late",), ("late",) if window else (), most)
+
 
 def held(k: int) -> bytes:
     """Encode the sensor's telemetry that it holds before slot k."""
@@ -56,71 +90,17 @@ def is_held(message: Reader) -> bool:
     return message.has("held")
 
 
-@dataclass(frozen=True)
-class Truth:
-    """The sensor's telemetry over c slots."""
-
-    first: int
-    x: Floats
-    """States as they are sent, (c, n, R)."""
-    nu: Flags
-    """ν, (c, R)."""
-    sent: Flags | None = None
-    """Whether a packet was sent, (c, R); None if the scheme sends in every slot."""
-    alarms: Flags | None = None
-    """Whether the sensor raised an alarm that its acknowledgements are attacked, (c, R); None if it does not watch them."""
-    u: Floats | None = None
-    """The inputs as they were decided, (c, m, R); None without a controller."""
-    failed: Flags | None = None
-    """Where the decision failed, (c, R)."""
-    true: Floats | None = None
-    """The true states, (c, n, R), if the sensor filters, so that x is its estimate; None if x is the true state."""
-    statistic: Floats | None = None
-    """The detector's statistic after each slot, (c, R); None without a detector."""
-    watermark: Floats | None = None
-    """The watermark of the inputs, (c, m, R); None without a detector."""
-
-    @property
-    def count(self) -> int:
-        """Number of slots."""
-        return len(self.x)
-
-    def pack(self) -> bytes:
-        """Encode it as a message."""
-        fields = {"k": self.first, "c": self.count, "x": self.x.tobytes(), "nu": packed_flags(self.nu).tobytes()}
-        if self.sent is not None:
-            fields["sent"] = packed_flags(self.sent).tobytes()
-        if self.alarms is not None:
-            fields["alarms"] = packed_flags(self.alarms).tobytes()
-        if self.u is not None:
-            fields["u"] = self.u.tobytes()
-        if self.failed is not None and self.failed.any():
-            fields["failed"] = packed_flags(self.failed).tobytes()
-        if self.true is not None:
-            fields["true"] = self.true.tobytes()
-        if self.statistic is not None and self.watermark is not None:
-            fields["statistic"], fields["watermark"] = self.statistic.tobytes(), self.watermark.tobytes()
-        return pack(fields)
+def truth(slots: SensorSlots) -> bytes:
+    """Encode the sensor's telemetry."""
+    return pack({"k": slots.first, "c": slots.count, **packed(slots)})
 
 
-def read_truth(message: Reader, first: int, extent: Extent) -> Truth:
+def read_truth(message: Reader, first: int, extent: Extent) -> SensorSlots:
     """Decode the sensor's telemetry, which must begin at slot `first`."""
-    c, (n, trials) = message.span(first, extent.slots, extent.batch), extent.shape
-    return Truth(
-        first,
-        message.finite("x", (c, n, trials)),
-        message.flags("nu", (c, trials)),
-        message.flags("sent", (c, trials)) if message.has("sent") else None,
-        message.flags("alarms", (c, trials)) if message.has("alarms") else None,
-        message.finite("u", (c, extent.inputs, trials)) if extent.inputs else None,
-        read_failed(message, (c, trials)) if extent.inputs else None,
-        message.finite("true", (c, n, trials)) if extent.measures else None,
-        message.finite("statistic", (c, trials)) if extent.monitored else None,
-        message.finite("watermark", (c, extent.inputs, trials)) if extent.monitored else None,
-    )
+    return sensor_format(extent).read(message, first, message.span(first, extent.slots, extent.batch))
 
 
-def read_failed(message: Reader, shape: tuple[int, ...]) -> Flags:
+def _read_failed(message: Reader, shape: tuple[int, ...]) -> Flags:
     """Decode where decisions failed, (…, R); nowhere if the field is absent."""
     if not message.has("failed"):
         return np.zeros(shape, np.bool_)
@@ -147,43 +127,21 @@ def read_digests(message: Reader, trials: int, blocks: list[int]) -> dict[int, D
 
 @dataclass(frozen=True)
 class Report:
-    """A receiver's telemetry over c slots."""
+    """A receiver's telemetry over some slots."""
 
-    first: int
-    x_hat: Floats
-    """Estimates, (c, n, R)."""
-    action: Codes
-    """`Action`, (c, R)."""
-    P: Floats
-    """Reported covariance of the recorded trials, (c, n, n, recorded)."""
-    trace: Floats
-    """Sum over all trials of tr P and of its square, (c, 2)."""
-    late: NDArray[np.uint16] | None
-    """How many packets of earlier slots arrived within the window, (c, R); None for a receiver without a window."""
+    slots: ReceiverSlots
     digests: Mapping[int, Digests]
     """Block, by its first slot → digests, (R, 16), of the blocks that ended in these slots."""
-    late_used: NDArray[np.uint16] | None = None
-    """How many of the late packets were used, and not discarded, (c, R)."""
     trace_sums: Mapping[int, Floats] = field(default_factory=dict)
     """Block, by its first slot → sum of tr P over its slots, (R,), of the same blocks; none if all trials are recorded."""
-
-    @property
-    def count(self) -> int:
-        """Number of slots."""
-        return len(self.x_hat)
 
     def pack(self) -> bytes:
         """Encode it as a message."""
         return pack(
             {
-                "k": self.first,
-                "c": self.count,
-                "x_hat": self.x_hat.tobytes(),
-                "action": self.action.tobytes(),
-                "P": self.P.tobytes(),
-                "trace": self.trace.tobytes(),
-                **({} if self.late is None else {"late": self.late.astype("<u2").tobytes()}),
-                **({} if self.late_used is None else {"late_used": self.late_used.astype("<u2").tobytes()}),
+                "k": self.slots.first,
+                "c": self.slots.count,
+                **packed(self.slots),
                 "digests": {block: digests.tobytes() for block, digests in self.digests.items()},
                 **({"trace_sums": sums} if (sums := _packed_sums(self.trace_sums)) else {}),
             }
@@ -217,33 +175,20 @@ def read_report(message: Reader, first: int, extent: Extent, blocks: Blocks, win
 
     blocks: of its digests; window: by how many slots its packets may be late.
     """
-    c, (n, trials) = message.span(first, extent.slots, extent.batch), extent.shape
-    action = message.array("action", "u1", (c, trials))
-    if action.size and int(action.max()) > max(Action):
-        raise message.malformed(f"action {int(action.max())}", f"actions from 0 to {int(max(Action))}")
-    late, used = (
-        message.counts(name, "<u2", (c, trials), window) if message.has(name) else None
-        for name in ("late", "late_used")
-    )
-    if used is not None and (late is None or (used > late).any()):
+    slots = receiver_format(extent, window).read(message, first, message.span(first, extent.slots, extent.batch))
+    if slots.late is not None and slots.late_used is not None and (slots.late_used > slots.late).any():
         raise message.malformed("more in late_used than in late", "at most as many late packets used as arrived")
-    ended = blocks.ended(first, first + c)
+    _check_symmetric(message, slots.P)
+    ended = blocks.ended(first, first + slots.count)
     return Report(
-        first,
-        message.finite("x_hat", (c, n, trials)),
-        action,
-        _covariances(message, (c, n, n, extent.recorded)),
-        message.finite("trace", (c, 2)),
-        late,
-        read_digests(message, trials, ended),
-        used,
-        _read_sums(message, trials, ended if extent.recorded < trials else []),
+        slots,
+        read_digests(message, extent.trials, ended),
+        _read_sums(message, extent.trials, ended if extent.recorded < extent.trials else []),
     )
 
 
-def _covariances(message: Reader, shape: tuple[int, ...]) -> Floats:
-    """Decode covariances, (…, n, n, R). Digests cover their upper triangles only, so the lower ones must agree with them."""
-    P = message.finite("P", shape)
+def _check_symmetric(message: Reader, P: Floats) -> None:
+    """Check covariances, (…, n, n, R). Digests cover their upper triangles only, so the lower ones must agree with them."""
     place = asymmetry(P)
     if place is not None:
         *before, i, j, r = place
@@ -252,7 +197,6 @@ def _covariances(message: Reader, shape: tuple[int, ...]) -> Floats:
             f"P with {P[place]} at {list(place)} and {P[other]} at {list(other)}",
             "covariances, which are symmetric except for rounding",
         )
-    return P
 
 
 def leaving(k: int, belief: Belief) -> bytes:
@@ -268,7 +212,8 @@ def is_leaving(message: Reader) -> bool:
 def read_leaving(message: Reader, extent: Extent) -> tuple[int, Belief]:
     """Decode the slot before which a receiver leaves, and its belief."""
     n, trials = extent.shape
-    x_hat, P = message.finite("x_hat", extent.shape), _covariances(message, (n, n, trials))
+    x_hat, P = message.finite("x_hat", extent.shape), message.finite("P", (n, n, trials))
+    _check_symmetric(message, P)
     return message.integer("k", 0, extent.slots), Belief(x_hat, P, np.zeros(trials, np.uint8))
 
 
@@ -282,19 +227,15 @@ class Journal:
 
     def pack(self) -> bytes:
         """Encode it as a message."""
-        links = {name: _account(link) for name, link in self.links.items()}
+        links = {
+            name: {
+                **packed(link.slots),
+                "bursts": link.bursts.astype("<u4").tobytes(),
+                "delays": link.delays.astype("<u4").tobytes(),
+            }
+            for name, link in self.links.items()
+        }
         return pack({"k": self.first, "c": self.count, "links": links})
-
-
-def _account(link: Account) -> dict[str, Any]:
-    return {
-        "delivered": packed_flags(link.delivered).tobytes(),
-        "lost": {reason: counts.astype("<u4").tobytes() for reason, counts in link.lost.items()},
-        **({} if link.late is None else {"late": link.late.astype("<u2").tobytes()}),
-        "bursts": link.bursts.astype("<u4").tobytes(),
-        "delays": link.delays.astype("<u4").tobytes(),
-        **({} if link.unsent is None else {"unsent": link.unsent.astype("<u4").tobytes()}),
-    }
 
 
 def read_journal(message: Reader, first: int, windows: Mapping[str, int], extent: Extent) -> Journal:
@@ -303,18 +244,10 @@ def read_journal(message: Reader, first: int, windows: Mapping[str, int], extent
     links: dict[str, Account] = {}
     for name, window in windows.items():
         link = message.nested("links").nested(name)
-        reasons = link.nested("lost")
-        if set(link.map("lost")) != set(REASONS):
-            raise message.malformed(
-                f"{name} lost for {shown(list(link.map('lost')))}", f"the reasons {sorted(REASONS)}"
-            )
         links[name] = Account(
-            link.flags("delivered", (c, trials)),
-            {reason: reasons.counts(reason, "<u4", (c,), trials) for reason in REASONS},
-            link.counts("late", "<u2", (c, trials), window) if link.has("late") else None,
+            link_format(extent, window).read(link, first, c),
             link.counts("bursts", "<u4", (COUNTED_BURSTS,), c * trials),
             link.counts("delays", "<u4", (window + 2,), c * trials),
-            link.counts("unsent", "<u4", (c,), trials) if link.has("unsent") else None,
         )
         _check_account(message, name, links[name], window)
     return Journal(first, c, links)
@@ -322,17 +255,17 @@ def read_journal(message: Reader, first: int, windows: Mapping[str, int], extent
 
 def _check_account(message: Reader, name: str, link: Account, window: int) -> None:
     """Check that every packet has one fate: delivered in its slot, lost, not sent, or, if packets may be late, under way."""
-    trials = link.delivered.shape[1]
-    fates = np.count_nonzero(link.delivered, axis=1) + sum(counts.astype(np.int64) for counts in link.lost.values())
-    fates += 0 if link.unsent is None else link.unsent.astype(np.int64)
+    slots = link.slots
+    trials = slots.delivered.shape[1]
+    fates = np.count_nonzero(slots.delivered, axis=1) + slots.lost.sum(axis=1, dtype=np.int64) + slots.unsent
     wrong = (fates > trials) if window else (fates != trials)
     if wrong.any():
         row = int(np.argmax(wrong))
         raise message.malformed(
             f"{int(fates[row])} fates of {name}'s packets of slot {message.integer('k') + row}", f"{trials} fates"
         )
-    if int(link.delays.sum(dtype=np.int64)) > link.delivered.size:
-        raise message.malformed(f"more delays than packets of {name}", f"at most {link.delivered.size}")
+    if int(link.delays.sum(dtype=np.int64)) > slots.delivered.size:
+        raise message.malformed(f"more delays than packets of {name}", f"at most {slots.delivered.size}")
 
 
 def known(name: str, k: int, x: Floats) -> bytes:
@@ -357,7 +290,7 @@ def decided(k: int, u: Floats, failed: Flags) -> bytes:
 def read_decided(message: Reader, k: int, shape: tuple[int, int]) -> tuple[Floats, Flags]:
     """Decode the inputs (m, R), which must be from slot k on, and where the decision failed."""
     message.slot(k)
-    return message.finite("u", shape), read_failed(message, (shape[1],))
+    return message.finite("u", shape), _read_failed(message, (shape[1],))
 
 
 @dataclass(frozen=True)

@@ -9,38 +9,32 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
-from typing import Any, Generic, TypeVar, final
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Generic, TypeVar, final
 
 from evedrop.live.network.reporting import BeliefReporter
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import (
     Extent,
-    Journal,
     Report,
-    Truth,
     read_decisions,
     read_journal,
     read_report,
     read_truth,
 )
 from evedrop.model.digest import Blocks, DigestLog
-from evedrop.model.integrity.monitor import MonitoredSlots
-from evedrop.model.links.loss_model import REASONS
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, prior
+from evedrop.model.record import Record, columns
 from evedrop.model.slot.cores import Absence
 from evedrop.model.slot.link import Account
+from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
 from evedrop.names import CONTROLLER, ROUTER, SENSOR
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.timeline import Away
-from evedrop.score.slots import InputSlots, ReceiverSlots, Slots, all_set
+from evedrop.score.slots import Slots
 
-Message = TypeVar("Message")
+Kind = TypeVar("Kind", bound=Record)
 
 
 @final
@@ -62,9 +56,9 @@ class Joiner:
         self._check = check
         self._extent, self._windows, self._blocks, self._period = extent, windows, blocks, period
         self._decided = 0
-        self._truth = _Column[Truth]()
-        self._journal = _Column[Journal]()
-        self._reports = {name: _Column[Report]() for name in windows}
+        self._truth = _Queue(SensorSlots)
+        self._links = {name: _Queue(LinkSlots) for name in windows}
+        self._reports = {name: _Queue(ReceiverSlots) for name in windows}
         self._done = 0
         self.digests = {name: DigestLog() for name in windows}
         """Receiver or controller → first slot of a block → its digests, (R, 16)."""
@@ -86,7 +80,7 @@ class Joiner:
     @property
     def journaled(self) -> int:
         """The first slot that the router has not journaled."""
-        return self._journal.end
+        return min(links.end for links in self._links.values())
 
     def reported(self, name: str) -> int:
         """The first slot that a receiver, or the controller, has not reported."""
@@ -109,125 +103,74 @@ class Joiner:
 
     def add_truth(self, telemetry: Reader) -> None:
         """Take the sensor's telemetry."""
-        message = read_truth(telemetry, self._truth.end, self._extent)
-        self._truth.add(message, message.count)
+        slots = read_truth(telemetry, self._truth.end, self._extent)
+        if (changed := self._truth.changed(slots)) is not None:
+            raise telemetry.malformed(f"{changed} in only some of the slots", "the same columns in every message")
+        self._truth.add(slots)
 
     def add_report(self, name: str, telemetry: Reader) -> None:
         """Take a receiver's telemetry."""
-        column = self._reports[name]
-        message = read_report(telemetry, column.end, self._extent, self._blocks[name], self._windows[name])
+        reports = self._reports[name]
+        message = read_report(telemetry, reports.end, self._extent, self._blocks[name], self._windows[name])
         self._check(name, message)
-        column.add(message, message.count)
+        reports.add(message.slots)
         self.digests[name].add(message.digests)
         for block in sorted(message.trace_sums):
             self.trace_sums[name] = self.trace_sums.get(name, 0.0) + message.trace_sums[block]
 
     def add_journal(self, journal: Reader) -> Mapping[str, Account]:
         """Take the router's journal; returns the accounts in it."""
-        message = read_journal(journal, self._journal.end, self._windows, self._extent)
-        self._journal.add(message, message.count)
+        message = read_journal(journal, self.journaled, self._windows, self._extent)
+        for name, account in message.links.items():
+            self._links[name].add(account.slots)
         return message.links
 
     def take_slots(self) -> Slots | None:
         """The next slots that all processes have reported, or None."""
-        count = min(self._truth.available, self._journal.available, *(c.available for c in self._reports.values()))
+        links, reports = self._links.values(), self._reports.values()
+        count = min(self._truth.end, *(queue.end for queue in links), *(queue.end for queue in reports)) - self._done
         if count == 0:
             return None
-        first, self._done = self._done, self._done + count
-        truth = self._truth.take(count)
-        journal = self._journal.take(count)
-        receivers = {}
-        for name, window in self._windows.items():
-            parts = self._reports[name].take(count)
-            receivers[name] = ReceiverSlots(
-                x_hat=_rows(parts, [part.x_hat for part, _ in parts]),
-                action=_rows(parts, [part.action for part, _ in parts]),
-                P=_rows(parts, [part.P for part, _ in parts]),
-                trace=_rows(parts, [part.trace for part, _ in parts]),
-                delivered=_rows(journal, [part.links[name].delivered for part, _ in journal]),
-                lost={
-                    reason: _rows(journal, [part.links[name].lost[reason] for part, _ in journal]) for reason in REASONS
-                },
-                late=_rows(parts, [_known(part.late, part.action) for part, _ in parts]) if window else None,
-                late_used=_rows(parts, [_known(part.late_used, part.action) for part, _ in parts]) if window else None,
-                late_delivered=_rows(
-                    journal, [_known(link.late, link.delivered) for link in (part.links[name] for part, _ in journal)]
-                )
-                if window
-                else None,
-                unsent=_counted([(part.links[name].unsent, part.count, rows) for part, rows in journal]),
-            )
-        x = _rows(truth, [part.x for part, _ in truth])
-        nu = _rows(truth, [part.nu for part, _ in truth])
-        sent, alarms = (
-            None
-            if getattr(truth[0][0], name) is None
-            else _rows(truth, [all_set(getattr(part, name), part.nu) for part, _ in truth])
-            for name in ("sent", "alarms")
+        self._done += count
+        return Slots(
+            self._truth.take(count),
+            {name: reports.take(count) for name, reports in self._reports.items()},
+            {name: links.take(count) for name, links in self._links.items()},
         )
-        inputs = None
-        if self._extent.inputs:
-            u, failed = (_rows(truth, [getattr(part, name) for part, _ in truth]) for name in ("u", "failed"))
-            inputs = InputSlots(u, failed)
-        if inputs is not None and self._extent.monitored:
-            statistic, watermark = (
-                _rows(truth, [getattr(part, name) for part, _ in truth]) for name in ("statistic", "watermark")
-            )
-            inputs = replace(inputs, monitored=MonitoredSlots(statistic, watermark))
-        true = (
-            _rows(truth, [part.true for part, _ in truth if part.true is not None]) if self._extent.measures else None
-        )
-        return Slots(first, x, nu, receivers, sent, alarms, inputs, true)
 
 
-def _counted(parts: list[tuple[NDArray[np.uint32] | None, int, slice]]) -> NDArray[np.uint32] | None:
-    """Counts for some slots, from parts with their lengths and rows; 0 for parts without counts; None if no part has any."""
-    if all(counts is None for counts, _, _ in parts):
-        return None
-    return np.concatenate(
-        [(np.zeros(count, np.uint32) if counts is None else counts)[rows] for counts, count, rows in parts]
-    )
+class _Queue(Generic[Kind]):
+    """Records of consecutive slots of one sender."""
 
-
-class _Column(Generic[Message]):
-    """Messages of one sender, and how many of their slots have been taken."""
-
-    def __init__(self) -> None:
-        self._messages: deque[tuple[Message, int]] = deque()
-        self._taken = 0  # slots taken from the first message
+    def __init__(self, kind: type[Kind]) -> None:
+        self._kind = kind
+        self._records: deque[Kind] = deque()
+        self._columns: list[str] | None = None
         self.end = 0
-        self.available = 0
+        """The first slot that is not here yet."""
 
-    def add(self, message: Message, count: int) -> None:
-        self._messages.append((message, count))
-        self.end += count
-        self.available += count
+    def changed(self, record: Kind) -> str | None:
+        """An optional column that is in this record and not in those before it, or the other way round; None if none is."""
+        there = [entry.name for entry in columns(self._kind) if getattr(record, entry.name) is not None]
+        self._columns = self._columns or there
+        return next(iter(set(there) ^ set(self._columns)), None)
 
-    def take(self, count: int) -> list[tuple[Message, slice]]:
-        """The next slots, as messages with the slices of their rows."""
-        self.available -= count
-        parts = []
+    def add(self, record: Kind) -> None:
+        """Add the next slots."""
+        self._records.append(record)
+        self.end += record.count
+
+    def take(self, count: int) -> Kind:
+        """Remove the first slots, as one record; there must be as many."""
+        parts: list[Kind] = []
         while count:
-            message, length = self._messages[0]
-            rows = slice(self._taken, min(length, self._taken + count))
-            parts.append((message, rows))
-            count -= rows.stop - rows.start
-            self._taken = rows.stop
-            if self._taken == length:
-                self._messages.popleft()
-                self._taken = 0
-        return parts
-
-
-def _known(late: NDArray[np.uint16] | None, like: NDArray[Any]) -> NDArray[np.uint16]:
-    """Counts of late packets, 0 where none are given."""
-    return np.zeros(like.shape, np.uint16) if late is None else late
-
-
-def _rows(parts: list[tuple[Message, slice]], arrays: list[NDArray[Any]]) -> NDArray[Any]:
-    """The rows of the parts' arrays, one after the other."""
-    chosen = [array[rows] for array, (_, rows) in zip(arrays, parts, strict=True)]
-    return chosen[0] if len(chosen) == 1 else np.concatenate(chosen)
+            record = self._records.popleft()
+            if record.count > count:
+                self._records.appendleft(record.rows(slice(count, None)))
+                record = record.rows(slice(0, count))
+            parts.append(record)
+            count -= record.count
+        return self._kind.joined(parts)
 
 
 @final
@@ -242,9 +185,9 @@ class AbsenceReporter:
     ) -> None:
         process = scenario.process.process
         fresh = prior(process, scenario.trials, away.start)
-        self._absence = Absence(process, left if away.keeps_state else fresh)
-        cuts, late = scenario.outage_bounds(receiver), scenario.window(receiver) > 0
-        self._reporter = BeliefReporter(brief, lambda _, payload: put(payload), lambda *_: None, cuts, away.start, late)
+        self._absence = Absence(process, left if away.keeps_state else fresh, scenario.window(receiver))
+        cuts = scenario.outage_bounds(receiver)
+        self._reporter = BeliefReporter(brief, lambda _, payload: put(payload), lambda *_: None, cuts)
         self.next = away.start
         """The first slot that has not been reported."""
         self._stop = min(away.stop, scenario.slots)
@@ -258,6 +201,6 @@ class AbsenceReporter:
         """Report the slots of the outage below `end`."""
         slots = range(self.next, min(end, self._stop))
         if slots:
-            self._reporter.add_slots(slots, self._absence.take_slots(slots))
+            self._reporter.add_slots(self._absence.take_slots(slots))
             self.next = slots.stop
         self._reporter.flush(self.next)

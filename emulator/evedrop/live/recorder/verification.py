@@ -19,11 +19,12 @@ from evedrop.live.protocol.telemetry import Extent, Report
 from evedrop.model.digest import Blocks, PartialDigests
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief
+from evedrop.model.receiver import Action, Belief, Flags
+from evedrop.model.slot.records import LinkSlots, ReceiverSlots
 from evedrop.names import ROUTER, SENSOR
 from evedrop.scenario.closed_loop import monitor_of
 from evedrop.scenario.tables import Scenario
-from evedrop.score.slots import ReceiverSlots, Slots
+from evedrop.score.slots import Slots
 
 _ROUNDING = 1e-9  # sums of a thousand traces in different orders differ by less
 
@@ -45,18 +46,19 @@ class Verifier:
 
     def report(self, name: str, report: Report) -> None:
         """Check a receiver's next report. Raises Contradiction if the report contradicts itself."""
-        self._check_traces(name, report)
-        end = report.first + report.count
-        self._check_leaving(name, report, end)
-        first, blocks = report.first, self._blocks[name]
+        slots = report.slots
+        self._check_traces(name, slots)
+        end = slots.slots.stop
+        self._check_leaving(name, slots, end)
+        first, blocks = slots.first, self._blocks[name]
         some = slice(0, self._recorded)
         while first < end:
             stop = min(end, blocks.end(first))
-            rows = slice(first - report.first, stop - report.first)
+            rows = slots.rows(slice(first - slots.first, stop - slots.first))
             partial = self._digests.setdefault(name, PartialDigests(self._recorded))
-            partial.add(report.x_hat[rows, :, some], report.P[rows], report.action[rows, some])
-            if report.x_hat.shape[2] > self._recorded:
-                self._add_to_block(name, report, rows)
+            partial.add(rows.x_hat[..., some], rows.P, rows.action[:, some])
+            if rows.x_hat.shape[2] > self._recorded:
+                self._add_to_block(name, rows)
                 if stop == blocks.end(first):
                     self._check_block_sums(name, report, blocks.start(first), stop)
             if stop == blocks.end(first):
@@ -75,12 +77,12 @@ class Verifier:
                 f"and what it reported of these slots gives {digests[r].tobytes().hex()}",
             )
 
-    def _add_to_block(self, name: str, report: Report, rows: slice) -> None:
+    def _add_to_block(self, name: str, slots: ReceiverSlots) -> None:
         """Add slots of one block to the sums of tr P of the recorded trials, and to the sum over all trials."""
         before = self._block_sums.get(name, (np.zeros(self._recorded), 0.0))
         with np.errstate(over="ignore", invalid="ignore"):  # a receiver may have made these numbers up
-            traces = kernels.traces(report.P[rows])
-            self._block_sums[name] = (before[0] + traces.sum(axis=0), before[1] + float(report.trace[rows, 0].sum()))
+            traces = kernels.traces(slots.P)
+            self._block_sums[name] = (before[0] + traces.sum(axis=0), before[1] + float(_sums_of(slots)[:, 0].sum()))
 
     def _check_block_sums(self, name: str, report: Report, start: int, stop: int) -> None:
         """Check that the sums of tr P of a block's trials are those of the recorded trials, and of all trials together."""
@@ -99,10 +101,10 @@ class Verifier:
                 f"these slots gives {sums[place]:.17g}",
             )
 
-    def _check_traces(self, name: str, report: Report) -> None:
+    def _check_traces(self, name: str, slots: ReceiverSlots) -> None:
         """Check that the sums of tr P over all trials are possible given the recorded trials; equal, if all are recorded."""
-        traces = kernels.traces(report.P)
-        trials, claimed = report.x_hat.shape[2], report.trace
+        traces = kernels.traces(slots.P)
+        trials, claimed = slots.x_hat.shape[2], _sums_of(slots)
         others = trials - traces.shape[1]
         with np.errstate(over="ignore", invalid="ignore"):  # a receiver may have made these numbers up
             sums_ = np.stack([traces.sum(axis=1), (traces * traces).sum(axis=1)], axis=1)
@@ -120,18 +122,18 @@ class Verifier:
             sums = [f"{value:.17g}" for value in (*claimed[row], *sums_[row])]
             raise Contradiction(
                 name,
-                f"its sums of tr P and of (tr P)² in slot {report.first + row} are {sums[0]} and {sums[1]}, and those of the "
-                f"recorded trials, {traces.shape[1]} of {report.x_hat.shape[2]}, are {sums[2]} and {sums[3]}",
+                f"its sums of tr P and of (tr P)² in slot {slots.first + row} are {sums[0]} and {sums[1]}, and those of the "
+                f"recorded trials, {traces.shape[1]} of {trials}, are {sums[2]} and {sums[3]}",
             )
 
-    def _check_leaving(self, name: str, report: Report, end: int) -> None:
+    def _check_leaving(self, name: str, slots: ReceiverSlots, end: int) -> None:
         """Check that a receiver's final belief is the one in its report of its last slot."""
         left = self._leaving.pop((name, end), None)
         if left is None:
             return
         for quantity, on_leaving, reported in (
-            ("x_hat", left.x_hat, report.x_hat[-1]),
-            ("P", left.P[..., : self._recorded], report.P[-1]),
+            ("x_hat", left.x_hat, slots.x_hat[-1]),
+            ("P", left.P[..., : self._recorded], slots.P[-1]),
         ):
             if on_leaving.tobytes() != np.ascontiguousarray(reported).tobytes():
                 place = (
@@ -148,50 +150,53 @@ class Verifier:
     def joined(self, slots: Slots) -> None:
         """Check joined slots against the journal. Raises Contradiction if they disagree."""
         for name, receiver in slots.receivers.items():
-            self._check_received(name, slots.first, receiver)
-            if slots.sent is not None:
-                self._check_sent(slots, receiver)
+            self._check_received(name, receiver, slots.links[name])
+            if slots.sensor.sent is not None:
+                self._check_sent(slots.sensor.sent, slots.links[name])
 
-    def _check_received(self, name: str, first: int, receiver: ReceiverSlots) -> None:
+    def _check_received(self, name: str, receiver: ReceiverSlots, link: LinkSlots) -> None:
         received = receiver.action != Action.LOST
-        wrong = received != receiver.delivered
+        wrong = received != link.delivered
         if wrong.any():
             row, r = (int(i) for i in np.argwhere(wrong)[0])
             says = "that it received the packet" if received[row, r] else "that it received nothing"
-            journal = "that it was delivered" if receiver.delivered[row, r] else "that it was not delivered"
+            journal = "that it was delivered" if link.delivered[row, r] else "that it was not delivered"
             raise Contradiction(
                 name,
-                f"in slot {first + row}, trial {self._first_trial + r}, it says {says} (action "
+                f"in slot {link.first + row}, trial {self._first_trial + r}, it says {says} (action "
                 f"{int(receiver.action[row, r])}), but the journal says {journal}",
                 ROUTER,
             )
-        if receiver.late is None or receiver.late_delivered is None:
+        if receiver.late is None or link.late is None:
             return
-        wrong = receiver.late != receiver.late_delivered
+        wrong = receiver.late != link.late
         if wrong.any():
             row, r = (int(i) for i in np.argwhere(wrong)[0])
             raise Contradiction(
                 name,
-                f"in slot {first + row}, trial {self._first_trial + r}, it says that {int(receiver.late[row, r])} late packets "
-                f"arrived, but the journal says {int(receiver.late_delivered[row, r])}",
+                f"in slot {link.first + row}, trial {self._first_trial + r}, it says that {int(receiver.late[row, r])} late "
+                f"packets arrived, but the journal says {int(link.late[row, r])}",
                 ROUTER,
             )
 
-    def _check_sent(self, slots: Slots, receiver: ReceiverSlots) -> None:
-        """Check the sensor's report of the packets that it sent against the journal."""
-        if slots.sent is None:
-            return
-        silent = np.count_nonzero(~slots.sent, axis=1)
-        unsent = 0 if receiver.unsent is None else receiver.unsent.astype(np.int64)
-        wrong = (silent != unsent) | (receiver.delivered & ~slots.sent).any(axis=1)
+    def _check_sent(self, sent: Flags, link: LinkSlots) -> None:
+        """Check the sensor's report of the packets that it sent, (c, R), against the journal."""
+        silent = np.count_nonzero(~sent, axis=1)
+        wrong = (silent != link.unsent) | (link.delivered & ~sent).any(axis=1)
         if wrong.any():
             row = int(np.argmax(wrong))
             raise Contradiction(
                 SENSOR,
-                f"in slot {slots.first + row} it says that {int(silent[row])} trials sent nothing, but the journal says "
-                f"{int(np.broadcast_to(unsent, silent.shape)[row])}, or that a packet of one of them was delivered",
+                f"in slot {link.first + row} it says that {int(silent[row])} trials sent nothing, but the journal says "
+                f"{int(link.unsent[row])}, or that a packet of one of them was delivered",
                 ROUTER,
             )
+
+
+def _sums_of(slots: ReceiverSlots) -> Floats:
+    """The sums of traces over all trials, (c, 2), which every report has."""
+    assert slots.trace is not None  # noqa: S101 - else the message would have been refused
+    return slots.trace
 
 
 def extent_of(scenario: Scenario, batch: int) -> Extent:

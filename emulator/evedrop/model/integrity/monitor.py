@@ -113,29 +113,6 @@ def assumed(loop: WatermarkedLoop, attack: SensorAttack | None, watermark: Float
     return spread(inverse(cholesky(loop.innovation)), loop.deceived(source, watermark))
 
 
-@dataclass(frozen=True)
-class MonitoredSlots:
-    """The monitor over c slots."""
-
-    statistic: Floats
-    """The policy's statistic after each slot, (c, R)."""
-    watermark: Floats
-    """e, which is added to the input of each slot, (c, m, R); 0 where there is none."""
-
-    @classmethod
-    def joined(cls, parts: Sequence[MonitoredSlots]) -> MonitoredSlots:
-        """Consecutive slots as one."""
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("statistic", "watermark")))
-
-    def part(self, trials: slice) -> MonitoredSlots:
-        """The same for some of the trials."""
-        return MonitoredSlots(self.statistic[:, trials], self.watermark[..., trials])
-
-    def rows(self, some: slice) -> MonitoredSlots:
-        """Some of the slots."""
-        return MonitoredSlots(self.statistic[some], self.watermark[some])
-
-
 @final
 class Monitor:
     """The detector of a batch of trials. key: of the stream `watermark`."""

@@ -14,18 +14,18 @@ from dataclasses import dataclass
 from typing import NamedTuple, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evedrop.model import update
 from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.detection import CusumBatch
-from evedrop.model.integrity.monitor import Monitor, MonitoredSlots
+from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.local_filter import LocalFilter
 from evedrop.model.plant import Drive, Plant
 from evedrop.model.process import Floats, Process, Trajectory, product
 from evedrop.model.receiver import Action, Belief, Beliefs, Flags, Receiver, Reception
 from evedrop.model.schemes.scheme import Encoder, PacketBlock
 from evedrop.model.slot.link_core import Arrival, Arrivals, Late
+from evedrop.model.slot.records import ReceiverSlots, SensorSlots
 from evedrop.model.streams import Batch
 
 LARGEST = 1e100
@@ -129,28 +129,21 @@ class PlantCore:
 class Sent(NamedTuple):
     """The sensor in c consecutive slots."""
 
-    true: Floats
-    """True states, (c, n, R)."""
-    x: Floats
-    """The states that packets are made from, (c, n, R): the true ones, or the estimates of the sensor's filter."""
+    slots: SensorSlots
     packets: PacketBlock
-    monitored: MonitoredSlots | None = None
-    """The detector for the filter; None without one."""
 
     @classmethod
     def joined(cls, parts: Sequence[Sent]) -> Sent:
         """Consecutive slots, at least one, as one."""
         if len(parts) == 1:
             return parts[0]
-        packets = PacketBlock.joined([part.packets for part in parts])
-        true, x = (np.concatenate(arrays) for arrays in zip(*((part.true, part.x) for part in parts), strict=True))
-        monitored = [part.monitored for part in parts if part.monitored is not None]
-        return cls(true, x, packets, MonitoredSlots.joined(monitored) if monitored else None)
+        return cls(
+            SensorSlots.joined([part.slots for part in parts]), PacketBlock.joined([part.packets for part in parts])
+        )
 
     def rows(self, some: slice) -> Sent:
         """Some of the slots."""
-        monitored = None if self.monitored is None else self.monitored.rows(some)
-        return Sent(self.true[some], self.x[some], self.packets.rows(some), monitored)
+        return Sent(self.slots.rows(some), self.packets.rows(some))
 
 
 @final
@@ -191,15 +184,25 @@ class SensorCore:
         """The next slots, at least one."""
         states = self._plant.advance(slots)
         x, predicted = self._filtered(slots, states)
-        monitored = None if self._monitor is None else self._monitored(slots.start, self._monitor)
-        return Sent(states.x, x, self._encoder.encode_block(slots, x, predicted), monitored)
+        statistic, watermark = None, None
+        if self._monitor is not None:
+            statistic, watermark = self._monitored(slots.start, self._monitor)
+        packets = self._encoder.encode_block(slots, x, predicted)
+        true = states.x if self.filters else None
+        sensor = SensorSlots(
+            slots.start, x, packets.nu, packets.sent, true=true, statistic=statistic, watermark=watermark
+        )
+        return Sent(sensor, packets)
 
-    def _monitored(self, k: int, monitor: Monitor) -> MonitoredSlots:
-        """Test the filter's innovation of slot k, and add the watermark to the input of this slot."""
+    def _monitored(self, k: int, monitor: Monitor) -> tuple[Floats, Floats]:
+        """Test the filter's innovation of slot k, and add the watermark to the input of this slot.
+
+        Returns the detector's statistic, (1, R), and the watermark, (1, m, R).
+        """
         assert self._local is not None  # noqa: S101 - a monitor is there only with a filter
         monitor.take(k, self._local.normalised, self._plant.entered)
         self._plant.add_watermark(monitor.watermark)
-        return MonitoredSlots(monitor.statistic[None], monitor.watermark[None])
+        return monitor.statistic[None], monitor.watermark[None]
 
     def _filtered(self, slots: range, states: States) -> tuple[Floats, Floats]:
         """The states to transmit, and the predictions that their innovations refer to."""
@@ -235,22 +238,6 @@ class _Slot:
     """Trials whose packet has just arrived."""
 
 
-class FollowedSlots(NamedTuple):
-    """A receiver after c consecutive slots."""
-
-    beliefs: Beliefs
-    late: NDArray[np.uint16] | None
-    """How many packets of earlier slots arrived that were not known before, and how many of them were used and not discarded,
-    (2, c, R); None for a receiver without a window."""
-
-    @classmethod
-    def joined(cls, parts: Sequence[FollowedSlots]) -> FollowedSlots:
-        """Consecutive slots, at least one, as one."""
-        beliefs = Beliefs.joined([part.beliefs for part in parts])
-        late = [part.late for part in parts if part.late is not None]
-        return cls(beliefs, np.concatenate(late, axis=1) if late else None)
-
-
 @final
 class ReceiverCore:
     """A receiver with its belief, which takes the arrivals of many slots at once, or of one.
@@ -264,11 +251,11 @@ class ReceiverCore:
         self.belief = receiver.prior(first)
         self._late = np.zeros((2, receiver.trials), np.uint16)
 
-    def take_slots(self, slots: range, arrivals: Arrivals) -> FollowedSlots:
-        """The beliefs after consecutive slots, at least one."""
+    def take_slots(self, slots: range, arrivals: Arrivals) -> ReceiverSlots:
+        """The receiver after consecutive slots, at least one, with the covariances of all trials."""
         if arrivals.plain and not self._history.maxlen:
             beliefs, self.belief = self._receiver.follow(slots, self.belief, arrivals.gamma, arrivals.z)
-            return FollowedSlots(beliefs, None)
+            return ReceiverSlots(slots.start, beliefs.x_hat, beliefs.action, beliefs.P)
         beliefs = Beliefs.empty(arrivals.z.shape)
         late = np.zeros((2, len(slots), self._receiver.trials), np.uint16) if self._history.maxlen else None
         for row, k in enumerate(slots):
@@ -276,7 +263,9 @@ class ReceiverCore:
             beliefs.put(row, self.belief)
             if late is not None:
                 late[:, row] = self._late
-        return FollowedSlots(beliefs, late)
+        return ReceiverSlots(
+            slots.start, beliefs.x_hat, beliefs.action, beliefs.P, None, *((None, None) if late is None else late)
+        )
 
     def _step(self, k: int, arrival: Arrival) -> None:
         changed = k
@@ -334,16 +323,18 @@ class Absence:
     A receiver that is away reports nothing; these are its beliefs for these slots once it is back.
     """
 
-    def __init__(self, process: Process, belief: Belief) -> None:
-        self._process, self._belief = process, belief
+    def __init__(self, process: Process, belief: Belief, window: int = 0) -> None:
+        """window: slots by which a packet may be late for the receiver."""
+        self._process, self._belief, self._window = process, belief, window
 
-    def take_slots(self, slots: range) -> Beliefs:
-        """The beliefs after consecutive slots, at least one, in which nothing was received."""
+    def take_slots(self, slots: range) -> ReceiverSlots:
+        """The receiver after consecutive slots, at least one, in which nothing was received."""
         n, trials = self._belief.x_hat.shape
         nothing = np.zeros((len(slots), trials), np.uint8)
         beliefs = update.beliefs(self._process, slots.start, self._belief, nothing, np.zeros((len(slots), n, trials)))
         self._belief = beliefs.last
-        return beliefs
+        late = np.zeros((len(slots), trials), np.uint16) if self._window else None
+        return ReceiverSlots(slots.start, beliefs.x_hat, beliefs.action, beliefs.P, None, late, late)
 
 
 class Decision(NamedTuple):

@@ -20,6 +20,7 @@ from evedrop.model.links import loss_of
 from evedrop.model.links.loss_model import REASONS, Fate, LossModel
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
+from evedrop.model.slot.records import LinkSlots
 from evedrop.model.streams import Batch, BlockReader, StreamReader
 
 NEVER = 2**62
@@ -302,21 +303,14 @@ COUNTED_BURSTS = 64
 
 @dataclass(frozen=True)
 class Account:
-    """The outcomes of the packets of c slots on one link."""
+    """The outcomes of the packets of some slots on one link."""
 
-    delivered: Flags
-    """Whether the packet was delivered in its own slot, (c, R)."""
-    lost: Mapping[str, NDArray[np.uint32]]
-    """Reason → packets of each slot lost for it, (c,)."""
-    late: NDArray[np.uint16] | None
-    """Packets of earlier slots delivered in each slot, without second copies, (c, R); None where there can be none."""
+    slots: LinkSlots
     bursts: NDArray[np.uint32]
     """Runs of packets lost to the loss model that ended in these slots, by length: 1, 2, … and 64 or more. A slot without a
     packet ends a run."""
     delays: NDArray[np.uint32]
     """Packets of these slots that were not lost, by their delay in slots: 0, 1, …, the window, and more."""
-    unsent: NDArray[np.uint32] | None = None
-    """Trials of each slot without a packet, (c,); None if all trials had one."""
 
 
 @final
@@ -332,14 +326,11 @@ class Accountant:
     def account(self, slots: range, fates: Fates) -> Account:
         """The account of the next slots."""
         counts = kernels.count_codes(fates.codes, len(Fate))
-        unsent = counts[:, Fate.UNSENT].copy()
+        lost = counts[:, 1 : 1 + len(REASONS)].copy()
         return Account(
-            fates.in_time,
-            {reason: counts[:, code].copy() for code, reason in enumerate(REASONS, 1)},
-            self._late(slots, fates),
+            LinkSlots(slots.start, fates.in_time, lost, counts[:, Fate.UNSENT].copy(), self._late(slots, fates)),
             kernels.count_bursts(fates.codes, Fate.LOST, self._run, COUNTED_BURSTS),
             self._delays(fates, counts),
-            unsent if unsent.any() else None,
         )
 
     def _late(self, slots: range, fates: Fates) -> NDArray[np.uint16] | None:

@@ -54,10 +54,10 @@ def simulate(assignment: Assignment, plan: MonitorPlan, slots: int, trials: int,
     sensor = SensorCore(PlainEncoder(), states, local, None, monitor)
     columns: tuple[list[Floats], ...] = ([], [], [], [])
     for k in range(slots):
-        made = sensor.send(range(k, k + 1))
+        made = sensor.send(range(k, k + 1)).slots
         u = -product(loop.L, made.x[0])
         sensor.set_inputs(u)
-        applied, x = u + monitor.watermark, made.true[0]
+        applied, x = u + monitor.watermark, made.states[0]
         cost = assignment.state_weights @ (x * x) + assignment.input_weights @ (applied * applied)
         for column, values in zip(columns, (monitor.statistic, monitor.watermark, local.normalised, cost), strict=True):
             column.append(values)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -21,9 +22,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from evedrop.errors import UsageError
-from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.process import Floats
-from evedrop.model.receiver import ACTION_OF, INNOVATION, NOTHING, Flags
+from evedrop.model.receiver import ACTION_OF, INNOVATION, NOTHING
+from evedrop.model.slot.records import ReceiverSlots, SensorSlots
 from evedrop.names import LEGITIMATE
 from evedrop.results.reading import Results
 from evedrop.scenario.application import APPLICATIONS, ControlledPlant
@@ -70,18 +71,20 @@ class LoopValues:
         loop = controlled_plant(scenario)
         return None if loop is None else cls(loop, scenario)
 
-    def take(self, u: Floats, estimates: Mapping[str, Floats], monitored: MonitoredSlots | None = None) -> Moved:
-        """The view's values of the next slots, from inputs as decided, (c, m), and estimates as deviations, (c, n).
+    def take(self, sensor: SensorSlots, estimates: Mapping[str, Floats]) -> Moved | None:
+        """The view's values of the next slots, from the sensor in this trial alone, and estimates as deviations, (c, n).
 
-        monitored: watermark and detector in this trial alone; None without them.
+        None without inputs.
         """
-        limited = self._plant.limited(u.T).T
-        first, self._next = self._next, self._next + len(u)
+        if sensor.u is None:
+            return None
+        limited = self._plant.limited(sensor.u[:, :, 0].T).T
+        first, self._next = self._next, self._next + len(limited)
         values = np.hstack([self._disturbances[first : self._next], limited])
         curves: dict[str, Floats] = {}
         for feed in self._feeds:
-            if monitored is not None:
-                curves |= feed.take_monitored(first, monitored)
+            if sensor.statistic is not None:
+                curves |= feed.take_monitored(first, sensor)
             curves |= feed.take(first, limited, estimates)
         return Moved(values, curves)
 
@@ -165,18 +168,17 @@ def shown(
             action=receiver.action[:, 0],
             squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
             standard_error=scored[name].sums.standard_errors,
-            trace=receiver.trace[:, 0] / slots.trials,
+            trace=_sums(receiver)[:, 0] / slots.trials,
             theoretical_trace=scored[name].expected,
         )
         for name, receiver in slots.receivers.items()
     }
-    moved = None
-    if loop_values is not None and slots.inputs is not None:
+    sensor, moved = slots.sensor, None
+    if loop_values is not None:
         estimates = {name: receiver.x_hat[:, :, 0] for name, receiver in slots.receivers.items()}
-        monitored = None if slots.inputs.monitored is None else slots.inputs.monitored.part(slice(0, 1))
-        moved = loop_values.take(slots.inputs.u[:, :, 0], estimates, monitored)
-    sent = None if slots.sent is None else slots.sent[:, 0]
-    return SceneSlots(slots.first, slots.x[:, :, 0] + around, slots.nu[:, 0], peers, moved, sent)
+        moved = loop_values.take(sensor.part(slice(0, 1)), estimates)
+    sent = None if sensor.sent is None else sensor.sent[:, 0]
+    return SceneSlots(slots.first, sensor.x[:, :, 0] + around, sensor.nu[:, 0], peers, moved, sent)
 
 
 _CHUNK = 1000  # slots recorded at once
@@ -192,12 +194,13 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     scenario = looked_at.scenario
     path = folder / "recording.rrd" if path is None else path
     peers = {name: _peer(results, name) for name in scenario.receivers}
-    x, nu, sent = _truth(results, scenario.receivers[0])
+    sensor = _sensor(results, scenario.receivers[0])
+    x = sensor.x[:, :, 0]
     if not len(x):
         raise UsageError(f"{folder} has no recorded trial to show; run it again, for example in the exact mode")
     _check_shapes(folder, len(scenario.process.A), x, peers)
-    inputs, monitored, loop_values = _inputs(results), _monitored(results), loop_values_of(scenario)
-    if loop_values is not None and len(inputs) != len(x):
+    loop_values = loop_values_of(scenario)
+    if loop_values is not None and (sensor.u is None or len(sensor.u) != len(x)):
         raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
     around = np.array(scenario.process.around)
     recording = open_recording(
@@ -207,10 +210,11 @@ def replay(folder: Path, path: Path | None = None) -> Path:
         for first in range(0, len(x), _CHUNK):
             rows = slice(first, min(first + _CHUNK, len(x)))
             deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
-            some = None if monitored is None else monitored.rows(rows)
-            moved = None if loop_values is None else loop_values.take(inputs[rows], deviations, some)
+            some = sensor.rows(rows)
+            moved = None if loop_values is None else loop_values.take(some, deviations)
             shown = {name: peer.mapped(itemgetter(rows)) for name, peer in peers.items()}
-            recording.add(SceneSlots(first, x[rows], nu[rows], shown, moved, sent[rows]))
+            sent = None if some.sent is None else some.sent[:, 0]
+            recording.add(SceneSlots(first, some.x[:, :, 0], some.nu[:, 0], shown, moved, sent))
         for event in results.events:
             recording.note(event.slot, "INFO", event.line)
     if recording.failure is not None:
@@ -238,29 +242,30 @@ def _first_trial(results: Results, name: str) -> pa.Table:
     return rows.sort_by("slot")
 
 
-def _truth(results: Results, name: str) -> tuple[Floats, Flags, Flags]:
-    """True states, ν, and whether a packet was sent, in the first recorded trial; name: any receiver."""
+def _sensor(results: Results, name: str) -> SensorSlots:
+    """The sensor in the first recorded trial, with states in absolute values; name: any receiver."""
     rows = _first_trial(results, name)
     words = rows["sent"].cast(pa.string()).to_pylist()
-    nu = np.array([word == INNOVATION for word in words], np.bool_)
-    return _matrix(rows["x"]), nu, np.array([word != NOTHING for word in words], np.bool_)
+    nu = np.array([word == INNOVATION for word in words], np.bool_)[:, None]
+    sent = np.array([word != NOTHING for word in words], np.bool_)[:, None]
+    sensor = SensorSlots(0, _matrix(rows["x"])[..., None], nu, sent)
+    inputs = results.inputs
+    if inputs is None or not inputs.num_rows:
+        return sensor
+    inputs = inputs.filter(pc.field("trial") == pc.min(inputs["trial"])).sort_by("slot")
+    monitored = "statistic" in inputs.schema.names
+    return replace(
+        sensor,
+        u=_matrix(inputs["u"])[..., None],
+        statistic=inputs["statistic"].to_numpy()[:, None] if monitored else None,
+        watermark=_matrix(inputs["watermark"])[..., None] if monitored else None,
+    )
 
 
-def _inputs(results: Results) -> Floats:
-    """Inputs of the first recorded trial, (slots, m); empty without a controller."""
-    rows = results.inputs
-    if rows is None or not rows.num_rows:
-        return np.empty((0, 0))
-    return _matrix(rows.filter(pc.field("trial") == pc.min(rows["trial"])).sort_by("slot")["u"])
-
-
-def _monitored(results: Results) -> MonitoredSlots | None:
-    """Watermark and detector of the first recorded trial; None without them."""
-    rows = results.inputs
-    if rows is None or not rows.num_rows or "statistic" not in rows.schema.names:
-        return None
-    rows = rows.filter(pc.field("trial") == pc.min(rows["trial"])).sort_by("slot")
-    return MonitoredSlots(rows["statistic"].to_numpy()[:, None], _matrix(rows["watermark"])[:, :, None])
+def _sums(receiver: ReceiverSlots) -> Floats:
+    """The sums of traces over all trials, (c, 2)."""
+    assert receiver.trace is not None  # noqa: S101 - of slots that are complete
+    return receiver.trace
 
 
 def _peer(results: Results, name: str) -> PeerSlots:

@@ -23,13 +23,14 @@ from evedrop.model.digest import Digests, InputLog, RunDigest
 from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
 from evedrop.model.integrity.attacks import Replay
 from evedrop.model.integrity.loop import WatermarkedLoop
-from evedrop.model.integrity.monitor import MonitoredSlots, MonitorPlan
+from evedrop.model.integrity.monitor import MonitorPlan
 from evedrop.model.integrity.policies import WatermarkPolicy
 from evedrop.model.integrity.theory import WatermarkTheory, loop_of
 from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.metrics.standard_error import z_of
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, product
+from evedrop.model.slot.records import SensorSlots
 from evedrop.scenario.application import (
     Application,
     ApplicationTally,
@@ -185,11 +186,12 @@ class IntegrityTally(ApplicationTally):
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
         """Do nothing: all metrics come from the monitor."""
 
-    def add_monitored(self, x: Floats, u: Floats, monitored: MonitoredSlots) -> None:
+    def add_monitored(self, x: Floats, u: Floats, sensor: SensorSlots) -> None:
         """Add the next slots, one by one, so that the sums have the same bits however the slots are divided."""
-        case = self._case
-        alarms = case.policy.alarms(monitored.statistic)
-        for row, (state, decided, e, alarm) in enumerate(zip(x, u, monitored.watermark, alarms, strict=True)):
+        case, statistic, watermark = self._case, sensor.statistic, sensor.watermark
+        assert statistic is not None and watermark is not None  # noqa: S101, PT018 - there is a detector
+        alarms = case.policy.alarms(statistic)
+        for row, (state, decided, e, alarm) in enumerate(zip(x, u, watermark, alarms, strict=True)):
             k = int(self._slots[0])
             self._slots = self._slots + 1
             self._first = np.where(alarm & (self._first < 0), k, self._first)
@@ -199,7 +201,7 @@ class IntegrityTally(ApplicationTally):
                 self._marked_before = self._marked_before + marked
                 self._cost = self._cost + self._advantage(state, decided, e)
             if self._log is not None:
-                stated = np.concatenate([monitored.statistic[row][None], e])
+                stated = np.concatenate([statistic[row][None], e])
                 ended = self._log.add(k, stated, alarm)
                 self._digests.update([] if ended is None else [ended])
         if self._slots[0] == case.slots:
@@ -305,9 +307,10 @@ class IntegrityFeed(PanelFeed):
         del first, u, estimates
         return {}
 
-    def take_monitored(self, first: int, monitored: MonitoredSlots) -> Mapping[str, Floats]:
+    def take_monitored(self, first: int, sensor: SensorSlots) -> Mapping[str, Floats]:
         """Add the next slots; the alarm is a point in the slot that raises it."""
-        statistic, e = monitored.statistic[:, 0], monitored.watermark[:, :, 0]
+        assert sensor.statistic is not None and sensor.watermark is not None  # noqa: S101, PT018 - there is a detector
+        statistic, e = sensor.statistic[:, 0], sensor.watermark[:, :, 0]
         slots = np.arange(first, first + len(statistic), dtype=np.float64)
         raised = np.flatnonzero(self._policy.alarms(statistic))[: 0 if self._alarmed else 1]
         self._alarmed = self._alarmed or bool(len(raised))

@@ -1,0 +1,84 @@
+"""Records as parts of messages: packed and read by the declaration of their columns, with every check.
+
+Each column is a binary field with the column's name: numbers as little-endian bytes, flags as bit masks.
+
+Source: docs/protocol.md, messages.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from typing import Any, Generic, TypeVar, final
+
+import numpy as np
+
+from evedrop.live.protocol.codec import Reader
+from evedrop.model.receiver import packed_flags
+from evedrop.model.record import Column, Record, columns
+
+Kind = TypeVar("Kind", bound=Record)
+
+_FIELD_BYTES = 32  # of a column's name and its size
+
+
+def packed(record: Record) -> dict[str, Any]:
+    """The columns of a record that are there, as fields of a message."""
+    fields: dict[str, Any] = {}
+    for entry in columns(type(record)):
+        array = getattr(record, entry.name)
+        if array is not None:
+            fields[entry.name] = (
+                packed_flags(array) if entry.is_flag else array.astype(entry.dtype, copy=False)
+            ).tobytes()
+    return fields
+
+
+@final
+class RecordFormat(Generic[Kind]):
+    """How messages carry one kind of record in a run."""
+
+    def __init__(
+        self,
+        kind: type[Kind],
+        extent: Mapping[str, int],
+        absent: Collection[str] = (),
+        present: Collection[str] = (),
+        most: Mapping[str, int] | None = None,
+    ) -> None:
+        """extent: axis → its length in the run, without c.
+
+        absent: optional columns that are not read; present: optional ones that must be there; most: column of whole numbers →
+        its largest.
+        """
+        self._kind, self._most = kind, most or {}
+        self._columns = [
+            (entry, entry.shape(extent), entry.name in present or not entry.optional)
+            for entry in columns(kind)
+            if entry.name not in absent
+        ]
+
+    def largest(self, count: int) -> int:
+        """The most bytes that a record of some slots takes."""
+        return sum(_FIELD_BYTES + count * _bytes_of(entry, shape) for entry, shape, _ in self._columns)
+
+    def read(self, message: Reader, first: int, count: int) -> Kind:
+        """The record of some slots from `first` on. Raises MalformedMessage, with the sender and the column."""
+        values: dict[str, Any] = {}
+        for entry, shape, needed in self._columns:
+            if needed or message.has(entry.name):
+                values[entry.name] = self._column(message, entry, (count, *shape))
+        return self._kind(first, **values)
+
+    def _column(self, message: Reader, entry: Column, shape: tuple[int, ...]) -> Any:
+        if entry.is_flag:
+            return message.flags(entry.name, shape)
+        if entry.dtype.kind == "f":
+            return message.finite(entry.name, shape)
+        return message.counts(entry.name, entry.dtype.str, shape, self._most.get(entry.name, np.iinfo(entry.dtype).max))
+
+
+def _bytes_of(entry: Column, shape: tuple[int, ...]) -> int:
+    if entry.is_flag:
+        return math.prod(shape[:-1]) * ((shape[-1] + 7) // 8)
+    return math.prod(shape) * entry.dtype.itemsize

@@ -1,0 +1,124 @@
+"""Records: what one process knows of c consecutive slots of R trials. A column is declared once, an operation written once.
+
+A record is a frozen dataclass whose columns say their axes, type and meaning. Messages, tables and the scorekeeper use the
+same objects: `live/protocol/record_messages.py` packs and reads any record by its declaration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Column(NamedTuple):
+    """A column of a record."""
+
+    name: str
+    axes: tuple[str, ...]
+    """The name of each axis: the first is c, the slots; R are the trials."""
+    dtype: np.dtype[Any]
+    meaning: str
+    optional: bool
+    """Whether the column may be None."""
+
+    @property
+    def is_flag(self) -> bool:
+        """Whether its values are true or false."""
+        return self.dtype.kind == "b"
+
+    def shape(self, extent: Mapping[str, int]) -> tuple[int, ...]:
+        """The shape of one slot's values; extent: axis → its length, unless the axis is a number itself."""
+        return tuple(int(axis) if axis.isdigit() else extent[axis] for axis in self.axes[1:])
+
+
+def column(axes: str, meaning: str, dtype: str = "<f8", **default: None) -> Any:
+    """Declare a column of a record.
+
+    axes: their names, "c" first, separated by blanks; dtype: "?" for flags. A column that may be missing has `default=None`.
+    """
+    metadata = {"axes": tuple(axes.split()), "dtype": np.dtype(dtype), "meaning": meaning}
+    return field(**default, metadata=metadata)  # type: ignore[call-overload]
+
+
+def columns(kind: type[Record]) -> tuple[Column, ...]:
+    """The columns of a kind of record, in the order of their declaration."""
+    hashable: Any = kind  # mypy takes a class whose instances cannot be hashed for one
+    return _columns(hashable)
+
+
+@cache
+def _columns(kind: Any) -> tuple[Column, ...]:
+    return tuple(
+        Column(entry.name, **entry.metadata, optional=entry.default is None)
+        for entry in fields(kind)
+        if "axes" in entry.metadata
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """The base of all records: a subclass is a frozen dataclass of columns."""
+
+    first: int
+    """The first slot."""
+
+    @property
+    def count(self) -> int:
+        """Number of slots."""
+        return len(next(self.arrays()))
+
+    @property
+    def slots(self) -> range:
+        """The slots."""
+        return range(self.first, self.first + self.count)
+
+    def arrays(self) -> Any:
+        """The columns that are there, in order."""
+        values = (getattr(self, entry.name) for entry in columns(type(self)))
+        return (array for array in values if array is not None)
+
+    def mapped(self, change: Callable[[Column, NDArray[Any]], NDArray[Any]], first: int | None = None) -> Self:
+        """The record with every column that is there changed; first: its first slot, if that changes."""
+        changed = {
+            entry.name: change(entry, array)
+            for entry in columns(type(self))
+            if (array := getattr(self, entry.name)) is not None
+        }
+        return replace(self, first=self.first if first is None else first, **changed)
+
+    def rows(self, some: slice) -> Self:
+        """Some of the slots, as views."""
+        if some == slice(0, self.count):
+            return self
+        return self.mapped(lambda _, array: array[some], self.first + (some.start or 0))
+
+    def part(self, trials: slice) -> Self:
+        """Some of the trials, as views. Columns without trials stay as they are."""
+        return self.mapped(lambda entry, array: array[..., trials] if entry.axes[-1] in TRIALS else array)
+
+    def copied(self) -> Self:
+        """A copy whose arrays are its own, so that it does not keep larger ones in memory."""
+        return self.mapped(lambda _, array: array.copy())
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Records of consecutive slots, at least one, as one. Raises ValueError if only some of them have a column."""
+        if len(parts) == 1:
+            return parts[0]
+        whole: dict[str, Any] = {}
+        for entry in columns(cls):
+            arrays = [getattr(part, entry.name) for part in parts]
+            there = [array for array in arrays if array is not None]
+            if there and len(there) < len(arrays):
+                raise ValueError(f"only some of the slots from {parts[0].first} on have {entry.name}: {entry.meaning}")
+            whole[entry.name] = np.concatenate(there) if there else None
+        return replace(parts[0], **whole)
+
+
+TRIALS = ("R", "S")
+"""Axes of trials: R of all of them, S of those that are recorded."""
