@@ -1,4 +1,4 @@
-"""The work of every receiver: take the deliveries that have arrived, update the estimate, report."""
+"""The work of every receiver: take a delivery, update the estimate, report."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import final
 
 import numpy as np
 
-from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession, most_slots
+from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession
 from evedrop.live.network.reporting import BeliefReporter
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief, ReceiverPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import EndRun
-from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_acknowledgement, read_deliveries
+from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_delivery
 from evedrop.live.protocol.telemetry import leaving
 from evedrop.model.receiver import Belief, Flags, Receiver
 from evedrop.model.slot.cores import ReceiverCore
@@ -47,10 +47,7 @@ def follow(
 
 @final
 class ReceiverLoop:
-    """A receiver's work on a session that is being opened: it takes all deliveries that have arrived at once.
-
-    Where another process waits for an answer to each of them, it takes them one by one.
-    """
+    """A receiver's work on a session that is being opened."""
 
     def __init__(
         self, brief: Brief[ReceiverPart], core: ReceiverCore, replies: ReceiverReplies, session: ProcessSession
@@ -58,7 +55,7 @@ class ReceiverLoop:
         name, key = brief.process, session.keys.downlink(brief.process)
         self._brief, self._core, self._replies, self._status = brief, core, replies, session.status
         self._outages = _outages_of(brief)
-        self.deliveries = Pending(session.subscribe(key), key, most_slots(brief))
+        self.deliveries = Pending(session.subscribe(key), key)
         self._put_telemetry = session.replaying_publisher(session.keys.telemetry(name), brief.flow.window + 1)
         cuts = [slot for start, (stop, _) in self._outages.items() for slot in (start, stop)]
         put_progress = session.replaying_publisher(session.keys.progress(name), 0)
@@ -105,23 +102,19 @@ class ReceiverLoop:
         self._k = stop
 
     def _take(self) -> None:
-        """Take the deliveries of this slot, and of those after it that have arrived."""
+        """Take the next delivery, which begins with this slot."""
         brief, k = self._brief, self._k
-        messages = self.deliveries.take_messages(k, 1 if self._replies.awaited else self._end_of_block - k)
-        slots = range(k, k + len(messages))
         shape = len(brief.model.A), brief.trials
-        arrivals = read_deliveries(messages, k, shape, brief.model.header, brief.part.window)
+        # An answer is awaited to every slot; a report ends at the end of its batch; an absence begins at a barrier.
+        most = 1 if self._replies.awaited else min(brief.flow.batch - k % brief.flow.batch, brief.slots - k)
+        message = self.deliveries.drop()
+        arrivals = read_delivery(message, k, shape, brief.model.header, brief.part.window, most)
+        slots = range(k, k + len(arrivals.gamma))
         self._replies.before(k, arrivals.gamma[0])
         followed = self._core.take_slots(slots, arrivals)
         self._replies.after(k, self._core.belief)
         self._reporter.add_slots(followed)
         self._k = slots.stop
-
-    @property
-    def _end_of_block(self) -> int:
-        """The slot up to which deliveries may be taken at once: the end of a report. An absence begins at a barrier."""
-        k, batch = self._k, self._brief.flow.batch
-        return min(k - k % batch + batch, self._brief.slots)
 
 
 @final
@@ -169,8 +162,8 @@ class ReceiverReplies:
 
 
 def _acknowledged(delivery: Reader, k: int, trials: int) -> bytes:
-    """The acknowledgement of a delivery: both messages have γ in the same field."""
-    return acknowledgement(k, read_acknowledgement(delivery, k, trials))
+    """The acknowledgement of a delivery of a single slot."""
+    return acknowledgement(k, delivery.flags("gamma", (1, trials))[0])
 
 
 def _save(brief: Brief[ReceiverPart], belief: Belief) -> None:

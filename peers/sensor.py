@@ -10,14 +10,14 @@ from queue import Empty
 from typing import final
 
 from evedrop.errors import RunError
-from evedrop.live.network.process_session import GapDetector, Mailbox, ProcessSession, ReplayBuffer, most_slots
+from evedrop.live.network.process_session import GapDetector, Mailbox, ProcessSession, ReplayBuffer
 from evedrop.live.network.program import ProgramStates
 from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief, ProgramEntry, SensorPart, decoded
 from evedrop.live.protocol.codec import Reader, read_progress
 from evedrop.live.protocol.commands import EndRun, Go, Hold, Start
-from evedrop.live.protocol.packets import barrier, read_acknowledgement, resend, uplink
+from evedrop.live.protocol.packets import barrier, packets_of, read_acknowledgement, resend, uplink
 from evedrop.live.protocol.telemetry import held
 from evedrop.model.detection import CusumBatch
 from evedrop.model.integrity.monitor import Monitor
@@ -25,7 +25,8 @@ from evedrop.model.local_filter import LocalFilter
 from evedrop.model.receiver import Flags
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.model.slot.cores import GivenStates, PlantCore, SensorCore, Sent, recorded
+from evedrop.model.slot.cores import GivenStates, PlantCore, SensorCore, recorded
+from evedrop.model.slot.link import NEVER
 from evedrop.model.slot.records import SensorSlots
 from evedrop.names import RECORDER, SENSOR
 from evedrop.peers.closed_loop import Steered
@@ -56,7 +57,8 @@ class Window:
         self._window, self._sent, self._status, self._clock = window, sent, session.status, clock
         self._done = dict.fromkeys(followers, 0)
         self._absent: Collection[str] = ()
-        self._limit = window
+        self.limit = window
+        """The first slot that may not be sent yet."""
         self._keys = {name: session.keys.progress(name) for name in followers}
         self._mailbox = Mailbox(self._keys, _PROGRESS_BYTES, clock)
         for name, key in self._keys.items():
@@ -69,7 +71,7 @@ class Window:
 
     def wait(self, k: int) -> None:
         """Wait until slot k may be sent."""
-        while k >= self._limit:
+        while k >= self.limit:
             with self._status.waiting(
                 *(self._keys[name] for name in self._followed if self._done[name] + self._window <= k)
             ):
@@ -102,7 +104,7 @@ class Window:
 
     def _measure(self) -> None:
         done = min(self._done[name] for name in self._followed)
-        self._limit = done + self._window
+        self.limit = done + self._window
         self._sent.forget(done)
 
 
@@ -124,6 +126,10 @@ class Barriers:
         self._session, self._window = session, window
         self._telemetry, self._flush = telemetry, flush
         self._barriers = set(brief.part.holds)
+
+    def after(self, k: int) -> int:
+        """The first slot after slot k before which to stop."""
+        return min((slot for slot in self._barriers if slot > k), default=NEVER)
 
     def wanted(self, k: int) -> bool:
         """Whether to stop before slot k."""
@@ -166,8 +172,8 @@ class Acknowledgements:
 class SensorLoop:
     """The sensor's work on a session that is being opened.
 
-    It makes many slots at once, and sends one after the other. It makes one at a time where each is due at a certain time, or
-    where the next depends on an answer to it.
+    It makes many slots at once, and sends them in one message; one at a time where each is due at a certain time, or where the
+    next depends on an answer to it.
     """
 
     def __init__(
@@ -194,48 +200,34 @@ class SensorLoop:
         self._barriers = Barriers(brief, session, self._window, telemetry, self._reporter.flush)
         self._betrayed = set(part.leaks.values())
         self._answered = self._back is not None or self._steered is not None
-        self._most = 1 if part.pace or self._answered or program is not None else most_slots(brief)
-        self._slots = range(0)
-        """Those that were made at once and are being sent."""
-        self._made: Sent
-        self._reported = 0
+        self._most = 1 if part.pace or self._answered or program is not None else brief.flow.message
         self._start = 0.0
 
     def carry_on(self) -> None:
         """Send all slots."""
         self._start = self._clock.monotonic()
-        for k in range(self._brief.slots):
+        k = 0
+        while k < self._brief.slots:
             self._wait(k)
-            if k == self._slots.stop:
-                self._slots = range(k, min(k + self._most, self._end_of_report(k)))
-                try:
-                    self._made = self._core.send(self._slots)
-                except RunError:  # the program gave no state: its states so far should be in the results
-                    self._window.settle(k - k % self._brief.flow.batch, _SETTLE_SECONDS)
-                    raise
-                if self._program is not None:
-                    self._start += self._program.waited  # so that later slots are not in a hurry
-            self._send_packet(k)
-            if k + 1 == self._slots.stop:
-                self._report(k + 1)
+            slots = range(k, self._end_of_message(k))
+            try:
+                made = self._core.send(slots)
+            except RunError:  # the program gave no state: its states so far should be in the results
+                self._window.settle(k - k % self._brief.flow.batch, _SETTLE_SECONDS)
+                raise
+            if self._program is not None:
+                self._start += self._program.waited  # so that later slots are not in a hurry
+            truth = made.slots.x if k in self._betrayed else None
+            self._send(slots[-1], uplink(packets_of(k, made.packets, truth)), k)
+            self._reporter.add_slots(self._answers(made.slots) if self._answered else made.slots)
+            k = slots.stop
 
-    def _end_of_report(self, k: int) -> int:
+    def _end_of_message(self, k: int) -> int:
+        """The slot after those that the next message carries: a report ends, the run is held, or a state is betrayed."""
         batch = self._brief.flow.batch
-        return min(k - k % batch + batch, self._brief.slots)
-
-    def _send_packet(self, k: int) -> None:
-        packets, row = self._made.packets, k - self._slots.start
-        header, sent = (None if column is None else column[row] for column in (packets.header, packets.sent))
-        self._send(k, uplink(k, packets.z[row], header, sent, self._made.slots.x[row] if k in self._betrayed else None))
-
-    def _report(self, end: int) -> None:
-        """Report the slots below `end` of those that were made at once; all of these have been sent."""
-        some = range(self._reported, end)
-        if some:
-            first = self._slots.start
-            slots = self._made.slots.rows(slice(some.start - first, end - first))
-            self._reporter.add_slots(self._answers(slots) if self._answered else slots)
-            self._reported = end
+        ends = [k + self._most, k - k % batch + batch, self._brief.slots, self._window.limit, self._barriers.after(k)]
+        ends += [end for slot in self._betrayed for end in (slot, slot + 1) if end > k]
+        return min(ends)
 
     def _answers(self, slots: SensorSlots) -> SensorSlots:
         """Wait for the answers to a single slot, and apply them; returns the slot with alarms and inputs."""
@@ -260,7 +252,6 @@ class SensorLoop:
         while not (wanted := self._barriers.wanted(k)) and pace and (left := self._left(k)) > 0.0:
             self._clock.sleep(min(left, _POLL_SECONDS))
         if wanted:
-            self._report(k)  # before the barrier is sent: at a barrier, nothing else may be on its way
             self._send(k, barrier(k))
             began = self._clock.monotonic()
             self._barriers.wait_at(k)

@@ -56,6 +56,8 @@ from evedrop.score.links import ack_channel_of, chart_of
 _WINDOW_BYTES = 64 * 2**20
 _MOST_SLOTS_AHEAD = 4096
 _REPORT_SECONDS = 0.04
+_MOST_SLOTS = 64  # whose packets one message carries
+_MESSAGE_BYTES = 1 << 18  # of their numbers, so that they stay in the processor's cache
 LAUNCHED_PATIENCE = 30  # seconds
 
 
@@ -72,12 +74,13 @@ def flow_of(scenario: Scenario) -> Flow:
         batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
     elif scenario.process.source == "zenoh":
         batch = 1  # the program's pace is not known, and its messages should be on disk when it falls silent
-    sizes = sizes_of(scenario, batch)
-    return Flow(window, batch, scenario.longest_outage, max(sizes.of_kinds.values()))
+    message = max(1, min(_MOST_SLOTS, batch, _MESSAGE_BYTES // (8 * len(scenario.process.A) * scenario.trials)))
+    largest = max(sizes_of(scenario, batch, message).of_kinds.values())
+    return Flow(window, batch, scenario.longest_outage, largest, message)
 
 
-def sizes_of(scenario: Scenario, batch: int) -> Sizes:
-    """The dimensions that determine the sizes of messages; batch: slots of a report."""
+def sizes_of(scenario: Scenario, batch: int, message: int) -> Sizes:
+    """The dimensions that determine the sizes of messages; batch: slots of a report; message: slots whose packets one carries."""
     plant, table = scenario.driven, scenario.controller
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
     return Sizes(
@@ -91,6 +94,7 @@ def sizes_of(scenario: Scenario, batch: int) -> Sizes:
         0 if plant is None or table is None else plant.inputs,
         1 if table is None else table.period,
         monitor_of(scenario) is not None,
+        message,
     )
 
 
@@ -153,7 +157,7 @@ def briefs_of(
     identities = identities_of(run, endpoints, tuple(users))
     loop, flow = LoopBriefs(scenario), flow_of(scenario)
     states = None if public.source == "zenoh" else states_of(scenario)
-    limits = sizes_of(scenario, flow.batch).of_kinds
+    limits = sizes_of(scenario, flow.batch, flow.message).of_kinds
 
     def modules(**named: Any) -> str | None:
         """The folder of own classes for a process whose part names one."""

@@ -18,11 +18,9 @@ from types import TracebackType
 from typing import Protocol, Self, final
 
 from evedrop.errors import Gap, MalformedMessage
-from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import ControlCommand, StatusReporter
 from evedrop.live.protocol.keys import RunKeys, writer_of
-from evedrop.live.protocol.packets import is_barrier, is_resend
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 
 
@@ -84,46 +82,26 @@ class ProcessSession(Protocol):
         """The next command, or None."""
 
 
-_MOST_SLOTS = 64
-_BLOCK_BYTES = 1 << 18  # of the numbers of a block, so that it stays in the processor's cache
-
-
-def most_slots(brief: AnyBrief) -> int:
-    """How many slots a process of a run handles at once at most."""
-    return max(1, min(_MOST_SLOTS, _BLOCK_BYTES // (8 * len(brief.model.A) * brief.trials)))
+_AHEAD = 64  # messages
 
 
 @final
 class Pending:
     """Reads packets, or deliveries, and the barriers between them from a subscription, as many messages ahead as have arrived."""
 
-    def __init__(self, subscription: Received, key: str, most: int) -> None:
-        """most: how many messages to read ahead."""
-        self._subscription, self._key, self._most = subscription, key, most
+    def __init__(self, subscription: Received, key: str) -> None:
+        self._subscription, self._key = subscription, key
         self._messages: deque[Reader] = deque()
 
     def peek(self) -> Reader:
         """The next message, which stays the next until it is taken or dropped; waits for it if need be."""
         if not self._messages:
-            self._messages.extend(Reader(self._key, payload) for payload in self._subscription.take(self._most))
+            self._messages.extend(Reader(self._key, payload) for payload in self._subscription.take(_AHEAD))
         return self._messages[0]
 
-    def drop(self) -> None:
+    def drop(self) -> Reader:
         """Remove the next message, which `peek` has returned."""
-        self._messages.popleft()
-
-    def take_messages(self, first: int, most: int) -> list[Reader]:
-        """Take the packets of slots `first`, `first` + 1, … without a gap or a barrier, as many as have arrived, up to `most`.
-
-        The next message must be the packet of slot `first`.
-        """
-        messages = [self._messages.popleft()]
-        while len(messages) < most and self._messages:
-            message = self._messages[0]
-            if message.fields.get("k") != first + len(messages) or is_barrier(message) or is_resend(message):
-                break
-            messages.append(self._messages.popleft())
-        return messages
+        return self._messages.popleft()
 
     def __iter__(self) -> Iterator[Reader]:
         """All messages that still come, until the connection is closed."""
@@ -206,14 +184,15 @@ class ReplayBuffer:
         back: int = 0,
     ) -> None:
         self._put, self._span, self._head, self._back = put, span, head, back
-        self._messages: deque[tuple[int, bytes]] = deque()
+        self._messages: deque[tuple[int, int, bytes]] = deque()
+        """First slot, last slot, and the message."""
         self._forgotten = 0
         self._lock = threading.Lock()
 
-    def __call__(self, k: int, payload: bytes) -> None:
-        """Send a message that belongs to slot k, and keep it."""
+    def __call__(self, k: int, payload: bytes, first: int | None = None) -> None:
+        """Send a message that ends with slot k, and keep it; first: the slot with which it begins, if not with k."""
         with self._lock:
-            self._messages.append((k, payload))
+            self._messages.append((k if first is None else first, k, payload))
             self._put(payload)
         if self._span is not None:
             self.forget(k - self._span)
@@ -222,19 +201,19 @@ class ReplayBuffer:
         """Forget messages of slots below k, which are done, except the `back` slots before k."""
         with self._lock:
             self._forgotten = max(self._forgotten, k)
-            while self._messages and self._messages[0][0] < k - self._back:
+            while self._messages and self._messages[0][1] < k - self._back:
                 self._messages.popleft()
 
     def again(self, number: int, k: int) -> None:
         """Send the messages of slots from k on, which are not done, again; the last message in any case."""
         with self._lock:
             k = max(k, self._forgotten)  # a late request must not announce slots that are forgotten
-            first = max(0, k - self._back)
-            if self._head is not None:
-                self._put(self._head(number, k, first))
-            for place, (slot, payload) in enumerate(self._messages, 1):
-                if slot >= first or place == len(self._messages):
-                    self._put(payload)
+            oldest = max(0, k - self._back)
+            again = [message for message in self._messages if message[1] >= oldest] or list(self._messages)[-1:]
+            if self._head is not None:  # the oldest message may begin before the first slot that is needed
+                self._put(self._head(number, k, min([oldest, *(first for first, _, _ in again[:1])])))
+            for _, _, payload in again:
+                self._put(payload)
 
 
 @final

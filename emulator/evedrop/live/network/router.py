@@ -22,7 +22,7 @@ import heapq
 import itertools
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from queue import SimpleQueue
 from typing import final
@@ -32,30 +32,29 @@ import numpy as np
 from evedrop.errors import EvedropError, NotRegistered
 from evedrop.live.network.access import access_control, at_relay, at_router, grants, until_all_left, users_file
 from evedrop.live.network.connecting import connected
-from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession, most_slots
+from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession
 from evedrop.live.network.session import ATTEMPT, Session, client_config, router_address_of, router_config
-from evedrop.live.protocol.brief import AnyBrief, Brief, RelayPart, RouterPart, Wiring
+from evedrop.live.protocol.brief import AnyBrief, Brief, RelayPart, RouterPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Again, ControlCommand, EndRun, Go, LinkChange
 from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.live.protocol.packets import (
-    Uplinked,
     acknowledgement,
     barrier,
     delivery,
     is_barrier,
     is_resend,
-    packed_header,
+    packet_format,
     read_acknowledgement,
     read_resend,
-    read_uplinks,
+    read_uplink,
 )
 from evedrop.live.protocol.telemetry import Journal
 from evedrop.model.acknowledgements import AckChannel, AckChannelSpec
-from evedrop.model.kernels.current import kernels
-from evedrop.model.receiver import Flags, packed_flags
+from evedrop.model.receiver import Flags
 from evedrop.model.slot.link import COUNTED_BURSTS, Account, Accountant, Change, LinkSchedule, streams_of
-from evedrop.model.slot.link_core import Late, LinkCore
+from evedrop.model.slot.link_core import Arrivals, Late, LinkCore
+from evedrop.model.slot.records import PacketSlots
 from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE, ROUTER
 
 
@@ -64,8 +63,14 @@ class Downlink:
     """One receiver's link, whose fates are decided a batch of slots ahead, and its publisher."""
 
     def __init__(
-        self, name: str, schedule: LinkSchedule, brief: Brief[RouterPart], put: Callable[[bytes, float], None]
+        self,
+        name: str,
+        schedule: LinkSchedule,
+        brief: Brief[RouterPart],
+        put: Callable[[bytes, float], None],
+        waited: bool = True,
     ) -> None:
+        """waited: whether deliveries are sent at once; in lock-step, waking up others would take most of the time."""
         keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, schedule)}
         self._core = LinkCore(schedule, name, keys, brief.batch)
         self._schedule = schedule
@@ -75,23 +80,16 @@ class Downlink:
         self._rests: dict[int, float] = {}
         """Slot → the fraction of a slot that the first trial's packet takes in addition, for packets that may still arrive."""
         self._leak = brief.part.leaks.get(name)
-        self._masks: list[bytes]
-        self._received: list[int]
+        self._waited = waited
+        self._held: list[PacketSlots] = []
 
     def plan(self, slots: range) -> None:
         """Decide the fates of the next batch of slots."""
         self._core.plan(slots)
-        self._masks, self._received = self._described(slots)
 
     def amend(self, at: int, changes: Iterable[Change]) -> None:
         """Decide the slots of the batch from `at` on again, with these changes; none of them may have been journaled."""
         self._core.amend(at, changes)
-        self._masks, self._received = self._described(self._core.slots)
-
-    def _described(self, slots: range) -> tuple[list[bytes], list[int]]:
-        """For each slot, the mask of the trials that receive in time, and how many they are."""
-        in_time = self._core.in_time[self._core.rows(slots)]
-        return [mask.tobytes() for mask in packed_flags(in_time)], np.count_nonzero(in_time, axis=1).tolist()
 
     def account(self, slots: range) -> Account:
         """The fates of the packets of the next slots, which belong to the current batch."""
@@ -105,34 +103,44 @@ class Downlink:
         """γ of slot k, which belongs to the current batch and was delivered, (R,)."""
         return self._core.gamma(k)
 
-    def deliver(self, slots: range, packets: Uplinked, again: bool = False) -> None:
-        """Send the deliveries of consecutive slots of the batch: the packets that arrive in each.
+    def take(self, packets: PacketSlots, again: bool = False) -> None:
+        """Take the packets of the next slots of the batch, and deliver them; hold them if nobody waits for them.
 
         again: the receiver has these deliveries; only update the packets under way.
         """
-        core = self._core
         if packets.sent is not None:
-            core.silence(slots, packets.sent)
-            rows = core.rows(slots)
-            self._masks[rows], self._received[rows] = self._described(slots)
-        arrivals = core.arrivals(slots, packets.z, packets.header)
+            self._core.silence(packets.slots, packets.sent)
         if again:
+            self._arrivals(packets)
+        elif self._waited:
+            self._deliver(packets)
+        else:
+            if packets.truth is not None:
+                self.flush()
+            self._held.append(packets)
+            if packets.truth is not None:
+                self.flush()
+
+    def flush(self) -> None:
+        """Deliver all packets that are held."""
+        if self._held:
+            held, self._held = PacketSlots.joined(self._held), []
+            self._deliver(held)
+
+    def _arrivals(self, packets: PacketSlots) -> Arrivals:
+        return self._core.arrivals(packets.slots, packets.z, packets.header)
+
+    def _deliver(self, packets: PacketSlots) -> None:
+        """Send the delivery of some slots: the packets that arrive in each. Nothing is sent to a receiver that is absent."""
+        slots, k = packets.slots, packets.first
+        arrivals = self._arrivals(packets)
+        if self._schedule.outages and not self._core.present(k):
             return
-        first, trials = core.rows(slots).start, packets.z.shape[2]
-        late, rests, put = arrivals.late, bool(self._rests) or core.fates.rests is not None, self._put
-        for row, k in enumerate(slots):
-            if self._schedule.outages and not core.present(k):
-                continue
-            received, z = self._received[first + row], b""
-            if received == trials:
-                z = packets.whole[row]
-            elif received:
-                z = kernels.gather(arrivals.gamma[row], packets.z[row]).tobytes()
-            header = b"" if packets.header is None else packed_header(packets.header[row], arrivals.gamma[row])
-            truth = packets.truth[row].tobytes() if k == self._leak and row in packets.truth else b""
-            arrived = late.get(row, ())
-            message = delivery(k, self._masks[first + row], z, arrived, header, truth)
-            put(message, self._rest(k, arrivals.gamma[row], arrived) if rests else 0.0)
+        if packets.truth is not None and k == self._leak:
+            arrivals = arrivals._replace(truth=dict(enumerate(packets.truth)))
+        rests = bool(self._rests) or self._core.fates.rests is not None
+        seconds = self._rest(k, arrivals.gamma[0], arrivals.late.get(0, ())) if rests else 0.0
+        self._put(delivery(slots, arrivals), seconds)
 
     def _rest(self, k: int, gamma: Flags, late: tuple[Late, ...]) -> float:
         """The seconds by which to delay slot k's delivery: the longest rest among the first trial's packets in it."""
@@ -148,29 +156,6 @@ class Downlink:
         """Pass a barrier on, if the receiver is present."""
         if not any(away.start < k <= away.stop for away in self._schedule.outages):
             self._put(barrier(k), 0.0)
-
-
-@final
-class Burst:
-    """Deliveries to a receiver that nobody waits for, sent many at a time.
-
-    When the sensor waits for another process in every slot, single messages would wake this receiver for each of them, and
-    these wake-ups would take most of the time.
-    """
-
-    def __init__(self, put: Callable[[bytes], None]) -> None:
-        self._put = put
-        self._held: list[bytes] = []
-
-    def hold(self, payload: bytes, _: float) -> None:
-        """Hold one message back until `flush`."""
-        self._held.append(payload)
-
-    def flush(self) -> None:
-        """Send all held messages."""
-        for payload in self._held:
-            self._put(payload)
-        self._held.clear()
 
 
 @final
@@ -234,19 +219,14 @@ class RouterLoop:
 
     def __init__(self, brief: Brief[RouterPart], session: ProcessSession) -> None:
         self._brief, self._session = brief, session
-        self._shape = (len(brief.model.A), brief.trials)
-        self._uplink = Pending(session.subscribe(session.keys.uplink), session.keys.uplink, most_slots(brief))
+        self._packets = packet_format(len(brief.model.A), brief.trials, brief.model.header)
+        self._uplink = Pending(session.subscribe(session.keys.uplink), session.keys.uplink)
         self._due = GapDetector(session.keys.uplink, brief.flow.longest_outage)
         self._put_journal = session.publisher(session.keys.journal)
         delayed_sender = DelayedSender() if brief.part.pace else None
-        self._bursts: list[Burst] = []
 
         def publisher(name: str, schedule: LinkSchedule) -> Callable[[bytes, float], None]:
             put = session.publisher(session.keys.downlink(name))
-            wiring = brief.part.controller
-            if delayed_sender is None and wiring is not None and not self._is_waited_for(name, wiring):
-                self._bursts.append(Burst(put))
-                return self._bursts[-1].hold
             delays = any(
                 "delay" in (settings or {}) for settings in (schedule.settings, *(c.settings for c in schedule.changes))
             )
@@ -268,8 +248,11 @@ class RouterLoop:
         """Whether to ignore packets until the resend begins."""
         self._begin(0, 0)
 
-    def _is_waited_for(self, receiver: str, wiring: Wiring) -> bool:
-        """Whether the sensor waits in some slots for a receiver's acknowledgement or estimate."""
+    def _is_waited_for(self, receiver: str) -> bool:
+        """Whether the deliveries to a receiver have a pace, or the sensor waits in some slots for what it answers."""
+        wiring = self._brief.part.controller
+        if self._brief.part.pace or wiring is None:
+            return True
         acknowledged = self._brief.part.acknowledgements is not None
         return receiver == LEGITIMATE and (not wiring.on_truth or wiring.knows_input or acknowledged)
 
@@ -289,10 +272,9 @@ class RouterLoop:
         done: all slots below it have been delivered, acknowledged and journaled.
         """
         self._stale = False
-        self._flush()  # nobody needs these messages, but they must not mix with the following ones
         self._k, self._done, self._journaled = start, done, start
         self._downlinks = {
-            name: Downlink(name, schedule, self._brief, self._publishers[name])
+            name: Downlink(name, schedule, self._brief, self._publishers[name], self._is_waited_for(name))
             for name, schedule in self._schedules.items()
         }
         for first in range(0, start + 1, self._brief.flow.batch):
@@ -331,30 +313,34 @@ class RouterLoop:
                 self._journal(k)
                 self._hold(k)
             return
-        stop = self._slots.stop if k >= self._done else min(self._slots.stop, self._done)
-        self._route(k, self._uplink.take_messages(k, 1 if self._ack_link is not None else stop - k))
+        most = 1 if self._ack_link is not None else self._slots.stop - k
+        packets = read_uplink(self._uplink.drop(), k, self._packets, most)
+        if k < self._done < packets.slots.stop:
+            self._route(packets.rows(slice(0, self._done - k)))
+            packets = packets.rows(slice(self._done - k, None))
+            self._journal(self._done)
+        self._route(packets)
         if self._k == self._slots.stop:
             self._flush()
             self._journal(self._k)
             self._plan(self._k)
 
-    def _route(self, first: int, messages: Sequence[Reader]) -> None:
+    def _route(self, packets: PacketSlots) -> None:
         """Deliver the packets of consecutive slots, unless it is known that they have been delivered."""
-        packets = read_uplinks(messages, first, self._shape, self._brief.model.header)
-        slots, again = range(first, first + len(messages)), first < self._done
+        first, again = packets.first, packets.first < self._done
         for downlink in self._downlinks.values():
-            downlink.deliver(slots, packets, again)
+            downlink.take(packets, again)
         if self._ack_link is not None:
             sent = None if packets.sent is None else packets.sent[0]
             if again:
                 self._ack_link.count(first, sent, self._downlinks)
             else:
                 self._ack_link.carry(first, sent, self._downlinks, self._commands)
-        self._k = self._session.status.slot = slots.stop
+        self._k = self._session.status.slot = packets.slots.stop
 
     def _flush(self) -> None:
-        for burst in self._bursts:
-            burst.flush()
+        for downlink in self._downlinks.values():
+            downlink.flush()
 
     def _resend(self, message: Reader) -> None:
         """Begin a resend, which the conductor and the sensor announce in either order; wait for the conductor if need be."""
@@ -378,9 +364,9 @@ class RouterLoop:
 
     def _hold(self, k: int) -> None:
         """Pass a barrier on, and obey the conductor until it lets the router continue."""
+        self._flush()
         for downlink in self._downlinks.values():
             downlink.mark(k)
-        self._flush()
         while True:
             match self._commands.next():
                 case Go(slot) if slot == k:

@@ -532,6 +532,8 @@ class Flow:
     """Seconds for which a process may be cut off before that ends the run."""
     largest_message: int = field(default=2**30, metadata=entry(whole(1)))
     """Bytes of the largest message of the run: larger ones are not accepted."""
+    message: int = field(default=1, metadata=entry(whole(1)))
+    """A message carries the packets of at most this many slots."""
 
 
 @dataclass(frozen=True)

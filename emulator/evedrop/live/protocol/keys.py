@@ -148,6 +148,8 @@ class Sizes:
     """Slots between decisions."""
     monitored: bool = False
     """Whether there are a watermark and a detector."""
+    message: int = 1
+    """The most slots whose packets a message carries."""
 
     @property
     def of_kinds(self) -> dict[str, int]:
@@ -166,8 +168,8 @@ class Sizes:
         waits = _NAME_BYTES * (self.receivers + 1)
         link = c * (mask + 4 * (len(REASONS) + 1) + 2 * R) + 4 * (COUNTED_BURSTS + self.window + 2) + _FRAME_BYTES
         kinds = {
-            "uplink": packet + state,
-            "downlink": packet * (1 + 2 * (self.window + 1)) + state,
+            "uplink": self.message * (packet + state),
+            "downlink": self.message * (packet * (1 + 2 * (self.window + 1)) + state),
             "ack": mask,
             "estimate": state,
             "state": state,

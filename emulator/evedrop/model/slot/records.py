@@ -1,7 +1,4 @@
-"""What sensor, link and receiver know of some slots: the columns that cores make, messages carry, and results hold.
-
-A scheme's packets, which the sensor sends, are `PacketBlock`; what arrives of them at a receiver is `Arrivals`.
-"""
+"""What sensor, link and receiver know of some slots: the columns that cores make, messages carry, and results hold."""
 
 from __future__ import annotations
 
@@ -17,6 +14,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Beliefs, Codes, Flags
 from evedrop.model.record import Record, column
 
+I64 = NDArray[np.int64]
 U16 = NDArray[np.uint16]
 U32 = NDArray[np.uint32]
 
@@ -41,6 +39,16 @@ class SensorSlots(Record):
     def states(self) -> Floats:
         """The true states, (c, n, R)."""
         return self.x if self.true is None else self.true
+
+
+@dataclass(frozen=True, eq=False)
+class PacketSlots(Record):
+    """The packets of some slots, as they reach the router."""
+
+    z: Floats = column("c n R", "payloads; 0 where no packet was sent")
+    header: I64 | None = column("c h R", "unencrypted headers; None for a scheme without", "<i8", default=None)
+    sent: Flags | None = column("c R", "whether a packet was sent; None: in every slot", "?", default=None)
+    truth: Floats | None = column("c n R", "the state itself, which is betrayed to one receiver", default=None)
 
 
 @dataclass(frozen=True, eq=False)
