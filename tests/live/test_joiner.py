@@ -5,28 +5,31 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 
+from evedrop.errors import MalformedMessage
+from evedrop.live.protocol import telemetry
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.telemetry import Decisions, Extent, Journal, Report, Truth
+from evedrop.live.protocol.telemetry import Decisions, Extent, Journal, Report
 from evedrop.live.recorder.joiner import Joiner
 from evedrop.model.digest import Blocks
 from evedrop.model.links.loss_model import REASONS
+from evedrop.model.record import Record, columns
 from evedrop.model.slot.link import COUNTED_BURSTS, Account
-from evedrop.score.slots import ReceiverSlots, Slots
+from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
+from evedrop.score.slots import Slots
 from tests.builders import mirrored
 
 SLOTS, N, TRIALS, RECORDED = 300, 2, 5, 2
 EXTENT = Extent(SLOTS, 300, N, TRIALS, RECORDED, inputs=1, measures=True, monitored=True)
 WINDOWS = {"legitimate": 2, "eve": 0}
 BLOCKS = Blocks(SLOTS)
-BARE = 40
-"""A message that begins with this slot has no optional counts: there were none."""
 
 RNG = np.random.default_rng(28)
-TRUTH = Truth(
+TRUTH = SensorSlots(
     0,
     RNG.normal(size=(SLOTS, N, TRIALS)),
     RNG.random((SLOTS, TRIALS)) < 0.5,
@@ -43,15 +46,18 @@ TRUTH = Truth(
 def report_of(window: int) -> Report:
     """What a receiver reports of all slots."""
     late = RNG.integers(0, window + 1, (SLOTS, TRIALS)).astype(np.uint16) if window else None
-    return Report(
+    slots = ReceiverSlots(
         0,
         RNG.normal(size=(SLOTS, N, TRIALS)),
         RNG.integers(0, 4, (SLOTS, TRIALS)).astype(np.uint8),
         mirrored(RNG.normal(size=(SLOTS, N, N, RECORDED))),
         RNG.random((SLOTS, 2)),
         late,
-        {block: RNG.integers(0, 256, (TRIALS, 16)).astype(np.uint8) for block in BLOCKS.ended(0, SLOTS)},
         None if late is None else late // 2,
+    )
+    return Report(
+        slots,
+        {block: RNG.integers(0, 256, (TRIALS, 16)).astype(np.uint8) for block in BLOCKS.ended(0, SLOTS)},
         {block: RNG.random(TRIALS) for block in BLOCKS.ended(0, SLOTS)},
     )
 
@@ -62,10 +68,10 @@ def account_of(window: int) -> Account:
     unsent = (RNG.random(SLOTS) < 0.5).astype(np.uint32) * (~delivered).any(axis=1)
     missing = np.count_nonzero(~delivered, axis=1) - unsent
     kind = RNG.integers(0, len(REASONS), SLOTS)
-    lost = {reason: np.where(kind == i, missing, 0).astype(np.uint32) for i, reason in enumerate(REASONS)}
+    lost = np.where(np.arange(len(REASONS)) == kind[:, None], missing[:, None], 0).astype(np.uint32)
     late = RNG.integers(0, window + 1, (SLOTS, TRIALS)).astype(np.uint16) if window else None
     nothing = np.zeros(COUNTED_BURSTS, np.uint32), np.zeros(window + 2, np.uint32)
-    return Account(delivered, lost, late, *nothing, unsent.astype(np.uint32))
+    return Account(LinkSlots(0, delivered, lost, unsent.astype(np.uint32), late), *nothing)
 
 
 REPORTS = {name: report_of(window) for name, window in WINDOWS.items()}
@@ -74,33 +80,21 @@ ACCOUNTS = {name: account_of(window) for name, window in WINDOWS.items()}
 
 def truth(start: int, stop: int) -> bytes:
     """The sensor's telemetry of some slots."""
-    names = ("x", "nu", "sent", "alarms", "u", "failed", "true", "statistic", "watermark")
-    return replace(TRUTH, first=start, **{name: getattr(TRUTH, name)[start:stop] for name in names}).pack()
+    return telemetry.truth(TRUTH.rows(slice(start, stop)))
 
 
 def report(name: str, start: int, stop: int) -> bytes:
     """A receiver's telemetry of some slots."""
     whole, ended = REPORTS[name], BLOCKS.ended(start, stop)
-    rows = slice(start, stop)
-    late = None if whole.late is None or whole.late_used is None or start == BARE else whole.late[rows]
-    used = None if late is None or whole.late_used is None else whole.late_used[rows]
     digests = {block: whole.digests[block] for block in ended}
-    sums = {block: whole.trace_sums[block] for block in ended}
-    numbers = whole.x_hat[rows], whole.action[rows], whole.P[rows], whole.trace[rows]
-    return Report(start, *numbers, late, digests, used, sums).pack()
+    return Report(
+        whole.slots.rows(slice(start, stop)), digests, {block: whole.trace_sums[block] for block in ended}
+    ).pack()
 
 
 def journal(start: int, stop: int) -> bytes:
     """The router's journal of some slots."""
-    links = {}
-    for name, whole in ACCOUNTS.items():
-        rows = slice(start, stop)
-        lost = {reason: counts[rows] for reason, counts in whole.lost.items()}
-        unsent = None if whole.unsent is None else whole.unsent[rows]
-        if start == BARE:  # its packets that were not sent count as lost
-            lost["lost"], unsent = lost["lost"] + (np.uint32(0) if unsent is None else unsent), None
-        late = None if whole.late is None or start == BARE else whole.late[rows]
-        links[name] = Account(whole.delivered[rows], lost, late, whole.bursts, whole.delays, unsent)
+    links = {name: replace(whole, slots=whole.slots.rows(slice(start, stop))) for name, whole in ACCOUNTS.items()}
     return Journal(start, stop - start, links).pack()
 
 
@@ -164,49 +158,28 @@ def test_every_number_is_joined_in_its_place(messages: list[tuple[str, int, int]
             "eve": ends["eve"],
             "legitimate": ends["legitimate"],
         }
-    for name in ("x", "nu", "sent", "alarms", "true"):
-        assert np.array_equal(np.concatenate([getattr(slots, name) for slots in joined]), getattr(TRUTH, name)), name
-    inputs = [slots.inputs for slots in joined if slots.inputs is not None]
-    monitored = [slots.monitored for slots in inputs if slots.monitored is not None]
-    for name, parts in (("u", inputs), ("failed", inputs), ("statistic", monitored), ("watermark", monitored)):
-        assert np.array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(TRUTH, name)), name
+    expect_equal(SensorSlots.joined([slots.sensor for slots in joined]), TRUTH)
     for name in WINDOWS:
-        check_receiver(name, [slots.receivers[name] for slots in joined])
+        expect_equal(ReceiverSlots.joined([slots.receivers[name] for slots in joined]), REPORTS[name].slots)
+        expect_equal(LinkSlots.joined([slots.links[name] for slots in joined]), ACCOUNTS[name].slots)
 
 
-def check_receiver(name: str, joined: list[ReceiverSlots]) -> None:
-    """Check one receiver's columns against its report and the journal."""
-    reported, account = REPORTS[name], ACCOUNTS[name]
+def expect_equal(record: Record, expected: Record) -> None:
+    """Check every column of a record."""
+    assert record.slots == expected.slots
+    for entry in columns(type(expected)):
+        assert np.array_equal(getattr(record, entry.name), getattr(expected, entry.name)), entry.name
 
-    def whole(column: str) -> np.ndarray:
-        return np.concatenate([getattr(slots, column) for slots in joined])
 
-    for column in ("x_hat", "action", "P", "trace"):
-        assert np.array_equal(whole(column), getattr(reported, column)), column
-    assert np.array_equal(whole("delivered"), account.delivered)
-    bare = {"report": slice(BARE, 48 if name == "legitimate" else 60), "journal": slice(BARE, 90)}
-    unsent = account.unsent
-    assert unsent is not None
-    for reason in REASONS:
-        counts = account.lost[reason].copy()
-        if reason == "lost":
-            counts[bare["journal"]] += unsent[bare["journal"]]
-        assert np.array_equal(np.concatenate([slots.lost[reason] for slots in joined]), counts), reason
-    for column, source, of in (
-        ("late", reported.late, "report"),
-        ("late_used", reported.late_used, "report"),
-        ("late_delivered", account.late, "journal"),
-    ):
-        if source is None:
-            assert {getattr(slots, column) for slots in joined} == {None}, column
-            continue
-        wanted = source.copy()
-        wanted[bare[of]] = 0
-        assert np.array_equal(whole(column), wanted), column
-    counted = unsent.copy()
-    counted[bare["journal"]] = 0
-    parts = [np.zeros(len(slots.x_hat), np.uint32) if slots.unsent is None else slots.unsent for slots in joined]
-    assert np.array_equal(np.concatenate(parts), counted)
+@pytest.mark.parametrize("missing", ["sent", "alarms"])
+def test_a_column_that_comes_and_goes_is_refused(missing: str) -> None:
+    """Slots of which only some say what was sent, or who was alarmed, could not be joined."""
+    joiner = joiner_of()
+    feed(joiner, "truth", 0, 7)
+    other: dict[str, Any] = {missing: None}
+    raw = telemetry.truth(replace(TRUTH.rows(slice(7, 8)), **other))
+    with pytest.raises(MalformedMessage, match=f"{missing} in only some of the slots"):
+        joiner.add_truth(Reader("evedrop/r/telemetry/sensor", raw))
 
 
 def test_digests_and_sums_are_those_of_all_blocks() -> None:

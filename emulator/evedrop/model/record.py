@@ -6,6 +6,7 @@ same objects: `live/protocol/record_messages.py` packs and reads any record by i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -30,6 +31,11 @@ class Column(NamedTuple):
     def is_flag(self) -> bool:
         """Whether its values are true or false."""
         return self.dtype.kind == "b"
+
+    def slot_bytes(self, extent: Mapping[str, int]) -> int:
+        """The bytes of one slot's values in a message, flags as bit masks; extent: as for `shape`."""
+        *outer, last = self.shape(extent) or (1,)
+        return math.prod(outer) * ((last + 7) // 8 if self.is_flag else last * self.dtype.itemsize)
 
     def shape(self, extent: Mapping[str, int]) -> tuple[int, ...]:
         """The shape of one slot's values; extent: axis → its length, unless the axis is a number itself."""
@@ -119,6 +125,13 @@ class Record:
             whole[entry.name] = np.concatenate(there) if there else None
         return replace(parts[0], **whole)
 
+
+def largest_bytes(kind: type[Record], count: int, extent: Mapping[str, int]) -> int:
+    """The bytes of all columns of some slots as they are in messages, with their names; extent: as for `Column.shape`."""
+    return sum(len(entry.name) + _COLUMN_BYTES + count * entry.slot_bytes(extent) for entry in columns(kind))
+
+
+_COLUMN_BYTES = 8  # of the frame of a column in a message
 
 TRIALS = ("R", "S")
 """Axes of trials: R of all of them, S of those that are recorded."""

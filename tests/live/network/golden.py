@@ -19,9 +19,10 @@ from evedrop.live.protocol.commands import ProcessStatus, read_process_status
 from evedrop.live.protocol.requests import REQUESTS, RunStatus, read_request
 from evedrop.model.digest import Blocks
 from evedrop.model.entries import read
-from evedrop.model.receiver import Belief, Reception, packed_flags
+from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.link import COUNTED_BURSTS, Account, Change
-from evedrop.model.slot.link_core import Late
+from evedrop.model.slot.link_core import Arrivals, Late
+from evedrop.model.slot.records import LinkSlots, PacketSlots, ReceiverSlots, SensorSlots
 
 TEXT = (Path(__file__).parents[3] / "docs" / "protocol.md").read_text(encoding="utf-8")
 GOLDEN: dict[str, str] = dict(re.findall(r"^```golden ([^\n]+)\n(.*?)^```$", TEXT, re.S | re.M))
@@ -45,16 +46,16 @@ def flags(rows: Any) -> np.ndarray:
 
 
 def heard_of(shape: dict[str, Any], gamma: Any, z: Any) -> Reception:
-    """What a receiver gets: payloads of the trials that receive one, 0 in the others."""
+    """What a receiver gets in a slot: payloads of the trials that receive one, 0 in the others."""
     full = np.zeros((shape["n"], shape["trials"]))
     full[:, flags(gamma)] = np.array(z, float).reshape(shape["n"], -1)
     return Reception(flags(gamma), full)
 
 
-def packets_of(heard: Reception) -> dict[str, Any]:
+def packets_of(gamma: np.ndarray, z: np.ndarray) -> dict[str, Any]:
     """The same as values: z of the trials that received, and nothing in the others."""
-    assert not heard.z[:, ~heard.gamma].any()
-    return {"gamma": heard.gamma.astype(int).tolist(), "z": heard.z[:, heard.gamma].tolist()}
+    assert not z[:, ~gamma].any()
+    return {"gamma": gamma.astype(int).tolist(), "z": z[:, gamma].tolist()}
 
 
 SLOTS = 100_000
@@ -68,16 +69,26 @@ def extent_of(shape: dict[str, Any]) -> telemetry.Extent:
 
 def encode_delivery(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the router makes it."""
-    mask = packed_flags(flags(value["gamma"])).tobytes()
-    late = tuple(Late(entry["k"], heard_of(shape, entry["gamma"], entry["z"])) for entry in value.get("late", ()))
-    return packets.delivery(value["k"], mask, np.array(value["z"], float).tobytes(), late)
+    heard = [heard_of(shape, gamma, z) for gamma, z in zip(value["gamma"], value["z"], strict=True)]
+    late: dict[int, tuple[Late, ...]] = {}
+    for entry in value.get("late", ()):
+        row = entry["at"] - value["k"]
+        late[row] = (*late.get(row, ()), Late(entry["k"], heard_of(shape, entry["gamma"], entry["z"])))
+    gamma, z = (np.array([getattr(of_slot, name) for of_slot in heard]) for name in ("gamma", "z"))
+    return packets.delivery(range(value["k"], value["k"] + value["c"]), Arrivals(gamma, z, None, late))
 
 
 def decode_delivery(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As a receiver reads it."""
-    arrival = packets.read_delivery(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]))
-    late = [{"k": late_packet.k, **packets_of(late_packet.heard)} for late_packet in arrival.late]
-    return {"k": value["k"], **packets_of(arrival.heard), **({"late": late} if late else {})}
+    arrivals = packets.read_delivery(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]), most=64)
+    late = [
+        {"at": value["k"] + row, "k": part.k, **packets_of(part.heard.gamma, part.heard.z)}
+        for row, parts in arrivals.late.items()
+        for part in parts
+    ]
+    of_slots = [packets_of(gamma, z) for gamma, z in zip(arrivals.gamma, arrivals.z, strict=True)]
+    columns = {name: [of_slot[name] for of_slot in of_slots] for name in ("gamma", "z")}
+    return {"k": value["k"], "c": len(of_slots), **columns, **({"late": late} if late else {})}
 
 
 def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
@@ -86,25 +97,29 @@ def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     action = np.array(value["action"], np.uint8)
     late, used = (np.array(value[name], np.uint16) if name in value else None for name in ("late", "late_used"))
     sums = {int(block): np.array(trace_sum, float) for block, trace_sum in value.get("trace_sums", {}).items()}
-    return telemetry.Report(value["k"], x_hat, action, P, trace, late, digests_of(value), used, sums).pack()
+    slots = ReceiverSlots(value["k"], x_hat, action, P, trace, late, used)
+    return telemetry.Report(slots, digests_of(value), sums).pack()
 
 
 def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the recorder reads it."""
     window = shape.get("window", 0)
     report = telemetry.read_report(wire.Reader(KEY, raw), value["k"], extent_of(shape), Blocks(SLOTS), window)
-    columns = {name: getattr(report, name).tolist() for name in ("x_hat", "action", "P", "trace")}
+    slots = report.slots
+    columns = {name: getattr(slots, name).tolist() for name in ("x_hat", "action", "P", "trace")}
     digests = {str(block): [bytes(digest).hex() for digest in rows] for block, rows in report.digests.items()}
-    late = {name: column.tolist() for name in ("late", "late_used") if (column := getattr(report, name)) is not None}
+    late = {name: column.tolist() for name in ("late", "late_used") if (column := getattr(slots, name)) is not None}
     sums = {str(block): trace_sum.tolist() for block, trace_sum in report.trace_sums.items()}
     more = {"trace_sums": sums} if sums else {}
-    return {"k": report.first, "c": report.count, **columns, **late, "digests": digests, **more}
+    return {"k": slots.first, "c": slots.count, **columns, **late, "digests": digests, **more}
 
 
 def encode_truth(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the sensor makes it."""
     steered = (np.array(value["u"], float), flags(value["failed"])) if "u" in value else (None, None)
-    return telemetry.Truth(value["k"], np.array(value["x"], float), flags(value["nu"]), None, None, *steered).pack()
+    return telemetry.truth(
+        SensorSlots(value["k"], np.array(value["x"], float), flags(value["nu"]), None, None, *steered)
+    )
 
 
 def decode_truth(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -176,12 +191,12 @@ def encode_journal(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the router makes it."""
     accounts = {}
     for name, link in value["links"].items():
-        lost = {reason: np.array(counts, np.uint32) for reason, counts in link["lost"].items()}
+        lost, unsent = (np.array(link[column], np.uint32) for column in ("lost", "unsent"))
         late = np.array(link["late"], np.uint16) if "late" in link else None
         bursts = np.zeros(COUNTED_BURSTS, np.uint32)
         bursts[: len(link["bursts"])] = link["bursts"]
-        delays = np.array(link["delays"], np.uint32)
-        accounts[name] = Account(flags(link["delivered"]), lost, late, bursts, delays)
+        slots = LinkSlots(value["k"], flags(link["delivered"]), lost, unsent, late)
+        accounts[name] = Account(slots, bursts, np.array(link["delays"], np.uint32))
     return telemetry.Journal(value["k"], value["c"], accounts).pack()
 
 
@@ -190,9 +205,10 @@ def decode_journal(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
     journal = telemetry.read_journal(wire.Reader(KEY, raw), value["k"], shape["windows"], extent_of({"n": 1, **shape}))
     links = {
         name: {
-            "delivered": link.delivered.astype(int).tolist(),
-            "lost": {reason: counts.tolist() for reason, counts in link.lost.items()},
-            **({} if link.late is None else {"late": link.late.tolist()}),
+            "delivered": link.slots.delivered.astype(int).tolist(),
+            "lost": link.slots.lost.tolist(),
+            "unsent": link.slots.unsent.tolist(),
+            **({} if link.slots.late is None else {"late": link.slots.late.tolist()}),
             "bursts": np.trim_zeros(link.bursts, "b").tolist(),
             "delays": link.delays.tolist(),
         }
@@ -283,10 +299,16 @@ def decode_control(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) ->
     return value
 
 
+def encode_packet(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
+    """As the sensor makes it."""
+    return packets.uplink(PacketSlots(value["k"], np.array(value["z"], float)))
+
+
 def decode_packet(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the router reads it."""
-    z = packets.read_uplink(wire.Reader(KEY, raw), value["k"], (shape["n"], shape["trials"]))
-    return {"k": value["k"], "z": z.tolist()}
+    carried = packets.packet_format(shape["n"], shape["trials"])
+    slots = packets.read_uplink(wire.Reader(KEY, raw), value["k"], carried, most=64)
+    return {"k": slots.first, "c": slots.count, "z": slots.z.tolist()}
 
 
 def decode_acknowledgement(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -322,7 +344,7 @@ def decode_answer(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> d
 
 
 CODECS: dict[str, tuple[Encode, Decode]] = {
-    "packet": (lambda _shape, value: packets.uplink(value["k"], np.array(value["z"])), decode_packet),
+    "packet": (encode_packet, decode_packet),
     "delivery": (encode_delivery, decode_delivery),
     "acknowledgement": (
         lambda _shape, value: packets.acknowledgement(value["k"], flags(value["gamma"])),

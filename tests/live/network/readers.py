@@ -18,7 +18,8 @@ from evedrop.model.digest import Blocks
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.link import COUNTED_BURSTS, Account, Change
-from evedrop.model.slot.link_core import Late
+from evedrop.model.slot.link_core import Arrivals, Late
+from evedrop.model.slot.records import LinkSlots, PacketSlots, ReceiverSlots, SensorSlots
 from evedrop.scenario.progress_events import RunEvent
 
 SLOTS, N, TRIALS, RECORDED, WINDOW, INPUTS, PERIOD = 40, 2, 3, 1, 2, 1, 4
@@ -39,10 +40,10 @@ def _commanded(process: str, receivers: tuple[str, ...] | None = None) -> tuple[
 
 
 READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
-    "packet": _on("uplink", lambda m: (packets.read_uplink(m, K, SHAPE), packets.read_extras(m, SHAPE, 1))),
+    "packet": _on("uplink", lambda m: packets.read_uplink(m, K, packets.packet_format(*SHAPE, header=1), 8)),
     "resend": _on("uplink", lambda m: packets.is_resend(m) and packets.read_resend(m, SLOTS)),
     "barrier": _on("uplink", lambda m: packets.is_barrier(m) and m.slot(K)),
-    "delivery": _on("downlink/eve", lambda m: packets.read_delivery(m, K, SHAPE, 1, WINDOW)),
+    "delivery": _on("downlink/eve", lambda m: packets.read_delivery(m, K, SHAPE, 1, WINDOW, 8)),
     "acknowledgement": _on("ack/sent", lambda m: packets.read_acknowledgement(m, K, TRIALS)),
     "estimate": _on("estimate", lambda m: loop_wire.read_known(m, "x_hat", K, SHAPE)),
     "state": _on("state", lambda m: loop_wire.read_known(m, "x", K, SHAPE)),
@@ -69,24 +70,26 @@ MalformedMessage or Gap; either names the key."""
 
 
 def _accounts() -> dict[str, Account]:
-    lost = {reason: np.zeros(2, np.uint32) for reason in REASONS}
+    lost, unsent = np.zeros((2, len(REASONS)), np.uint32), np.zeros(2, np.uint32)
     delivered, bursts = np.ones((2, TRIALS), bool), np.zeros(COUNTED_BURSTS, np.uint32)
 
     def account(window: int) -> Account:
         late = np.zeros((2, TRIALS), np.uint16) if window else None
-        return Account(delivered, lost, late, bursts, np.array([6, *[0] * (window + 1)], np.uint32))
+        slots = LinkSlots(K, delivered, lost, unsent, late)
+        return Account(slots, bursts, np.array([6, *[0] * (window + 1)], np.uint32))
 
     return {"legitimate": account(0), "eve": account(WINDOW)}
 
 
 _z, _header, _flags = np.arange(6.0).reshape(SHAPE), np.ones((1, TRIALS), np.int64), np.array([True, False, True])
-_late = (Late(3, Reception(_flags, _z, _header)),)
+_late = {0: (Late(3, Reception(_flags, _z, _header)),)}
+_arrivals = Arrivals(_flags[None], _z[None], _header[None], _late, {0: _z})
 _digests = {0: np.zeros((TRIALS, 16), np.uint8)}
 EXAMPLES: Mapping[str, bytes] = {
-    "packet": packets.uplink(K, _z, _header, _flags, _z),
+    "packet": packets.uplink(PacketSlots(K, _z[None], _header[None], _flags[None], _z[None])),
     "resend": packets.resend(2, 6, 4),
     "barrier": packets.barrier(K),
-    "delivery": packets.delivery(K, b"\5", _z[:, _flags].tobytes(), _late, packets.packed_header(_header, _flags), _z.tobytes()),
+    "delivery": packets.delivery(range(K, K + 1), _arrivals),
     "acknowledgement": packets.acknowledgement(K, _flags),
     "estimate": loop_wire.known("x_hat", K, _z),
     "state": loop_wire.known("x", K, _z),
@@ -100,13 +103,14 @@ EXAMPLES: Mapping[str, bytes] = {
     "answer": operator.Answer(3, "done").pack(),
     "status": operator.Answer(status=RunStatus(
         K, SLOTS, 9.0, "held", {"eve": True}, {"eve": LinkStatus.of(4, 2)}, [RunEvent(2, "cut eve", "scenario")])).pack(),
-    "truth": telemetry.Truth(K, np.ones((2, *SHAPE)), np.ones((2, 3), bool), None, None, np.ones((2, 1, 3)),
-                             np.ones((2, 3), bool), np.ones((2, *SHAPE)), np.ones((2, 3)), np.ones((2, 1, 3))).pack(),
+    "truth": telemetry.truth(SensorSlots(K, np.ones((2, *SHAPE)), np.ones((2, 3), bool), None, None, np.ones((2, 1, 3)),
+                             np.ones((2, 3), bool), np.ones((2, *SHAPE)), np.ones((2, 3)), np.ones((2, 1, 3)))),
     "held": telemetry.held(K),
     "leaving": telemetry.leaving(K, Belief(_z, np.ones((N, N, TRIALS)), np.zeros(TRIALS, np.uint8))),
-    "report": telemetry.Report(K, np.ones((2, *SHAPE)), np.ones((2, TRIALS), np.uint8), np.ones((2, N, N, 1)), np.ones((2, 2)),
-                               np.ones((2, TRIALS), np.uint16), _digests, np.ones((2, TRIALS), np.uint16),
-                               {0: np.ones(TRIALS)}).pack(),
+    "report": telemetry.Report(
+        ReceiverSlots(K, np.ones((2, *SHAPE)), np.ones((2, TRIALS), np.uint8), np.ones((2, N, N, 1)), np.ones((2, 2)),
+                      np.ones((2, TRIALS), np.uint16), np.ones((2, TRIALS), np.uint16)),
+        _digests, {0: np.ones(TRIALS)}).pack(),
     "decisions": loop_wire.Decisions(K, 4, np.ones(1), _digests).pack(),
     "journal": telemetry.Journal(K, 2, _accounts()).pack(),
     "process-status": commands.ProcessStatus(K, ("evedrop/r1/uplink",)).pack(),

@@ -23,9 +23,10 @@ from evedrop.live.protocol.keys import writer_of
 from evedrop.live.recorder.joiner import Joiner
 from evedrop.model.digest import Blocks
 from evedrop.model.links.loss_model import REASONS
-from evedrop.model.receiver import Belief, Reception, packed_flags
+from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.link import COUNTED_BURSTS, Account
-from evedrop.model.slot.link_core import Late
+from evedrop.model.slot.link_core import Arrivals, Late
+from evedrop.model.slot.records import LinkSlots, PacketSlots, ReceiverSlots, SensorSlots
 from tests.builders import mirrored
 from tests.examples import examples
 from tests.live.network.readers import EXAMPLES, READERS, fields_of
@@ -41,25 +42,40 @@ def extent(n: int, trials: int, recorded: int = 1) -> telemetry.Extent:
 
 
 @settings(deadline=None)
-@given(st.data(), SLOTS, st.integers(1, 4), SIZES)
-def test_packet(data: st.DataObject, k: int, n: int, trials: int) -> None:
-    """A packet reads back bit by bit, negative zeros and subnormal numbers included."""
-    z = data.draw(arrays(float, (n, trials), elements=FINITE))
-    assert packets.read_uplink(Reader("u", packets.uplink(k, z)), k, (n, trials)).tobytes() == z.tobytes()
+@given(st.data(), SLOTS, st.integers(1, 5), st.integers(1, 4), SIZES, st.integers(0, 2))
+def test_packets(data: st.DataObject, k: int, c: int, n: int, trials: int, h: int) -> None:
+    """Packets read back bit by bit, negative zeros and subnormal numbers included, with header and what was sent."""
+    sent = PacketSlots(
+        k,
+        data.draw(arrays(float, (c, n, trials), elements=FINITE)),
+        data.draw(arrays(np.int64, (c, h, trials))) if h else None,
+        data.draw(st.one_of(st.none(), arrays(bool, (c, trials)))),
+    )
+    read = packets.read_uplink(Reader("u", packets.uplink(sent)), k, packets.packet_format(n, trials, h), 5)
+    assert read.slots == sent.slots
+    for name in ("z", "header", "sent"):
+        column, expected = getattr(read, name), getattr(sent, name)
+        assert (column is None) == (expected is None)
+        assert column is None or column.tobytes() == expected.tobytes()
 
 
 @settings(deadline=None)
-@given(st.data(), SLOTS, st.integers(1, 4), SIZES)
-def test_delivery(data: st.DataObject, k: int, n: int, trials: int) -> None:
-    """A receiver gets γ, and z of exactly the trials that received; of the others not a bit is in the message."""
-    z = data.draw(arrays(float, (n, trials), elements=FINITE))
-    gamma = data.draw(arrays(bool, trials))
-    raw = packets.delivery(k, packed_flags(gamma).tobytes(), z[:, gamma].tobytes())
-    heard, late = packets.read_delivery(Reader("d", raw), k, (n, trials))
-    assert np.array_equal(heard.gamma, gamma)
-    assert heard.z.tobytes() == np.where(gamma, z, 0.0).tobytes()
-    assert late == ()
-    assert len(msgpack.unpackb(raw).get("z", b"")) == 8 * n * gamma.sum()
+@given(st.data(), SLOTS, st.integers(1, 5), st.integers(1, 4), SIZES, st.integers(0, 2))
+def test_delivery(data: st.DataObject, k: int, c: int, n: int, trials: int, h: int) -> None:
+    """A receiver gets γ, and z and header of exactly the trials that received; of the others not a bit is in the message."""
+    z = data.draw(arrays(float, (c, n, trials), elements=FINITE))
+    gamma = data.draw(arrays(bool, (c, trials)))
+    header = data.draw(arrays(np.int64, (c, h, trials))) if h else None
+    raw = packets.delivery(range(k, k + c), Arrivals(gamma, z, header))
+    read = packets.read_delivery(Reader("d", raw), k, (n, trials), h, most=5)
+    assert np.array_equal(read.gamma, gamma)
+    assert read.z.tobytes() == np.where(gamma[:, None], z, 0.0).tobytes()
+    assert (read.header is None) == (header is None)
+    assert header is None or np.array_equal(read.header, np.where(gamma[:, None], header, 0))
+    assert not read.late
+    fields = msgpack.unpackb(raw)
+    assert len(fields.get("z", b"")) == 8 * n * gamma.sum()
+    assert len(fields.get("header", b"")) == 8 * h * gamma.sum()
 
 
 @settings(deadline=None)
@@ -76,9 +92,13 @@ def test_delivery_with_late_packets(data: st.DataObject, k: int, n: int, trials:
         )
         for _ in range(min(count, 2 * (k + 1)))
     )
-    raw = packets.delivery(k, bytes((trials + 7) // 8), b"", late)
-    heard, arrived = packets.read_delivery(Reader("d", raw), k, (n, trials))
-    assert not heard.gamma.any()
+    row = data.draw(st.integers(0, 2))
+    nothing = np.zeros((row + 1, trials), bool), np.zeros((row + 1, n, trials))
+    raw = packets.delivery(range(k - row, k + 1), Arrivals(*nothing, None, {row: late} if late else {}))
+    read = packets.read_delivery(Reader("d", raw), k - row, (n, trials), most=3)
+    assert not read.gamma.any()
+    assert read.late.keys() <= {row}
+    arrived = read.late.get(row, ())
     assert [packet.k for packet in arrived] == [packet.k for packet in late]
     for packet, sent in zip(arrived, late, strict=True):
         assert np.array_equal(packet.heard.gamma, sent.heard.gamma)
@@ -87,22 +107,30 @@ def test_delivery_with_late_packets(data: st.DataObject, k: int, n: int, trials:
     assert sizes == [8 * n * packet.heard.gamma.sum() for packet in late]
 
 
+def late_delivery(k: int, late: tuple[Late, ...]) -> bytes:
+    """A delivery in which nothing but late packets arrives, in one trial of one state."""
+    return packets.delivery(range(k, k + 1), Arrivals(np.zeros((1, 1), bool), np.zeros((1, 1, 1)), None, {0: late}))
+
+
 def test_a_late_packet_from_the_future_is_refused() -> None:
     """What arrives in slot 4 was not sent in slot 5."""
     late = (Late(5, Reception(np.ones(1, bool), np.zeros((1, 1)))),)
     with pytest.raises(MalformedMessage, match="a late packet of slot 5; expected one of slot 4 or before"):
-        packets.read_delivery(Reader("d", packets.delivery(4, b"\0", b"", late)), 4, (1, 1))
+        packets.read_delivery(Reader("d", late_delivery(4, late)), 4, (1, 1))
 
 
 @given(SLOTS)
 def test_marks(k: int) -> None:
     """A mark is neither packet nor delivery, a word that the sensor holds is not truth, and each says before which slot."""
     mark, held = Reader("u", packets.barrier(k)), Reader("t", telemetry.held(k))
-    assert (packets.is_barrier(mark), packets.is_barrier(Reader("u", packets.uplink(k, np.zeros((1, 1)))))) == (
+    assert (
+        packets.is_barrier(mark),
+        packets.is_barrier(Reader("u", packets.uplink(PacketSlots(k, np.zeros((1, 1, 1)))))),
+    ) == (
         True,
         False,
     )
-    truth = telemetry.Truth(k, np.zeros((1, 1, 1)), np.zeros((1, 1), bool)).pack()
+    truth = telemetry.truth(SensorSlots(k, np.zeros((1, 1, 1)), np.zeros((1, 1), bool)))
     assert (telemetry.is_held(held), telemetry.is_held(Reader("t", truth))) == (True, False)
     assert mark.slot(k) == held.slot(k) == k
 
@@ -126,7 +154,7 @@ def test_truth(data: st.DataObject, k: int, n: int, trials: int, count: int) -> 
     """Truth reads back."""
     x = data.draw(arrays(float, (count, n, trials), elements=FINITE))
     nu = data.draw(arrays(bool, (count, trials)))
-    truth = telemetry.read_truth(Reader("t", telemetry.Truth(k, x, nu).pack()), k, extent(n, trials))
+    truth = telemetry.read_truth(Reader("t", telemetry.truth(SensorSlots(k, x, nu))), k, extent(n, trials))
     assert (truth.first, truth.count, truth.x.tobytes()) == (k, count, x.tobytes())
     assert np.array_equal(truth.nu, nu)
 
@@ -138,16 +166,19 @@ def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) ->
     recorded = data.draw(st.integers(1, trials))
     slots, window = k + count + data.draw(st.integers(0, 2)), data.draw(st.integers(0, 9))
     blocks = Blocks(slots, data.draw(st.sets(st.integers(k, k + count), max_size=2)))
-    late = data.draw(st.one_of(st.none(), arrays(np.uint16, (count, trials), elements=st.integers(0, window))))
-    report = telemetry.Report(
+    late = data.draw(arrays(np.uint16, (count, trials), elements=st.integers(0, window))) if window else None
+    sent = ReceiverSlots(
         k,
         data.draw(arrays(float, (count, n, trials), elements=FINITE)),
         data.draw(arrays(np.uint8, (count, trials), elements=st.integers(0, 3))),
         mirrored(data.draw(arrays(float, (count, n, n, recorded), elements=FINITE))),
         data.draw(arrays(float, (count, 2), elements=FINITE)),
         late,
-        {block: data.draw(arrays(np.uint8, (trials, 16))) for block in blocks.ended(k, k + count)},
         None if late is None else late // 2,
+    )
+    report = telemetry.Report(
+        sent,
+        {block: data.draw(arrays(np.uint8, (trials, 16))) for block in blocks.ended(k, k + count)},
         {block: np.abs(data.draw(arrays(float, trials, elements=FINITE))) for block in blocks.ended(k, k + count)}
         if recorded < trials
         else {},
@@ -155,23 +186,25 @@ def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) ->
     of_run = replace(extent(n, trials, recorded), slots=slots)
     result = telemetry.read_report(Reader("r", report.pack()), k, of_run, blocks, window)
     for name in ("x_hat", "action", "P", "trace"):
-        assert getattr(result, name).tobytes() == getattr(report, name).tobytes()
+        assert getattr(result.slots, name).tobytes() == getattr(sent, name).tobytes()
     assert {b: d.tobytes() for b, d in result.digests.items()} == {b: d.tobytes() for b, d in report.digests.items()}
     assert {b: s.tobytes() for b, s in result.trace_sums.items()} == {
         b: s.tobytes() for b, s in report.trace_sums.items()
     }
-    assert result.count == count
+    assert result.slots.count == count
     for name in ("late", "late_used"):
-        assert np.array_equal(getattr(result, name), getattr(report, name))
+        assert np.array_equal(getattr(result.slots, name), getattr(sent, name))
 
 
 def account_of(delivered: np.ndarray, window: int = 0, **changes: Any) -> Account:
     """The account of a link that only loses; changes replace its columns."""
     count, trials = delivered.shape
-    lost = {reason: np.zeros(count, np.uint32) for reason in REASONS}
-    lost["lost"] = (trials - delivered.sum(axis=1)).astype(np.uint32)
+    lost = np.zeros((count, len(REASONS)), np.uint32)
+    lost[:, 0] = trials - delivered.sum(axis=1)
     bursts, delays = np.zeros(COUNTED_BURSTS, np.uint32), np.zeros(window + 2, np.uint32)
-    return replace(Account(delivered, lost, None, bursts, delays), **changes)
+    late = np.zeros((count, trials), np.uint16) if window else None
+    slots = replace(LinkSlots(0, delivered, lost, np.zeros(count, np.uint32), late), **changes)
+    return Account(slots, bursts, delays)
 
 
 @settings(deadline=None)
@@ -184,28 +217,22 @@ def test_journal(data: st.DataObject, k: int, trials: int, count: int) -> None:
         delivered = data.draw(arrays(bool, (count, trials)))
         most = (trials - delivered.sum(axis=1)).astype(np.uint32)
         unsent = data.draw(arrays(np.uint32, count, elements=st.integers(0, trials))) % (most + 1)
-        lost = {reason: np.zeros(count, np.uint32) for reason in REASONS}
-        lost[data.draw(st.sampled_from(REASONS))] = most - unsent
+        lost = np.zeros((count, len(REASONS)), np.uint32)
+        lost[:, data.draw(st.integers(0, len(REASONS) - 1))] = most - unsent
+        late = data.draw(arrays(np.uint16, (count, trials), elements=st.integers(0, window))) if window else None
         links[name] = Account(
-            delivered,
-            lost,
-            data.draw(arrays(np.uint16, (count, trials), elements=st.integers(0, window))) if window else None,
+            LinkSlots(k, delivered, lost, unsent, late),
             data.draw(arrays(np.uint32, 64, elements=st.integers(0, count * trials))),
             np.array([delivered.sum(), *[0] * (window + 1)], np.uint32),
-            unsent,
         )
     raw = telemetry.Journal(k, count, links).pack()
     journal = telemetry.read_journal(Reader("j", raw), k, windows, extent(1, trials))
     assert (journal.first, journal.count, set(journal.links)) == (k, count, set(links))
     for name, link in links.items():
-        for column in ("delivered", "bursts", "delays"):
+        for column in ("bursts", "delays"):
             assert np.array_equal(getattr(journal.links[name], column), getattr(link, column))
-        assert {reason: counts.tolist() for reason, counts in journal.links[name].lost.items()} == {
-            reason: counts.tolist() for reason, counts in link.lost.items()
-        }
-        late = journal.links[name].late
-        assert (late is None) == (link.late is None)
-        assert late is None or link.late is None or np.array_equal(late, link.late)
+        for column in ("delivered", "lost", "unsent", "late"):
+            assert np.array_equal(getattr(journal.links[name].slots, column), getattr(link.slots, column)), column
 
 
 def refused(read: Callable[[bytes], Any], raw: bytes) -> MalformedMessage | Gap | None:
@@ -290,13 +317,14 @@ def test_a_large_message_is_refused_before_it_is_larger(case: str) -> None:
 
 def test_errors_say_what_was_found_where_and_what_to_do() -> None:
     """A malformed message shows key, found, expected and the bytes; a gap both slots; either ends with a remedy."""
+    carried = packets.packet_format(2, 3)
     with pytest.raises(MalformedMessage) as malformed:
-        packets.read_uplink(Reader("evedrop/r/uplink", packets.uplink(0, np.zeros((2, 2)))), 0, (2, 3))
+        packets.read_uplink(Reader("evedrop/r/uplink", packets.uplink(PacketSlots(0, np.zeros((1, 2, 2))))), 0, carried)
     assert str(malformed.value).startswith(
-        "malformed message on evedrop/r/uplink: z of 32 bytes; expected 48 bytes, <f8 of shape (2, 3). Its 40 bytes: 82 a1 6b"
+        "malformed message on evedrop/r/uplink: z of 32 bytes; expected 48 bytes, <f8 of shape (1, 2, 3). Its 43 bytes: 83 a1 6b"
     )
     with pytest.raises(Gap) as gap:
-        packets.read_uplink(Reader("evedrop/r/uplink", packets.uplink(7, np.zeros((2, 3)))), 6, (2, 3))
+        packets.read_uplink(Reader("evedrop/r/uplink", packets.uplink(PacketSlots(7, np.zeros((1, 2, 3))))), 6, carried)
     assert "gap on evedrop/r/uplink: slot 7 arrived where slot 6 was due" in str(gap.value)
     assert issubclass(Gap, RunError)
     assert issubclass(MalformedMessage, RunError)
@@ -306,10 +334,11 @@ def test_errors_say_what_was_found_where_and_what_to_do() -> None:
 @pytest.mark.parametrize("value", [4, 255])
 def test_unknown_actions_are_refused(value: int) -> None:
     """An action beyond the documented four is malformed."""
-    report = telemetry.Report(
-        0, np.zeros((1, 1, 1)), np.full((1, 1), value, np.uint8), np.zeros((1, 1, 1, 1)), np.zeros((1, 2)), None, {}
+    slots = ReceiverSlots(
+        0, np.zeros((1, 1, 1)), np.full((1, 1), value, np.uint8), np.zeros((1, 1, 1, 1)), np.zeros((1, 2))
     )
-    with pytest.raises(MalformedMessage, match=f"action {value}; expected actions from 0 to 3"):
+    report = telemetry.Report(slots, {})
+    with pytest.raises(MalformedMessage, match=f"action of {value}; expected numbers from 0 to 3"):
         telemetry.read_report(Reader("key", report.pack()), 0, extent(1, 1), Blocks(9))
 
 
@@ -327,9 +356,8 @@ def test_unknown_actions_are_refused(value: int) -> None:
 def test_wrong_sums_of_traces_are_refused(sums: dict[int, np.ndarray], recorded: int, message: str) -> None:
     """They are of the blocks that end in the slots, if not all trials are recorded, and of every trial."""
     P, digests = np.zeros((1, 1, 1, recorded)), {0: np.zeros((2, 16), np.uint8)}
-    report = telemetry.Report(
-        0, np.zeros((1, 1, 2)), np.zeros((1, 2), np.uint8), P, np.zeros((1, 2)), None, digests, trace_sums=sums
-    )
+    slots = ReceiverSlots(0, np.zeros((1, 1, 2)), np.zeros((1, 2), np.uint8), P, np.zeros((1, 2)))
+    report = telemetry.Report(slots, digests, sums)
     with pytest.raises(MalformedMessage, match=re.escape(message)):
         telemetry.read_report(Reader("key", report.pack()), 0, replace(extent(1, 2, recorded), slots=1), Blocks(1))
 
@@ -341,21 +369,22 @@ def test_a_journal_without_a_receiver_is_refused() -> None:
         telemetry.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, extent(1, 3))
 
 
-@pytest.mark.parametrize("reasons", [[], ["eaten"], ["lost", "eaten"]])
-def test_a_journal_with_other_reasons_is_refused(reasons: list[str]) -> None:
-    """A journal gives every reason of the links and no other: columns of messages must fit together."""
-    counts = {reason: np.zeros(1, np.uint32) for reason in reasons}
-    raw = telemetry.Journal(0, 1, dict.fromkeys("ab", account_of(np.ones((1, 3), bool), lost=counts))).pack()
+@pytest.mark.parametrize("reasons", [0, 1, 7, 9])
+def test_a_journal_with_other_reasons_is_refused(reasons: int) -> None:
+    """A journal counts for every reason of the links and for no other: columns of messages must fit together."""
+    lost = np.zeros((1, reasons), np.uint32)
+    raw = telemetry.Journal(0, 1, dict.fromkeys("ab", account_of(np.ones((1, 3), bool), lost=lost))).pack()
     with pytest.raises(
-        MalformedMessage, match=r"a lost for \[.*\]; expected the reasons \['corrupted', 'cut', 'down', "
+        MalformedMessage, match=rf"lost of {4 * reasons} bytes; expected 32 bytes, <u4 of shape \(1, 8\)"
     ):
         telemetry.read_journal(Reader("key", raw), 0, {"a": 0, "b": 2}, extent(1, 3))
 
 
 TELEMETRY = {
-    "truth": lambda k: telemetry.Truth(k, np.zeros((2, 1, 3)), np.zeros((2, 3), bool)).pack(),
+    "truth": lambda k: telemetry.truth(SensorSlots(k, np.zeros((2, 1, 3)), np.zeros((2, 3), bool))),
     "report": lambda k: telemetry.Report(
-        k, np.zeros((2, 1, 3)), np.zeros((2, 3), np.uint8), np.zeros((2, 1, 1, 1)), np.zeros((2, 2)), None, {}
+        ReceiverSlots(k, np.zeros((2, 1, 3)), np.zeros((2, 3), np.uint8), np.zeros((2, 1, 1, 1)), np.zeros((2, 2))),
+        {},
     ).pack(),
     "journal": lambda k: telemetry.Journal(k, 2, {"a": account_of(np.ones((2, 3), bool))}).pack(),
 }

@@ -93,7 +93,6 @@ def sizes_of(scenario: Scenario, batch: int, message: int) -> Sizes:
         len(scheme.header),
         0 if plant is None or table is None else plant.inputs,
         1 if table is None else table.period,
-        monitor_of(scenario) is not None,
         message,
     )
 

@@ -13,7 +13,9 @@ from typing import Any
 
 from evedrop.model.digest import BLOCK_SLOTS, DIGEST_BYTES
 from evedrop.model.links.loss_model import REASONS
+from evedrop.model.record import largest_bytes
 from evedrop.model.slot.link import COUNTED_BURSTS
+from evedrop.model.slot.records import LinkSlots, PacketSlots, ReceiverSlots, SensorSlots
 from evedrop.names import CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, ROUTER, SENSOR
 
 KINDS = ("uplink", "downlink", "ack", "estimate", "state", "input", "telemetry", "journal", "progress", "control")
@@ -128,6 +130,7 @@ _FRAME_BYTES = 4096
 _COMMAND_BYTES = 32 * 2**20  # changes of links contain their settings, such as recorded losses
 _QUESTION_BYTES = 2**20
 _NAME_BYTES = 128  # of a key in a list
+_LATE_BYTES = 32  # of the slots of a late packet, besides its columns
 
 
 @dataclass(frozen=True)
@@ -146,8 +149,6 @@ class Sizes:
     inputs: int = 0
     period: int = 1
     """Slots between decisions."""
-    monitored: bool = False
-    """Whether there are a watermark and a detector."""
     message: int = 1
     """The most slots whose packets a message carries."""
 
@@ -156,20 +157,20 @@ class Sizes:
         """Kind of key, the part after the run's name → bytes of its largest message."""
         n, R, c = self.n, self.trials, self.batch
         mask, state = (R + 7) // 8, 8 * n * R
-        packet = state + 8 * self.header * R + mask + _NAME_BYTES
+        axes = {"n": n, "R": R, "S": self.recorded, "m": self.inputs, "h": self.header, "F": len(REASONS)}
+        packet = largest_bytes(PacketSlots, 1, axes) + _LATE_BYTES
         # Blocks of the digest that end in a report: one may have begun before it, and the last may be short.
         blocks = c // BLOCK_SLOTS + 2
         digests, sums = blocks * DIGEST_BYTES * R, blocks * 8 * R
-        report = c * (state + 5 * R + 8 * n * n * self.recorded + 16) + digests + sums
-        monitored = 8 * (self.inputs + 1) * R if self.monitored else 0
-        truth = c * (2 * state + 8 * self.inputs * R + 4 * mask + monitored)
+        report = largest_bytes(ReceiverSlots, c, axes) + digests + sums
+        truth = largest_bytes(SensorSlots, c, axes)
         leaving = state + 8 * n * n * R
         decisions = 8 * (c + self.period) + digests + self.period // BLOCK_SLOTS * DIGEST_BYTES * R
         waits = _NAME_BYTES * (self.receivers + 1)
-        link = c * (mask + 4 * (len(REASONS) + 1) + 2 * R) + 4 * (COUNTED_BURSTS + self.window + 2) + _FRAME_BYTES
+        link = largest_bytes(LinkSlots, c, axes) + 4 * (COUNTED_BURSTS + self.window + 2) + _FRAME_BYTES
         kinds = {
-            "uplink": self.message * (packet + state),
-            "downlink": self.message * (packet * (1 + 2 * (self.window + 1)) + state),
+            "uplink": self.message * packet,
+            "downlink": self.message * packet * (1 + 2 * (self.window + 1)),
             "ack": mask,
             "estimate": state,
             "state": state,

@@ -7,7 +7,6 @@ Source: docs/protocol.md, messages.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping
 from typing import Any, Generic, TypeVar, final
 
@@ -18,8 +17,6 @@ from evedrop.model.receiver import packed_flags
 from evedrop.model.record import Column, Record, columns
 
 Kind = TypeVar("Kind", bound=Record)
-
-_FIELD_BYTES = 32  # of a column's name and its size
 
 
 def packed(record: Record) -> dict[str, Any]:
@@ -58,10 +55,6 @@ class RecordFormat(Generic[Kind]):
             if entry.name not in absent
         ]
 
-    def largest(self, count: int) -> int:
-        """The most bytes that a record of some slots takes."""
-        return sum(_FIELD_BYTES + count * _bytes_of(entry, shape) for entry, shape, _ in self._columns)
-
     def read(self, message: Reader, first: int, count: int) -> Kind:
         """The record of some slots from `first` on. Raises MalformedMessage, with the sender and the column."""
         values: dict[str, Any] = {}
@@ -76,9 +69,3 @@ class RecordFormat(Generic[Kind]):
         if entry.dtype.kind == "f":
             return message.finite(entry.name, shape)
         return message.counts(entry.name, entry.dtype.str, shape, self._most.get(entry.name, np.iinfo(entry.dtype).max))
-
-
-def _bytes_of(entry: Column, shape: tuple[int, ...]) -> int:
-    if entry.is_flag:
-        return math.prod(shape[:-1]) * ((shape[-1] + 7) // 8)
-    return math.prod(shape) * entry.dtype.itemsize
