@@ -15,6 +15,7 @@ from evedrop.errors import DisturbanceError, ScenarioError
 from evedrop.live.protocol.brief import AnyBrief, Part
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Beliefs
+from evedrop.model.slot.records import SensorSlots
 from evedrop.model.streams import root_of_seed, stream_key
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, parse
@@ -155,6 +156,12 @@ def mirrored(P: Floats) -> Floats:
     """Covariances (…, n, n, R) with the upper triangles of P, each its own transpose."""
     upper = np.triu(np.ones(P.shape[-3:-1], np.bool_))[:, :, None]
     return np.where(upper, P, P.swapaxes(-3, -2))
+
+
+def with_inputs(u: Floats) -> SensorSlots:
+    """A sensor in one trial of two states, with inputs (c, m)."""
+    zeros = np.zeros((len(u), 2, 1))
+    return SensorSlots(0, zeros, zeros[:, 0] > 0.0, u=u[..., None], failed=zeros[:, 0] > 0.0)
 
 
 def one_slot(belief: Belief) -> Beliefs:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -15,8 +16,9 @@ from hypothesis import strategies as st
 
 from evedrop.live.launch.gathering import Gathered, Journals, Recorded, Statistics
 from evedrop.model.links.loss_model import REASONS
+from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
 from evedrop.results.writer import ResultsWriter
-from evedrop.score.slots import ReceiverSlots, Slots
+from evedrop.score.slots import Slots
 from evedrop.score.sums import slot_sums, squared_errors
 from tests.examples import examples
 
@@ -28,36 +30,33 @@ def slots_of(seed: int) -> Slots:
     """What a run of all trials might have been."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(SLOTS, N, TRIALS))
-    receivers = {}
+    receivers, links = {}, {}
     for name in NAMES:
         action = rng.integers(0, 4, (SLOTS, TRIALS)).astype(np.uint8)
         delivered = action > 0
-        lost = {reason: np.zeros(SLOTS, np.uint32) for reason in REASONS}
-        lost["lost"] = np.count_nonzero(~delivered, axis=1).astype(np.uint32)
         P = rng.random((SLOTS, N, N, TRIALS))
-        receivers[name] = ReceiverSlots(
-            x + rng.normal(size=x.shape), action, P, rng.random((SLOTS, 2)), delivered, lost
-        )
-    return Slots(0, x, rng.random((SLOTS, TRIALS)) < 0.5, receivers)
+        receivers[name] = ReceiverSlots(0, x + rng.normal(size=x.shape), action, P, rng.random((SLOTS, 2)))
+        links[name] = link_of(0, delivered)
+    return Slots(SensorSlots(0, x, rng.random((SLOTS, TRIALS)) < 0.5), receivers, links)
+
+
+def link_of(first: int, delivered: np.ndarray) -> LinkSlots:
+    """A link that loses what it does not deliver."""
+    lost = np.zeros((len(delivered), len(REASONS)), np.uint32)
+    lost[:, 0] = np.count_nonzero(~delivered, axis=1)
+    return LinkSlots(first, delivered, lost, np.zeros(len(delivered), np.uint32))
 
 
 def part_of(whole: Slots, rows: slice, trials: slice, recorded: int) -> Slots:
     """Some slots of some of its trials, the first `recorded` trials in full."""
-    receivers = {}
+    receivers, links = {}, {}
     for name, receiver in whole.receivers.items():
-        trace = np.einsum("kiir->kr", receiver.P)[rows, trials]
-        delivered = receiver.delivered[rows, trials]
-        lost = {**{reason: counts[rows] for reason, counts in receiver.lost.items()}}
-        lost["lost"] = np.count_nonzero(~delivered, axis=1).astype(np.uint32)
-        receivers[name] = ReceiverSlots(
-            receiver.x_hat[rows, :, trials],
-            receiver.action[rows, trials],
-            receiver.P[rows, :, :, trials][..., :recorded],
-            np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1),
-            delivered,
-            lost,
-        )
-    return Slots(rows.start, whole.x[rows, :, trials], whole.nu[rows, trials], receivers)
+        some = receiver.rows(rows).part(trials)
+        trace = np.einsum("kiir->kr", some.P)
+        sums = np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1)
+        receivers[name] = replace(some, P=some.P[..., :recorded], trace=sums)
+        links[name] = link_of(rows.start, whole.links[name].delivered[rows, trials])
+    return Slots(whole.sensor.rows(rows).part(trials), receivers, links)
 
 
 def write(folder: Path, whole: Slots, trials: slice, recorded: int, ends: Sequence[int]) -> None:
@@ -68,7 +67,7 @@ def write(folder: Path, whole: Slots, trials: slice, recorded: int, ends: Sequen
     with ResultsWriter(folder, NAMES, N) as writer:
         for first, end in zip([0, *ends], ends, strict=False):
             part = part_of(whole, slice(first, end), trials, recorded)
-            errors = {name: squared_errors(part.x, receiver.x_hat) for name, receiver in part.receivers.items()}
+            errors = {name: squared_errors(part.sensor.x, receiver.x_hat) for name, receiver in part.receivers.items()}
             for name, receiver in part.receivers.items():
                 sums = slot_sums(errors[name], receiver.action, receiver.trace)
                 writer.slot_rows(first, name, sums, np.arange(first, end) / 7.0)
@@ -165,7 +164,7 @@ def test_a_shard_that_came_to_less_leaves_the_others_as_they_are(tmp_path: Path,
     for row in tables["slots"].to_pylist():
         assert row["trials"] == (TRIALS if row["slot"] < here else 4)
     for row in tables["journal"].to_pylist():
-        flags = whole.receivers[row["link"]].delivered[row["slot"]].copy()
+        flags = whole.links[row["link"]].delivered[row["slot"]].copy()
         flags[slice(TRIALS if row["slot"] < here else 4, None)] = False
         assert row["offered"] == (TRIALS if row["slot"] < here else 4)
         assert row["delivered_mask"] == np.packbits(flags, bitorder="little").tobytes()

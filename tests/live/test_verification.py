@@ -19,7 +19,8 @@ from evedrop.model.digest import BlockDigests, Blocks, BlockSums
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.receiver import Belief
 from evedrop.model.slot.link import COUNTED_BURSTS, Account
-from evedrop.score.slots import ReceiverSlots, Slots
+from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
+from evedrop.score.slots import Slots
 from tests.builders import mirrored, one_slot
 
 TRIALS, N, SLOTS, RECORDED = 4, 2, 600, 2
@@ -48,14 +49,15 @@ def reports(batch: int, recorded: int = RECORDED, trials: int = TRIALS) -> list[
         traces = np.array([np.trace(row.P) for row in rows])
         made.append(
             Report(
-                first,
-                np.array([row.x_hat for row in rows]),
-                np.array([row.action for row in rows]),
-                np.ascontiguousarray(np.array([row.P for row in rows])[..., :recorded]),
-                np.stack([traces.sum(axis=1), (traces**2).sum(axis=1)], axis=1),
-                None,
+                ReceiverSlots(
+                    first,
+                    np.array([row.x_hat for row in rows]),
+                    np.array([row.action for row in rows]),
+                    np.ascontiguousarray(np.array([row.P for row in rows])[..., :recorded]),
+                    np.stack([traces.sum(axis=1), (traces**2).sum(axis=1)], axis=1),
+                ),
                 digests,
-                trace_sums=ended if recorded < trials else {},
+                ended if recorded < trials else {},
             )
         )
         first, ended = k + 1, {}
@@ -79,8 +81,21 @@ def test_an_honest_receiver_passes(batch: int, recorded: int) -> None:
 def changed(place: int, **how: Callable[[Any], Any]) -> list[Report]:
     """Reports, one of them with other columns."""
     made = reports(100)
-    made[place] = replace(made[place], **{name: change(getattr(made[place], name)) for name, change in how.items()})
+    for name, change in how.items():
+        report = made[place]
+        made[place] = with_columns(
+            report, **{name: change(getattr(report if name in OF_BLOCKS else report.slots, name))}
+        )
     return made
+
+
+OF_BLOCKS = ("digests", "trace_sums")
+
+
+def with_columns(report: Report, **changes: Any) -> Report:
+    """A report with other columns, or other digests."""
+    of_blocks = {name: changes.pop(name) for name in OF_BLOCKS if name in changes}
+    return replace(report, slots=replace(report.slots, **changes), **of_blocks)
 
 
 def at(where: tuple[int, ...], change: Callable[[Any], Any]) -> Callable[[np.ndarray], np.ndarray]:
@@ -132,7 +147,9 @@ def test_what_is_not_recorded_rests_on_its_own_word() -> None:
 def test_traces_of_recorded_trials_are_theirs(scale: float, factor: list[float]) -> None:
     """Where all trials are recorded the sums are known to within rounding, however large they are."""
     made = reports(100, TRIALS)
-    made[0] = replace(made[0], P=scale * made[0].P, trace=made[0].trace * [scale, scale**2] * factor)
+    slots = made[0].slots
+    assert slots.trace is not None
+    made[0] = with_columns(made[0], P=scale * slots.P, trace=slots.trace * [scale, scale**2] * factor)
     with pytest.raises(Contradiction, match="its sums of tr P"):
         verified(made, TRIALS)
 
@@ -140,7 +157,7 @@ def test_traces_of_recorded_trials_are_theirs(scale: float, factor: list[float])
 @given(st.floats(-1e150, 1e150), st.floats(-1e300, 1e300))
 def test_any_sums_are_judged(first: float, second: float) -> None:
     """Any numbers claimed as sums either pass or are a contradiction."""
-    report = replace(reports(1)[0], trace=np.array([[first, second]]))
+    report = with_columns(reports(1)[0], trace=np.array([[first, second]]))
     try:
         Verifier({"eve": Blocks(SLOTS, CUTS)}, RECORDED, 0).report("eve", report)
     except Contradiction:
@@ -162,7 +179,7 @@ def test_a_receiver_leaves_with_what_it_reported(column: str, place: tuple[int, 
     last = followed[299]
     other = at(place, lambda x: x + 1.0)(getattr(last, column))
     verifier.left("eve", 300, last._replace(x_hat=other) if column == "x_hat" else last._replace(P=other))
-    *before, of_last = [report for report in reports(100) if report.first < 300]
+    *before, of_last = [report for report in reports(100) if report.slots.first < 300]
     for report in before:
         verifier.report("eve", report)
     if message is None:
@@ -175,19 +192,22 @@ def test_a_receiver_leaves_with_what_it_reported(column: str, place: tuple[int, 
 def slots_of(**changes: Any) -> Slots:
     """Two slots from 8 on, in which everybody says the same."""
     delivered = np.array([[True, False, True, True], [False, True, True, True]])
+    late = np.zeros((2, TRIALS), np.uint16)
+    action = np.where(delivered, 2, 0).astype(np.uint8)
+    columns = {"action": action, "late": late, "late_used": late, "late_delivered": late, "sent": None, **changes}
+    unsent = columns.get("unsent", np.zeros(2, np.uint32))
     receiver = ReceiverSlots(
+        8,
         np.zeros((2, N, TRIALS)),
-        np.where(delivered, 2, 0).astype(np.uint8),
+        columns["action"],
         np.zeros((2, N, N, 1)),
         np.zeros((2, 2)),
-        delivered,
-        {},
-        np.zeros((2, TRIALS), np.uint16),
-        np.zeros((2, TRIALS), np.uint16),
-        np.zeros((2, TRIALS), np.uint16),
+        columns["late"],
+        columns["late_used"],
     )
-    sent = changes.pop("sent", None)
-    return Slots(8, np.zeros((2, N, TRIALS)), np.zeros((2, TRIALS), bool), {"eve": replace(receiver, **changes)}, sent)
+    link = LinkSlots(8, delivered, np.zeros((2, len(REASONS)), np.uint32), unsent, columns["late_delivered"])
+    sensor = SensorSlots(8, np.zeros((2, N, TRIALS)), np.zeros((2, TRIALS), bool), columns["sent"])
+    return Slots(sensor, {"eve": receiver}, {"eve": link})
 
 
 CLAIMS: dict[str, tuple[dict[str, Any], str]] = {
@@ -230,8 +250,18 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a block of no run": ({"digests": {2**63: np.zeros((4, 32), np.uint8)}}, "digests of block 9223372036854775808"),
     "a block before the run": ({"digests": {-5: np.zeros((4, 32), np.uint8)}}, "digests of block -5"),
-    "late without a window": ({"late": np.ones((100, 4), np.uint16)}, "late of 1; expected numbers from 0 to 0"),
-    "used that never came": ({"late_used": np.zeros((100, 4), np.uint16)}, "more in late_used than in late"),
+    "late beyond the window": (
+        {"late": np.full((100, 4), 4, np.uint16), "late_used": np.zeros((100, 4), np.uint16)},
+        "late of 4; expected numbers from 0 to 3",
+    ),
+    "late, and nothing of their use": (
+        {"late": np.zeros((100, 4), np.uint16)},
+        "late_used of None; expected 800 bytes",
+    ),
+    "used that never came": (
+        {"late": np.zeros((100, 4), np.uint16), "late_used": np.ones((100, 4), np.uint16)},
+        "more in late_used than in late",
+    ),
     "another shape": ({"x_hat": np.zeros((100, N, 3))}, "x_hat of 4800 bytes; expected 6400 bytes"),
     "more slots than a batch": ({"x_hat": np.zeros((301, N, 4))}, "c = 301; expected an integer c from 1 to 300"),
 }
@@ -242,15 +272,16 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 def test_a_report_that_no_run_has_is_refused(case: str) -> None:
     """Blocks, slots, shapes and counts are held to what the run has."""
     changes, message = WRONG[case]
-    raw = replace(reports(100)[0], **changes).pack()
+    raw = with_columns(reports(100)[0], **changes).pack()
+    window = 3 if "late" in changes else 0
     with pytest.raises(MalformedMessage, match=f"telemetry/eve: {message}") as raised:
-        read_report(Reader("evedrop/r/telemetry/eve", raw), 0, EXTENT, Blocks(SLOTS, CUTS))
+        read_report(Reader("evedrop/r/telemetry/eve", raw), 0, EXTENT, Blocks(SLOTS, CUTS), window)
     assert raised.value.at_fault == ("eve",)
 
 
 def test_digests_that_are_due_are_missed() -> None:
     """A report without the digests of a block that ends in it is refused, or its metrics could never be verified."""
-    raw = replace(reports(100)[2], digests={}).pack()
+    raw = with_columns(reports(100)[2], digests={}).pack()
     with pytest.raises(
         MalformedMessage, match=r"digests of blocks \[\]; expected those of \[0\], which end in these slots"
     ):
@@ -260,13 +291,13 @@ def test_digests_that_are_due_are_missed() -> None:
 @pytest.mark.parametrize("first", [600, 2**40])
 def test_nothing_follows_the_last_slot(first: int) -> None:
     """A report of slots after the run's last is refused, even where it is the next one."""
-    raw = replace(reports(100)[0], first=first).pack()
+    raw = with_columns(reports(100)[0], first=first).pack()
     with pytest.raises(MalformedMessage, match="c = 100; expected an integer c from 1 to"):
         read_report(Reader("evedrop/r/telemetry/eve", raw), first, EXTENT, Blocks(SLOTS, CUTS))
 
 
 JOURNALS: dict[str, tuple[dict[str, Any], str]] = {
-    "more fates than packets": ({"lost": {**dict.fromkeys(REASONS, np.zeros(1, np.uint32)), "cut": np.ones(1, np.uint32)}},
+    "more fates than packets": ({"lost": np.eye(1, len(REASONS), dtype=np.uint32)},
                                 r"5 fates of eve's packets of slot 7; expected 4 fates"),
     "fewer fates than packets": ({"delivered": np.array([[True, True, False, True]])},
                                  r"3 fates of eve's packets of slot 7; expected 4 fates"),
@@ -279,10 +310,13 @@ JOURNALS: dict[str, tuple[dict[str, Any], str]] = {
 @pytest.mark.parametrize("case", JOURNALS)
 def test_a_journal_that_does_not_add_up_is_refused(case: str) -> None:
     """Every packet has one fate; a journal in which one has none, or two, is malformed."""
-    changes, message = JOURNALS[case]
-    no_loss = dict.fromkeys(REASONS, np.zeros(1, np.uint32))
-    bursts, delays = np.zeros(COUNTED_BURSTS, np.uint32), np.array([4, 0], np.uint32)
-    link = replace(Account(np.ones((1, 4), bool), no_loss, None, bursts, delays), **changes)
+    of_case, message = JOURNALS[case]
+    changes = dict(of_case)
+    no_loss, none = np.zeros((1, len(REASONS)), np.uint32), np.zeros(1, np.uint32)
+    histograms = {"bursts": np.zeros(COUNTED_BURSTS, np.uint32), "delays": np.array([4, 0], np.uint32)}
+    histograms |= {name: changes.pop(name) for name in histograms if name in changes}
+    slots = replace(LinkSlots(7, np.ones((1, 4), bool), no_loss, none), **changes)
+    link = Account(slots, **histograms)
     raw = Journal(7, 1, {"eve": link}).pack()
     with pytest.raises(MalformedMessage, match=message) as raised:
         read_journal(Reader("evedrop/r/journal", raw), 7, {"eve": 0}, EXTENT)

@@ -15,13 +15,15 @@ from evedrop.model.local_filter import LocalFilter
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Receiver
+from evedrop.model.record import columns
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.innovation import InnovationEncoder, SharedSecret
 from evedrop.model.schemes.plain import PlainEncoder
 from evedrop.model.schemes.scheme import Packet, PacketBlock
-from evedrop.model.slot.cores import FollowedSlots, PlantCore, ReceiverCore, SensorCore, Sent
+from evedrop.model.slot.cores import PlantCore, ReceiverCore, SensorCore, Sent
 from evedrop.model.slot.link import Change, LinkSchedule, ReceiverOutage, streams_of
 from evedrop.model.slot.link_core import Arrivals, LinkCore
+from evedrop.model.slot.records import ReceiverSlots, SensorSlots
 from evedrop.model.streams import Batch, stream_key
 from tests.builders import MARGINAL, stream_keys
 from tests.model.slot_loop import ROOT, keys_of
@@ -83,7 +85,6 @@ def test_what_is_sent_does_not_depend_on_blocks(scheme: str, driven: bool) -> No
     made = []
     for edges in EDGES:
         core = sensor(scheme, PLANT if driven else None)
-        assert core.filters is driven
         parts = []
         for slots in ranges(edges):
             parts.append(core.send(slots))
@@ -93,11 +94,15 @@ def test_what_is_sent_does_not_depend_on_blocks(scheme: str, driven: bool) -> No
     if driven:  # the inputs came at another slot
         made = made[1:]
     for sent in made[1:]:
-        assert same(sent.true, made[0].true)
-        assert same(sent.x, made[0].x)
+        assert (sent.slots.true is not None) is driven
+        assert all(
+            same(getattr(sent.slots, column.name), getattr(made[0].slots, column.name))
+            for column in columns(SensorSlots)
+        )
         assert all(same(*pair) for pair in zip(sent.packets, made[0].packets, strict=True))
     rows = made[0].rows(slice(3, 5))
-    assert same(rows.x, made[0].x[3:5])
+    assert rows.slots.slots == range(3, 5)
+    assert same(rows.slots.x, made[0].slots.x[3:5])
     assert same(rows.packets.at(1).z, made[0].packets.at(4).z)
 
 
@@ -111,7 +116,7 @@ def test_arrivals_and_beliefs_do_not_depend_on_blocks(window: int) -> None:
     """With losses, delays and second copies; late packets are counted alike."""
     schedule = LinkSchedule(LINK, window)
     sent = sensor("innovation").send(range(BATCH.slots))
-    followed: list[FollowedSlots] = []
+    followed: list[ReceiverSlots] = []
     for edges in EDGES:
         core, receiver = link(schedule), ReceiverCore(estimator(), window)
         parts = []
@@ -121,11 +126,12 @@ def test_arrivals_and_beliefs_do_not_depend_on_blocks(window: int) -> None:
                 part = range(max(slots.start, batch.start), min(slots.stop, batch.stop))
                 if part:
                     parts.append(receiver.take_slots(part, core.arrivals(part, sent.packets.z[part.start : part.stop])))
-        followed.append(FollowedSlots.joined(parts))
+        followed.append(ReceiverSlots.joined(parts))
     assert (followed[0].late is None) is (window == 0)
     for divided in followed[1:]:
-        assert all(same(*pair) for pair in zip(divided.beliefs, followed[0].beliefs, strict=True))
-        assert same(divided.late, followed[0].late)
+        assert all(
+            same(getattr(divided, column.name), getattr(followed[0], column.name)) for column in columns(ReceiverSlots)
+        )
     assert window == 0 or (followed[0].late is not None and followed[0].late.any())
     beliefs = followed[0].beliefs
     some = beliefs.rows(slice(3, 5))
@@ -205,11 +211,9 @@ def test_acknowledgements_reach_scheme_and_watch() -> None:
     """Without a chart, missing acknowledgements go unnoticed; with one, they raise an alarm."""
     everyone, nobody = np.ones(BATCH.trials, np.bool_), np.zeros(BATCH.trials, np.bool_)
     plain = sensor("plain")
-    assert not plain.watches
     assert plain.acknowledged(0, nobody, None) is None
     states = PlantCore(MARGINAL, stream_key(ROOT, "process"), BATCH)
     watching = SensorCore(PlainEncoder(), states, watch=CusumBatch(Chart(0, 1, 1), BATCH.trials))
-    assert watching.watches
     assert not np.any(watching.acknowledged(0, everyone, None))
     assert np.all(watching.acknowledged(1, nobody, None))
 

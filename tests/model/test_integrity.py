@@ -10,12 +10,10 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
 from evedrop.model.integrity.loop import Source, spread, stationary
-from evedrop.model.integrity.monitor import Monitor, MonitoredSlots, MonitorPlan, assumed
+from evedrop.model.integrity.monitor import Monitor, MonitorPlan, assumed
 from evedrop.model.integrity.theory import WatermarkTheory, loop_of, watermark_cost
 from evedrop.model.plant import Plant
-from evedrop.model.schemes.plain import PlainEncoder
-from evedrop.model.schemes.scheme import PacketBlock
-from evedrop.model.slot.cores import PlantCore, SensorCore, Sent
+from evedrop.model.slot.cores import PlantCore
 from evedrop.model.streams import Batch
 from tests.builders import stream_keys
 from tests.model.integrity_loop import ALWAYS, ONE, PLANAR, REPLACED, SCALAR, simulated
@@ -218,7 +216,7 @@ def test_a_clipped_watermark_counts_as_far_as_it_enters() -> None:
 
 
 def test_a_plan_without_attack_is_designed_for_a_replay() -> None:
-    """It feeds the filter with what was measured, and assumes the distribution of a replay; slots are joined and cut."""
+    """It feeds the filter with what was measured, and assumes the distribution of a replay."""
     plan = MonitorPlan.of(LOOP, 0.3 * ONE, ALWAYS, None)
     replay = MonitorPlan.of(LOOP, 0.3 * ONE, ALWAYS, ("replay", {"recorded": 5}))
     key = stream_keys(1, ("watermark",))["watermark"]
@@ -227,12 +225,6 @@ def test_a_plan_without_attack_is_designed_for_a_replay() -> None:
     monitor = Monitor(plan, key, Batch(4, 3))
     monitor.take(0, np.full((1, 3), 9.0), None)
     assert monitor.statistic.tolist() == [0.0] * 3
-    parts = [MonitoredSlots(np.full((1, 2), v), np.full((1, 1, 2), v)) for v in (1.0, 2.0)]
-    whole = MonitoredSlots.joined(parts)
-    assert whole.statistic[:, 0].tolist() == [1.0, 2.0]
-    assert whole.rows(slice(1, 2)).watermark.tolist() == [[[2.0, 2.0]]]
-    assert whole.part(slice(0, 1)).watermark.tolist() == [[[1.0]], [[2.0]]]
-    assert whole.part(slice(0, 1)).statistic.tolist() == [[1.0], [2.0]]
 
 
 def test_evidence_is_weighed_by_the_distribution_of_its_own_slot() -> None:
@@ -253,35 +245,11 @@ def test_evidence_is_weighed_by_the_distribution_of_its_own_slot() -> None:
         assert abs(plan.marked.precision - plan.unmarked.precision).min() > 1e-4
 
 
-def test_a_sensor_says_whether_it_has_a_detector() -> None:
-    """Its process then reports what the detector finds."""
-    batch = Batch(4, 1)
-    plan = MonitorPlan.of(LOOP, 0.3 * ONE, ALWAYS, None)
-    for monitor in (None, Monitor(plan, bytes(32), batch)):
-        sensor = SensorCore(PlainEncoder(), PlantCore(SCALAR.process, bytes(32), batch), None, None, monitor)
-        assert sensor.monitors is (monitor is not None)
-
-
-def test_slots_of_a_monitored_sensor_are_joined_and_cut() -> None:
-    """The monitor's results are joined and cut with them; a plant without inputs has nothing to mark."""
+def test_a_plant_without_inputs_has_nothing_to_mark() -> None:
+    """A watermark that is added to it never enters."""
     states = PlantCore(SCALAR.process, bytes(32), Batch(4, 1))
     states.add_watermark(ONE)
     assert states.entered is None
-    packets = PacketBlock(np.zeros((1, 1, 2)), np.zeros((1, 2), np.bool_))
-    parts = [
-        Sent(
-            np.full((1, 1, 2), v),
-            np.full((1, 1, 2), -v),
-            packets,
-            MonitoredSlots(np.full((1, 2), v), np.full((1, 1, 2), v)),
-        )
-        for v in (1.0, 2.0)
-    ]
-    later = Sent.joined(parts).rows(slice(1, 2))
-    assert later.monitored is not None
-    assert later.monitored.statistic.tolist() == [[2.0, 2.0]]
-    assert later.true[0, 0, 0] == 2.0
-    assert later.x[0, 0, 0] == -2.0
 
 
 def test_attacks_come_back_from_plain_numbers() -> None:

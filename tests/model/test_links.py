@@ -92,7 +92,7 @@ def test_links_are_independent() -> None:
 def test_losses_account_for_every_packet(slots: int, trials: int, seed: int) -> None:
     """Delivered and the losses of all reasons add up to what was offered, slot by slot."""
     fates = np.random.default_rng(seed).integers(0, int(Fate.UNSENT), (slots, trials), np.uint8)
-    counted = Accountant(0, trials).account(range(slots), Fates(fates)).lost
+    counted = Accountant(0, trials).account(range(slots), Fates(fates)).slots.lost_by_reason
     assert set(counted) == {fate.name.lower() for fate in Fate} - {"delivered", "unsent"}
     assert np.array_equal((fates == Fate.DELIVERED).sum(axis=1) + sum(counted.values()), np.full(slots, trials))
     assert all(counts.dtype == np.uint32 for counts in counted.values())

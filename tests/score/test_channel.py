@@ -65,7 +65,7 @@ def tally_of(scenario: Scenario, name: str) -> Tally:
     )
     account = accountant.account(range(scenario.slots), fates)
     tally = Tally(scenario.slots, scenario.trials, done=scenario.slots, offered=scenario.slots * scenario.trials)
-    tally.account(account.delivered, (account.delivered).astype(np.uint8), account.lost)
+    tally.account(account.slots, account.slots.delivered.astype(np.uint8))
     tally.count(account)
     return tally
 

@@ -199,8 +199,8 @@ def test_the_sensor_notices_what_it_cannot_miss() -> None:
     detection = Detection(5)
     for chunk in Simulation(scenario, range(5)).chunks():
         assert chunk.slots is not None
-        assert chunk.slots.alarms is not None
-        detection.add_alarms(chunk.first, chunk.slots.alarms)
+        assert chunk.slots.sensor.alarms is not None
+        detection.add_alarms(chunk.first, chunk.slots.sensor.alarms)
     assert np.array_equal(detection.first, np.full(5, 10))
     assert detection.summary(scenario) == DetectionSummary(
         attack_from=10,

@@ -9,6 +9,7 @@ from evedrop import load_results, montecarlo
 from evedrop.errors import UsageError
 from evedrop.scenario.loading import checked, load
 from evedrop.show.view.scene_slots import LoopValues, replay
+from tests.builders import with_inputs
 from tests.show.view.drawn import panels_are_filled
 from tests.show.view.read_back import rows
 
@@ -77,7 +78,10 @@ def test_slots_may_come_in_any_pieces() -> None:
         loop_values = LoopValues.of(scenario)
         assert loop_values is not None
         pieces = [slice(first, end) for first, end in pairwise(cuts)]
-        moves = [loop_values.take(u[rows], {name: x[rows] for name, x in estimates.items()}) for rows in pieces]
+        moves = [
+            loop_values.take(with_inputs(u).rows(rows), {name: x[rows] for name, x in estimates.items()})
+            for rows in pieces
+        ]
         curves = {path: np.concatenate([move.curves[path] for move in moves], axis=1) for path in moves[0].curves}
         energies = np.stack([curves["energy/bought"][1], curves["energy/sold"][1]], axis=1)
         results.append((np.concatenate([move.values for move in moves]), energies, curves["guesses/naive"]))

@@ -15,6 +15,7 @@ from evedrop.scenario.closed_loop import controlled_plant
 from evedrop.scenario.loading import load
 from evedrop.show.view.scene_slots import LoopValues, driven_scene
 from evedrop.simulate.montecarlo import Plan
+from tests.builders import with_inputs
 from tests.conftest import Evedrop
 from tests.packages import install
 
@@ -75,9 +76,9 @@ def test_the_view_is_given_every_curve_of_its_panels() -> None:
     whole, parts = LoopValues.of(scenario), LoopValues.of(scenario)
     assert whole is not None
     assert parts is not None
-    at_once = whole.take(u, estimates).curves
+    at_once = whole.take(with_inputs(u), estimates).curves
     blocks = [
-        parts.take(u[rows], {name: estimate[rows] for name, estimate in estimates.items()}).curves
+        parts.take(with_inputs(u).rows(rows), {name: estimate[rows] for name, estimate in estimates.items()}).curves
         for rows in (slice(0, 7), slice(7, 40))
     ]
     wanted = {f"{panel.path}/{curve.name}" for panel in driven_scene(scenario)["panels"] for curve in panel.curves}

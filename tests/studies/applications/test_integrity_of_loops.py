@@ -10,7 +10,7 @@ import pytest
 
 from evedrop.cli.api import montecarlo, run
 from evedrop.errors import ScenarioError
-from evedrop.model.integrity.monitor import MonitoredSlots
+from evedrop.model.slot.records import SensorSlots
 from evedrop.scenario.closed_loop import controlled_plant, monitor_of
 from evedrop.scenario.loading import load
 from evedrop.show.view.scene_slots import LoopValues, driven_scene, replay
@@ -109,14 +109,16 @@ def test_the_view_is_given_every_curve_of_its_panels() -> None:
     """In blocks of slots as in one; the alarm is a point, once. Without watermark there is one panel less."""
     scenario = load("replay-attack", {"expect": []})
     u, statistic = np.zeros((6, 1)), np.array([0.0, 1.0, 9.0, 9.0, 9.0, 9.0])[:, None]
-    monitored = MonitoredSlots(statistic, np.arange(6.0)[:, None, None])
+    zeros = np.zeros((6, 2, 1))
+    watermark = np.arange(6.0)[:, None, None]
+    sensor = SensorSlots(0, zeros, zeros[:, 0] > 0.0, u=u[..., None], statistic=statistic, watermark=watermark)
     estimates = {name: np.zeros((6, 1)) for name in scenario.receivers}
     whole, parts = LoopValues.of(scenario), LoopValues.of(scenario)
     assert whole is not None
     assert parts is not None
-    at_once = whole.take(u, estimates, monitored).curves
+    at_once = whole.take(sensor, estimates).curves
     blocks = [
-        parts.take(u[some], {name: estimate[some] for name, estimate in estimates.items()}, monitored.rows(some)).curves
+        parts.take(sensor.rows(some), {name: estimate[some] for name, estimate in estimates.items()}).curves
         for some in (slice(0, 3), slice(3, 6))
     ]
     panels = driven_scene(scenario)["panels"]

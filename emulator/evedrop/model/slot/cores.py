@@ -165,21 +165,6 @@ class SensorCore:
         self._encoder, self._plant = encoder, plant
         self._local, self._watch, self._monitor = local, watch, monitor
 
-    @property
-    def watches(self) -> bool:
-        """Whether the sensor watches the acknowledgements."""
-        return self._watch is not None
-
-    @property
-    def filters(self) -> bool:
-        """Whether the sensor filters its measurements, so that it does not transmit the true state."""
-        return self._local is not None
-
-    @property
-    def monitors(self) -> bool:
-        """Whether the sensor's filter has a detector."""
-        return self._monitor is not None
-
     def send(self, slots: range) -> Sent:
         """The next slots, at least one."""
         states = self._plant.advance(slots)
@@ -188,7 +173,7 @@ class SensorCore:
         if self._monitor is not None:
             statistic, watermark = self._monitored(slots.start, self._monitor)
         packets = self._encoder.encode_block(slots, x, predicted)
-        true = states.x if self.filters else None
+        true = None if self._local is None else states.x
         sensor = SensorSlots(
             slots.start, x, packets.nu, packets.sent, true=true, statistic=statistic, watermark=watermark
         )

@@ -71,13 +71,9 @@ class LoopValues:
         loop = controlled_plant(scenario)
         return None if loop is None else cls(loop, scenario)
 
-    def take(self, sensor: SensorSlots, estimates: Mapping[str, Floats]) -> Moved | None:
-        """The view's values of the next slots, from the sensor in this trial alone, and estimates as deviations, (c, n).
-
-        None without inputs.
-        """
-        if sensor.u is None:
-            return None
+    def take(self, sensor: SensorSlots, estimates: Mapping[str, Floats]) -> Moved:
+        """The view's values of the next slots, from the sensor in this trial alone, and estimates as deviations, (c, n)."""
+        assert sensor.u is not None  # noqa: S101 - there is a controller
         limited = self._plant.limited(sensor.u[:, :, 0].T).T
         first, self._next = self._next, self._next + len(limited)
         values = np.hstack([self._disturbances[first : self._next], limited])
