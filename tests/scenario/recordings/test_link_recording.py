@@ -21,8 +21,9 @@ from evedrop.scenario.loading import load
 from evedrop.scenario.recordings import link_recording as traces
 from evedrop.scenario.recordings.link_recording import LinkRecording
 from evedrop.scenario.tables import Scenario
-from tests.builders import mistakes_of, scalar_tables
+from tests.builders import mistakes_of, places_of, scalar_tables
 from tests.conftest import Evedrop
+from tests.golden.pages import Golden
 
 GOOD = scalar_tables(1.0, 0.01, slots=6, legitimate={"link": {"loss": {"model": "trace", "file": "walk.csv"}}})
 
@@ -68,39 +69,37 @@ def test_delays_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "column", "entry", "message"),
+    ("name", "text", "column", "entry"),
     [
-        ("walk.csv", None, None, "file", "cannot be read (No such file or directory); expected a CSV or Parquet file"),
-        ("walk.csv", "", None, "file", "is empty; expected"),
-        ("walk.csv", "received\n", None, "file", "is empty; expected"),
-        ("walk.csv", "1\n0\n2\n", None, "file", 'line 3 is "2"; expected 0 (lost) or 1 (delivered)'),
-        ("walk.csv", "2\n0\n1\n", None, "file", 'line 1 is "2"; expected'),
-        ("walk.csv", "a,b\n1,0\n,1\n", "a", "file", "line 3 is empty; expected 0"),
-        ("walk.csv", "a,b\n1,0\n1\n", "a", "file", "line 3 has 1 columns; expected 2, as the first line has"),
-        ("walk.csv", "a,b\n1,0\n", "c", "column", '"c" is not a column of walk.csv; there are a, b'),
-        ("walk.csv", "a,b\n1,0\n", None, "column", 'is missing; walk.csv has a, b; expected column = "a"'),
-        ("walk.csv", "t,ok\n0.5,1\n", None, "column", 'is missing; walk.csv has t, ok; expected column = "ok"'),
+        ("walk.csv", None, None, "file"),
+        ("walk.csv", "", None, "file"),
+        ("walk.csv", "received\n", None, "file"),
+        ("walk.csv", "1\n0\n2\n", None, "file"),
+        ("walk.csv", "2\n0\n1\n", None, "file"),
+        ("walk.csv", "a,b\n1,0\n,1\n", "a", "file"),
+        ("walk.csv", "a,b\n1,0\n1\n", "a", "file"),
+        ("walk.csv", "a,b\n1,0\n", "c", "column"),
+        ("walk.csv", "a,b\n1,0\n", None, "column"),
+        ("walk.csv", "t,ok\n0.5,1\n", None, "column"),
         (
             "walk.csv",
             "t,lost,ok\n0.5,1,1\n",
             None,
             "column",
-            'is missing; walk.csv has t, lost, ok; expected column = "ok"',
         ),
         (
             "walk.csv",
             "lost\n1\n",
             None,
             "column",
-            'walk.csv has lost; expected lost = "lost" if 1 means lost there, or column',
         ),
-        ("walk.csv", "a,b\n7,x\n", None, "column", "walk.csv has a, b, and none of these has only 0 (lost) and 1 (del"),
-        ("walk.csv", "1\n0\n", "a", "column", '"a" is not a column of walk.csv; there are no names'),
-        ("walk.csv", "1,0\n0,1\n", None, "file", "has 2 columns without names; expected one column, or a line of"),
-        ("walk.csv", b"\xff\xfe1", None, "file", "cannot be read (it is not text in UTF-8"),
-        ("walk.csv", b"1\n" * 21, None, "file", "has more than 20 outcomes; expected at most that many"),
-        ("walk.parquet", "1\n0\n", None, "file", "cannot be read ("),
-        ("walk.parquet", None, None, "file", "cannot be read ("),
+        ("walk.csv", "a,b\n7,x\n", None, "column"),
+        ("walk.csv", "1\n0\n", "a", "column"),
+        ("walk.csv", "1,0\n0,1\n", None, "file"),
+        ("walk.csv", b"\xff\xfe1", None, "file"),
+        ("walk.csv", b"1\n" * 21, None, "file"),
+        ("walk.parquet", "1\n0\n", None, "file"),
+        ("walk.parquet", None, None, "file"),
     ],
 )
 def test_what_is_no_recording_is_said(
@@ -110,7 +109,7 @@ def test_what_is_no_recording_is_said(
     text: str | bytes | None,
     column: str | None,
     entry: str,
-    message: str,
+    golden: Golden,
 ) -> None:
     """What is wrong and where, what was expected; a scenario says it at the path of the entry."""
     monkeypatch.setattr(traces, "MOST_OUTCOMES", 20)
@@ -119,11 +118,11 @@ def test_what_is_no_recording_is_said(
     with pytest.raises(TraceError) as caught:
         LinkRecording(tmp_path / name).outcomes(column)
     assert (caught.value.entry, caught.value.exit_status) == (entry, 2)
-    assert message in caught.value.reason
     loss = {"model": "trace", "file": name, **({} if column is None else {"column": column})}
     (line,) = mistakes_of(with_trace, tmp_path, loss)
     assert line.startswith(f"legitimate.link.loss.{entry}: ")
-    assert message in line
+    assert caught.value.reason in line
+    golden("check", line.partition("cannot be read (")[0])  # what follows is the library's
 
 
 def test_a_column_of_lists_does_not_hide_the_others(tmp_path: Path) -> None:
@@ -160,27 +159,29 @@ def with_trace(folder: Path, loss: dict[str, Any], **more: Any) -> Scenario:
 
 
 @pytest.mark.parametrize(
-    ("loss", "message"),
+    ("loss", "place"),
     [
-        ({}, 'file: is missing; expected file = "walk.csv", or outcomes'),
-        ({"fiel": "walk.csv"}, "fiel: is not a parameter of trace; expected file, once, outcomes or random_start"),
-        ({"column": "a"}, 'file: is missing; expected file = "walk.csv"'),
-        ({"file": 3}, "file: is 3; expected a string"),
-        ({"file": "walk.csv", "column": True}, "column: is true; expected a string"),
-        ({"file": "walk.csv", "outcomes": "1"}, "file: is given together with outcomes; expected one of them"),
-        ({"file": "walk.csv", "once": "no"}, 'once: is "no"; expected true or false'),
-        ({"file": "walk.csv", "twice": True}, "twice: is not a parameter of trace; expected"),
-        ({"file": "."}, "cannot be read (it is a folder); expected a CSV"),
-        ({"outcomes": "10110", "once": True}, "outcomes: has 5 outcomes and is read once; expected slots, which is 6, or"),
-        ({"file": "walk.csv", "once": True}, "file: has 4 outcomes and is read once; expected slots, which is 6, or more"),
-    ],
+        ({}, "file"),
+        ({"fiel": "walk.csv"}, "fiel"),
+        ({"column": "a"}, "file"),
+        ({"file": 3}, "file"),
+        ({"file": "walk.csv", "column": True}, "column"),
+        ({"file": "walk.csv", "outcomes": "1"}, "file"),
+        ({"file": "walk.csv", "once": "no"}, "once"),
+        ({"file": "walk.csv", "twice": True}, "twice"),
+        ({"file": "."}, "file"),
+        ({"outcomes": "10110", "once": True}, "outcomes"),
+        ({"file": "walk.csv", "once": True}, "file"),
+    ], ids=str,
 )  # fmt: skip
-def test_a_mistake_of_a_scenarios_trace_is_named(tmp_path: Path, loss: dict[str, Any], message: str) -> None:
+def test_a_mistake_of_a_scenarios_trace_is_named(
+    tmp_path: Path, loss: dict[str, Any], place: str, golden: Golden
+) -> None:
     """One line each, with its path."""
     write(tmp_path, "walk.csv", "1\n0\n1\n1\n")
-    (line,) = mistakes_of(with_trace, tmp_path, {"model": "trace", **loss})
-    assert line.startswith("legitimate.link.loss.")
-    assert message in line
+    mistakes = mistakes_of(with_trace, tmp_path, {"model": "trace", **loss})
+    assert places_of(mistakes) == [f"legitimate.link.loss.{place}"]
+    golden("check", mistakes)
 
 
 def test_mistakes_of_recordings_hide_no_others(tmp_path: Path) -> None:
