@@ -89,7 +89,8 @@ def test_in_python() -> None:
         (*SHORT, "--set", BURSTS),
         (*SHORT, "--set", 'encoding={scheme="cipher"}', "--set", NAIVE),
         (*SHORT, "--set", 'eavesdroppers={wise={strategy="bayesian",link={quality=0.85}}}'),
-    ], ids=str,
+    ],
+    ids=str,
 )  # fmt: skip
 def test_refusals(evedrop: Evedrop, words: tuple[str, ...], golden: Golden) -> None:
     """A design that does not exist is refused, with the bound and the remedy."""

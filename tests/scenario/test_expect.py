@@ -74,7 +74,8 @@ def expecting(*expectations: dict[str, Any], **changes: Any) -> Scenario:
         ({"synchronised": "smart", "by": 9, "since": 10}, "by"),
         ({"synchronised": "smart", "by": -1}, "by"),
         ({"metric": ERROR, "blow": 1.0}, "blow"),
-    ], ids=str,
+    ],
+    ids=str,
 )  # fmt: skip
 def test_a_mistake_of_an_expectation_is_named(expectation: dict[str, Any], place: str, golden: Golden) -> None:
     """Its path, what was found, what was expected."""

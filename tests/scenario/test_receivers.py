@@ -32,7 +32,8 @@ SPY = {"strategy": "replay-informed", "learns_at": 5, "reads_as": "bayesian", "l
         ({**SPY, "learns_at": -1}, ["learns_at"]),
         ({**SPY, "learns_at": 50}, ["learns_at"]),
         ({"strategy": "clever"}, ["strategy"]),
-    ], ids=str,
+    ],
+    ids=str,
 )  # fmt: skip
 def test_a_mistake_of_an_eavesdropper_is_named(table: dict[str, Any], places: list[str], golden: Golden) -> None:
     """Missing, superfluous and wrong entries of a strategy: a line each."""
@@ -100,7 +101,8 @@ CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.
         ({"loss": {"model": "pattern", "outcomes": "11x1"}}, "link.loss.outcomes"),
         ({"loss": {"model": "pattern", "outcomes": ""}}, "link.loss.outcomes"),
         ({"loss": {"model": "pattern", "outcomes": 11}}, "link.loss.outcomes"),
-    ], ids=str,
+    ],
+    ids=str,
 )  # fmt: skip
 def test_a_mistake_of_a_link_is_named(link: dict[str, Any], place: str, golden: Golden) -> None:
     """A mistake in the legitimate link or in an eavesdropper's link gets one line, with the path of the entry."""

@@ -95,14 +95,7 @@ def test_all_wrong_names_are_told_at_once(evedrop: Evedrop) -> None:
     options = ("--schemes", "cypher,plain", "--adversaries", "smrt", "--with", "innovation.mu_d=0.7")
     done = evedrop("compare", "numerical", *options)
     assert (done.status, done.out) == (2, "")
-    for message in (
-        "cypher is not a scheme",
-        "did you mean cipher?",
-        "smrt is not an adversary",
-        "did you mean smart?",
-    ):
-        assert message in done.err
-    assert "innovation.mu_d is not a parameter of a scheme" in done.err
+    assert [line.split()[0] for line in done.err.splitlines()[1:]] == ["cypher", "smrt", "innovation.mu_d"]
     assert all(name in done.err for name in (*SCHEMES, *adversaries_of(), "innovation.state_probability"))
     assert not list(evedrop.folder.glob("runs/*"))
 

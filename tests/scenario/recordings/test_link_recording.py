@@ -172,7 +172,8 @@ def with_trace(folder: Path, loss: dict[str, Any], **more: Any) -> Scenario:
         ({"file": "."}, "file"),
         ({"outcomes": "10110", "once": True}, "outcomes"),
         ({"file": "walk.csv", "once": True}, "file"),
-    ], ids=str,
+    ],
+    ids=str,
 )  # fmt: skip
 def test_a_mistake_of_a_scenarios_trace_is_named(
     tmp_path: Path, loss: dict[str, Any], place: str, golden: Golden

@@ -199,7 +199,8 @@ BASE = {"policy": "always", "threshold": 8.0, "watermark": [[0.3]]}
         ({"controller": {"strategy": "mpc", "state_weights": [1.0], "input_weights": [0.1]}}, "controller.strategy"),
         ({"event": [{"at": 160, "spoof": "sensor"}]}, "event.0.spoof"),
         ({"event": [{"at": 150, "spoof": "measurements"}, {"at": 170, "spoof": "measurements"}]}, "event.1.spoof"),
-    ], ids=str,
+    ],
+    ids=str,
 )  # fmt: skip
 def test_mistakes_are_named(changes: dict[str, Any], place: str, golden: Golden) -> None:
     """Mistakes in the table, and in its use with plant, controller and events, say what is expected."""
