@@ -318,6 +318,14 @@ def test_what_the_scenario_needs_is_missed(changes: dict[str, Any], place: str, 
     golden("run", error.value.mistakes)
 
 
+def test_a_configuration_of_ssh_is_beside_the_file(tmp_path: Path) -> None:
+    """Wherever the command is called."""
+    (tmp_path / "hosts.toml").write_text(f'ssh_config = "ssh/config"\n{NO_CLASSES}')
+    assert load_hosts(tmp_path / "hosts.toml", load("restart")).ssh_config == tmp_path / "ssh" / "config"
+    (tmp_path / "hosts.toml").write_text(NO_CLASSES)
+    assert load_hosts(tmp_path / "hosts.toml", load("restart")).ssh_config is None
+
+
 def test_a_host_has_a_plain_name(tmp_path: Path) -> None:
     """It is part of sentences and of paths in mistakes."""
     (tmp_path / "hosts.toml").write_text(NO_CLASSES.replace("hosts.beta", 'hosts."Beta 1"'))

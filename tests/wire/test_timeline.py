@@ -8,7 +8,8 @@ from typing import Any
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.timeline import moment_at, moments, with_change, with_cut_ended, with_partition_ended
-from tests.builders import mistakes_of
+from tests.builders import mistakes_of, places_of
+from tests.golden.pages import Golden
 
 SIDES: dict[str, Any] = {"robot": {}, "base": {}, "listener": {}}
 LINKS = [
@@ -104,39 +105,28 @@ def test_an_operator_ends_partitions() -> None:
     assert moment_at(healed, 4.0).cut == {"scan"}
 
 
-def test_what_an_operator_cannot_do() -> None:
+def test_what_an_operator_cannot_do(golden: Golden) -> None:
     """The messages are those of a file, in the same two steps, and say what to do."""
     plan = plan_of({"at": 1, "partition": ["robot", "base"]})
-    assert mistakes_of(with_change, plan, {"link": "scan", "set": {"qualty": 1, "corrupt": 2}}, 2.0) == [
-        "set.qualty: is not a link setting that can be changed; expected quality, loss, delay, reorder, duplicate, corrupt, rate "
-        "or queue; did you mean quality?",
-        "set.corrupt: is 2; expected a number from 0 to 1, such as 0.01",
-    ]
-    assert mistakes_of(with_change, plan, {"cut": "scna", "partition": ["robot", "bas"]}, 2.0) == [
-        'event: has partition or cut at once; expected one of partition, cut, set or note, such as partition = ["robot", "base"]'
-    ]
-    assert mistakes_of(with_change, plan, {"partition": ["rbot", "bas"]}, 2.0) == [
-        'partition.0: is "rbot"; expected robot, base or listener; did you mean robot?',
-        'partition.1: is "bas"; expected robot, base or listener; did you mean base?',
-    ]
-    assert mistakes_of(with_change, plan, {"cut": "scna"}, 2.0) == [
-        'cut: is "scna"; expected scan, robot-base, base-robot or robot-listener; did you mean scan?',
-    ]
-    assert mistakes_of(with_cut_ended, plan, "scan", 2.0) == [
-        "heal: scan is not cut by itself; end the partition of its sides with `evedrop heal`"
-    ]
-    assert mistakes_of(with_cut_ended, plan, "scan", 0.5) == [
-        "heal: scan is not cut by itself; expected a link that is cut"
-    ]
-    assert mistakes_of(with_cut_ended, plan, "scn", 2.0) == [
-        'heal: is "scn"; expected scan, robot-base, base-robot or robot-listener; did you mean scan?'
-    ]
-    assert mistakes_of(with_partition_ended, plan, "robot", "listener", 2.0) == [
-        "heal: robot and listener are not partitioned; expected two sides that are"
-    ]
-    assert mistakes_of(with_partition_ended, plan, "robot", "bse", 2.0) == [
-        'heal: is "bse"; expected robot, base or listener; did you mean base?'
-    ]
+    for change, places in (
+        ({"link": "scan", "set": {"qualty": 1, "corrupt": 2}}, ["set.qualty", "set.corrupt"]),
+        ({"cut": "scna", "partition": ["robot", "bas"]}, ["event"]),
+        ({"partition": ["rbot", "bas"]}, ["partition.0", "partition.1"]),
+        ({"cut": "scna"}, ["cut"]),
+    ):
+        mistakes = mistakes_of(with_change, plan, change, 2.0)
+        assert places_of(mistakes) == places
+        golden("link", mistakes)
+    for end, arguments in (
+        (with_cut_ended, ("scan", 2.0)),
+        (with_cut_ended, ("scan", 0.5)),
+        (with_cut_ended, ("scn", 2.0)),
+        (with_partition_ended, ("robot", "listener", 2.0)),
+        (with_partition_ended, ("robot", "bse", 2.0)),
+    ):
+        mistakes = mistakes_of(end, plan, *arguments)
+        assert places_of(mistakes) == ["heal"]
+        golden("heal", mistakes)
 
 
 def test_the_loss_model_of_correlated_links_cannot_change() -> None:

@@ -206,8 +206,8 @@ def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
     if kind == "expected":
         ending = context.get("said") or f"; expected {context['expected']}{context['hint'] or example}"
         return f"is {as_toml(value)}{ending}"
-    if kind in {"greater_than_equal", "less_than_equal", "less_than"}:
-        words = {"ge": "at least", "le": "at most", "lt": "less than"}
+    if kind in {"greater_than", "greater_than_equal", "less_than_equal", "less_than"}:
+        words = {"gt": "above", "ge": "at least", "le": "at most", "lt": "less than"}
         bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)
         return f"is {as_toml(value)}; expected a number {bound}{example}"
     if kind in {"too_long", "too_short", "string_too_long"}:

@@ -15,7 +15,8 @@ from evedrop.model.slot.link import Change
 from evedrop.scenario.loading import checked
 from evedrop.scenario.progress_events import Held, ProgressEvent
 from evedrop.scenario.tables import Scenario
-from tests.builders import scalar_tables
+from tests.builders import places_of, scalar_tables
+from tests.golden.pages import Golden
 
 SLOTS = 100
 TABLES = scalar_tables(1.0, 0.01, slots=SLOTS, eavesdroppers={"smart": {"strategy": "smart", "link": {"quality": 0.7}}})
@@ -138,30 +139,30 @@ def test_two_operators_are_served_in_the_order_they_came() -> None:
 
 
 @pytest.mark.parametrize(
-    ("event", "mistakes"),
+    ("event", "places"),
     [
-        ({"link": "legitimate", "set": {"quality": 1.2}}, ["set.quality: is 1.2; expected a number from 0 to 1"]),
-        ({"heal": "smart"}, ["heal: smart is not cut at slot 5; expected a cut before"]),
-        ({"cut": "nobody"}, ['cut: names "nobody"; expected legitimate or smart']),
-        ({"cut": "legitimate"}, ["event.0.cut: legitimate is cut already, from slot 5 on; expected a heal before"]),
-        ({"kill": "smart"}, ["kill: cannot be done now; expected link with set, cut or heal"]),
-        ({"at": 9, "cut": "smart"}, ["at: cannot be done now; expected link with set, cut or heal"]),
-        ({}, ["event: does not say what happens; expected one of"]),
+        ({"link": "legitimate", "set": {"quality": 1.2}}, ["set.quality"]),
+        ({"heal": "smart"}, ["heal"]),
+        ({"cut": "nobody"}, ["cut"]),
+        ({"cut": "legitimate"}, ["event.0.cut"]),
+        ({"kill": "smart"}, ["kill"]),
+        ({"at": 9, "cut": "smart"}, ["at"]),
+        ({}, ["event"]),
         (
             {"link": "smart", "set": {"loss": {"model": "gilbert-elliott", "p": 2.0}, "sluts": 1}},
-            ["set.sluts: is not a link setting", "set.loss.r: is missing", "set.loss.p: is 2.0; expected"],
+            ["set.sluts", "set.loss.r", "set.loss.p"],
         ),
     ],
+    ids=str,
 )
-def test_mistakes_change_nothing(event: dict[str, Any], mistakes: list[str]) -> None:
+def test_mistakes_change_nothing(event: dict[str, Any], places: list[str], golden: Golden) -> None:
     """All mistakes are answered at once, in the words for a scenario's events, and the run goes on as it was."""
     run = Run({"at": 40, "cut": "legitimate"})
     asked = run.asks("link", event=event)
     assert run.holds(5) == go(5)
     refused = asked.answers[0].refused
-    assert len(refused) == len(mistakes)
-    for line, wanted in zip(refused, mistakes, strict=True):
-        assert line.startswith(wanted)
+    assert places_of(refused) == places
+    golden("link", refused)
     assert (run.events, run.kept) == ([], [])
 
 
