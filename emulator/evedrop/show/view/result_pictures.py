@@ -375,8 +375,7 @@ def _cell(axes: Axes, column: int, row: int, scheme: SchemeResult, cell: Cell) -
     axes.add_patch(Rectangle(**box, facecolor=_GROUND[word]))
     axes.text(column + 0.5, row - 0.17, MARKS[word], ha="center", va="center", color=_INK[word], fontsize=11)
     legitimate = cell.legitimate.typical / scheme.legitimate.typical if scheme.legitimate.typical else math.inf
-    raised = f"  u×{_number(legitimate)}" if legitimate > _NOTABLE else ""
-    size = 7.2 if raised else 8.4
+    raised = f"\nlegitimate {_number(legitimate)}×" if legitimate > _NOTABLE else ""
     axes.text(
         column + 0.5,
         row + 0.24,
@@ -384,7 +383,8 @@ def _cell(axes: Axes, column: int, row: int, scheme: SchemeResult, cell: Cell) -
         ha="center",
         va="center",
         color=_INK[word],
-        fontsize=size,
+        fontsize=6.6 if raised else 8.4,
+        linespacing=1.1,
     )
 
 
@@ -398,8 +398,8 @@ def _legend(axes: Axes, comparison: Comparison, left: float) -> None:
         place += 1.0 + 0.092 * len(meaning)
     notes = [
         f"{comparison.title}: {comparison.slots:,} slots, {comparison.trials:,} trial{'s' if comparison.trials > 1 else ''}.",
-        "n×: the adversary's over the legitimate error. u×: an attack raises the legitimate error. ·: not defined."
-        + (f" Bold: dominates ({', '.join(comparison.dominant)})." if comparison.dominant else ""),
+        "n×: the adversary's error over the legitimate one. legitimate n×: an attack raises the legitimate error n-fold. "
+        "·: not defined." + (f" Bold: dominates ({', '.join(comparison.dominant)})." if comparison.dominant else ""),
     ]
     axes.text(-left - 1.9, rows + 0.55, "\n".join(notes), ha="left", va="top", fontsize=8.8, linespacing=1.5)
 
