@@ -188,7 +188,7 @@ BASE = {"policy": "always", "threshold": 8.0, "watermark": [[0.3]]}
         ({"integrity.attack.recorded": 161}, "integrity.attack.recorded: is 161, but the attack begins in slot 160; expected"),
         ({"integrity.attack": {"model": "replace", "matrix": []}}, "integrity.attack.matrix: is []; expected a matrix"),
         ({"integrity.attack": {**ATTACK, "noise": 3}}, "integrity.attack.noise: is 3; expected a matrix, such as"),
-        ({"integrity.attack": {**ATTACK, "recorded": 3}}, "integrity.attack.recorded: is not a parameter of the attack replace"),
+        ({"integrity.attack": {**ATTACK, "recorded": 3}}, "integrity.attack.recorded: is set, but the attack"),
         ({"integrity.attack": {"model": "replace", "matrix": [[1.2]]}}, "integrity.attack.matrix: has the spectral radius 1.2"),
         ({"integrity": BASE}, "integrity.attack: is missing, but an event begins it; expected attack = {"),
         ({"controller.period": 2}, "controller.period: is 2, but the theory of integrity assumes a decision in every slot"),
