@@ -60,7 +60,7 @@ def registered(classes: Registry[Any]) -> Callable[[str], str]:
         if why is None:
             return value
         if why:
-            raise PydanticCustomError("expected", "one value", {"said": why})
+            raise PydanticCustomError("expected", "one value", {"ending": why})
         raise expected(listed(classes.names), near(value, classes.names))
 
     return check
@@ -195,7 +195,7 @@ def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
     if kind == "extra_forbidden":
         return no_entry(name, table.entries())
     if kind == "expected":
-        ending = context.get("said") or f"; expected {context['expected']}{context['hint'] or example}"
+        ending = context.get("ending") or f"; expected {context['expected']}{context['hint'] or example}"
         return f"is {as_toml(value)}{ending}"
     if kind in {"greater_than_equal", "less_than_equal", "less_than"}:
         words = {"ge": "at least", "le": "at most", "lt": "less than"}
