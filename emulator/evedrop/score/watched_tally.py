@@ -181,15 +181,15 @@ class WatchedTally:
     """Keeps the tallies of these quantities over R trials."""
 
     def __init__(self, watches: Iterable[WatchedSlots], trials: int) -> None:
-        self._kept = {watch: _tally(watch.metric, trials) for watch in watches}
+        self._tallies = {watch: _tally(watch.metric, trials) for watch in watches}
 
     def add_slots(self, slots: ScoredSlots) -> None:
         """Add the next slots."""
-        for watch, kept in self._kept.items():
+        for watch, tally in self._tallies.items():
             start, stop = max(watch.first - slots.first, 0), min(watch.end - slots.first, len(slots.error))
             stateless = slots.x is None and watch.metric != SYNCHRONISED and metric(watch.metric).needs_states
             if start < stop and not stateless:
-                kept.add(slots if (start, stop) == (0, len(slots.error)) else slots.part(start, stop))
+                tally.add(slots if (start, stop) == (0, len(slots.error)) else slots.part(start, stop))
 
     def begin(self) -> None:
         """Make the tallies of packages' metrics now, not with the first slot."""
@@ -199,7 +199,7 @@ class WatchedTally:
     @property
     def of_packages(self) -> dict[WatchedSlots, GuardedTally]:
         """The tallies of packages' metrics."""
-        return {watch: tally for watch, tally in self._kept.items() if isinstance(tally, GuardedTally)}
+        return {watch: tally for watch, tally in self._tallies.items() if isinstance(tally, GuardedTally)}
 
     @property
     def failures(self) -> list[str]:
@@ -208,13 +208,14 @@ class WatchedTally:
 
     def tally(self, watch: WatchedSlots) -> MetricTally:
         """The tally of a quantity over its slots."""
-        return self._kept[watch]
+        return self._tallies[watch]
 
     @classmethod
     def merged(cls, parts: Sequence[WatchedTally]) -> WatchedTally:
         """The quantities of disjoint sets of trials, in their order."""
         total = cls((), 0)
-        total._kept = {
-            watch: type(tally).merged([part._kept[watch] for part in parts]) for watch, tally in parts[0]._kept.items()
+        total._tallies = {
+            watch: type(tally).merged([part._tallies[watch] for part in parts])
+            for watch, tally in parts[0]._tallies.items()
         }
         return total
