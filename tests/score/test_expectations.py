@@ -24,7 +24,7 @@ from evedrop.score.expectations_held import Evidence
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
-from evedrop.score.watched_tally import SYNCHRONISED, WatchedSlots, WatchedTally
+from evedrop.score.watched_tally import SYNCHRONISED, WatchedQuantity, WatchedTally
 from evedrop.simulate.montecarlo import Plan
 from tests.conftest import Evedrop
 
@@ -152,8 +152,8 @@ def test_what_is_watched_does_not_depend_on_how_it_is_cut(cuts: set[int], blocks
     """Slots in chunks and trials in blocks: the bits are those of one piece."""
     draw = np.random.default_rng(1)
     error, action = draw.lognormal(size=(40, 7)), draw.integers(0, 4, (40, 7)).astype(np.uint8)
-    watches = [WatchedSlots(metric, *span) for metric in METRICS for span in ((0, 40), (7, 21))]
-    steps = [WatchedSlots(SYNCHRONISED, 0, 40), WatchedSlots(SYNCHRONISED, 11, 40)]
+    watches = [WatchedQuantity(metric, *span) for metric in METRICS for span in ((0, 40), (7, 21))]
+    steps = [WatchedQuantity(SYNCHRONISED, 0, 40), WatchedQuantity(SYNCHRONISED, 11, 40)]
 
     def watched(trials: slice, ends: list[int]) -> WatchedTally:
         whole_tally = WatchedTally([*watches, *steps], error[:, trials].shape[1])

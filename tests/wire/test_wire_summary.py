@@ -18,10 +18,10 @@ from evedrop.show.report.wire import WITHOUT_MODEL, wire_failures, wire_sentence
 from evedrop.show.report.writing import write_report
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.link_state import KeyFates
 from evedrop.wire.on_disk import closing_lines, scorekeeper_on_disk
 from evedrop.wire.plan import Side, WirePlan
 from evedrop.wire.records import AGAIN, UNLINKED, Kind, WireFate
+from evedrop.wire.running_link import KeyFates
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.tables import WireExpectTable
 from evedrop.wire.tallies import WIRE_METRICS, LinkTally

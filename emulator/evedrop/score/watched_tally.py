@@ -101,7 +101,7 @@ SYNCHRONISED = "synchronised"
 _NEVER = -1
 
 
-class WatchedSlots(NamedTuple):
+class WatchedQuantity(NamedTuple):
     """A quantity to keep, over the slots from `first` to before `end`."""
 
     metric: str
@@ -110,14 +110,14 @@ class WatchedSlots(NamedTuple):
     end: int
 
 
-def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedSlots] | None:
+def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedQuantity] | None:
     """The receiver and the quantity that an expectation needs; None if the summary's metrics are enough."""
     if expect.synchronised is not None:
-        return expect.synchronised, WatchedSlots(SYNCHRONISED, _since(scenario, expect), scenario.slots)
+        return expect.synchronised, WatchedQuantity(SYNCHRONISED, _since(scenario, expect), scenario.slots)
     if expect.metric is None or (expect.slots is None and expect.quantile is None):
         return None
     receiver, _, name = expect.metric.partition(".")
-    return receiver, WatchedSlots(name, *(expect.slots or (0, scenario.slots)))
+    return receiver, WatchedQuantity(name, *(expect.slots or (0, scenario.slots)))
 
 
 def _since(scenario: Scenario, expect: ExpectTable) -> int:
@@ -129,13 +129,13 @@ def _since(scenario: Scenario, expect: ExpectTable) -> int:
     return max(over, default=0)
 
 
-def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedSlots, ...]]:
+def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedQuantity, ...]]:
     """Receiver → all quantities that its metrics and the scenario's expectations need."""
     wanted = [watch for expect in scenario.expect if (watch := watch_of(scenario, expect)) is not None]
     watches = {}
     for receiver in scenario.receivers:
         own = [
-            WatchedSlots(name, 0, scenario.slots)
+            WatchedQuantity(name, 0, scenario.slots)
             for name, kind in metrics_of(receiver).items()
             if not issubclass(kind, TallyMetric)
         ]
@@ -180,7 +180,7 @@ def _tally(name: str, trials: int) -> MetricTally:
 class WatchedTally:
     """Keeps the tallies of these quantities over R trials."""
 
-    def __init__(self, watches: Iterable[WatchedSlots], trials: int) -> None:
+    def __init__(self, watches: Iterable[WatchedQuantity], trials: int) -> None:
         self._tallies = {watch: _tally(watch.metric, trials) for watch in watches}
 
     def add_slots(self, slots: ScoredSlots) -> None:
@@ -197,7 +197,7 @@ class WatchedTally:
             tally.begin()
 
     @property
-    def of_packages(self) -> dict[WatchedSlots, GuardedTally]:
+    def of_packages(self) -> dict[WatchedQuantity, GuardedTally]:
         """The tallies of packages' metrics."""
         return {watch: tally for watch, tally in self._tallies.items() if isinstance(tally, GuardedTally)}
 
@@ -206,7 +206,7 @@ class WatchedTally:
         """Why metrics of packages failed, in words."""
         return [tally.failure for tally in self.of_packages.values() if tally.failure]
 
-    def tally(self, watch: WatchedSlots) -> MetricTally:
+    def tally(self, watch: WatchedQuantity) -> MetricTally:
         """The tally of a quantity over its slots."""
         return self._tallies[watch]
 

@@ -107,11 +107,11 @@ def mcap_recording(
 
     Raises TraceError if the recording cannot be read, or does not tell which messages are missing.
     """
-    return _Reader(path).recording(topic, period, longest)
+    return _Contents(path).recording(topic, period, longest)
 
 
 @final
-class _Reader:
+class _Contents:
     """The contents of a recording, without the messages' data."""
 
     def __init__(self, path: Path) -> None:
