@@ -310,12 +310,12 @@ def test_other_errors_of_the_system_are_not_blamed_on_the_output(
     evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An error within a study is reported as it is, exit 3."""
-    from evedrop.simulate import kept_tasks
+    from evedrop.simulate import finished_tasks
 
     def fail(_: object) -> None:
         raise OSError(errno.EMFILE, "Too many open files")
 
-    monkeypatch.setattr(kept_tasks, "new_folder", fail)
+    monkeypatch.setattr(finished_tasks, "new_folder", fail)
     done = evedrop("sweep", "eavesdroppers", "--over", "seed=1,2", "--trials", "2", "--slots", "5", "--out", "x")
     assert (done.status, done.out) == (3, "")
     assert done.err == "evedrop: [Errno 24] Too many open files; free system resources and try again\n"

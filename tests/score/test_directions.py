@@ -106,8 +106,8 @@ def test_expectations_hold_in_directions(tmp_path: Path) -> None:
     judged = results.typed_summary.expectations
     assert [expectation.held for expectation in judged] == [True, False, False, True, True]
     assert judged[0].text == "perfect secrecy of position against antenna promised by theory and shown by the run"
-    assert judged[1].found == "theory denies it, the run shows that it fails"
-    assert judged[3].found == "the run shows it"
+    assert judged[1].value == "theory denies it, the run shows that it fails"
+    assert judged[3].value == "the run shows it"
 
 
 def test_modes_without_estimates_have_no_directions(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from evedrop.score.expectations_held import Evidence
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
-from evedrop.score.watched_tally import SYNCHRONISED, WatchedSlots, WatchedTally
+from evedrop.score.watched_tally import SYNCHRONISED, WatchedQuantity, WatchedTally
 from evedrop.simulate.montecarlo import Plan
 from tests.conftest import Evedrop
 
@@ -79,8 +79,8 @@ def test_live_and_memory_agree_on_every_expectation(made: Runs) -> None:
         exact = (
             "slots" in expectation["text"] or "quantile" in expectation["text"]
         ) and "mean_trace" not in expectation["text"]
-        exact = exact or not isinstance(expectation["found"], float)
-        assert expectation["found"] == (other["found"] if exact else pytest.approx(other["found"], rel=1e-12))
+        exact = exact or not isinstance(expectation["value"], float)
+        assert expectation["value"] == (other["value"] if exact else pytest.approx(other["value"], rel=1e-12))
         assert {key: expectation[key] for key in ("text", "held", "wanted")} == {
             key: other[key] for key in ("text", "held", "wanted")
         }
@@ -99,7 +99,7 @@ def test_metrics_of_ranges_and_quantiles_are_those_of_the_table(made: Runs) -> N
     for expect, expectation in zip(ON_SUSPICIOUS, made("memory").summary["expectations"], strict=False):
         means = columns[expect["metric"].split(".")[1]][slice(*expect.get("slots", (0, SLOTS)))].mean(axis=0)
         value = np.quantile(means, expect["quantile"]) if "quantile" in expect else means.mean()
-        assert expectation["found"] == pytest.approx(value, rel=1e-12), expectation["text"]
+        assert expectation["value"] == pytest.approx(value, rel=1e-12), expectation["text"]
         assert expectation["held"] is True
 
 
@@ -110,22 +110,22 @@ def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
     rows = [row for row in results.slots.to_pylist() if row["peer"] == "naive" and FIRST <= row["slot"] < 70]
     for metric in ("mean_trace_covariance", "theoretical_trace_covariance"):
         value = np.mean([row[metric] for row in rows])
-        assert expectations[f"naive.{metric} over slots {FIRST} to 69 above 0"]["found"] == pytest.approx(
+        assert expectations[f"naive.{metric} over slots {FIRST} to 69 above 0"]["value"] == pytest.approx(
             value, rel=1e-12
         )
-    assert expectations["links.naive.lost above 0"]["found"] == results.summary["links"]["naive"]["lost"]
+    assert expectations["links.naive.lost above 0"]["value"] == results.summary["links"]["naive"]["lost"]
     unknown = expectations["links.naive.lost_by.nothing above 0"]
-    assert (unknown["found"], unknown["held"]) == (None, None)
+    assert (unknown["value"], unknown["held"]) == (None, None)
     assert Judged(**unknown).sentence.endswith(": FAILED, the run has no value for it")
     perfect = expectations["perfect secrecy against smart promised by theory and shown by the run"]
-    assert (perfect["held"], perfect["found"]) == (False, "theory denies it, the run shows that it fails")
+    assert (perfect["held"], perfect["value"]) == (False, "theory denies it, the run shows that it fails")
     states = np.isin(of_trials(results, "suspicious")["action"], ("state", "misled"))
     for since, text in ((0, ""), (FIRST, f", since slot {FIRST}")):
         expectation = expectations[f"suspicious synchronised by slot 80{text}"]
-        assert expectation["found"] == since + states[since:].argmax(axis=0).max()
-        assert expectation["held"] is (expectation["found"] <= 80)
+        assert expectation["value"] == since + states[since:].argmax(axis=0).max()
+        assert expectation["held"] is (expectation["value"] <= 80)
     late = expectations["suspicious synchronised by slot 0"]
-    assert late["found"] > 0
+    assert late["value"] > 0
     assert late["held"] is False
 
 
@@ -152,8 +152,8 @@ def test_what_is_watched_does_not_depend_on_how_it_is_cut(cuts: set[int], blocks
     """Slots in chunks and trials in blocks: the bits are those of one piece."""
     draw = np.random.default_rng(1)
     error, action = draw.lognormal(size=(40, 7)), draw.integers(0, 4, (40, 7)).astype(np.uint8)
-    watches = [WatchedSlots(metric, *span) for metric in METRICS for span in ((0, 40), (7, 21))]
-    steps = [WatchedSlots(SYNCHRONISED, 0, 40), WatchedSlots(SYNCHRONISED, 11, 40)]
+    watches = [WatchedQuantity(metric, *span) for metric in METRICS for span in ((0, 40), (7, 21))]
+    steps = [WatchedQuantity(SYNCHRONISED, 0, 40), WatchedQuantity(SYNCHRONISED, 11, 40)]
 
     def watched(trials: slice, ends: list[int]) -> WatchedTally:
         whole_tally = WatchedTally([*watches, *steps], error[:, trials].shape[1])
@@ -185,7 +185,7 @@ def test_a_trial_that_never_is_synchronised_is_found_as_nothing(tmp_path: Path) 
         "eavesdroppers", slots=9, trials=5, legitimate__link__quality=0.0, expect=expect, out=tmp_path / "a"
     )
     (expectation,) = results.summary["expectations"]
-    assert (expectation["held"], expectation["found"], expectation["wanted"]) == (False, None, "by slot 3")
+    assert (expectation["held"], expectation["value"], expectation["wanted"]) == (False, None, "by slot 3")
     assert Judged(**expectation).sentence == "expected legitimate synchronised by slot 3: FAILED, found none"
     ranged = {"metric": "smart.used_fraction", "slots": [3, 9], "below": 1}
     secret = {"secrecy": "relative", "against": "smart"}
@@ -195,7 +195,7 @@ def test_a_trial_that_never_is_synchronised_is_found_as_nothing(tmp_path: Path) 
     peers = dict.fromkeys(scenario.receivers, PeerSummary({"used_fraction": 0.5}, None, False, None))
     judged = Evidence(scenario, peers, {}, short, {"smart": open_}).judged("evedrop run x")
     assert [judgement.held for judgement in judged] == [None] * 3
-    assert [judgement.found for judgement in judged[:2]] == [None] * 2
+    assert [judgement.value for judgement in judged[:2]] == [None] * 2
     assert not any("replay" in judgement.as_dict() for judgement in judged)
 
 
@@ -220,7 +220,7 @@ def test_secrecy_is_held_where_theory_and_run_agree(
         verdict = Secrecy("smart", **{**other, kind: shown}, **claims, relative_from=None, windows="", ratio=1.0,
                           trials=9, judged_by="mean")  # fmt: skip
         (judged,) = Evidence(scenario, {}, {}, {}, {"smart": verdict}).judged(None)
-        assert (judged.found, judged.held) == (value, held)
+        assert (judged.value, judged.held) == (value, held)
 
 
 @pytest.mark.parametrize(
@@ -235,7 +235,7 @@ def test_a_link_must_be_within_its_interval(account: dict[str, Any], value: floa
     """As its account says; an account that does not say leaves it open."""
     scenario = load("eavesdroppers", {"expect": [{"link": "smart"}]})
     (judged,) = Evidence(scenario, {}, {"smart": LinkSummary(9, 9, 0, 0, 0, **account)}, {}, {}).judged(None)
-    assert (judged.found, judged.held) == (value, held)
+    assert (judged.value, judged.held) == (value, held)
 
 
 @pytest.mark.long
@@ -260,9 +260,9 @@ def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: 
     again = evedrop(*words[1:], *view, "--json", "--out", "again")
     assert again.status == 1
     for expectation, other in zip(first, json.loads(again.out)["expectations"], strict=True):
-        assert (expectation["text"], expectation["found"], expectation["held"]) == (
+        assert (expectation["text"], expectation["value"], expectation["held"]) == (
             other["text"],
-            other["found"],
+            other["value"],
             other["held"],
         )
 

@@ -22,8 +22,8 @@ from evedrop.cli.api import montecarlo
 from evedrop.errors import Interrupted, UsageError
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
-from evedrop.simulate import kept_tasks
-from evedrop.simulate.kept_tasks import KeptTasks
+from evedrop.simulate import finished_tasks
+from evedrop.simulate.finished_tasks import FinishedTasks
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import tasks_of
@@ -57,7 +57,7 @@ def files(folder: Path, name: str = "") -> dict[str, bytes | str]:
 
 def interrupted_after(monkeypatch: pytest.MonkeyPatch, tasks: int) -> None:
     """Press Ctrl-C when so many tasks are kept."""
-    keep: Callable[..., None] = KeptTasks.keep
+    keep: Callable[..., None] = FinishedTasks.keep
     stops: list[threading.Event] = []
 
     @contextlib.contextmanager
@@ -66,13 +66,13 @@ def interrupted_after(monkeypatch: pytest.MonkeyPatch, tasks: int) -> None:
             stops.append(stop)
             yield stop
 
-    def then(kept: KeptTasks, *given: Any) -> None:
-        keep(kept, *given)
-        if kept.count == tasks:
+    def then(finished: FinishedTasks, *given: Any) -> None:
+        keep(finished, *given)
+        if finished.count == tasks:
             os.kill(os.getpid(), signal.SIGINT)
             assert stops[-1].wait(LIMIT)
 
-    monkeypatch.setattr(KeptTasks, "keep", then)
+    monkeypatch.setattr(FinishedTasks, "keep", then)
     for module in ("simulate.montecarlo", "studies.sweep", "studies.compare", "studies.parts"):
         monkeypatch.setattr(f"evedrop.{module}.stop_on_signals", told)
 
@@ -109,9 +109,9 @@ def cut(interrupted: Path, evedrop: Evedrop) -> Path:
     return Path(shutil.copytree(interrupted / "cut/run", evedrop.folder / "cut/run"))
 
 
-def kept_in(folder: Path) -> list[Path]:
+def task_files(folder: Path) -> list[Path]:
     """The files of kept tasks."""
-    return sorted(path for path in (folder / "kept").glob("*") if path.suffix != ".json")
+    return sorted(path for path in (folder / "finished_tasks").glob("*") if path.suffix != ".json")
 
 
 MODES = {"exact": (), "cov": ("--covariance-only",), "err": ("--error-coordinates",)}
@@ -131,7 +131,7 @@ def test_an_interrupted_study_ends_like_a_whole_one(
         done = evedrop(*study, "--out", "cut/run")
     assert done.status == 130
     assert Results.read(evedrop.folder / "cut/run").summary["ended"] == "interrupted"
-    assert len(kept_in(evedrop.folder / "cut/run")) == 1
+    assert len(task_files(evedrop.folder / "cut/run")) == 1
     (command,) = (line for line in done.err.splitlines() if "go on with: " in line)
     words = shlex.split(command.partition("go on with: ")[2])
     assert words == ["evedrop", *study, "--out", "cut/run", "--resume"]
@@ -142,12 +142,12 @@ def test_an_interrupted_study_ends_like_a_whole_one(
 KILLED = """
 import os, signal, sys
 from evedrop.cli.main import main
-from evedrop.simulate.kept_tasks import KeptTasks
-keep = KeptTasks.keep
-def then(kept, *given):
-    keep(kept, *given)
+from evedrop.simulate.finished_tasks import FinishedTasks
+keep = FinishedTasks.keep
+def then(finished, *given):
+    keep(finished, *given)
     os.kill(os.getpid(), signal.SIGKILL)
-KeptTasks.keep = then
+FinishedTasks.keep = then
 main(sys.argv[1:])
 """
 """A command that is killed when the first task is kept."""
@@ -158,7 +158,7 @@ def test_a_killed_study_goes_on(evedrop: Evedrop, whole: Whole) -> None:
     live = evedrop.start(["-c", KILLED], (*STUDY, "--out", "cut/run"), {})
     assert (live.wait(LIMIT), live.communicate()[1]) == (-signal.SIGKILL, "")
     folder = evedrop.folder / "cut/run"
-    assert len(kept_in(folder)) == 1
+    assert len(task_files(folder)) == 1
     assert not (folder / "summary.json").exists()
     assert evedrop(*STUDY, "--out", "cut/run", "--resume").status == 0
     assert files(folder) == whole(STUDY)
@@ -174,9 +174,9 @@ def test_only_what_is_missing_is_computed(cut: Path, evedrop: Evedrop, monkeypat
         return carry_out(task, *given)
 
     monkeypatch.setattr("evedrop.simulate.trials.TrialsTask.carry_out", told)
-    (kept,) = kept_in(cut)
-    start, stop = map(int, kept.name.split("-")[1:])
-    before = json.loads((cut / "kept" / "seconds.json").read_text())
+    (file,) = task_files(cut)
+    start, stop = map(int, file.name.split("-")[1:])
+    before = json.loads((cut / "finished_tasks" / "seconds.json").read_text())
     assert evedrop(*STUDY, "--out", "cut/run", "--resume").status == 0
     assert start == 0
     assert simulated[0].start == stop
@@ -204,7 +204,7 @@ def renamed(path: Path) -> None:
 @pytest.mark.parametrize("damage", [flip, cut_short, renamed])
 def test_a_damaged_part_is_not_used(damage: Callable[[Path], None], cut: Path, evedrop: Evedrop, whole: Whole) -> None:
     """Its trials are computed again, which a line on standard error says."""
-    damage(kept_in(cut)[0])
+    damage(task_files(cut)[0])
     done = evedrop(*STUDY, "--out", "cut/run", "--resume")
     assert done.status == 0
     assert "is damaged; its trials are computed again" in done.err
@@ -217,7 +217,7 @@ def test_a_part_of_another_study_is_not_used(cut: Path, evedrop: Evedrop, whole:
     with pytest.MonkeyPatch.context() as patched:
         interrupted_after(patched, 1)
         assert evedrop(*STUDY, "--seed", "5", "--out", "other/run").status == 130
-    kept_in(cut)[0].write_bytes(kept_in(other)[0].read_bytes())
+    task_files(cut)[0].write_bytes(task_files(other)[0].read_bytes())
     assert "is damaged" in evedrop(*STUDY, "--out", "cut/run", "--resume").err
     assert files(cut) == whole(STUDY)
 
@@ -265,8 +265,8 @@ def test_a_new_folder_is_that_of_a_study_that_has_not_begun(evedrop: Evedrop) ->
 def test_two_cannot_resume_at_once(cut: Path, evedrop: Evedrop) -> None:
     """While one process goes on with a study, another is refused, and changes nothing."""
     before = files(cut)
-    study = json.loads((cut / "kept" / "study.json").read_text())
-    with kept_tasks.kept_tasks(cut, study, resume=True):
+    study = json.loads((cut / "finished_tasks" / "study.json").read_text())
+    with finished_tasks.finished_tasks(cut, study, resume=True):
         files_then = files(cut)
         done = evedrop(*STUDY, "--out", "cut/run", "--resume")
         assert files(cut) == files_then

@@ -326,7 +326,7 @@ def test_results_say_what_was_simulated(covariances: Results) -> None:
         assert (peer["digest"], peer["mean_squared_error"]) == (None, None)
         assert peer["mean_actual_trace_covariance"] > 0.0
     (expectation,) = covariances.summary["expectations"]
-    assert (expectation["held"], expectation["found"]) == (None, None)
+    assert (expectation["held"], expectation["value"]) == (None, None)
     assert covariances.digests.num_rows == covariances.trials.num_rows == 0
     assert covariances.slots["mean_squared_error"].null_count == covariances.slots.num_rows
     assert covariances.slots["mean_actual_trace_covariance"].null_count == 0

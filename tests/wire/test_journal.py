@@ -21,7 +21,6 @@ from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER
 from evedrop.wire import journal as journal_module
 from evedrop.wire.journal import WireJournal, journal_tables, part_names, unfinished_table
-from evedrop.wire.link_state import LinkState
 from evedrop.wire.records import (
     AGAIN,
     HELD,
@@ -37,6 +36,7 @@ from evedrop.wire.records import (
     records_of,
     table_of,
 )
+from evedrop.wire.running_link import RunningLink
 from tests.conftest import LIMIT, wait_until
 from tests.examples import mostly_long
 from tests.wire.wire_plans import wire_plan
@@ -317,7 +317,7 @@ def test_a_history_goes_on_although_its_session_has_another_id(killed: bool, tmp
         if killed:
             shutil.copytree(folder, tmp_path / "killed")
     with WireJournal(tmp_path / "killed" if killed else folder, plan) as second:
-        decide = LinkState(plan.links[0], plan, second).lane("query", "scan/1/@adv/pub/bb/1/_", lossless=False)
+        decide = RunningLink(plan.links[0], plan, second).lane("query", "scan/1/@adv/pub/bb/1/_", lossless=False)
         assert decide(time.time(), 8)[0] == 3
         changes = second.changes_of("scan", "scan/1/@adv/*/cc/9/**", "query")
         assert [(change.at, change.settings) for change in changes] == [(0, LOSSY), (2, BETTER), (3, LOSSY)]

@@ -13,22 +13,22 @@ from typing import Any
 import pytest
 
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.link_state import Decision, KeyFates, LinkState
 from evedrop.wire.records import WireFate
+from evedrop.wire.running_link import Decision, KeyFates, RunningLink
 from tests.wire.wire_at_work import DEAD, LOSSY, PERFECT, both_ways, link, plan_of
 
 LARGEST = 100
 
 
 @pytest.fixture
-def lossy(tmp_path: Path) -> Iterator[LinkState]:
+def lossy(tmp_path: Path) -> Iterator[RunningLink]:
     """A link that loses 40 %, and queues what comes faster than 1000 bytes a second."""
     plan = both_ways({**LOSSY, "rate": 1000.0, "queue": 50}, largest=LARGEST)
     with WireJournal(tmp_path, plan) as journal:
-        yield LinkState(plan.links[0], plan, journal)
+        yield RunningLink(plan.links[0], plan, journal)
 
 
-def test_the_reasons_have_an_order(lossy: LinkState) -> None:
+def test_the_reasons_have_an_order(lossy: RunningLink) -> None:
     """Its queue, its size, a loop, a cut, and then the models; whatever it is, the next message has the next number."""
     decide = lossy.lane("put", "scan", lossless=False)
     fates = KeyFates(lossy.link, "scan", "put", 7)
@@ -44,7 +44,7 @@ def test_the_reasons_have_an_order(lossy: LinkState) -> None:
     assert [decide(4.0 + n, 1)[:2] for n in range(95)] == [(5 + n, fate) for n, fate in enumerate(due[5:])]
 
 
-def test_what_is_lossless_is_not_cut_but_does_not_go_round(lossy: LinkState) -> None:
+def test_what_is_lossless_is_not_cut_but_does_not_go_round(lossy: RunningLink) -> None:
     """Nor does a queue hold it up; it is numbered all the same."""
     lossy.change(DEAD)
     decide = lossy.lane("put", "stop", lossless=True)
@@ -67,7 +67,7 @@ def test_a_message_waits_for_those_before_it(tmp_path: Path) -> None:
     """Its delay, then the bytes in the queue and its own at the link's rate; the queue is full beyond its bytes, not at them."""
     plan = both_ways({**SLOW, "rate": 1000.0, "queue": 100}, largest=LARGEST)
     with WireJournal(tmp_path, plan) as journal:
-        decide = LinkState(plan.links[0], plan, journal).lane("put", "scan", lossless=False)
+        decide = RunningLink(plan.links[0], plan, journal).lane("put", "scan", lossless=False)
         sent = [
             decide(now, size) for now, size in ((5.0, 50), (5.0, 50), (5.0, 50), (5.05, 50), (9.0, LARGEST), (9.0, 1))
         ]
@@ -87,7 +87,7 @@ def test_what_is_not_delivered_has_no_delay_and_no_copy(tmp_path: Path) -> None:
     """Whatever the reason; and a link without a rate has no queue."""
     plan = both_ways(SLOW, largest=LARGEST)
     with WireJournal(tmp_path, plan) as journal:
-        state = LinkState(plan.links[0], plan, journal)
+        state = RunningLink(plan.links[0], plan, journal)
         decide = state.lane("put", "scan", lossless=False)
         assert [decide(0.0, LARGEST) for _ in range(2)] == [(n, WireFate.DELIVERED, 0.25, True) for n in range(2)]
         assert decide(0.0, LARGEST + 1) == (2, WireFate.TOO_LARGE, 0.0, False)
@@ -104,7 +104,7 @@ def test_other_settings_hold_from_the_next_message_on(tmp_path: Path) -> None:
     """Of every key that is in use, for its model and for the rate; the journal has the number of that message."""
     plan = both_ways(SLOW)
     with WireJournal(tmp_path, plan) as journal:
-        state = LinkState(plan.links[0], plan, journal)
+        state = RunningLink(plan.links[0], plan, journal)
         scan, pose = (state.lane("put", key, lossless=False) for key in ("scan", "pose"))
         for _ in range(3):
             scan(0.0, 10)
@@ -117,7 +117,7 @@ def test_other_settings_hold_from_the_next_message_on(tmp_path: Path) -> None:
     assert [at[-2:] for at in messages] == [[3, 4], [0, 1]]
 
 
-def test_a_key_that_comes_after_a_change_has_the_new_settings_alone(lossy: LinkState) -> None:
+def test_a_key_that_comes_after_a_change_has_the_new_settings_alone(lossy: RunningLink) -> None:
     """From its first message on, each time that the settings change; the keys before it had others."""
     some = {WireFate.LOST, WireFate.DELIVERED}
     before = lossy.link.settings
@@ -130,7 +130,7 @@ def test_a_key_that_comes_after_a_change_has_the_new_settings_alone(lossy: LinkS
         assert {*expected} == fates
 
 
-def test_two_who_ask_for_a_key_share_its_messages(lossy: LinkState) -> None:
+def test_two_who_ask_for_a_key_share_its_messages(lossy: RunningLink) -> None:
     """They have one sequence of numbers, with one sequence of fates."""
     fates = KeyFates(lossy.link, "scan", "put", 7)
     two = [lossy.lane("put", "scan", lossless=False) for _ in range(2)]
@@ -139,7 +139,7 @@ def test_two_who_ask_for_a_key_share_its_messages(lossy: LinkState) -> None:
 
 
 @pytest.mark.parametrize("lossless", [False, True])
-def test_a_key_that_was_forgotten_goes_on(lossy: LinkState, lossless: bool) -> None:
+def test_a_key_that_was_forgotten_goes_on(lossy: RunningLink, lossless: bool) -> None:
     """With the next number, and its fate; other keys and kinds have numbers of their own."""
     decide = lossy.lane("put", "scan", lossless)
     before = [decide(float(n), 1) for n in range(50)]
@@ -158,12 +158,12 @@ def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
 ) -> None:
     """The losses, and the delays of messages that no earlier one holds up, are those of the same link without an order."""
     now = [100.0]
-    monkeypatch.setattr("evedrop.wire.link_state.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr("evedrop.wire.running_link.time", SimpleNamespace(monotonic=lambda: now[0]))
     settings = {**LOSSY, "delay": {"model": "normal", "mean": 0.05, "standard_deviation": 0.02}}
     plan = plan_of(link("robot", "base", settings, ordered=True), link("base", "robot"))
     fates = KeyFates(plan.links[0], "scan", "put", plan.seed)
     with WireJournal(tmp_path, plan) as journal:
-        decide, latest = LinkState(plan.links[0], plan, journal).lane("put", "scan", lossless=False), 0.0
+        decide, latest = RunningLink(plan.links[0], plan, journal).lane("put", "scan", lossless=False), 0.0
         for n in range(200):
             now[0] = 100.0 + n / 100
             code, delay, _ = fates.next()
@@ -177,10 +177,10 @@ def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
 def test_an_order_is_kept_until_its_last_message_is_due(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Although the key is forgotten, and used again, meanwhile."""
     now = [100.0]
-    monkeypatch.setattr("evedrop.wire.link_state.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr("evedrop.wire.running_link.time", SimpleNamespace(monotonic=lambda: now[0]))
     plan = plan_of(link("robot", "base", {**PERFECT, "delay": {"model": "constant", "value": 5.0}}, ordered=True))
     with WireJournal(tmp_path, plan) as journal:
-        state = LinkState(plan.links[0], plan, journal)
+        state = RunningLink(plan.links[0], plan, journal)
         state.lane("put", "scan", lossless=False)(0.0, 1)
         order = state.order("put", "scan")
         state.forget("put", "scan")
@@ -193,7 +193,7 @@ def test_an_order_is_kept_until_its_last_message_is_due(tmp_path: Path, monkeypa
         assert state.order("put", "scan") is None
 
 
-def test_the_keys_of_a_history_are_numbered_together(lossy: LinkState) -> None:
+def test_the_keys_of_a_history_are_numbered_together(lossy: RunningLink) -> None:
     """Whichever session they are of, and although one of them is forgotten; so do a change and the end of all of them."""
     first, second = "map/@adv/pub/aa/1/_", "map/@adv/pub/bb/1/_"
     lossy.change(LOSSY)
@@ -210,7 +210,7 @@ def test_the_keys_of_a_history_are_numbered_together(lossy: LinkState) -> None:
 
 
 @pytest.mark.parametrize("lossless", [False, True])
-def test_a_key_that_only_the_journal_remembers_goes_on(lossy: LinkState, tmp_path: Path, lossless: bool) -> None:
+def test_a_key_that_only_the_journal_remembers_goes_on(lossy: RunningLink, tmp_path: Path, lossless: bool) -> None:
     """Its numbers need no memory of the link's, also for the settings that it has from its next message on."""
     decide = lossy.lane("put", "scan", lossless)
     journal = lossy._journal
@@ -238,7 +238,7 @@ def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
     decisions: list[list[Decision]] = [[], [], []]
     before = sys.getswitchinterval()
     with WireJournal(tmp_path, plan) as journal:
-        state = LinkState(plan.links[0], plan, journal)
+        state = RunningLink(plan.links[0], plan, journal)
         decide = state.lane("put", "scan", lossless=False)
 
         def take(into: list[Decision]) -> None:
@@ -264,7 +264,7 @@ def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
     assert sorted(decision for into in decisions for decision in into) == [(n, 0, n / 8, False) for n in range(30_000)]
 
 
-def test_settings_that_stay_the_same_are_not_written_again(lossy: LinkState, tmp_path: Path) -> None:
+def test_settings_that_stay_the_same_are_not_written_again(lossy: RunningLink, tmp_path: Path) -> None:
     """Every event gives every link its settings, and most links have them already."""
     history = tmp_path / "journal" / "history.jsonl"
     before = history.read_bytes()

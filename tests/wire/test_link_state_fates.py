@@ -14,7 +14,7 @@ from evedrop.model.links import LOSS_MODELS, loss_of
 from evedrop.model.links.loss_model import Fate
 from evedrop.model.slot.link import Change
 from evedrop.model.streams import Stream, normals, root_of_seed, stream_key, uniforms
-from evedrop.wire.link_state import KeyFates, KeyLinks, MessageFate
+from evedrop.wire.running_link import KeyFates, MessageFate, PerKeyLinks
 from tests.examples import examples
 from tests.wire.wire_links import DELAYS, LOSSES, wire_link
 
@@ -102,7 +102,7 @@ def test_other_keys_kinds_links_and_seeds_have_other_fates() -> None:
 @pytest.mark.parametrize("changes", [(), (Change(0, POOR), Change(5, FULL))])
 def test_keys_that_share_their_links_have_fates_of_their_own(changes: tuple[Change, ...]) -> None:
     """However they come in turns: no key's losses go on with the memory of another one."""
-    links = KeyLinks(wire_link(FULL), SEED, changes)
+    links = PerKeyLinks(wire_link(FULL), SEED, changes)
     shared = [of_scan(FULL, key=f"robot/{n}", links=links) for n in range(4)]
     in_turn = list(zip(*([fates.next() for fates in shared] for _ in range(100)), strict=True))
     assert [list(fates) for fates in in_turn] == [

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from functools import partial
 
-from evedrop.wire.link_state import KeyOrder, Scheduler
+from evedrop.wire.running_link import KeyOrder, Scheduler
 from tests.clock import TestClock
 from tests.conftest import LIMIT, wait_until
 

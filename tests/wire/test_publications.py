@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from evedrop.wire.link_state import KeyFates
 from evedrop.wire.records import UNLINKED, Kind, WireFate
+from evedrop.wire.running_link import KeyFates
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import DEAD, LOSSY, PERFECT, WireAtWork, at_work, both_ways, link, plan_of
 

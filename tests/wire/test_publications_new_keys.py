@@ -133,7 +133,7 @@ def test_a_key_that_is_in_use_is_not_forgotten_for_new_ones(
 ) -> None:
     """Otherwise its fates would be computed again from its first message on, each time."""
     forgotten: list[str] = []
-    monkeypatch.setattr("evedrop.wire.link_state.LinkState.forget", lambda _self, _kind, key: forgotten.append(key))
+    monkeypatch.setattr("evedrop.wire.running_link.RunningLink.forget", lambda _self, _kind, key: forgotten.append(key))
     with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as sender:
         for n in range(100):
             sender.put("scan", b"", congestion_control=BLOCK)

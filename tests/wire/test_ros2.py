@@ -22,7 +22,7 @@ from zenoh import ext
 from evedrop.cli import main as cli
 from evedrop.wire import ros2
 from evedrop.wire.file import load_wire
-from evedrop.wire.ros2 import Entity, EntityLog, Qos, SourceReader, read_token, reply_seconds, service_key
+from evedrop.wire.ros2 import Entity, EntityLog, Qos, SenderReader, read_token, reply_seconds, service_key
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 NODE = "@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"
@@ -60,7 +60,7 @@ class Codes:
 def test_a_message_is_known_by_gid_and_sequence_number(named: bool) -> None:
     """Both forms of the attachment give the sender's gid and its number; a sender is looked up once."""
     codes = Codes()
-    read = SourceReader(codes)
+    read = SenderReader(codes)
     other = bytes(reversed(GID))
     numbers = [read(attachment(n, gid, named), None) for n, gid in [(1, GID), (2, GID), (2**62, other), (3, GID)]]
     assert numbers == [(1, 1), (1, 2), (2, 2**62), (1, 3)]
@@ -70,14 +70,14 @@ def test_a_message_is_known_by_gid_and_sequence_number(named: bool) -> None:
 @given(st.binary(max_size=90))
 def test_no_attachment_confuses_the_reader(octets: bytes) -> None:
     """For any attachment of a program, the reader names a sender or none."""
-    code, sequence = SourceReader(Codes())(zenoh.ZBytes(octets), None)
+    code, sequence = SenderReader(Codes())(zenoh.ZBytes(octets), None)
     assert (code, sequence) == (0, -1) or (code == 1 and len(octets) in {33, 77})
 
 
 @pytest.mark.parametrize("octets", [b"\0" * 33, b"\0" * 77, attachment(1, named=True).to_bytes()[:60] + b"\x08" + GID])
 def test_an_attachment_of_the_right_length_only_is_none_of_rmw_zenoh(octets: bytes) -> None:
     """The length of the gid and the names of the fields must be there, too."""
-    assert SourceReader(Codes())(zenoh.ZBytes(octets), None) == (0, -1)
+    assert SenderReader(Codes())(zenoh.ZBytes(octets), None) == (0, -1)
 
 
 def test_without_an_attachment_zenoh_says_who_sent_a_message() -> None:
@@ -86,7 +86,7 @@ def test_without_an_attachment_zenoh_says_who_sent_a_message() -> None:
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")
     codes = Codes()
-    read = SourceReader(codes)
+    read = SenderReader(codes)
     with zenoh.open(config) as session:
         publisher = session.declare_publisher("a")
         info = zenoh.SourceInfo(publisher.id, 41)
@@ -100,7 +100,7 @@ def test_senders_beyond_the_limit_are_unknown(monkeypatch: pytest.MonkeyPatch) -
     """A program that shows a new gid with every message does not fill the wire's memory; known senders stay known."""
     monkeypatch.setattr(ros2, "MOST_SENDERS", 3)
     codes = Codes()
-    read = SourceReader(codes)
+    read = SenderReader(codes)
     gids = [bytes([n] * 16) for n in range(5)]
     assert [read(attachment(n, gid), None) for n, gid in enumerate(gids)] == [(1, 0), (2, 1), (3, 2), (0, 3), (0, 4)]
     assert read(attachment(9, gids[2]), None) == (3, 9)

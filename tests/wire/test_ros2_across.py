@@ -14,9 +14,9 @@ import zenoh
 
 from evedrop.wire.file import load_wire
 from evedrop.wire.journal import WireJournal, journal_tables
-from evedrop.wire.link_state import KeyFates
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.relay import WireRelay
+from evedrop.wire.running_link import KeyFates
 from tests.conftest import LIMIT, wait_until
 from tests.wire.rmw import Node, ReceivedMessage, ros_context
 

@@ -22,8 +22,8 @@ from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.montecarlo import Plan
 from evedrop.wire.file import wire_of
-from evedrop.wire.link_state import KeyFates
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.running_link import KeyFates
 from evedrop.wire.scenario_network import over_wire
 from evedrop.wire.timeline import moments
 from tests.builders import MARGINAL, listener, places_of, process_table, scenario_of

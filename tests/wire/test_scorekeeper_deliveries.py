@@ -11,7 +11,7 @@ import pytest
 from evedrop.model.links import loss_of
 from evedrop.model.links.loss_model import Fate
 from evedrop.model.slot.link import Change
-from evedrop.wire.link_state import KeyFates
+from evedrop.wire.running_link import KeyFates
 from evedrop.wire.scorekeeper import bounds, expected
 from tests.wire.wire_links import LOSSES, wire_link
 

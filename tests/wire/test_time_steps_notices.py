@@ -12,7 +12,7 @@ from evedrop.wire.time_steps import (
     OUTCOMES,
     CutWatcher,
     LaneState,
-    LinkWatcher,
+    NoticeWatcher,
     WireSteps,
     legend,
     loss_state_of,
@@ -35,7 +35,7 @@ def test_losses_of_the_wire_itself_are_told_once() -> None:
     steps = steps_of(
         {WireFate.HELD_UP: 3}, {WireFate.HELD_UP: 3, WireFate.REFUSED: 1}, {WireFate.LOST: 4, WireFate.CONGESTED: 1}
     )
-    watcher = LinkWatcher(["scan"], 0.2)
+    watcher = NoticeWatcher(["scan"], 0.2)
     lines = watcher.watch(steps)
     assert [(round(line.seconds, 6), line.level) for line in lines if "does not cross" in line.text] == [
         (0.0, "ERROR"),
@@ -48,7 +48,7 @@ def test_losses_of_the_wire_itself_are_told_once() -> None:
 
 def test_frequent_stretches_get_few_lines() -> None:
     """A link that fails for a second out of two gets a few lines in an hour, not thousands."""
-    watcher = LinkWatcher(["scan"], 0.2)
+    watcher = NoticeWatcher(["scan"], 0.2)
     lines = watcher.watch(steps_of(*([{WireFate.DELIVERED: 5}] * 5 + [{WireFate.LOST: 5}] * 5) * 1800))
     assert 2 <= len(lines) < 200
 

@@ -310,7 +310,7 @@ def encode_answer(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the recorder makes it."""
     refused = tuple(value.get("refused", ()))
     status = read(RunStatus, value["status"]) if "status" in value else None
-    return operator.Answer(value.get("k"), value.get("said", ""), refused, status).pack()
+    return operator.Answer(value.get("k"), value.get("effect", ""), refused, status).pack()
 
 
 def decode_answer(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -318,7 +318,7 @@ def decode_answer(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> d
     answer = operator.read_answer(KEY, raw)
     if answer.refused:
         return {"refused": list(answer.refused)}
-    return {"k": answer.slot, "said": answer.said} if answer.status is None else {"status": asdict(answer.status)}
+    return {"k": answer.slot, "effect": answer.effect} if answer.status is None else {"status": asdict(answer.status)}
 
 
 CODECS: dict[str, tuple[Encode, Decode]] = {

@@ -16,7 +16,7 @@ from tests.live.recorder.test_conductor_ending import Network
 
 
 class Told(Network):
-    """Notes what is said, to whom, and how many seconds after the start."""
+    """Notes what is sent, to whom, and how many seconds after the start."""
 
     patience = 30.0
 
@@ -24,7 +24,7 @@ class Told(Network):
         super().__init__()
         self.clock = TestClock()
         self.absent = absent
-        self.said: list[tuple[str, bytes, float]] = []
+        self.sent: list[tuple[str, bytes, float]] = []
         self.opened = False
 
     def watch(self, name: str, changed: Callable[[bool], None]) -> None:
@@ -34,8 +34,8 @@ class Told(Network):
             changed(True)
 
     def publisher(self, key: str) -> Callable[[bytes], None]:
-        """Whatever is said is noted."""
-        return lambda payload: self.said.append((key.rpartition("/")[2], payload, self.clock.now - 1000.0))
+        """Whatever is sent is noted."""
+        return lambda payload: self.sent.append((key.rpartition("/")[2], payload, self.clock.now - 1000.0))
 
     def ready(self) -> None:
         """The run can begin."""
@@ -58,9 +58,9 @@ def test_a_run_begins_when_all_are_there() -> None:
     assert network.opened
     assert network.clock.now == 1000.0
     conductor.start()
-    assert network.said == [("sensor", Start().pack(), 0.0)]
+    assert network.sent == [("sensor", Start().pack(), 0.0)]
     conductor.report_progress(7)
-    assert network.said[-1][0] == RECORDER
+    assert network.sent[-1][0] == RECORDER
 
 
 @pytest.mark.parametrize(
@@ -141,14 +141,14 @@ def test_the_routers_are_told_last_that_a_run_is_given_up() -> None:
     conductor = conducted(network, relayed=True)
     conductor.assemble()
     conductor.abandon("a reason")
-    order = [(name, round(at)) for name, _, at in network.said]
+    order = [(name, round(at)) for name, _, at in network.sent]
     assert order == [("sensor", 0), ("legitimate", 0), ("smart", 0), ("router", 2), ("relay", 4)]
-    assert {payload for _, payload, _ in network.said} == {Abandon("a reason").pack()}
+    assert {payload for _, payload, _ in network.sent} == {Abandon("a reason").pack()}
     # Nobody is waited for when everybody has left.
     quick = Told()
     quick.unread = {quick.keys.control(name) for name in ("router", "relay", "sensor", "legitimate", "smart")}
     conducted(quick, relayed=True).abandon("a reason")
-    assert [round(at) for *_, at in quick.said] == [0, 0, 0, 0, 0]
+    assert [round(at) for *_, at in quick.sent] == [0, 0, 0, 0, 0]
 
 
 def test_a_command_to_all_reaches_who_reports_and_is_there() -> None:
@@ -159,7 +159,7 @@ def test_a_command_to_all_reaches_who_reports_and_is_there() -> None:
     network.watches["smart"](False)
     assert conductor.next_message() is None
     conductor.send_to_all(Start())
-    assert [name for name, *_ in network.said] == ["router", "sensor", "legitimate"]
+    assert [name for name, *_ in network.sent] == ["router", "sensor", "legitimate"]
 
 
 def test_another_router_is_noticed_once() -> None:

@@ -65,14 +65,14 @@ class Run:
 
     def __init__(self, *events: dict[str, Any], paused: bool = False) -> None:
         self.conductor = RecordingConductor()
-        self.kept: list[Scenario] = []
+        self.saved: list[Scenario] = []
         self.progress: list[ProgressEvent] = []
         scenario = checked({**TABLES, "event": list(events)}, "test")
         self.steering = Steering(
             scenario,
             self.conductor,  # type: ignore[arg-type]
             self.progress.append,
-            self.kept.append,
+            self.saved.append,
             paused=paused,
         )
 
@@ -115,7 +115,7 @@ def test_a_change_is_made_between_two_slots() -> None:
     assert run.holds(17) == [("router", change), *go(17)]
     assert asked.answers == [Answer(17, "from slot 17 on: link legitimate: quality = 0.2")]
     assert run.events == [(17, "link legitimate: quality = 0.2", "operator")]
-    assert [message.model_dump(exclude_none=True)["event"] for message in run.kept] == [[{"at": 17, **SET}]]
+    assert [message.model_dump(exclude_none=True)["event"] for message in run.saved] == [[{"at": 17, **SET}]]
 
 
 def test_what_the_scenario_changes_later_is_told_again() -> None:
@@ -163,7 +163,7 @@ def test_mistakes_change_nothing(event: dict[str, Any], places: list[str], golde
     refused = asked.answers[0].refused
     assert places_of(refused) == places
     golden("link", refused)
-    assert (run.events, run.kept) == ([], [])
+    assert (run.events, run.saved) == ([], [])
 
 
 def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
@@ -317,7 +317,7 @@ def test_what_comes_after_the_last_slot_is_refused(do: str, fields: dict[str, An
     asked = run.asks(do, reported=SLOTS - 3, **fields)
     run.steering.answer_open_orders(SLOTS, complete=True)
     assert asked.answers[0].refused == ("the run ended first; nothing was done",)
-    assert (run.events, run.kept) == ([], [])
+    assert (run.events, run.saved) == ([], [])
 
 
 def test_an_interrupt_answers_who_waits() -> None:

@@ -52,7 +52,7 @@ def test_a_metric_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
         assert "largest |x−x̂|²" in done.out
         summary = Results.read(evedrop.folder / name).summary
         largest[name] = {receiver: peer["largest_error"] for receiver, peer in summary["peers"].items()}
-        judged[name] = [(expectation["held"], expectation["found"]) for expectation in summary["expectations"]]
+        judged[name] = [(expectation["held"], expectation["value"]) for expectation in summary["expectations"]]
     assert largest["live"] == largest["memory"] == largest["shards"]
     assert judged["live"] == judged["memory"] == judged["shards"]
     rows = [row for row in Results.read(evedrop.folder / "memory").trials.to_pylist() if row["peer"] == "smart"]

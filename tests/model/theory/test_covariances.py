@@ -235,7 +235,7 @@ def test_limits_are_where_long_runs_end(process: Process, mu: float, mu_d: float
         (Outcomes.legitimate(mu, mu_d), mu),
         (Outcomes.eavesdropper(mu, mu_d, *use), mu * use[0]),
     ):
-        rate = outcomes.kept * process.spectral_radius**2
+        rate = outcomes.propagated * process.spectral_radius**2
         if rate < 0.98:
             assert mu_d > stability_bound(process, quality)
             assert close(theoretical_covariances(process, outcomes, 3000)[-1:], limit(process, outcomes)[None])

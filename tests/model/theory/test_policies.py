@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from evedrop.model.process import Process
 from evedrop.model.theory.policies import (
+    LinkProbabilities,
     PolicyMetrics,
-    ScheduledLinks,
     best_policy,
     front,
     held_traces,
@@ -30,9 +30,9 @@ MU, MU_E = 0.8, 0.6
 SIGMAS = 4.5
 
 
-def links_of(mu: float, mu_e: float) -> ScheduledLinks:
+def links_of(mu: float, mu_e: float) -> LinkProbabilities:
     """Links whose acknowledgements all arrive."""
-    return ScheduledLinks(mu, mu_e, (mu, 0.0), (mu * mu_e, mu * (1.0 - mu_e)))
+    return LinkProbabilities(mu, mu_e, (mu, 0.0), (mu * mu_e, mu * (1.0 - mu_e)))
 
 
 @settings(deadline=None, max_examples=examples(25))
@@ -144,7 +144,7 @@ def test_the_metrics_of_a_policy_are_those_of_following_it(weight: float) -> Non
 
 def test_a_point_of_the_front_is_what_the_scheme_does() -> None:
     """`scheduled` simulated with the best threshold of a point: squared errors and packets within 4.5 standard errors."""
-    result = front(STABLE, ScheduledLinks(0.7, 0.5, (0.56, 0.0), (0.28, 0.28)), (0.45, 0.5), (0.0,), 4)
+    result = front(STABLE, LinkProbabilities(0.7, 0.5, (0.56, 0.0), (0.28, 0.28)), (0.45, 0.5), (0.0,), 4)
     threshold = result.points[-1].scheduled
     assert threshold > 1
     metrics = result.thresholds[threshold - 1]

@@ -174,7 +174,7 @@ def test_the_limit_of_what_a_leak_leaves(model: Model) -> None:
 def test_limits(model: Model, outcomes: Outcomes) -> None:
     """S = p A S Aᵀ + source; near the bound of stability rounding of A itself is amplified as S is."""
     rho = radius(model.process)
-    assume(outcomes.kept * rho**2 < 0.99)
+    assume(outcomes.propagated * rho**2 < 0.99)
     assume(outcomes.predicted + outcomes.leaked + outcomes.misled > 0.0)
     assume(rho < 0.97 or not (outcomes.misled or outcomes.leaked))
     odds = odds_of(outcomes)
@@ -225,7 +225,7 @@ def test_limits_behind_bursts(model: Model, p: float, r: float, good: float) -> 
     distribution = np.array([r, p]) / (p + r)
     outcomes = [Outcomes.legitimate(good, 0.6), Outcomes.legitimate(0.0, 0.6)]
     T, weights = exact(transitions), [Fraction(float(probability)) for probability in distribution]
-    n, kept = model.process.n, [Fraction(outcome.kept) for outcome in outcomes]
+    n, kept = model.process.n, [Fraction(outcome.propagated) for outcome in outcomes]
     places = [(s, i, j) for s in range(2) for i in range(n) for j in range(n)]
     equations = [
         [

@@ -31,7 +31,7 @@ def test_late_and_repeated_messages_are_no_losses(word: list[int], first: int, r
     firsts = list(dict.fromkeys(arrived))
     assert series.late == sum(place < max(firsts[: i + 1]) for i, place in enumerate(firsts))
     assert series.parts == 1
-    assert series.kept.sum() == len(places)
+    assert series.first_arrivals.sum() == len(places)
 
 
 @pytest.mark.parametrize("times_known", [True, False])

@@ -20,7 +20,7 @@ from itertools import repeat
 from typing import Any, NamedTuple, final
 
 from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule
-from evedrop.model.streams import Batch, ShortReader, root_of_seed, stream_keys
+from evedrop.model.streams import Batch, SingleTrialReader, root_of_seed, stream_keys
 from evedrop.scenario.receivers import wire_stream
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock, wait_for_thread
 from evedrop.wire.journal import WireJournal
@@ -48,7 +48,7 @@ class KeyFates:
 
     links: made from the link, the seed and the changes; keys may share them.
 
-    Only one thread may call its methods at a time: `LinkState` holds its lock.
+    Only one thread may call its methods at a time: `RunningLink` holds its lock.
     """
 
     __slots__ = ("_block", "_key", "_kind", "_link", "_links_of_keys", "_ready", "_stop")
@@ -61,9 +61,9 @@ class KeyFates:
         seed: int,
         start: int = 0,
         changes: Iterable[Change] = (),
-        links: KeyLinks | None = None,
+        links: PerKeyLinks | None = None,
     ) -> None:
-        self._links_of_keys = links or KeyLinks(link, seed, changes)
+        self._links_of_keys = links or PerKeyLinks(link, seed, changes)
         self._kind, self._key = kind, numbered_as(key)
         self._link: Link | None = None
         self._stop = start  # the end of the fates in `_ready`
@@ -111,14 +111,14 @@ class KeyFates:
 
 
 @final
-class KeyLinks:
+class PerKeyLinks:
     """How a link decides on the messages of each key: what does not depend on the key is made once."""
 
     def __init__(self, link: WireLink, seed: int, changes: Iterable[Change]) -> None:
         """changes: as for `KeyFates`."""
         schedule = _schedule_of(link, changes)
         self._long = Link(schedule, link.name, {}, _MESSAGES)
-        self._short = Link(schedule, link.name, {}, _MESSAGES, ShortReader)
+        self._short = Link(schedule, link.name, {}, _MESSAGES, SingleTrialReader)
         self._stream_key = stream_keys(root_of_seed(seed))
 
     def link(self, kind: str, key: str, start: int, *, short: bool = False) -> Link:
@@ -294,7 +294,7 @@ Lane = Callable[[float, int], Decision]
 
 
 @final
-class LinkState:
+class RunningLink:
     """A link while the wire runs. Threads may call its methods at the same time."""
 
     def __init__(self, link: WireLink, plan: WirePlan, journal: WireJournal) -> None:
@@ -309,7 +309,7 @@ class LinkState:
         self._lanes: dict[_Stream, int] = {}
         """How many keys share each stream: several for the history of an advanced publisher."""
         self._numbers: dict[_Stream, int] = {}
-        self._links_of_keys: tuple[tuple[Change, ...], KeyLinks] | None = None  # the latest, which new keys share
+        self._links_of_keys: tuple[tuple[Change, ...], PerKeyLinks] | None = None  # the latest, which new keys share
         self._orders: dict[_Stream, KeyOrder] = {}
         self._lock = threading.Lock()
         self._free = 0.0  # when the queue will have sent all its messages
@@ -408,7 +408,7 @@ class LinkState:
             start = self._numbers.pop(stream) if stream in self._numbers else self._counted(stream)
             changes = self._journal.changes_of(self.link.name, key, kind)
             if self._links_of_keys is None or self._links_of_keys[0] != changes:
-                self._links_of_keys = (changes, KeyLinks(self.link, self._seed, changes))
+                self._links_of_keys = (changes, PerKeyLinks(self.link, self._seed, changes))
             fates = self._fates[stream] = KeyFates(
                 self.link, key, kind, self._seed, start, links=self._links_of_keys[1]
             )

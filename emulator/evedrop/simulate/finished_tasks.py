@@ -1,6 +1,6 @@
 """Keeps the results of a study's finished tasks in its folder, so that an interrupted study can go on where it stopped.
 
-The folder `kept` in a results folder has `study.json`, which says exactly what is studied, and a file for each finished task.
+The folder `finished_tasks` in a results folder has `study.json`, which says exactly what is studied, and a file for each task.
 A file counts only if it is complete, undamaged, and of this study. All of it is data (`evedrop.results.shard_score`).
 
 Source: docs/results.md, an interrupted study.
@@ -33,11 +33,11 @@ from evedrop.simulate.tasks import R, Task
 from evedrop.system.files import try_lock
 from evedrop.system.output import say
 
-KEPT = "kept"
+TASKS = "finished_tasks"
 """The folder in a results folder."""
 _STUDY = "study.json"
 _SECONDS = "seconds.json"
-_MAGIC = b"evedrop kept task 1\n"
+_MAGIC = b"evedrop finished task 1\n"
 _NAME = re.compile(r"([0-9a-f]{32})-([0-9]+)-([0-9]+)")
 _MOST_BYTES = 2**33
 """The most bytes of a task's result, uncompressed."""
@@ -74,7 +74,7 @@ def _json(value: object) -> bytes:
 
 
 @contextlib.contextmanager
-def kept_tasks(folder: Path, study: Study, resume: bool) -> Iterator[KeptTasks]:
+def finished_tasks(folder: Path, study: Study, resume: bool) -> Iterator[FinishedTasks]:
     """Where the finished tasks of a study are kept, in its results folder, which is created.
 
     resume: go on with the study in the folder; a new or empty folder is that of a study that has not begun. If the block fails
@@ -88,35 +88,35 @@ def kept_tasks(folder: Path, study: Study, resume: bool) -> Iterator[KeptTasks]:
     else:
         new_folder(folder)
         with disk_errors(folder):
-            make_private(folder / KEPT)
-            write_private(folder / KEPT / _STUDY, json.dumps(study, ensure_ascii=False, indent=1) + "\n")
-    kept = KeptTasks(folder / KEPT, study)
+            make_private(folder / TASKS)
+            write_private(folder / TASKS / _STUDY, json.dumps(study, ensure_ascii=False, indent=1) + "\n")
+    tasks = FinishedTasks(folder / TASKS, study)
     try:
         if began:
             _clear(folder)
-        yield kept
+        yield tasks
     except EvedropError as error:
-        if kept.count:
-            error.resumable = str(kept.results_folder)
+        if tasks.count:
+            error.resumable = str(tasks.results_folder)
         raise
     finally:
-        kept.close()
+        tasks.close()
 
 
 def _check(folder: Path, study: Study) -> None:
     """Raise UsageError unless a folder has this study, and no process works in it."""
     try:
-        kept = json.loads((folder / KEPT / _STUDY).read_text(encoding="utf-8"))
+        there = json.loads((folder / TASKS / _STUDY).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UsageError(
-            f"{folder} has no interrupted study: there is no {KEPT}/{_STUDY} in it, so its study is complete, or is not one "
+            f"{folder} has no interrupted study: there is no {TASKS}/{_STUDY} in it, so its study is complete, or is not one "
             "of a version that keeps finished trials; give another folder"
         ) from None
     except (OSError, ValueError) as error:
-        raise UsageError(f"{folder / KEPT / _STUDY} cannot be read ({error}); give another folder") from error
-    if kept != study:
+        raise UsageError(f"{folder / TASKS / _STUDY} cannot be read ({error}); give another folder") from error
+    if there != study:
         raise UsageError(
-            f"{folder} has another study: {'; '.join(_differences(kept, study))}; give the same scenario and options, or "
+            f"{folder} has another study: {'; '.join(_differences(there, study))}; give the same scenario and options, or "
             "another folder"
         )
     if goes_on(folder):
@@ -152,7 +152,7 @@ def _clear(folder: Path) -> None:
 
 
 @final
-class KeptTasks:
+class FinishedTasks:
     """The finished tasks of one study. Holds a lock on their folder."""
 
     def __init__(self, place: Path, study: Study) -> None:
