@@ -25,7 +25,7 @@ test-wheel: $(READY)
 test-pictures: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "pictures and not long" tests/show/view
 
-COVERING := $(addprefix tests/,model live/protocol live/network/test_protocol.py live/network/test_wire.py)
+COVERING := $(addprefix tests/,model live/protocol)
 
 # Branch coverage of the mathematics and of the message readers, by tests that run in one process; fails below 100 %. Tests with
 # random examples are left out, so that it is the same in every run.

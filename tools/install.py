@@ -48,11 +48,11 @@ class Progress:
     size: float = 0.0
     latest: str = ""
     installing: bool = False
-    said: list[str] = field(default_factory=list)
+    lines: list[str] = field(default_factory=list)
 
     def read(self, line: str) -> None:
         """Take note of a line of pip."""
-        self.said.append(line)
+        self.lines.append(line)
         if match := _FETCHED.match(line):
             self._handle(match["file"], float(match["size"]) * _UNITS.get(match["unit"], 0.0))
         elif match := _LOCAL.match(line):
@@ -149,7 +149,7 @@ def _pip(progress: Progress, *arguments: str) -> int:
                 _say(progress.line(Path(sysconfig.get_path("purelib"))))
                 next_time = time.monotonic() + SECONDS
     if pip.returncode:
-        _write("\n".join(progress.said))
+        _write("\n".join(progress.lines))
         _say(f"pip failed with status {pip.returncode}; what it said is above")
     return pip.returncode
 

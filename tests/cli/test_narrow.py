@@ -31,7 +31,7 @@ def lines(columns: int) -> list[str]:
     return out.getvalue().splitlines()
 
 
-def said(columns: int) -> list[str]:
+def shown(columns: int) -> list[str]:
     """What a terminal of this width shows."""
     return [line.rstrip() for line in lines(columns)]
 
@@ -39,7 +39,7 @@ def said(columns: int) -> list[str]:
 @pytest.mark.parametrize("columns", [32, 44])
 def test_a_table_that_does_not_fit_is_shown_row_by_row(columns: int) -> None:
     """Every entry is there in full, on a line of its own, under the first cell of its row."""
-    assert said(columns) == [
+    assert shown(columns) == [
         "A comparison",
         "",
         "scheme innovation",
@@ -55,15 +55,15 @@ def test_a_table_that_does_not_fit_is_shown_row_by_row(columns: int) -> None:
 
 def test_a_table_that_fits_stays_a_table() -> None:
     """On a terminal of 80 columns it has its heads in one line."""
-    assert any("scheme" in line and "ratio" in line for line in said(80))
+    assert any("scheme" in line and "ratio" in line for line in shown(80))
 
 
 def test_a_table_stays_a_table_as_long_as_it_fits() -> None:
     """On a terminal that is as wide as its widest line, and not on one that is a column narrower."""
     wide = max(map(len, lines(80)))
     assert {len(line) for line in lines(wide) if line.strip()} == {wide}
-    assert any("scheme" in line and "ratio" in line for line in said(wide))
-    assert said(wide - 1)[2] == "scheme innovation"
+    assert any("scheme" in line and "ratio" in line for line in shown(wide))
+    assert shown(wide - 1)[2] == "scheme innovation"
 
 
 def test_a_report_fits_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:

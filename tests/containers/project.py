@@ -79,14 +79,14 @@ class Project:
         """The status with which a service ends, once it has."""
         return int(self.docker("wait", self.container(service)))
 
-    def said(self, service: str) -> str:
+    def log(self, service: str) -> str:
         """All that a service has said so far."""
         done = run("docker", "-H", self.docker.address, "logs", self.container(service))
         return done.stdout + done.stderr
 
     def progress(self) -> int:
         """The slots that the run has done."""
-        lines = [line for line in self.said("recorder").splitlines() if line.startswith("{") and '"progress"' in line]
+        lines = [line for line in self.log("recorder").splitlines() if line.startswith("{") and '"progress"' in line]
         return max((json.loads(line)["done"] for line in lines), default=0)
 
     def running(self, more_than: int = 0) -> None:

@@ -114,11 +114,11 @@ def test_of_a_scenario_that_does_not_fit_nothing_is_started(project: Make) -> No
         done = own.compose("up", may_fail=True)
         assert done.returncode != 0
         assert own.state("briefs")["ExitCode"] == 2
-        (line,) = own.said("briefs").splitlines()[-1:]
+        (line,) = own.log("briefs").splitlines()[-1:]
         assert line.startswith(f"evedrop: {reason}")
     own.environment["EVEDROP_USER"] = "somebody"
     own.compose("up", may_fail=True)
-    assert "evedrop: EVEDROP_USER is somebody, and must be numbers" in own.said("briefs")
+    assert "evedrop: EVEDROP_USER is somebody, and must be numbers" in own.log("briefs")
     assert not any((own.folder / "runs").iterdir())
     assert own.docker("ps", "--quiet") == ""
 
@@ -130,7 +130,7 @@ def test_a_killed_container_ends_the_run_and_the_next_one_goes_well(project: Mak
     own.running()
     own.docker("kill", own.container("smart"))
     assert own.ended("recorder") == 3
-    assert "smart cut off from the network for 2 s" in own.said("recorder")
+    assert "smart cut off from the network for 2 s" in own.log("recorder")
     assert own.results().slots.num_rows > 0
     assert {service: own.ended(service) for service in ROLES} == {**dict.fromkeys(ROLES, 3), "smart": 137}
     again = project(EVEDROP_OPTIONS=SHORT)
@@ -151,5 +151,5 @@ def test_a_router_started_again_and_a_network_that_was_away_change_nothing(proje
     health = ("docker", "-H", own.docker.address, "exec", smart, "evedrop", "health", "/brief/brief.json")
     wait_until(lambda: subprocess.run(health, capture_output=True, check=False).returncode, "an eavesdropper cut off")
     own.docker("network", "connect", network, smart)
-    assert own.ended("recorder") == 0, own.said("recorder")
+    assert own.ended("recorder") == 0, own.log("recorder")
     complete(own, 3000)

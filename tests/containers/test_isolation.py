@@ -192,6 +192,6 @@ def test_a_container_cannot_take_the_whole_machine(going: Project) -> None:
 
 def test_the_view_is_on_loopback_alone(going: Project) -> None:
     """The page answers at the address that the recorder tells, and nothing else of the machine's listens for others."""
-    address = next(line for line in going.said("recorder").splitlines() if '"view"' in line)
+    address = next(line for line in going.log("recorder").splitlines() if '"view"' in line)
     assert "http://127.0.0.1:17450/?url=" in address
     going.shown()

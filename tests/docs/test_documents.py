@@ -20,13 +20,13 @@ def commands(page: str) -> list[list[str]]:
     text = (DOCS / page).read_text(encoding="utf-8")
     lines = [line.strip().removeprefix("$ ") for line in text.splitlines()]
     texts = [line.partition("  #")[0] for line in lines if line.startswith(("evedrop ", "python -m pytest "))]
-    return [shlex.split(line) for line in texts if " -m pytest " not in line or "test_errata.py" in line]
+    return [shlex.split(line) for line in texts if " -m pytest " not in line or "test_theory_errata.py" in line]
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_every_command_of_the_documents_is_one(page: str) -> None:
     """Options and their values are understood; tests that are named exist."""
-    names = (DOCS.parent / "tests" / "model" / "test_errata.py").read_text(encoding="utf-8")
+    names = (DOCS.parent / "tests" / "model" / "theory" / "test_theory_errata.py").read_text(encoding="utf-8")
     for words in commands(page):
         if words[0] == "python":
             assert (DOCS.parent / words[3]).is_file()

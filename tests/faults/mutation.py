@@ -56,7 +56,7 @@ class Outcome:
     mutant: Mutant
     noticed: str | None
     """The first line that says so; None if nothing does."""
-    said: str
+    output: str
     """All that the campaign said."""
     cases: int
     """How many cases had been carried out by then; 0 if an undisturbed run was already wrong."""
@@ -137,7 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             outcomes.append(tried(mutant, Path(folder)))
         _say(str(outcomes[-1]))
         if outcomes[-1].noticed is None:
-            _say(outcomes[-1].said)
+            _say(outcomes[-1].output)
     missed = [outcome for outcome in outcomes if outcome.noticed is None]
     _say(f"\n{len(outcomes) - len(missed)} of {len(outcomes)} mutants were noticed")
     return 1 if missed else 0

@@ -129,7 +129,7 @@ def carried_out(case: StudyCase, folder: Path, before: frozenset[int], usual: Un
             and repr(actual.to_pylist()) != repr(wanted.to_pylist())
         ):
             yield f"the table of {name} is not that of an undisturbed study: {len(actual)} rows, wanted {len(wanted)}"
-    if (folder / "out" / "kept").exists():
+    if (folder / "out" / "finished_tasks").exists():
         yield "the kept trials are left in the folder of a complete study"
     yield from failed_looks(folder / "out", usual.results.folder)
 
@@ -164,7 +164,7 @@ def _attempt(fault: StudyFault | None, folder: Path, number: int, seconds: float
 def _interrupted_at_its_end(status: int, out: Path) -> bool:
     """Whether a signal came when the study was complete on disk, while its report was made or printed."""
     signals = {_INTERRUPTED, *(-number for number in _ENDS.values())}
-    if status not in signals or (out / "kept").exists():
+    if status not in signals or (out / "finished_tasks").exists():
         return False
     try:
         return bool(Results.read(out).summary["ended"] == "complete")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.wire.file import load_wire
-from evedrop.wire.link_state import KeyFates
+from evedrop.wire.running_link import KeyFates
 from tests.faults import wires
 from tests.faults.facilities import facilities, limited, process_group
 from tests.faults.programs import KEYS

@@ -111,14 +111,14 @@ class Outcome:
     ended: Mapping[str, tuple[int, int]]
     left: tuple[str, ...]
     """What is there after the last command: the command lines of processes, the names of files in /tmp and in /dev/shm."""
-    said: tuple[str, ...]
+    lines: tuple[str, ...]
     used_kilobytes: int
 
     def mistakes(self, commands: tuple[str, ...]) -> list[str]:
         """All that is not as README promises, in words."""
         mistakes = [f"`{command}` did not end" for command in commands if command not in self.ended]
         mistakes += [f"`{command}` ended with {status}" for command, (status, _) in self.ended.items() if status]
-        mistakes += [line for line in self.said if re.match(r"(FAILED|ERROR) \S+\.py\b", line)]
+        mistakes += [line for line in self.lines if re.match(r"(FAILED|ERROR) \S+\.py\b", line)]
         return mistakes + [f"left behind: {path}" for path in self.left]
 
 
@@ -179,7 +179,7 @@ def outcome(
     return Outcome(
         ended={line[3]: (int(line[1]), int(line[2])) for line in lines if line[0] == "ended"},
         left=tuple(line[1] for line in lines if line[0] == "left"),
-        said=tuple(printed),
+        lines=tuple(printed),
         used_kilobytes=max((int(line[1]) for line in lines if line[0] == "used"), default=0),
     )
 

@@ -27,7 +27,7 @@ def test_a_newcomers_commands_succeed_on_a_bare_machine(machine: Machine, outcom
             outcomes[machine.name] = outcome(machine, folder, write)
         except CannotRun as error:
             skip(error)
-    text = "\n".join(outcomes[machine.name].said)
+    text = "\n".join(outcomes[machine.name].lines)
     sizes = [re.search(pattern, text) for pattern in (r"about (\d+) MB to download", r"(\d+) MB downloaded")]
     announced, downloaded = (int(size[1]) if size else 0 for size in sizes)
     assert announced == pytest.approx(downloaded, rel=0.15), "tools/install.py announces another size than it downloads"

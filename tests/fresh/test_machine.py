@@ -45,7 +45,7 @@ def test_all_that_went_wrong_is_named() -> None:
     outcomes = Outcome(
         ended={"make demo": (0, 3), "make test": (2, 5)},
         left=("x.zenoh",),
-        said=(
+        lines=(
             "FAILED tests/a.py::test_b - assert 0",
             "FAILED to be kind",
             "ERROR tests/c.py::test_d",
@@ -113,7 +113,7 @@ def test_a_machine_is_bare_and_what_stays_there_is_told(user: str) -> None:
             seen = outcome(MACHINES[name], folder, print, (look, leave, "exit 3"))
         except CannotRun as error:
             skip(error)
-    text = "\n".join(seen.said)
+    text = "\n".join(seen.lines)
     (home,) = re.findall(r"^HOME=(/.*)$", text, re.MULTILINE)
     assert Path(home).name == user
     assert f"{home}/evedrop\n/dev/shm:\n\n/tmp:\n" in text

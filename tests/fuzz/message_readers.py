@@ -9,7 +9,7 @@ from typing import Any
 
 from evedrop.errors import EvedropError
 from tests.fuzz.reader import Reader, as_msgpack, raw
-from tests.live.network import golden
+from tests.live.protocol import golden
 
 
 def _messages(name: str) -> Callable[[], list[bytes]]:

@@ -23,7 +23,7 @@ from evedrop.scenario.recordings.link_recording import LinkRecording
 from evedrop.scenario.recordings.process_fit import fit_process
 from evedrop.scenarios import shipped
 from evedrop.wire.file import example_wire, key_lines, load_wire, resolved_wire, warnings_of_wire, wire_lines, wire_of
-from evedrop.wire.link_state import KeyFates
+from evedrop.wire.running_link import KeyFates
 from evedrop.wire.scorekeeper import expected
 from evedrop.wire.timeline import moments
 from tests.fuzz.mutation import words_of

@@ -36,19 +36,19 @@ for number in range(60):
     mutator = Mutator(f"scenario/kernels/{number}", scenario.words())
     cases[f"scenario {number}"] = scenario, scenario.changed(mutator, number)
 warnings.simplefilter("ignore")
-said = {}
+messages = {}
 for name, (reader, data) in sorted(cases.items()):
     with tempfile.TemporaryDirectory() as place, contextlib.redirect_stdout(io.StringIO()):
         try:
             read = reader.read(data, Path(place))
-            said[name] = read if reader is scenario else "read"
+            messages[name] = read if reader is scenario else "read"
         except EvedropError as error:
-            said[name] = str(error).replace(place, "FOLDER")
-print(json.dumps(said, indent=1))
+            messages[name] = str(error).replace(place, "FOLDER")
+print(json.dumps(messages, indent=1))
 """
 
 
-def said_with(kernels: str) -> list[str]:
+def messages_with(kernels: str) -> list[str]:
     """What is said of every file of the corpus and of sixty changed scenarios, with these kernels."""
     command, environment = [sys.executable, "-c", READ], {**os.environ, KERNELS_VARIABLE: kernels}
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False, timeout=300)
@@ -59,8 +59,8 @@ def said_with(kernels: str) -> list[str]:
 @pytest.mark.long
 def test_the_corpus_is_read_the_same_with_either_kernels() -> None:
     """Every file is read or refused in our words in numpy, and in the same words as in C where that is built."""
-    numpy = said_with("numpy")
+    numpy = messages_with("numpy")
     assert len(numpy) > 80
     if importlib.util.find_spec(EXTENSION) is None:
         pytest.skip("the C kernels are not built: no compiler worked")
-    assert said_with("baseline") == numpy
+    assert messages_with("baseline") == numpy

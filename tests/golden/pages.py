@@ -90,7 +90,7 @@ class Golden:
 def _lines(text: object) -> Iterable[str]:
     if isinstance(text, (list, tuple)):
         return [line for part in text for line in _lines(part)]
-    return str(text).split("\n")
+    return str(text).rstrip("\n").split("\n")
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ class Stage:
     queues: dict[str, SimpleQueue[bytes]] = field(default_factory=dict)
     callbacks: dict[str, Callable[[bytes], None]] = field(default_factory=dict)
     put: SimpleQueue[tuple[str, bytes]] = field(default_factory=SimpleQueue)
-    kept: dict[str, ReplayBuffer] = field(default_factory=dict)
+    buffers: dict[str, ReplayBuffer] = field(default_factory=dict)
     commands: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
     """The conductor's commands, as its classes pack them."""
 
@@ -100,8 +100,8 @@ class FakeSession:
 
     def replaying_publisher(self, key: str, *how: Any, **more: Any) -> ReplayBuffer:
         """The same, kept to be sent again."""
-        self._stage.kept[key] = kept = ReplayBuffer(self.publisher(key), *how, **more)
-        return kept
+        self._stage.buffers[key] = buffer = ReplayBuffer(self.publisher(key), *how, **more)
+        return buffer
 
     def ready(self) -> None:
         """Nobody to wait for."""

@@ -28,9 +28,10 @@ from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import NetworkTable
 from evedrop.system.ports import free_port
-from tests.builders import digests_of
+from tests.builders import digests_of, places_of
 from tests.conftest import LIMIT, Evedrop, Live, wait_until, with_mark
 from tests.examples import mostly_long
+from tests.golden.pages import Golden
 from tests.privileged import CannotRun, skip
 from tests.processes import parent_of
 from tests.sshd import Sshd, sshd
@@ -274,38 +275,20 @@ processes = ["router"]
 
 
 @pytest.mark.parametrize(
-    ("text", "mistakes"),
+    ("text", "places"),
     [
-        (
-            WRONG,
-            [
-                'hosts.alpha.address: is "-oProxyCommand=x"; expected a word that does not begin with a dash, and has no spaces, '
-                'such as "beta.lan" (line 5)',
-                "hosts.alpha.port: is 0; expected a number at least 1, such as 22 (line 6)",
-                "hosts.alpha.speed: is not an entry of this table; expected one of address, user, port, processes, command, "
-                "folder, modules (line 8)",
-            ],
-        ),
-        (
-            UNFIT,
-            [
-                "hosts.alpha.processes: names smrt; expected router, sensor, legitimate, smart or naive; did you mean smart? "
-                "(line 9)",
-                "hosts.alpha.processes: names recorder, which is always on this machine, where it writes the results (line 9)",
-                "hosts.beta.processes: names router, which is on alpha already; expected one host for it (line 12)",
-                "router.listen: tcp/0.0.0.0:7447 is not encrypted, and other machines can reach it: they could read everything, "
-                "and pose as the router; give tls/0.0.0.0:7447, or add insecure = true (line 3)",
-                "relay: the scenario has one router; leave it out, or add --set network.routers=2 (line 5)",
-            ],
-        ),
+        (WRONG, ["hosts.alpha.address", "hosts.alpha.port", "hosts.alpha.speed"]),
+        (UNFIT, ["hosts.alpha.processes", "hosts.alpha.processes", "hosts.beta.processes", "router.listen", "relay"]),
     ],
+    ids=["wrong", "unfit"],
 )
-def test_mistakes_in_the_file_are_all_listed(text: str, mistakes: list[str], tmp_path: Path) -> None:
+def test_mistakes_in_the_file_are_all_listed(text: str, places: list[str], tmp_path: Path, golden: Golden) -> None:
     """Each with its line."""
     (tmp_path / "hosts.toml").write_text(text)
     with pytest.raises(ScenarioError) as error:
         load_hosts(tmp_path / "hosts.toml", load("restart"))
-    assert error.value.mistakes == mistakes
+    assert places_of(error.value.mistakes) == places
+    golden("run", error.value.mistakes)
 
 
 NO_CLASSES = """
@@ -322,26 +305,17 @@ modules = "/srv/classes"
 
 
 @pytest.mark.parametrize(
-    ("changes", "mistakes"),
-    [
-        (
-            {"network": NetworkTable(routers=2)},
-            ['relay: is missing; expected [relay] with listen = "tls/HOST:PORT": the scenario has two routers'],
-        ),
-        (
-            {"modules": "/srv/here"},
-            [
-                "hosts.alpha.modules: is missing; expected the folder there of the modules that the scenario names (line 4)"
-            ],
-        ),
-    ],
+    ("changes", "place"),
+    [({"network": NetworkTable(routers=2)}, "relay"), ({"modules": "/srv/here"}, "hosts.alpha.modules")],
+    ids=["relay", "modules"],
 )
-def test_what_the_scenario_needs_is_missed(changes: dict[str, Any], mistakes: list[str], tmp_path: Path) -> None:
+def test_what_the_scenario_needs_is_missed(changes: dict[str, Any], place: str, tmp_path: Path, golden: Golden) -> None:
     """A second router, and a folder of classes on every host."""
     (tmp_path / "hosts.toml").write_text(NO_CLASSES)
     with pytest.raises(ScenarioError) as error:
         load_hosts(tmp_path / "hosts.toml", load("restart").model_copy(update=changes))
-    assert error.value.mistakes == mistakes
+    assert places_of(error.value.mistakes) == [place]
+    golden("run", error.value.mistakes)
 
 
 def test_a_configuration_of_ssh_is_beside_the_file(tmp_path: Path) -> None:

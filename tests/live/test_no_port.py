@@ -30,8 +30,8 @@ from evedrop.scenario.tables import Scenario
 from evedrop.system.ports import free_port
 from tests.conftest import LIMIT, Evedrop, Live, with_mark
 from tests.examples import mostly_long
+from tests.live.launch.test_children import Ended
 from tests.live.network.bench import small_network
-from tests.live.test_children import Ended
 from tests.privileged import CannotRun, skip
 
 NOBODY = 65_534

@@ -21,7 +21,7 @@ from tests.builders import digests_of
 from tests.by_hand import as_if_undisturbed
 from tests.conftest import Evedrop, wait_until
 from tests.live.test_shards import child, close, in_order
-from tests.studies.applications.test_microgrid import part_of_day
+from tests.studies.applications.microgrid.test_microgrid import part_of_day
 
 TIMED = {"decisions", "mean_solve_seconds", "longest_solve_seconds"}
 """The controller's metrics that depend on its own process."""

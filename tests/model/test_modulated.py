@@ -206,7 +206,7 @@ def test_tails_are_those_of_the_chain() -> None:
     for r in (0.5, 0.72, 0.74, 0.9):
         for p in (0.01, 0.2):
             outcomes = tail_outcomes(bursts(p, r), Outcomes.plain)
-            assert outcomes.kept == pytest.approx(1.0 - r, abs=1e-12)
+            assert outcomes.propagated == pytest.approx(1.0 - r, abs=1e-12)
             assert tail_index(UNSTABLE, outcomes) == pytest.approx(-math.log(1.0 - r) / (2.0 * math.log(rho)))
             assert has_infinite_variance(UNSTABLE, outcomes) is ((1.0 - r) * rho**4 >= 1.0)
     assert math.isinf(tail_index(MARGINAL, tail_outcomes(bursts(0.1, 0.2), legitimate)))
@@ -216,11 +216,11 @@ def test_tails_are_those_of_the_chain() -> None:
 def test_the_rate_of_the_tail_is_how_long_a_word_lasts() -> None:
     """P(no state packet in k slots), summed slot by slot over the chain, falls by the factor `kept` a slot."""
     chain = THREE
-    kept = np.array([legitimate(q).kept for q in chain.quality])
+    kept = np.array([legitimate(q).propagated for q in chain.quality])
     alive = chain.stationary * kept
     for _ in range(200):
         before, alive = alive.sum(), (alive @ chain.transitions) * kept
-    assert alive.sum() / before == pytest.approx(tail_outcomes(chain, legitimate).kept, rel=1e-9)
+    assert alive.sum() / before == pytest.approx(tail_outcomes(chain, legitimate).propagated, rel=1e-9)
 
 
 def recursion(process: Process, chain: Chain, outcomes_at: Callable[[float], Outcomes], slots: int) -> Floats:
@@ -233,7 +233,7 @@ def recursion(process: Process, chain: Chain, outcomes_at: Callable[[float], Out
     traces = [float(np.trace(sum(states)))]
     for k in range(1, slots):
         states = [
-            odd.kept
+            odd.propagated
             * process.A
             @ sum(T * E for T, E in zip(chain.transitions[:, s], states, strict=True))
             @ process.A.T
@@ -279,7 +279,7 @@ def late(process: Process, link: LinkDistribution, outcomes_at: Callable[[float]
         fresh = j == segment.start
         weights = [pi[s] * np.ones(len(states)) if fresh else segment.chain.transitions[:, s] for s in range(len(pi))]
         return [
-            odd.kept * process.A @ sum(T * E for T, E in zip(weights[s], states, strict=True)) @ process.A.T
+            odd.propagated * process.A @ sum(T * E for T, E in zip(weights[s], states, strict=True)) @ process.A.T
             + pi[s] * (odd.predicted * process.Q + odd.misled * f[j])
             for s, odd in enumerate(odds)
         ]

@@ -17,7 +17,7 @@ from evedrop.model.slot.link_distribution import LinkDistribution, Segment
 from evedrop.model.theory.covariances import NOBODY, Outcomes, OutcomesAt, theoretical_traces
 from evedrop.model.theory.leak import RemainingCovariances
 from evedrop.model.theory.rare_events import Streaks, streaks
-from tests.model.test_rare_events import FIRST, LEGITIMATE, LOST, MISLEADING, MISLED, PLANE, SMART
+from tests.model.theory.test_rare_events import FIRST, LEGITIMATE, LOST, MISLEADING, MISLED, PLANE, SMART
 
 BURSTS = Chain(np.array([[0.8, 0.2], [0.5, 0.5]]), np.array([5.0, 2.0]) / 7.0, np.array([0.9, 0.3]))
 STEADY = Chain(np.ones((1, 1)), np.ones(1), np.array([0.7]))

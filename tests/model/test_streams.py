@@ -16,7 +16,7 @@ from evedrop.model.streams import (
     Ahead,
     Batch,
     BlockReader,
-    ShortReader,
+    SingleTrialReader,
     Stream,
     normals,
     root_of_seed,
@@ -156,7 +156,7 @@ def test_numbers_have_their_distributions(per_trial: int) -> None:
 def test_a_short_reader_has_the_numbers_of_the_stream(per_trial: int, slots: range) -> None:
     """In any order, to the bit."""
     batch = Batch(100, 1)
-    short, block = ShortReader(KEY, batch, per_trial), BlockReader(KEY, batch, per_trial)
+    short, block = SingleTrialReader(KEY, batch, per_trial), BlockReader(KEY, batch, per_trial)
     for _ in range(2):
         for made, expected in (
             (short.normals(slots), block.normals(slots)),
@@ -171,7 +171,7 @@ def test_a_short_reader_has_the_numbers_of_the_stream(per_trial: int, slots: ran
 def test_a_short_reader_reads_the_first_trial_alone(batch: Batch) -> None:
     """Others are refused."""
     with pytest.raises(ValueError, match="Batch"):
-        ShortReader(KEY, batch, 1)
+        SingleTrialReader(KEY, batch, 1)
 
 
 def test_many_keys_under_one_root_are_those_of_each_name() -> None:

@@ -217,13 +217,13 @@ def test_a_report_is_kept_for_a_window(name: str, stage: Stage) -> None:
     stage.commands.put(EndRun().pack())
     RECEIVERS[name](brief, stage.session)
     stage.all("")
-    stage.kept[RunKeys("r").telemetry(name)].again(1, 0)
+    stage.buffers[RunKeys("r").telemetry(name)].again(1, 0)
     ends = []
     for payload in stage.all(RunKeys("r").telemetry(name)):
         message = wire.Reader("", payload)
         ends.append(message.integer("k") + message.integer("c"))
     assert ends == [40, 44, 48, 50]
-    stage.kept[RunKeys("r").progress(name)].again(1, SLOTS)
+    stage.buffers[RunKeys("r").progress(name)].again(1, SLOTS)
     assert stage.all(RunKeys("r").progress(name)) == [wire.progress(SLOTS)]
 
 
@@ -295,12 +295,12 @@ def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
     for name in (*part_of(brief, SensorPart).receivers, "recorder"):
         sensor.progress(name, 8)
     sensor.packets(WINDOW, WINDOW + 8)
-    stage.kept[sensor.keys.uplink].again(4, 10)
+    stage.buffers[sensor.keys.uplink].again(4, 10)
     key, payload = sensor.next()
     assert (key, payload) == (sensor.keys.uplink, packets.resend(4, 10, 7))
     for k in range(7, WINDOW + 8):
         packets.read_uplink(wire.Reader(*sensor.next()), k, (2, 3))
-    stage.kept[sensor.keys.uplink].again(5, 8)
+    stage.buffers[sensor.keys.uplink].again(5, 8)
     assert wire.Reader(*sensor.next()).integer("k") == 5
     for k in range(5, WINDOW + 8):
         packets.read_uplink(wire.Reader(*sensor.next()), k, (2, 3))

@@ -1,19 +1,28 @@
-"""The tally of a shard is data: it comes back the same, and bytes in the file run nothing."""
+"""The tally of a shard is data: it comes back as it was stored, and bytes in the file decide values, never which code runs."""
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
 import pickle
 import stat
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from evedrop.errors import RunError
-from evedrop.results.shard_score import dump_score, load_score, packed
+from evedrop.errors import RunError, ScenarioError, UsageError
+from evedrop.results.shard_score import NotData, dump_score, load_score, packed, unpacked
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
+from evedrop.scenarios import shipped
 from evedrop.score.run_tally import RunTally
+from evedrop.simulate.montecarlo import check_mode
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import tasks_of
 
@@ -54,3 +63,101 @@ def test_a_file_of_somebody_else_runs_nothing(tmp_path: Path) -> None:
         with pytest.raises(RunError, match=r"score is damaged \(.*run again"):
             load_score(tmp_path, scenario)
     assert not (tmp_path / "ran").exists()
+
+
+class Place(NamedTuple):
+    """A tuple of a class."""
+
+    x: int
+    y: float
+
+
+@dataclass(frozen=True)
+class Inner:
+    """An instance in an instance."""
+
+    values: Any = None
+
+
+@dataclass
+class Outer:
+    """Everything that a result may have."""
+
+    one: Any = 1
+    inner: Inner = field(default_factory=Inner)
+    table: dict[Any, Any] = field(default_factory=lambda: {Place(1, 2.0): Inner()})
+    parts: list[Inner] = field(default_factory=lambda: [Inner()])
+    act: Any = len
+
+
+def test_instances_come_back() -> None:
+    """Numbers to the bit, arrays with their kinds, tuples and names of classes, and functions of the example."""
+    array = np.array([[0.1, -0.0], [math.inf, math.nan]])
+    value = Outer((None, True, -(2**63), 1e-300, "μ", b"\0"), Inner(array), {Place(1, 2.0): Inner(Place(3, 4.0))})
+    value.parts = [Inner({"a", "b"}), Inner(np.float32(0.1)), Inner(np.zeros((0, 3), np.uint16))]
+    back: Outer = unpacked(packed(value), Outer())
+    assert (back.one, back.act) == (value.one, len)
+    assert back.inner.values.tobytes() == array.tobytes()
+    assert [type(name) for name in back.table] == [Place]
+    assert back.table[Place(1, 2.0)].values == (3, 4.0)
+    assert [type(part) for part in back.parts] == [Inner] * 3
+    assert back.parts[1].values.dtype == np.float32
+    assert (back.parts[2].values.shape, back.parts[2].values.dtype) == ((0, 3), np.uint16)
+    back.inner.values[0, 0] = 2.0  # an array of its own
+
+
+@pytest.mark.parametrize(
+    "value", [object, lambda: 1, np.array([object()], object), open], ids=["class", "function", "objects", "built-in"]
+)
+def test_what_is_not_data_is_refused(value: object) -> None:
+    """Classes, arrays of objects; a function is only a place that the example fills."""
+    try:
+        data = packed(value)
+    except NotData:
+        return
+    with pytest.raises(NotData, match="a function where the example has none"):
+        unpacked(data, None)
+
+
+def test_bytes_name_no_class() -> None:
+    """An instance where the example has a number is refused, and no bytes contain the name of a class."""
+    data = packed(Outer())
+    assert b"Outer" not in data
+    assert b"Inner" not in data
+    others: tuple[object, ...] = (None, 1, [], {}, np.zeros(2))
+    for like in others:
+        with pytest.raises(NotData, match="an instance where the example has none"):
+            unpacked(data, like)
+
+
+@given(st.binary(max_size=200), st.integers(0, 10_000))
+def test_any_bytes_are_read_or_refused(noise: bytes, place: int) -> None:
+    """Bytes that are damaged anywhere give a value or NotData, and no other error."""
+    data = bytearray(packed(Outer(np.arange(3), Inner([1.5]))))
+    data[place % len(data)] ^= 1 + place % 255
+    for data_ in (noise, bytes(data), bytes(data[: place % len(data)])):
+        with contextlib.suppress(NotData):
+            unpacked(data_, Outer())
+
+
+SHORT = {"slots": 12, "trials": 503, "record_trials": 2, "expect": []}
+
+
+@pytest.mark.parametrize("name", [name for name in shipped() if name != "microgrid-mpc"])
+def test_every_shipped_scenario_s_results_are_data(name: str) -> None:
+    """What a task finds comes back the same, in every mode that the scenario allows."""
+    try:
+        scenario = load(name, SHORT, beyond_horizon=True)
+    except ScenarioError:  # its events need its own slots
+        scenario = load(name, {"trials": 2, "record_trials": 1}, beyond_horizon=True)
+    for mode in Mode:
+        try:
+            check_mode(scenario, mode)
+        except UsageError:
+            continue
+        (task,) = tasks_of(scenario, mode, 1)
+        result = task.carry_out(lambda _: None, lambda: False)
+        assert result.complete
+        data = packed(result)
+        back = unpacked(data, task.example())
+        assert packed(back) == data

@@ -17,7 +17,7 @@ from evedrop.model.theory.closed_forms import encrypted_fraction
 from evedrop.results.comparison import Comparison, read_comparison
 from evedrop.results.summary_file import plain
 from evedrop.scenario.loading import load
-from evedrop.score.verdict import SecrecyKept
+from evedrop.score.verdict import SecrecyVerdict
 from evedrop.show.report.comparison import verdict
 from evedrop.show.report.writing import write_report
 from evedrop.simulate.montecarlo import Plan
@@ -29,19 +29,19 @@ MARGINAL: dict[str, Any] = {"slots": 100, "trials": 30, "process__initial_covari
 """Changes of `bayesian`: long enough for verdicts, and trials that lose the first slot do not dominate the mean."""
 
 VERDICTS = {
-    ("plain", "naive"): SecrecyKept.BROKEN,
-    ("cipher", "naive"): SecrecyKept.PERFECT,
-    ("innovation", "naive"): SecrecyKept.PERFECT,
-    ("acknowledged", "reference"): SecrecyKept.PERFECT,
-    ("acknowledged", "blocks-critical"): SecrecyKept.BROKEN,
-    ("acknowledged", "blocks-all"): SecrecyKept.BROKEN,
-    ("acknowledged", "hijacks"): SecrecyKept.PERFECT,  # no acknowledgement is lost
-    ("open-loop", "reference"): SecrecyKept.PERFECT,
-    ("open-loop", "forges"): SecrecyKept.BROKEN,
-    ("twin-track", "naive"): SecrecyKept.PERFECT,
-    ("twin-track", "tracker"): SecrecyKept.PERFECT,
-    ("twin-track", "replay-informed"): SecrecyKept.RELATIVE,
-    ("innovation", "genie"): SecrecyKept.RELATIVE,
+    ("plain", "naive"): SecrecyVerdict.BROKEN,
+    ("cipher", "naive"): SecrecyVerdict.PERFECT,
+    ("innovation", "naive"): SecrecyVerdict.PERFECT,
+    ("acknowledged", "reference"): SecrecyVerdict.PERFECT,
+    ("acknowledged", "blocks-critical"): SecrecyVerdict.BROKEN,
+    ("acknowledged", "blocks-all"): SecrecyVerdict.BROKEN,
+    ("acknowledged", "hijacks"): SecrecyVerdict.PERFECT,  # no acknowledgement is lost
+    ("open-loop", "reference"): SecrecyVerdict.PERFECT,
+    ("open-loop", "forges"): SecrecyVerdict.BROKEN,
+    ("twin-track", "naive"): SecrecyVerdict.PERFECT,
+    ("twin-track", "tracker"): SecrecyVerdict.PERFECT,
+    ("twin-track", "replay-informed"): SecrecyVerdict.RELATIVE,
+    ("innovation", "genie"): SecrecyVerdict.RELATIVE,
 }
 
 Everything = tuple[Comparison, Path]
@@ -131,7 +131,7 @@ def test_an_adversary_that_learns_a_state_is_not_the_closest(literature: Compari
     then = replace(innovation, cells={**innovation.cells, first.match.adversary: betrayed})
     assert then.closest is not None
     assert then.closest.match.adversary != first.match.adversary
-    assert then.kept > innovation.kept
+    assert then.protection > innovation.protection
 
 
 def test_every_adversary_is_played_somewhere(everything: Everything) -> None:
@@ -218,7 +218,7 @@ def test_one_trial_decides_nothing(tmp_path: Path) -> None:
     for adversary in ("naive", "smart"):
         cell = result.cell("innovation", adversary)
         assert cell.eavesdropper is not None
-        assert cell.verdict is SecrecyKept.UNDECIDED
+        assert cell.verdict is SecrecyVerdict.UNDECIDED
         assert cell.eavesdropper.standard_error is None
 
 
@@ -322,7 +322,7 @@ def test_innovations_have_no_acknowledgements_to_block(literature: Comparison) -
         cell = literature.cell("innovation", adversary)
         assert cell.ratio is not None
         assert cell.ratio > 1.0
-        assert cell.verdict in {SecrecyKept.RELATIVE, SecrecyKept.PERFECT}
+        assert cell.verdict in {SecrecyVerdict.RELATIVE, SecrecyVerdict.PERFECT}
 
 
 def test_a_forged_acknowledgement_is_the_users_loss(literature: Comparison) -> None:

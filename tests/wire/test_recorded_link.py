@@ -15,10 +15,10 @@ from evedrop.errors import TraceError, UsageError
 from evedrop.scenario.recordings.link_fit import fit_messages
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.link_state import KeyFates
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.recorded_link import journal_recording
 from evedrop.wire.records import AGAIN, Kind, WireFate
+from evedrop.wire.running_link import KeyFates
 from tests.conftest import Evedrop
 
 SETTINGS = {

@@ -19,7 +19,7 @@ from evedrop.wire.plan import WireEvent
 from evedrop.wire.records import AGAIN, Kind, WireFate
 from evedrop.wire.steering import WireConductor
 from tests.conftest import wait_until
-from tests.wire.test_wire_publications import reader, ready
+from tests.wire.test_publications import reader, ready
 from tests.wire.wire_at_work import LOSSY, PERFECT, at_work, both_ways, is_declared, link, plan_of
 
 READY = link("robot", "base", keys="ready", name="ready")

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from evedrop.wire.link_state import KeyFates
+from evedrop.wire.running_link import KeyFates
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import LOSSY, WireAtWork, at_work, both_ways, is_declared
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import zenoh
 
 from evedrop.model.links.loss_model import Fate
-from evedrop.wire.link_state import KeyFates
+from evedrop.wire.running_link import KeyFates
 from evedrop.wire.scorekeeper import bounds, expected
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import at_work, link, plan_of

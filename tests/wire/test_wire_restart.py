@@ -17,8 +17,8 @@ from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest, WireStatus
 from evedrop.wire.file import load_wire
 from evedrop.wire.journal import journal_tables
-from evedrop.wire.link_state import KeyFates
 from evedrop.wire.run import continuation, run_wire
+from evedrop.wire.running_link import KeyFates
 from tests.conftest import Evedrop, Live, wait_until
 from tests.wire.wire_at_work import program
 from tests.wire.wire_plans import wire_plan

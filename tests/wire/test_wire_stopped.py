@@ -29,7 +29,7 @@ from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.send_queue import SendQueue
 from evedrop.wire.side import ZenohConfig, side_config
 from tests.conftest import LIMIT, Evedrop, wait_until
-from tests.wire.test_wire_publications import reader
+from tests.wire.test_publications import reader
 from tests.wire.wire_at_work import at_work, is_declared, link, plan_of, program
 
 BLOCK = zenoh.CongestionControl.BLOCK

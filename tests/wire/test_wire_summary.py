@@ -18,10 +18,10 @@ from evedrop.show.report.wire import WITHOUT_MODEL, wire_failures, wire_sentence
 from evedrop.show.report.writing import write_report
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.link_state import KeyFates
 from evedrop.wire.on_disk import closing_lines, scorekeeper_on_disk
 from evedrop.wire.plan import Side, WirePlan
 from evedrop.wire.records import AGAIN, UNLINKED, Kind, WireFate
+from evedrop.wire.running_link import KeyFates
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.tables import WireExpectTable
 from evedrop.wire.tallies import WIRE_METRICS, LinkTally
@@ -430,7 +430,7 @@ def test_a_latency_is_that_of_its_quantile(tmp_path: Path) -> None:
         for n in range(100):
             journal.record(1.0, n, -1, (n + 1) / 1000, journal.key_code("a"), 0, 0, 0, Kind.PUT, WireFate.DELIVERED)
     (judged,) = keeper.judged(keeper.links())
-    assert judged.found == 0.09
+    assert judged.value == 0.09
 
 
 def test_the_exit_status_tells_of_an_incomplete_journal_and_of_unaccounted_messages(tmp_path: Path) -> None:
@@ -465,7 +465,7 @@ def test_a_metric_of_a_link_is_one_line_of_the_registry(tmp_path: Path, monkeypa
     monkeypatch.setitem(WIRE_METRICS, "bytes", Bytes())
     summary, _ = run(tmp_path, expecting('[[expect]]\nmetric = "scan.bytes"\nabove = 0.5\n'), messages=30)
     (judged,) = summary["expectations"]
-    assert (judged["held"], judged["found"]) == (True, summary["links"]["scan"]["bytes"])
+    assert (judged["held"], judged["value"]) == (True, summary["links"]["scan"]["bytes"])
 
 
 def test_the_page_lists_every_metric_of_a_link() -> None:

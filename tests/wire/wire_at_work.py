@@ -101,7 +101,7 @@ def at_work(plan: WirePlan, folder: Path) -> Iterator[WireAtWork]:
 def sending(messages: list[str]) -> Iterator[None]:
     """A program that publishes `scan` at the side robot of a wire from the moment at which `run_wire` says its endpoint.
 
-    said: the list into which the wire says its lines.
+    messages: the list into which the wire says its lines.
     """
     ended = Event()
 

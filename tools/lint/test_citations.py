@@ -55,6 +55,24 @@ def test_every_cited_section_exists() -> None:
     assert {name: absent for name, absent in wrong.items() if absent} == {}
 
 
+def test_every_cited_section_of_the_mathematics_exists() -> None:
+    """Wherever code cites docs/mathematics.md, as its source or in passing."""
+    headings = re.findall(
+        r"^## (.+)$", (ROOT / "docs" / "mathematics.md").read_text(encoding="utf-8").lower(), re.MULTILINE
+    )
+    cited = [
+        (name, section.lower())
+        for name in FILES
+        for section in re.findall(
+            r"docs/mathematics\.md, ([A-Za-z][\w ]*\w)", (ROOT / name).read_text(encoding="utf-8")
+        )
+    ]
+    assert len(cited) > 20
+    assert [
+        (name, section) for name, section in cited if not any(section.startswith(title) for title in headings)
+    ] == []
+
+
 @pytest.mark.parametrize(
     ("source", "expected"),
     [

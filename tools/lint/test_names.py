@@ -86,13 +86,27 @@ def test_classes_say_that_they_are_final_by_the_decorator() -> None:
             assert not pattern.search(ast.get_docstring(node) or ""), f"{path}: {node.name}"
 
 
-def test_no_two_test_files_have_the_same_name() -> None:
-    """Pytest imports test files by their names alone, and collects only the first of two."""
-    folders = defaultdict(list)
-    for folder in ("tests", "tools", "docs/examples"):
-        for path in (ROOT / folder).rglob("test_*.py"):
-            folders[path.name].append(str(path.parent))
-    assert {name: where for name, where in folders.items() if len(where) > 1} == {}
+def modules_of(folder: str) -> set[str]:
+    """The modules and packages of a package, and the package itself, by their last names."""
+    path = ROOT / "emulator" / "evedrop" / folder
+    return {path.name, *(entry.stem for entry in path.iterdir() if entry.suffix == ".py" or entry.is_dir())}
+
+
+def test_a_test_file_is_named_after_a_module() -> None:
+    """Whoever changes P/M.py finds its tests in tests/P/test_M.py or test_M_ASPECT.py; P's own in test_P_ASPECT.py.
+
+    In tests/live and tests/cli themselves, a file is named after what somebody does.
+    """
+    packages = [path.parent.name for path in (ROOT / "emulator" / "evedrop").glob("*/__init__.py")]
+    paths = [path for package in packages for path in (ROOT / "tests" / package).rglob("test_*.py")]
+    assert len(paths) > 250
+    wrong = {
+        path.relative_to(ROOT).as_posix()
+        for path in paths
+        if (folder := path.parent.relative_to(ROOT / "tests").as_posix()) not in {"live", "cli"}
+        and not any(f"{path.stem}_".startswith(f"test_{module}_") for module in modules_of(folder))
+    }
+    assert wrong == set()
 
 
 GLOSSARY = ROOT / "docs" / "glossary.md"
@@ -177,7 +191,7 @@ MEANT_OTHERWISE = {
         "emulator/evedrop/show/view/*",
         "emulator/evedrop/studies/applications/microgrid/sweep_picture.py",
         "emulator/evedrop/studies/papers/*",
-        "tests/cli/api/test_plots.py",
+        "tests/cli/api/test_api_plots.py",
         "tests/cli/test_design_command.py",
         "tests/cli/test_output.py",
         "tests/cli/test_results_are_data.py",
@@ -185,6 +199,7 @@ MEANT_OTHERWISE = {
         "tests/notebooks/*",
         "tests/show/report/test_report.py",
         "tests/show/view/*",
+        "tests/studies/papers/*",
     ),
 }
 """Former word → the files in which it, or its plural, means something else: here a picture."""

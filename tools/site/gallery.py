@@ -10,7 +10,7 @@ import hashlib
 import re
 from pathlib import Path
 
-from kept import PICTURES, program_digest
+from picture_folder import PICTURES, program_digest
 from view_pictures import view_pictures, view_section
 
 from evedrop import Scenario, montecarlo

@@ -12,7 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from kept import PICTURES, program_digest
+from picture_folder import PICTURES, program_digest
 
 from evedrop.scenarios import built_in_text
 

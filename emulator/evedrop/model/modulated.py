@@ -163,7 +163,7 @@ class ModulatedCovariance:
         source = odds["predicted"] * self._process.Q + misled
         if slot.remaining is not None:
             source = source + odds["leaked"] * slot.remaining
-        kept: Floats = odds["kept"] * (A @ mixed @ A.T) + weights * source
+        kept: Floats = odds["propagated"] * (A @ mixed @ A.T) + weights * source
         return kept
 
 
@@ -242,7 +242,7 @@ def limit_states(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> Flo
         return None
     if not misled and all(outcome.predicted + outcome.leaked + outcome.initial == 0.0 for outcome in outcomes):
         return np.zeros((states, n, n))
-    kept = np.repeat([outcome.kept for outcome in outcomes], n * n)
+    kept = np.repeat([outcome.propagated for outcome in outcomes], n * n)
     operator = kept[:, None] * np.kron(chain.transitions.T, np.kron(process.A, process.A))
     if np.max(np.abs(np.linalg.eigvals(operator))) >= 1.0 - 1e-12:
         return None
@@ -267,7 +267,7 @@ def _limit_sources(process: Process, chain: Chain, outcomes: list[Outcomes]) -> 
 def _limit_step(process: Process, chain: Chain, outcomes_at: OutcomesAt, states: Floats) -> Floats:
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
     mixed = np.tensordot(chain.transitions.T, states, axes=1)
-    kept = np.array([outcome.kept for outcome in outcomes])[:, None, None]
+    kept = np.array([outcome.propagated for outcome in outcomes])[:, None, None]
     stepped: Floats = kept * (process.A @ mixed @ process.A.T) + _limit_sources(process, chain, outcomes)
     return stepped
 
@@ -280,7 +280,7 @@ def tail_outcomes(chain: Chain, outcomes_at: OutcomesAt) -> Outcomes:
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
     if all(outcome.predicted + outcome.leaked == 0.0 for outcome in outcomes):
         return outcomes[0]
-    keeps = np.array([outcome.kept for outcome in outcomes])[:, None] * chain.transitions.T
+    keeps = np.array([outcome.propagated for outcome in outcomes])[:, None] * chain.transitions.T
     rate = min(1.0, float(np.max(np.abs(np.linalg.eigvals(keeps)))))
     misled = max(outcome.misled for outcome in outcomes)
     return Outcomes(predicted=rate, state=max(0.0, 1.0 - rate - misled), misled=misled, decoded=0.0, initial=1.0)
@@ -288,7 +288,7 @@ def tail_outcomes(chain: Chain, outcomes_at: OutcomesAt) -> Outcomes:
 
 BLOCK = 128
 """Slots in a block, a power of 2."""
-PARTS = ("kept", "predicted", "misled", "leaked", "initial")
+PARTS = ("propagated", "predicted", "misled", "leaked", "initial")
 """The outcomes of a slot that the recursion needs."""
 
 
@@ -337,7 +337,7 @@ def _operator(process: Process, chain: Chain, odds: Mapping[str, Floats], mislea
     carried = np.kron(process.A, process.A)
     count = states * size + (size if misleads else 0) + 1
     M = np.zeros((count, count))
-    M[: states * size, : states * size] = np.kron(odds["kept"][:, None] * chain.transitions.T, carried)
+    M[: states * size, : states * size] = np.kron(odds["propagated"][:, None] * chain.transitions.T, carried)
     M[: states * size, -1] = np.kron(chain.stationary * odds["predicted"], process.Q.reshape(-1))
     if misleads:
         sigma = slice(states * size, -1)
@@ -435,8 +435,8 @@ def _begun(process: Process, distributions: _SlotDistributions) -> list[tuple[Fl
     """
     odds, stationary = distributions.odds, distributions.stationary
     leaving = odds["predicted"] + odds["leaked"]
-    decoded = odds["kept"] - leaving
-    state = 1.0 - odds["kept"] - odds["misled"]
+    decoded = odds["propagated"] - leaving
+    state = 1.0 - odds["propagated"] - odds["misled"]
     first = (stationary * odds["initial"])[:1]
     before, synchronised = np.zeros(stationary.shape), stationary[0] - first[0]
     for k in range(1, len(stationary)):
@@ -458,7 +458,7 @@ def _lasting(
     """The same one slot later, of the streaks that continue, when they have lasted for `length` slots."""
     count = min(len(w), len(distributions.stationary) - length)
     some = slice(length, length + count)
-    kept, T, noise = distributions.odds["kept"][some], distributions.transitions[some], distributions.noise[some]
+    kept, T, noise = distributions.odds["propagated"][some], distributions.transitions[some], distributions.noise[some]
     states = range(w.shape[1])
     before, moved = np.zeros(kept.shape), np.zeros(noise.shape)
     for s in states:

@@ -64,7 +64,7 @@ class ReferenceCode:
         self.decorrelates = not open_loop and is_nonsingular(process.A)
         """Whether packets are independent of the state that they are sent for: L is not A."""
         self._states = StateFactors(process)
-        self._kept = max(2, _NUMBERS_KEPT // (_SLOTS_AT_ONCE * process.n * process.n))
+        self._most_blocks = max(2, _NUMBERS_KEPT // (_SLOTS_AT_ONCE * process.n * process.n))
         self._blocks: dict[int, tuple[Floats, Floats]] = {}
         self._watch: _Watch
         self._watched: int
@@ -110,7 +110,7 @@ class ReferenceCode:
     def _block_of(self, k: int) -> tuple[Floats, Floats]:
         number = k // _SLOTS_AT_ONCE
         if number not in self._blocks:
-            if len(self._blocks) == self._kept:
+            if len(self._blocks) == self._most_blocks:
                 del self._blocks[min(self._blocks)]
             self._blocks[number] = self._computed(range(number * _SLOTS_AT_ONCE, (number + 1) * _SLOTS_AT_ONCE))
         return self._blocks[number]

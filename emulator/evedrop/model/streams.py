@@ -161,7 +161,7 @@ class StreamReader(Protocol):
 
 
 @final
-class ShortReader:
+class SingleTrialReader:
     """The numbers of a stream for the one trial of a batch, made as quickly as possible for a few slots.
 
     A compiled kernel lets other threads run meanwhile, which takes longer than some numbers do.

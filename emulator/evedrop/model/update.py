@@ -65,12 +65,12 @@ def error(process: Process, e: Floats, action: Codes, nu: Flags, w: Floats, misl
     Nothing cancels, so it is accurate even where x exceeds all precision. Before slot 0, e is 0, and w is then x_0.
     """
 
-    def kept() -> Floats:
+    def predicted() -> Floats:
         carried = process.predict(e)
         return select(action == _INNOVATION, lambda: carried, lambda: carried + w)
 
     return select(
         (action == _STATE) & nu,
         misled,
-        lambda: cleared(action == _STATE, e.shape, kept),
+        lambda: cleared(action == _STATE, e.shape, predicted),
     )

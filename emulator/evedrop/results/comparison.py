@@ -20,7 +20,7 @@ from evedrop.errors import UsageError
 from evedrop.results.reading import ByName
 from evedrop.results.summary_file import plain
 from evedrop.score.summary import RareEvents, SecrecySummary
-from evedrop.score.verdict import Secrecy, SecrecyKept, Verdict
+from evedrop.score.verdict import Secrecy, SecrecyVerdict, Verdict
 from evedrop.system.files import Unreadable, text_of
 
 COMPARISON = "compare.json"
@@ -120,20 +120,20 @@ class Cell:
         return None if self.secrecy is None else self.secrecy.ratio_error
 
     @property
-    def verdict(self) -> SecrecyKept | None:
+    def verdict(self) -> SecrecyVerdict | None:
         """The verdict of the run; theory also decides whether an error is unbounded, and whether two are equal."""
         secrecy, other, legitimate = self.secrecy, self.eavesdropper, self.legitimate
         if secrecy is None or other is None or legitimate is None:
             return None
         if secrecy.relative is Verdict.FAILED:
-            return SecrecyKept.BROKEN
+            return SecrecyVerdict.BROKEN
         unbounded = _limit(other) == math.inf and _limit(legitimate) < math.inf
         if secrecy.perfect is Verdict.HELD and unbounded:
-            return SecrecyKept.PERFECT
+            return SecrecyVerdict.PERFECT
         if secrecy.relative is Verdict.HELD:
-            return SecrecyKept.RELATIVE
+            return SecrecyVerdict.RELATIVE
         denied = secrecy.relative_by_theory is False and secrecy.relative_from is None and not unbounded
-        return SecrecyKept.BROKEN if denied else SecrecyKept.UNDECIDED
+        return SecrecyVerdict.BROKEN if denied else SecrecyVerdict.UNDECIDED
 
     def as_dict(self) -> dict[str, Any]:
         """The cell in the form of compare.json."""
@@ -217,7 +217,7 @@ class SchemeResult:
         return min(played, key=lambda cell: _error(cell.eavesdropper), default=None)
 
     @property
-    def kept(self) -> float:
+    def protection(self) -> float:
         """The error of the closest adversary, by theory if it is known."""
         return math.nan if self.closest is None else _error(self.closest.eavesdropper)
 
@@ -260,12 +260,12 @@ class Comparison:
     @property
     def dominant(self) -> tuple[str, ...]:
         """Schemes that no other beats: none has a smaller legitimate error, or a larger error of the closest adversary."""
-        usable = [scheme for scheme in self.schemes.values() if not math.isnan(scheme.kept)]
+        usable = [scheme for scheme in self.schemes.values() if not math.isnan(scheme.protection)]
         return tuple(
             scheme.name
             for scheme in usable
             if all(
-                scheme.price <= other.price * (1.0 + _ALIKE) and scheme.kept >= other.kept * (1.0 - _ALIKE)
+                scheme.price <= other.price * (1.0 + _ALIKE) and scheme.protection >= other.protection * (1.0 - _ALIKE)
                 for other in usable
             )
         )

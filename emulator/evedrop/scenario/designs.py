@@ -19,7 +19,7 @@ from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.theory.closed_forms import encrypted_fraction, threshold_for
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, stability_bound
 from evedrop.model.theory.json_values import JsonFields
-from evedrop.model.theory.policies import Front, ScheduledLinks, front, held_traces, least_weight
+from evedrop.model.theory.policies import Front, LinkProbabilities, front, held_traces, least_weight
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import conditions_of, stated_form
@@ -205,7 +205,7 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
     for name, conditions in heard.items():
         if name == LEGITIMATE or conditions is None:
             continue
-        links = ScheduledLinks(mu, conditions[0], acknowledged, conditions[1])
+        links = LinkProbabilities(mu, conditions[0], acknowledged, conditions[1])
         fronts[name] = front(process, links, weights, prices, states)
         if not fronts[name].points:
             raise UsageError(_never(scenario, name, links, max(weights), min(prices), states))
@@ -248,7 +248,7 @@ def _not_for(scheme: str) -> str:
     )
 
 
-def _never(scenario: Scenario, name: str, links: ScheduledLinks, weight: float, price: float, states: int) -> str:
+def _never(scenario: Scenario, name: str, links: LinkProbabilities, weight: float, price: float, states: int) -> str:
     least = least_weight(scenario.process.process, links.mu, links.mu_e, price, states)
     never = f"the best policy against {name} never sends at weight {weight:g} and price {price:g}"
     if least is None:

@@ -291,26 +291,26 @@ def plain_tables(values: Mapping[str, Any], source: str, modules: str | None = N
 
     Raises ScenarioError with every value that cannot be in a scenario.
     """
-    reader = _Reader()
-    tables = {name: plain for name, value in values.items() if (plain := reader.plain(name, value)) is not None}
+    plain_tables = _PlainTables()
+    tables = {name: plain for name, value in values.items() if (plain := plain_tables.plain(name, value)) is not None}
     given = tables.get("modules", modules)
-    if reader.folders and not reader.mistakes and isinstance(given, (str, Path, type(None))):
-        folders = dict.fromkeys(reader.folders) if given is None else {str(Path(given).absolute()): None}
-        folders |= dict.fromkeys(reader.folders)
+    if plain_tables.folders and not plain_tables.mistakes and isinstance(given, (str, Path, type(None))):
+        folders = dict.fromkeys(plain_tables.folders) if given is None else {str(Path(given).absolute()): None}
+        folders |= dict.fromkeys(plain_tables.folders)
         if len(folders) > 1:
             both = " and ".join(folders)
-            reader.mistakes.append(
+            plain_tables.mistakes.append(
                 f"modules: the classes are in modules of several folders, {both}; put the modules into one folder"
             )
         tables["modules"] = next(iter(folders))
-    if reader.mistakes:
-        raise ScenarioError(source, reader.mistakes)
+    if plain_tables.mistakes:
+        raise ScenarioError(source, plain_tables.mistakes)
     return tables
 
 
 @final
 @dataclass
-class _Reader:
+class _PlainTables:
     mistakes: list[str] = field(default_factory=list)
     folders: list[str] = field(default_factory=list)
     """The folders of the modules in which classes are."""

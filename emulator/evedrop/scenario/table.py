@@ -60,7 +60,7 @@ def registered(classes: Registry[Any]) -> Callable[[str], str]:
         if why is None:
             return value
         if why:
-            raise PydanticCustomError("expected", "one value", {"said": why})
+            raise PydanticCustomError("expected", "one value", {"ending": why})
         raise expected(listed(classes.names), near(value, classes.names))
 
     return check
@@ -134,8 +134,9 @@ def parameter_mistakes(kind: str, name: str, model: Any, given: Mapping[str, Any
     """Missing and unknown parameters of a class; kind, name: the class in messages, such as scheme innovation."""
     for entry, example in model.parameters.items():
         if entry not in given and entry not in getattr(model, "optional", ()):
-            yield entry, f"is missing; the {kind} {name} needs it, such as {entry} = {as_toml(example)}"
-    choice = f"expected {listed(sorted(model.parameters))}" if model.parameters else "remove the line"
+            yield entry, f"is missing; the {kind} {name} needs it; expected {entry} = {as_toml(example)}"
+    names = {*model.parameters, *(("file",) if getattr(model, "recorded", None) is not None else ())}
+    choice = f"expected {listed(sorted(names))}" if names else "remove the line"
     for entry in given:
         if entry not in model.parameters:
             yield entry, f"is set, but the {kind} {name} has no such parameter; {choice}"
@@ -154,17 +155,7 @@ def model_mistakes(table: Mapping[str, Any], models: Registry[Any]) -> list[Mist
         problem = _no_class(name, models) or f"; expected {listed(models.names)}{near(name, models.names)}"
         return [("model", f"is {as_toml(name)}{problem}")]
     given = {name: value for name, value in table.items() if name != "model"}
-    mistakes = [
-        (name, f"is missing; expected {name} = {as_toml(example)}")
-        for name, example in model.parameters.items()
-        if name not in given and name not in model.optional
-    ]
-    names = {*model.parameters, *(("file",) if getattr(model, "recorded", None) is not None else ())}
-    mistakes += [
-        (name, f"is not a parameter of {table['model']}; expected {listed(sorted(names))}")
-        for name in given
-        if name not in model.parameters
-    ]
+    mistakes = [*parameter_mistakes(models.kind, str(table["model"]), model, given)]
     return mistakes + asked(model, {name: value for name, value in given.items() if name in model.parameters})
 
 
@@ -204,10 +195,10 @@ def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
     if kind == "extra_forbidden":
         return no_entry(name, table.entries())
     if kind == "expected":
-        ending = context.get("said") or f"; expected {context['expected']}{context['hint'] or example}"
+        ending = context.get("ending") or f"; expected {context['expected']}{context['hint'] or example}"
         return f"is {as_toml(value)}{ending}"
-    if kind in {"greater_than_equal", "less_than_equal", "less_than"}:
-        words = {"ge": "at least", "le": "at most", "lt": "less than"}
+    if kind in {"greater_than", "greater_than_equal", "less_than_equal", "less_than"}:
+        words = {"gt": "above", "ge": "at least", "le": "at most", "lt": "less than"}
         bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)
         return f"is {as_toml(value)}; expected a number {bound}{example}"
     if kind in {"too_long", "too_short", "string_too_long"}:

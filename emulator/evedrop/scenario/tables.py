@@ -154,7 +154,7 @@ class NetworkTable(Table):
 def _folder(path: str) -> str:
     if not Path(path).is_dir():
         ending = ", which is not a folder; expected the folder that contains the modules"
-        raise PydanticCustomError("expected", "one value", {"said": ending})
+        raise PydanticCustomError("expected", "one value", {"ending": ending})
     return path
 
 

@@ -309,7 +309,7 @@ class Judged:
     text: str
     held: bool | None
     """None: it cannot be decided, and so it failed (see `failed`)."""
-    found: JudgedValue
+    value: JudgedValue
     wanted: str
     replay: str | None = None
     """The command that reproduces a failure; left out of the entry if None."""
@@ -325,11 +325,11 @@ class Judged:
         """The expectation as a sentence of the closing report."""
         words = {True: "held", False: "FAILED", None: f"FAILED, {self.why or 'the run has no value for it'}"}
         sentence = f"expected {self.text}: {words[self.held]}"
-        if self.found is None:
+        if self.value is None:
             return sentence + (", found none" if self.held is False else "")
-        if isinstance(self.found, str) and self.found not in {"inf", "-inf", "nan"}:
-            return f"{sentence}, found {self.found}"
-        number = str(self.found) if isinstance(self.found, int) else f"{float(self.found):.6g}"
+        if isinstance(self.value, str) and self.value not in {"inf", "-inf", "nan"}:
+            return f"{sentence}, found {self.value}"
+        number = str(self.value) if isinstance(self.value, int) else f"{float(self.value):.6g}"
         return f"{sentence}, found {number}"
 
 

@@ -28,7 +28,7 @@ from evedrop.model.slot.link import COUNTED_BURSTS, Account
 from evedrop.model.slot.records import LinkSlots
 from evedrop.score.conditional import ConditionalError
 from evedrop.score.leak import LeakTally
-from evedrop.score.watched_tally import WatchedSlots, WatchedTally
+from evedrop.score.watched_tally import WatchedQuantity, WatchedTally
 
 LEVELS = (0.05, 0.5, 0.95)
 """The quantiles that are reported."""
@@ -320,7 +320,7 @@ class Tally(ReceiverTally):
         """A metric of the run by its name; None if it has no value."""
         metric_class = metric(name)
         if not issubclass(metric_class, TallyMetric):
-            return self.watched.tally(WatchedSlots(name, 0, self.slots)).value
+            return self.watched.tally(WatchedQuantity(name, 0, self.slots)).value
         value = metric_class.of_tally(self) if self.offered else math.nan
         return None if math.isnan(value) else value
 
@@ -341,7 +341,7 @@ class Tally(ReceiverTally):
             error: Floats = self.window_errors.sum(axis=0)
             sums = kind.sums_of_trials(TrialTally(error, self.traces, self.packets[0], self.packets[1]))
             return None if sums is None else sums / self.done
-        return self.watched.tally(WatchedSlots(name, 0, self.slots)).of_trials if kind.by_trial else None
+        return self.watched.tally(WatchedQuantity(name, 0, self.slots)).of_trials if kind.by_trial else None
 
     def standard_error(self, name: str) -> float | None:
         """The standard error of a metric of the run; None if it has none."""

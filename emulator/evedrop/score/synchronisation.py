@@ -100,7 +100,7 @@ class LongestSpans:
         """most: how many are kept, of equally long ones the earlier; first: the first slot of the first piece."""
         self._most, self._next = most, first
         self._ended = 0
-        self._kept: list[LostSpan] = []
+        self._longest_spans: list[LostSpan] = []
         self._open: LostSpan | None = None
         """The last span so far: further slots may prolong it."""
 
@@ -115,7 +115,7 @@ class LongestSpans:
                 spans.insert(0, self._open)
         self._open = spans.pop() if spans else None
         self._ended += len(spans)
-        self._kept = self._longest(spans)
+        self._longest_spans = self._longest(spans)
 
     @property
     def count(self) -> int:
@@ -128,4 +128,4 @@ class LongestSpans:
         return self._longest([] if self._open is None else [self._open])
 
     def _longest(self, further: list[LostSpan]) -> list[LostSpan]:
-        return nlargest(self._most, [*self._kept, *further], key=lambda span: (span.slots, -span.first))
+        return nlargest(self._most, [*self._longest_spans, *further], key=lambda span: (span.slots, -span.first))

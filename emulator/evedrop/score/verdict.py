@@ -369,7 +369,7 @@ def _holds_from(legitimate: Expectation, other: Expectation, slots: int) -> int 
     return first if first < slots else None
 
 
-class SecrecyKept(StrEnum):
+class SecrecyVerdict(StrEnum):
     """How much a scheme keeps secret from an adversary, in a word."""
 
     PERFECT = "perfect"
@@ -378,5 +378,10 @@ class SecrecyKept(StrEnum):
     BROKEN = "broken"
 
 
-MARKS = {SecrecyKept.PERFECT: "●", SecrecyKept.RELATIVE: "◐", SecrecyKept.UNDECIDED: "?", SecrecyKept.BROKEN: "✕"}
+MARKS = {
+    SecrecyVerdict.PERFECT: "●",
+    SecrecyVerdict.RELATIVE: "◐",
+    SecrecyVerdict.UNDECIDED: "?",
+    SecrecyVerdict.BROKEN: "✕",
+}
 """Verdicts as marks that can be distinguished without colours."""

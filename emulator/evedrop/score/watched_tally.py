@@ -101,7 +101,7 @@ SYNCHRONISED = "synchronised"
 _NEVER = -1
 
 
-class WatchedSlots(NamedTuple):
+class WatchedQuantity(NamedTuple):
     """A quantity to keep, over the slots from `first` to before `end`."""
 
     metric: str
@@ -110,14 +110,14 @@ class WatchedSlots(NamedTuple):
     end: int
 
 
-def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedSlots] | None:
+def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedQuantity] | None:
     """The receiver and the quantity that an expectation needs; None if the summary's metrics are enough."""
     if expect.synchronised is not None:
-        return expect.synchronised, WatchedSlots(SYNCHRONISED, _since(scenario, expect), scenario.slots)
+        return expect.synchronised, WatchedQuantity(SYNCHRONISED, _since(scenario, expect), scenario.slots)
     if expect.metric is None or (expect.slots is None and expect.quantile is None):
         return None
     receiver, _, name = expect.metric.partition(".")
-    return receiver, WatchedSlots(name, *(expect.slots or (0, scenario.slots)))
+    return receiver, WatchedQuantity(name, *(expect.slots or (0, scenario.slots)))
 
 
 def _since(scenario: Scenario, expect: ExpectTable) -> int:
@@ -129,13 +129,13 @@ def _since(scenario: Scenario, expect: ExpectTable) -> int:
     return max(over, default=0)
 
 
-def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedSlots, ...]]:
+def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedQuantity, ...]]:
     """Receiver → all quantities that its metrics and the scenario's expectations need."""
     wanted = [watch for expect in scenario.expect if (watch := watch_of(scenario, expect)) is not None]
     watches = {}
     for receiver in scenario.receivers:
         own = [
-            WatchedSlots(name, 0, scenario.slots)
+            WatchedQuantity(name, 0, scenario.slots)
             for name, kind in metrics_of(receiver).items()
             if not issubclass(kind, TallyMetric)
         ]
@@ -180,16 +180,16 @@ def _tally(name: str, trials: int) -> MetricTally:
 class WatchedTally:
     """Keeps the tallies of these quantities over R trials."""
 
-    def __init__(self, watches: Iterable[WatchedSlots], trials: int) -> None:
-        self._kept = {watch: _tally(watch.metric, trials) for watch in watches}
+    def __init__(self, watches: Iterable[WatchedQuantity], trials: int) -> None:
+        self._tallies = {watch: _tally(watch.metric, trials) for watch in watches}
 
     def add_slots(self, slots: ScoredSlots) -> None:
         """Add the next slots."""
-        for watch, kept in self._kept.items():
+        for watch, tally in self._tallies.items():
             start, stop = max(watch.first - slots.first, 0), min(watch.end - slots.first, len(slots.error))
             stateless = slots.x is None and watch.metric != SYNCHRONISED and metric(watch.metric).needs_states
             if start < stop and not stateless:
-                kept.add(slots if (start, stop) == (0, len(slots.error)) else slots.part(start, stop))
+                tally.add(slots if (start, stop) == (0, len(slots.error)) else slots.part(start, stop))
 
     def begin(self) -> None:
         """Make the tallies of packages' metrics now, not with the first slot."""
@@ -197,24 +197,25 @@ class WatchedTally:
             tally.begin()
 
     @property
-    def of_packages(self) -> dict[WatchedSlots, GuardedTally]:
+    def of_packages(self) -> dict[WatchedQuantity, GuardedTally]:
         """The tallies of packages' metrics."""
-        return {watch: tally for watch, tally in self._kept.items() if isinstance(tally, GuardedTally)}
+        return {watch: tally for watch, tally in self._tallies.items() if isinstance(tally, GuardedTally)}
 
     @property
     def failures(self) -> list[str]:
         """Why metrics of packages failed, in words."""
         return [tally.failure for tally in self.of_packages.values() if tally.failure]
 
-    def tally(self, watch: WatchedSlots) -> MetricTally:
+    def tally(self, watch: WatchedQuantity) -> MetricTally:
         """The tally of a quantity over its slots."""
-        return self._kept[watch]
+        return self._tallies[watch]
 
     @classmethod
     def merged(cls, parts: Sequence[WatchedTally]) -> WatchedTally:
         """The quantities of disjoint sets of trials, in their order."""
         total = cls((), 0)
-        total._kept = {
-            watch: type(tally).merged([part._kept[watch] for part in parts]) for watch, tally in parts[0]._kept.items()
+        total._tallies = {
+            watch: type(tally).merged([part._tallies[watch] for part in parts])
+            for watch, tally in parts[0]._tallies.items()
         }
         return total

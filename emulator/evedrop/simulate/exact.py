@@ -104,7 +104,7 @@ class ExactSimulation:
             controller = ControllerCore(scenario.controller.strategy, scenario.assignment, disturbances, batch.trials)
             self._control_loop = _ControlLoop(roles, controller, self._sensor, digests[CONTROLLER], times)
         self._receivers = {
-            name: LinkedReceiver(role, scenario.window(name), scenario.timeline.outages[name])
+            name: SimulatedReceiver(role, scenario.window(name), scenario.timeline.outages[name])
             for name, role in roles.receivers.items()
         }
         self._logs = {
@@ -224,7 +224,7 @@ class _ControlLoop:
 
 
 @final
-class LinkedReceiver:
+class SimulatedReceiver:
     """A receiver that follows the slots from 0 on, and may be away in some of them."""
 
     def __init__(self, receiver: Receiver, window: int, outages: Sequence[Away]) -> None:

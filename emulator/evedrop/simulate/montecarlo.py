@@ -37,7 +37,7 @@ from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotHistograms, SlotSums, squared_errors
 from evedrop.simulate.chunk import PacketTally
 from evedrop.simulate.cluster import REACH_SECONDS, Cluster, connected
-from evedrop.simulate.kept_tasks import KeptTasks, kept_tasks, study_of
+from evedrop.simulate.finished_tasks import FinishedTasks, finished_tasks, study_of
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.splitting import rare_estimates, work_of
 from evedrop.simulate.tasks import OnProgress, R, Stopped, Task
@@ -57,16 +57,16 @@ class Crew:
     cluster: Cluster | None = None
 
     def results(
-        self, tasks: Sequence[Task[R]], on_progress: OnProgress, stopped: Stopped, kept: KeptTasks | None = None
+        self, tasks: Sequence[Task[R]], on_progress: OnProgress, stopped: Stopped, finished: FinishedTasks | None = None
     ) -> Generator[R]:
         """Carry out tasks; yields their results in task order.
 
-        on_progress: gets the trial-slots done since its last call; kept: where complete results are kept as they come, and from
+        on_progress: gets the trial-slots done since its last call; finished: where complete results are kept, and from
         where those that it has are read. After a stop, the last results may be incomplete.
 
         Raises RunError if a worker fails, OSError if a result cannot be kept.
         """
-        read = {number for number, task in enumerate(tasks) if kept is not None and kept.has(task)}
+        read = {number for number, task in enumerate(tasks) if finished is not None and finished.has(task)}
         left = [number for number in range(len(tasks)) if number not in read]
         held: dict[int, R] = {}
         due = 0
@@ -75,8 +75,8 @@ class Crew:
                 while due in read or due in held:
                     if due in held:
                         yield held.pop(due)
-                    elif kept is not None and not stopped():
-                        yield kept.load(tasks[due])
+                    elif finished is not None and not stopped():
+                        yield finished.load(tasks[due])
                         on_progress(tasks[due].work)
                     else:
                         return
@@ -85,8 +85,9 @@ class Crew:
                     return
                 number, result = left[following[0]], following[1]
                 held[number] = result
-                if kept is not None and result.complete and len(tasks) > 1:  # a study of one task is complete with it
-                    kept.keep(tasks[number], result)
+                # A study of one task is complete with it.
+                if finished is not None and result.complete and len(tasks) > 1:
+                    finished.keep(tasks[number], result)
 
     def _as_they_come(
         self, tasks: Sequence[Task[R]], on_progress: OnProgress, stopped: Stopped
@@ -179,16 +180,16 @@ def simulate(scenario: Scenario, folder: Path, on_event: OnEvent, plan: Plan = P
     merger = Merger(scenario, plan.mode)
 
     def ending(how: str) -> RunOutcome:
-        return RunOutcome(kept.seconds, how, replay_of(folder, scenario, plan.mode.value))
+        return RunOutcome(finished.seconds, how, replay_of(folder, scenario, plan.mode.value))
 
-    with stop_on_signals() as stop, plan.crew([scenario]) as crew, kept_tasks(folder, study, resume) as kept:
-        tasks = tasks_of(scenario, plan.mode, crew.workers, kept)
+    with stop_on_signals() as stop, plan.crew([scenario]) as crew, finished_tasks(folder, study, resume) as finished:
+        tasks = tasks_of(scenario, plan.mode, crew.workers, finished)
         on_progress = progress_counter(on_event, scenario.trials * scenario.slots)
         with contextlib.closing(HeldFolder(folder)) as held, disk_errors(folder):
             write_resolved(folder, scenario)
             with (
                 ResultsWriter.of(folder, scenario) as writer,
-                contextlib.closing(crew.results(tasks, on_progress, stop.is_set, kept)) as results,
+                contextlib.closing(crew.results(tasks, on_progress, stop.is_set, finished)) as results,
             ):
                 try:
                     for result in results:
@@ -206,8 +207,8 @@ def simulate(scenario: Scenario, folder: Path, on_event: OnEvent, plan: Plan = P
                         summary = summary.with_rare_estimates(estimates)
                     writer.settle(merger.at, summary)
             if not merger.trials:
-                kept.remove_unless_any()
-                raise failure or kept.interrupted("any trials were done")
+                finished.remove_unless_any()
+                raise failure or finished.interrupted("any trials were done")
             place = held.now
             write_summary(place, summary)
             if place != folder:
@@ -216,7 +217,7 @@ def simulate(scenario: Scenario, folder: Path, on_event: OnEvent, plan: Plan = P
             raise failure
         if not merger.complete or (plan.rare and stop.is_set()):
             raise Interrupted.with_results(place)
-        kept.forget()
+        finished.forget()
     if summary.ended != how:  # a metric failed
         raise RunError(summary.ended)
     return 1 if summary.failed_expectations else 0

@@ -24,7 +24,7 @@ from evedrop.score.scorekeeper import Scorekeeper
 from evedrop.score.slots import Slots
 from evedrop.score.sums import SlotHistograms, SlotSums, slot_sums
 from evedrop.simulate.chunk import Chunk, PacketTally
-from evedrop.simulate.kept_tasks import KeptTasks
+from evedrop.simulate.finished_tasks import FinishedTasks
 from evedrop.simulate.simulation import Mode, Simulation
 from evedrop.simulate.tasks import OnProgress, Stopped, Task
 
@@ -87,14 +87,14 @@ class TrialsTask(Task[BatchResult]):
         return BatchResult(self.start, [block], histograms, histograms, [Slots.example(scenario.receivers)])
 
 
-def tasks_of(scenario: Scenario, mode: Mode, workers: int, kept: KeptTasks | None = None) -> list[TrialsTask]:
+def tasks_of(scenario: Scenario, mode: Mode, workers: int, finished: FinishedTasks | None = None) -> list[TrialsTask]:
     """Split the trials, in order, into parts of nearly equal size, the same number for each worker.
 
-    kept: has the results of some tasks, which stay as they are; the trials between them are split.
+    finished: has the results of some tasks, which stay as they are; the trials between them are split.
     """
     tables = scenario.model_dump(mode="json")
     end = scenario.first_trial + scenario.trials
-    done = [] if kept is None else kept.ranges(TrialsTask(tables, scenario.first_trial, end, mode))
+    done = [] if finished is None else finished.ranges(TrialsTask(tables, scenario.first_trial, end, mode))
     work = BLOCK_TRIALS * scenario.slots * len(scenario.receivers)
     side_by_side = max(1, min(_SIDE_BY_SIDE, _MOST_WORK // work))
     bounds, at = list[tuple[int, int]](), scenario.first_trial

@@ -39,7 +39,7 @@ from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.scorekeeper import verdicts
 from evedrop.score.sums import LEVELS, Tally, trial_means
 from evedrop.simulate.chunk import PacketTally
-from evedrop.simulate.kept_tasks import kept_tasks, study_of
+from evedrop.simulate.finished_tasks import finished_tasks, study_of
 from evedrop.simulate.montecarlo import Merger, Plan, progress_counter
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import BatchResult, tasks_of
@@ -73,13 +73,13 @@ def compare_all(matchups: Matchups, folder: Path, on_event: OnEvent, plan: Plan,
     with (
         stop_on_signals() as stop,
         plan.crew(group.scenario for group in groups) as crew,
-        kept_tasks(folder, study, resume) as kept,
+        finished_tasks(folder, study, resume) as finished,
     ):
-        tasks = [tasks_of(group.scenario, plan.mode, 1, kept) for group in groups]
+        tasks = [tasks_of(group.scenario, plan.mode, 1, finished) for group in groups]
         everything = list(itertools.chain(*tasks))
         with (
             disk_errors(folder),
-            contextlib.closing(crew.results(everything, on_progress, stop.is_set, kept)) as results,
+            contextlib.closing(crew.results(everything, on_progress, stop.is_set, finished)) as results,
         ):
             written, took = time.monotonic(), 0.0
             try:
@@ -97,8 +97,8 @@ def compare_all(matchups: Matchups, folder: Path, on_event: OnEvent, plan: Plan,
                 failure = error
         comparison = _comparison(matchups, played)
         if not comparison.schemes:
-            kept.remove_unless_any()
-            raise failure or kept.interrupted("a scheme was done")
+            finished.remove_unless_any()
+            raise failure or finished.interrupted("a scheme was done")
         _write(folder, comparison, played)
         if failure is not None:
             raise failure
@@ -106,7 +106,7 @@ def compare_all(matchups: Matchups, folder: Path, on_event: OnEvent, plan: Plan,
             raise Interrupted(
                 f"interrupted; {len(comparison.schemes)} of {len(matchups.schemes)} schemes are in {folder}"
             )
-        kept.forget()
+        finished.forget()
     return comparison
 
 

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, final
 from evedrop.errors import Interrupted
 from evedrop.results.folder import disk_errors, replace_private
 from evedrop.scenario.tables import Scenario
-from evedrop.simulate.kept_tasks import KeptTasks, kept_tasks, study_of
+from evedrop.simulate.finished_tasks import FinishedTasks, finished_tasks, study_of
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.tasks import OnProgress, R, Task
 from evedrop.system.signals import stop_on_signals
@@ -55,20 +55,20 @@ def all_results(
     with ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
         crew = stack.enter_context(plan.crew([scenario]))
-        kept: KeptTasks | None = None
+        finished: FinishedTasks | None = None
         if place is not None:
-            kept = stack.enter_context(kept_tasks(place.folder, study_of(kind, {}, [scenario]), place.resume))
+            finished = stack.enter_context(finished_tasks(place.folder, study_of(kind, {}, [scenario]), place.resume))
             stack.enter_context(disk_errors(place.folder))
-        with closing(crew.results(tasks, on_progress, stop.is_set, kept)) as results:
+        with closing(crew.results(tasks, on_progress, stop.is_set, finished)) as results:
             complete = [result for result in results if result.complete]
         if len(complete) < len(tasks):
-            if kept is None:
+            if finished is None:
                 raise Interrupted("interrupted before all trials were done; nothing was kept")
-            kept.remove_unless_any()
-            raise kept.interrupted("all trials were done")
+            finished.remove_unless_any()
+            raise finished.interrupted("all trials were done")
         yield complete
-        if kept is not None:
-            kept.forget()
+        if finished is not None:
+            finished.forget()
 
 
 def write_found(place: StudyPlace | None, name: str, result: object) -> None:

@@ -35,7 +35,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.scenarios import shipped
 from evedrop.score.summary import Judged, failed
 from evedrop.show.report.writing import has_results, try_report
-from evedrop.simulate.kept_tasks import KEPT
+from evedrop.simulate.finished_tasks import TASKS
 from evedrop.simulate.montecarlo import Plan, simulate
 from evedrop.system.processes import SUSPENDED_SECONDS, SuspensionWatch, continue_when_parent_dies, kill, wait_for
 from evedrop.system.signals import stop_on_signals
@@ -175,7 +175,7 @@ def _folder_for(scenario: str, made: Scenario, manner: Manner) -> Path:
 
 def _has_ended(folder: Path) -> bool:
     """Whether a folder has the results of a study that is complete."""
-    return has_results(folder) and not (folder / KEPT).exists()
+    return has_results(folder) and not (folder / TASKS).exists()
 
 
 def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:

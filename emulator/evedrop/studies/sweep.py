@@ -25,7 +25,7 @@ from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import RunOutcome
 from evedrop.score.summary import Summary
-from evedrop.simulate.kept_tasks import kept_tasks, study_of
+from evedrop.simulate.finished_tasks import finished_tasks, study_of
 from evedrop.simulate.montecarlo import Merger, Plan, check_mode, progress_counter
 from evedrop.simulate.trials import BatchResult, tasks_of
 from evedrop.system.signals import stop_on_signals
@@ -107,17 +107,17 @@ def sweep_over(
     with (
         stop_on_signals() as stop,
         plan.crew(scenario for _, scenario in scenarios) as crew,
-        kept_tasks(folder, study, resume) as kept,
+        finished_tasks(folder, study, resume) as finished,
     ):
         each = crew.workers if len(scenarios) < 4 * crew.workers else 1  # if there are many points, do not split them
-        tasks = [tasks_of(scenario, plan.mode, each, kept) for _, scenario in scenarios]
+        tasks = [tasks_of(scenario, plan.mode, each, finished) for _, scenario in scenarios]
         on_progress = progress_counter(on_event, total)
         everything = list(itertools.chain(*tasks))
         with disk_errors(folder):
             write_private(folder / "sweep.json", text + "\n")
             if isinstance(source, Scenario):  # there is no other file from which the sweep could be repeated
                 write_private(folder / "scenario.toml", source.to_toml())
-            with contextlib.closing(crew.results(everything, on_progress, stop.is_set, kept)) as results:
+            with contextlib.closing(crew.results(everything, on_progress, stop.is_set, finished)) as results:
                 written = time.monotonic()
                 try:
                     for (point, scenario), its_tasks in zip(scenarios, tasks, strict=True):
@@ -132,8 +132,8 @@ def sweep_over(
                 except RunError as error:
                     failure = error
             if not rows:
-                kept.remove_unless_any()
-                raise failure or kept.interrupted("a point was done")
+                finished.remove_unless_any()
+                raise failure or finished.interrupted("a point was done")
             table = _write_table(folder, rows)
             used = dict.fromkeys(name for _, scenario in scenarios for name in scenario.applications)
             _draw(folder, table, grid, used)
@@ -141,7 +141,7 @@ def sweep_over(
             raise failure
         if done < len(scenarios):
             raise Interrupted(f"interrupted; {done} of {len(scenarios)} points were done, and are in {folder}")
-        kept.forget()
+        finished.forget()
     return table
 
 

@@ -272,14 +272,14 @@ def _endpoint_mistakes(sides: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     for i, placed in enumerate(listens):
         if (other := _overlapping(placed, listens[:i])) is not None:
             same = "the same place" if placed.endpoint == other.endpoint else f"the same place as {other.endpoint}"
-            yield f"{placed.said}, {same} at which side {other.side} listens; expected another port"
+            yield f"{placed.beginning}, {same} at which side {other.side} listens; expected another port"
     for i, placed in enumerate(connects):
         if (other := _overlapping(placed, listens)) is not None:
             where = f"where side {other.side} of this wire listens, {round_and_round}"
-            yield f"{placed.said}, {where}; expected a router outside of the wire"
+            yield f"{placed.beginning}, {where}; expected a router outside of the wire"
         if (other := _overlapping(placed, connects[:i])) is not None:
             why = "" if placed.side == other.side else f", {round_and_round}"
-            yield f"{placed.said}, the router to which side {other.side} connects{why}; expected another router"
+            yield f"{placed.beginning}, the router to which side {other.side} connects{why}; expected another router"
 
 
 class _Placed(NamedTuple):
@@ -291,7 +291,7 @@ class _Placed(NamedTuple):
     place: EndpointPlace
 
     @property
-    def said(self) -> str:
+    def beginning(self) -> str:
         """The beginning of a message about it."""
         return f"{self.path}: is {as_toml(self.endpoint)}"
 

@@ -105,7 +105,7 @@ class WireHistory:
 
     def note(self, line: str, now: float, bypass: bool = False) -> None:
         """Note an event. Raises OSError."""
-        self._write({"said": line, "time": now, **({"bypass": True} if bypass else {})})
+        self._write({"event": line, "time": now, **({"bypass": True} if bypass else {})})
 
     def end(self, counts: Mapping[Numbered, int], now: float, missing: int = 0) -> None:
         """End the latest start. missing: the number of rows for which the disk had no room. Raises OSError."""
@@ -176,8 +176,8 @@ class WireHistory:
             self._add(
                 entry["change"], entry["settings"], {(str(k), str(kind)): _number(n) for k, kind, n in entry["since"]}
             )
-        elif "said" in entry:
-            self.noted.append(NotedEvent(float(entry["time"]), str(entry["said"]), bool(entry.get("bypass"))))
+        elif "event" in entry:
+            self.noted.append(NotedEvent(float(entry["time"]), str(entry["event"]), bool(entry.get("bypass"))))
         elif int(entry["end"]) == self.start:
             self.ended = True
             self.counts = {(str(link), str(key), str(kind)): _number(n) for link, key, kind, n in entry["counts"]}

@@ -23,7 +23,7 @@ from typing import Any, final
 import zenoh
 
 from evedrop.wire.departures import FewLines
-from evedrop.wire.link_state import LinkState
+from evedrop.wire.running_link import RunningLink
 from evedrop.wire.side import PROBES, SideSession
 
 _MULTICAST: Mapping[str, Any] = {"enabled": True}
@@ -123,7 +123,7 @@ class Neighbours:
     def __init__(
         self,
         sides: Mapping[str, SideSession],
-        states: Sequence[LinkState],
+        states: Sequence[RunningLink],
         tell: Callable[[str], None],
         bypasses: Bypasses,
     ) -> None:

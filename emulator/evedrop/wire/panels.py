@@ -29,8 +29,8 @@ from evedrop.wire.time_steps import (
     Counts,
     CutWatcher,
     LaneState,
-    LinkWatcher,
     Notice,
+    NoticeWatcher,
     WireSteps,
     legend,
     loss_state_of,
@@ -81,7 +81,7 @@ class WirePanels:
         self._lanes = StateLanes(_LANES, [(name, LANE) for name in self._names], first=1)
         self._cut_path = f"{_LANES}/{'0' * digits}_cut"
         self._graph = WireGraph(plan)
-        self._watcher = LinkWatcher(self._names, pace.step)
+        self._watcher = NoticeWatcher(self._names, pace.step)
         self._cuts = CutWatcher(plan.links)
         self._cut_word = ""
         self._cut_words: dict[str, str] = {}

@@ -20,10 +20,10 @@ import zenoh
 from evedrop.system.waiting import wait_for_thread
 from evedrop.wire.departures import Backlog
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.link_state import Lane, LinkState
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.records import AGAIN, HELD, UNLINKED, Kind, WireFate
-from evedrop.wire.ros2 import SourceReader
+from evedrop.wire.ros2 import SenderReader
+from evedrop.wire.running_link import Lane, RunningLink
 from evedrop.wire.send_queue import LONG_SECONDS, SendQueue, waiting_bytes
 from evedrop.wire.side import SideSession, expressions_of
 from evedrop.wire.watchdog import Duty
@@ -56,7 +56,7 @@ class _Way:
     )  # fmt: skip
 
     def __init__(
-        self, state: LinkState, key: str, publishers: Publishers, send_queue: SendQueue, decide: Lane, only: bool
+        self, state: RunningLink, key: str, publishers: Publishers, send_queue: SendQueue, decide: Lane, only: bool
     ) -> None:
         """only: whether all links from its side lead to the same other side, apart from taps."""
         self.decide = decide
@@ -135,7 +135,7 @@ class PublicationRelay:
     def __init__(
         self,
         side: SideSession,
-        links: Mapping[str, LinkState],
+        links: Mapping[str, RunningLink],
         publishers: Mapping[str, Publishers],
         send_queues: Mapping[str, SendQueue],
         plan: WirePlan,
@@ -206,7 +206,7 @@ class PublicationRelay:
         ways_of: dict[str, _Ways] = {}
         now, clock, way_to = time.time, time.monotonic, self._way_to
         record, amend = self._journal.record, self._journal.amend
-        read = SourceReader(self._journal.source_code)
+        read = SenderReader(self._journal.source_code)
         put, put_kind, delete_kind = zenoh.SampleKind.PUT, int(Kind.PUT), int(Kind.DELETE)
         unlinked, underway, zenoh_error = int(WireFate.UNLINKED), int(WireFate.UNDERWAY), zenoh.ZError
         refused = WireFate.REFUSED

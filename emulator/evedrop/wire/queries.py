@@ -20,11 +20,11 @@ import zenoh
 
 from evedrop.system.waiting import wait_for_thread
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.link_state import Decision, Lane, LinkState, Scheduler
 from evedrop.wire.plan import LOST_HISTORY_SECONDS, WirePlan, published_key
 from evedrop.wire.publications import READY_KEYS
 from evedrop.wire.records import AGAIN, HELD, UNLINKED, Kind, WireFate
-from evedrop.wire.ros2 import SourceReader, reply_seconds
+from evedrop.wire.ros2 import SenderReader, reply_seconds
+from evedrop.wire.running_link import Decision, Lane, RunningLink, Scheduler
 from evedrop.wire.send_queue import SendQueue, waiting_bytes
 from evedrop.wire.side import SideSession, expressions_of
 from evedrop.wire.watchdog import Duty
@@ -72,7 +72,7 @@ class QueryRelay:
     def __init__(
         self,
         sides: Mapping[str, SideSession],
-        links: Mapping[str, LinkState],
+        links: Mapping[str, RunningLink],
         send_queues: Mapping[str, SendQueue],
         plan: WirePlan,
         journal: WireJournal,
@@ -83,12 +83,12 @@ class QueryRelay:
         self._sides, self._plan, self._journal = sides, plan, journal
         self._links, self._send_queues = links, send_queues
         self._states = [state for state in links.values() if not state.link.tap]
-        self._lanes: dict[tuple[str, str, str], tuple[Lane, LinkState]] = {}
+        self._lanes: dict[tuple[str, str, str], tuple[Lane, RunningLink]] = {}
         self._queriers: dict[tuple[str, str, bool, bool], zenoh.Querier] = {}
         self._services: tuple[frozenset[tuple[str, str]], tuple[bool, ...]] | None = None
         self._mirrored: dict[str, dict[str, tuple[zenoh.KeyExpr, Any]]] = {name: {} for name in sides}
         self._lock = threading.RLock()
-        self._read = SourceReader(journal.source_code)
+        self._read = SenderReader(journal.source_code)
         self._patience = Scheduler(_MOST_WAITING, 0, lambda _: None)
         self._heard: SimpleQueue[tuple[str, str | None, zenoh.Query] | None] = SimpleQueue()
         self.duty = Duty("among the queries")
@@ -291,12 +291,12 @@ class QueryRelay:
         if not self._patience.hold(asked.patience, 0, -1, asked.release):
             asked.release()
 
-    def _link(self, source: str, target: str, key: zenoh.KeyExpr) -> LinkState | None:
+    def _link(self, source: str, target: str, key: zenoh.KeyExpr) -> RunningLink | None:
         link = self._plan.link_of(source, target, key, query=True)
         return None if link is None else self._links[link.name]
 
     def _decided(
-        self, state: LinkState, kind: str, key: str, expression: zenoh.KeyExpr, now: float, size: int
+        self, state: RunningLink, kind: str, key: str, expression: zenoh.KeyExpr, now: float, size: int
     ) -> Decision:
         with self._lock:
             name = (state.link.name, kind, key)

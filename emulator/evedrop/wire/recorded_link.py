@@ -53,11 +53,11 @@ def journal_recording(
 
     Raises UsageError if the folder has no journal, and TraceError if it does not tell what was asked.
     """
-    return _Reader(folder, link, key).recording(gaps, longest)
+    return _LinkRows(folder, link, key).recording(gaps, longest)
 
 
 @final
-class _Reader:
+class _LinkRows:
     """The rows of one link in a journal."""
 
     def __init__(self, folder: Path, link: str | None, key: str | None) -> None:

@@ -20,13 +20,13 @@ from evedrop.system.output import warn
 from evedrop.system.waiting import wait_for_thread
 from evedrop.wire.departures import Departures
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.link_state import LinkState
 from evedrop.wire.liveliness import LivelinessRelay
 from evedrop.wire.neighbours import Bypasses, Neighbours
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.publications import PublicationRelay, Publishers
 from evedrop.wire.queries import QueryRelay
 from evedrop.wire.ros2 import EntityLog, service_key
+from evedrop.wire.running_link import RunningLink
 from evedrop.wire.send_queue import LAST_SECONDS, SendQueue
 from evedrop.wire.side import SideSession
 from evedrop.wire.timeline import Moment
@@ -60,7 +60,7 @@ class WireRelay:
         self.plan = plan
         self.duties: Sequence[Duty] = ()
         """What its threads do, once it is open."""
-        self.links: Mapping[str, LinkState] = {link.name: LinkState(link, plan, journal) for link in plan.links}
+        self.links: Mapping[str, RunningLink] = {link.name: RunningLink(link, plan, journal) for link in plan.links}
         """By their names."""
         self._journal, self._tell, self._happened = journal, tell, happened
         self._stack = contextlib.ExitStack()

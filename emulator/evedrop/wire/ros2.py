@@ -53,7 +53,7 @@ RESULT_SECONDS: Final = 30 * 86_400.0
 
 
 @final
-class SourceReader:
+class SenderReader:
     """Reads who sent a message, and the number that its sender gave it.
 
     `code` gives the journal's code of a sender's name; it is called once for each sender.

@@ -16,9 +16,9 @@ from collections.abc import Callable
 from typing import Final, final
 
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.link_state import KeyOrder, Scheduler
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.records import WireFate
+from evedrop.wire.running_link import KeyOrder, Scheduler
 from evedrop.wire.watchdog import Duty
 
 MOST_WAITING: Final = 8192

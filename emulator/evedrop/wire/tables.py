@@ -251,7 +251,7 @@ def key_expression_mistake(text: str) -> str | None:
 
 def _key_expression(text: str) -> str:
     if (why := key_expression_mistake(text)) is not None:
-        raise PydanticCustomError("expected", "one value", {"said": why})
+        raise PydanticCustomError("expected", "one value", {"ending": why})
     return text
 
 

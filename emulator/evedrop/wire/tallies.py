@@ -130,7 +130,7 @@ class LinkTally:
         self.streams: dict[tuple[int, int], StreamTally] = {}
         """(code of the key, kind) → its messages."""
         self._delays: list[Floats] = []
-        self._kept, self._step, self._skip = 0, 1, 0
+        self._sampled, self._step, self._skip = 0, 1, 0
 
     def add(self, records: Records) -> None:
         """Add messages to all but `streams`."""
@@ -142,12 +142,12 @@ class LinkTally:
         taken = delays[self._skip :: self._step].copy()
         self._skip = (self._skip - len(delays)) % self._step
         self._delays.append(taken)
-        self._kept += len(taken)
-        if self._kept > _SAMPLE:
+        self._sampled += len(taken)
+        if self._sampled > _SAMPLE:
             thinned = np.concatenate(self._delays)
             self._skip += self._step * (len(thinned) % 2)
             self._delays, self._step = [thinned[::2]], 2 * self._step
-            self._kept = len(self._delays[0])
+            self._sampled = len(self._delays[0])
 
     def amend(self, records: Records, fate: WireFate) -> None:
         """Messages that were added have another fate."""

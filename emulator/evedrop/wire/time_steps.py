@@ -233,7 +233,7 @@ class Notice(NamedTuple):
 
 
 @final
-class LinkWatcher:
+class NoticeWatcher:
     """Finds the notices of all links, block of steps by block. names: of the links; step: seconds."""
 
     def __init__(self, names: Iterable[str], step: float) -> None:

@@ -15,7 +15,7 @@ from evedrop.live.protocol.packets import delivery, packed_header, read_delivery
 from evedrop.live.protocol.telemetry import Extent, Truth, read_truth
 from evedrop.model.receiver import Reception
 from evedrop.model.slot.link_core import Late
-from tests.live.network.readers import EXAMPLES, READERS, TRIALS, fields_of
+from tests.live.protocol.readers import EXAMPLES, READERS, TRIALS, fields_of
 
 KEY = "evedrop/r1/telemetry/eve"
 

@@ -21,7 +21,7 @@ from evedrop.model.links.loss_model import Fate
 from evedrop.scenario.recordings.link_fit import fit_messages
 from evedrop.scenario.recordings.mcap_recording import mcap_recording
 from evedrop.wire.file import wire_of
-from evedrop.wire.link_state import KeyFates
+from evedrop.wire.running_link import KeyFates
 from tests.conftest import Evedrop
 from tests.scenario.recordings.recorded_messages import BURSTS, Recorded, heard, lossy, trimmed, write
 

@@ -221,9 +221,9 @@ class ComparisonResults(Comparison, ReportedResults):
         numbers = ["largest legitimate error", "error of the closest adversary"]
         table = TextTable.headed(["scheme"], numbers, ["beaten by another scheme"])
         for scheme in self.schemes.values():
-            price, kept = (None if math.isnan(error) else error for error in (scheme.price, scheme.kept))
-            beaten = "–" if kept is None else "no" if scheme.name in self.dominant else "yes"
-            table.add(scheme.name, number_text(price, ".3g"), number_text(kept, ".3g"), beaten)
+            price, protection = (None if math.isnan(error) else error for error in (scheme.price, scheme.protection))
+            beaten = "–" if protection is None else "no" if scheme.name in self.dominant else "yes"
+            table.add(scheme.name, number_text(price, ".3g"), number_text(protection, ".3g"), beaten)
         return table_text(f"{self.title} · {self._facts}", table)
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from evedrop.studies.secrecy_cost import SecrecyCost
 
 
-_OF_RESULTS = ("summary.json", "unfinished", "shards", "sweep.json", "compare.json", "kept")
+_OF_RESULTS = ("summary.json", "unfinished", "shards", "sweep.json", "compare.json", "finished_tasks")
 """Files and folders that show that a folder is a results folder."""
 _NO_FOLDER = "resume=True goes on with the study in a folder: give the folder as out, and leave overwrite out"
 
@@ -59,17 +59,17 @@ class ResultsPlace:
 
     folder: Path
     temporary: bool
-    _kept: bool = field(default=False, init=False)
+    _stays: bool = field(default=False, init=False)
 
     def keep_for(self, results: object) -> None:
         """Keep a temporary folder as long as the results object exists, and this program runs."""
         if self.temporary:
-            self._kept = True
+            self._stays = True
             weakref.finalize(results, shutil.rmtree, self.folder, ignore_errors=True)
 
     def end(self, error: EvedropError | None = None) -> None:
         """Remove a temporary folder that nothing keeps; after an error, results so far stay until this program ends."""
-        if not self.temporary or self._kept:
+        if not self.temporary or self._stays:
             return
         if error is not None and self.folder.is_dir() and any(self.folder.iterdir()):
             atexit.register(shutil.rmtree, self.folder, ignore_errors=True)

@@ -98,7 +98,7 @@ def _ask(run: Path, request: OperatorRequest, subject: str, patience: float = _P
     from evedrop.live.network.control_file import read_controls
 
     control = read_controls(run)[0]  # in a run in shards, any of them refuses
-    print(_answer(run, control, request, subject, patience).said)
+    print(_answer(run, control, request, subject, patience).effect)
     return 0
 
 

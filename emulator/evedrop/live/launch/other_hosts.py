@@ -583,7 +583,7 @@ class HostProcesses:
         end_all(self._processes.values())
 
     def _begin(self, order: StartProcess) -> None:
-        number, brief = order.number, self._kept_here(order.brief)
+        number, brief = order.number, self._with_local_files(order.brief)
         if Path(brief.process).name != brief.process:
             raise ValueError(f"{brief.process} is not the name of a process")
         environment = {**own_environment(), **order.environment}
@@ -606,7 +606,7 @@ class HostProcesses:
             events.close()  # the launcher waits for no router on another host
         threading.Thread(target=self._follow, args=(number, brief.process, read), daemon=True).start()
 
-    def _kept_here(self, brief: AnyBrief) -> AnyBrief:
+    def _with_local_files(self, brief: AnyBrief) -> AnyBrief:
         """The same brief with the files of the process in the private folder of this host."""
         if brief.last_word is not None:
             brief = replace(brief, last_word=str(last_word_file(self._private, brief.process)))

@@ -408,7 +408,7 @@ class PreloadedStarter:
 
 @final
 @dataclass(frozen=True)
-class _Kept:
+class _Preloaded:
     """The fork servers of a `preloaded` block, and the environment in which their interpreters were started."""
 
     servers: tuple[ForkServer, ...]
@@ -421,7 +421,7 @@ class _Kept:
         return all(server.alive for server in self.servers) and self.environment == _inherited()
 
 
-_kept: list[_Kept] = []
+_preloaded: list[_Preloaded] = []
 """What is kept for the `preloaded` blocks that this process is in."""
 
 
@@ -433,8 +433,8 @@ def process_starter(stop: threading.Event | None = None) -> Iterator[Starter]:
     imports are not made in advance, so that one run starts as early as it can.
     """
     with ExitStack() as stack:
-        usable = bool(_kept) and _kept[-1].usable
-        starter = _kept[-1].starter if usable else stack.enter_context(_kept_servers(OF_OTHERS, OF_RECORDERS))
+        usable = bool(_preloaded) and _preloaded[-1].usable
+        starter = _preloaded[-1].starter if usable else stack.enter_context(_waiting_servers(OF_OTHERS, OF_RECORDERS))
         if stop is not None and isinstance(starter, PreloadedStarter):
             starter = starter.until(stop)
         yield starter
@@ -449,19 +449,19 @@ def preloaded() -> Iterator[Starter]:
     >>> with preloaded():                                                               # doctest: +SKIP
     ...     found = [run("eavesdroppers", slots=1000, seed=seed) for seed in range(10)]
     """
-    with _kept_servers(OF_OTHERS, (*OF_RECORDERS, *OF_SUMMARIES)) as starter:
+    with _waiting_servers(OF_OTHERS, (*OF_RECORDERS, *OF_SUMMARIES)) as starter:
         yield starter
 
 
 @contextmanager
 def preloaded_without_recorder() -> Iterator[Starter]:
     """The same on a host that carries only other processes of a run: the imports of a recorder are not made. Raises OSError."""
-    with _kept_servers(OF_OTHERS) as starter:
+    with _waiting_servers(OF_OTHERS) as starter:
         yield starter
 
 
 @contextmanager
-def _kept_servers(*modules: Sequence[str]) -> Iterator[Starter]:
+def _waiting_servers(*modules: Sequence[str]) -> Iterator[Starter]:
     """Fork servers that import these modules, for all runs in the block. Raises OSError."""
     try:
         os.close(os.pidfd_open(os.getpid()))
@@ -470,12 +470,12 @@ def _kept_servers(*modules: Sequence[str]) -> Iterator[Starter]:
         return
     with fork_servers(*modules) as servers:
         starter = PreloadedStarter(servers)
-        kept = _Kept(servers, starter, _inherited())
-        _kept.append(kept)
+        waiting = _Preloaded(servers, starter, _inherited())
+        _preloaded.append(waiting)
         try:
             yield starter
         finally:
-            _kept.remove(kept)
+            _preloaded.remove(waiting)
 
 
 def _inherited() -> dict[str, str]:

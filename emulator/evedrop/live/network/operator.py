@@ -36,7 +36,7 @@ class Answer:
 
     slot: int | None = None
     """The slot from which on the request takes effect."""
-    said: str = ""
+    effect: str = ""
     """The effect, as a sentence."""
     refused: tuple[str, ...] = ()
     """The mistakes in the request, a line each; then nothing has changed."""
@@ -49,7 +49,7 @@ class Answer:
             return pack({"refused": list(self.refused)})
         if self.status is not None:
             return pack({"wire" if isinstance(self.status, WireStatus) else "status": asdict(self.status)})
-        return pack({"k": self.slot, "said": self.said})
+        return pack({"k": self.slot, "effect": self.effect})
 
 
 @final
@@ -95,7 +95,7 @@ def read_answer(key: str, payload: bytes) -> Answer:
             except ValueError as error:
                 raise message.malformed(str(error), f"the status of a {'run' if name == 'status' else name}") from error
             return Answer(status=read(kind, entries))
-    return Answer(message.integer("k"), message.text("said"))
+    return Answer(message.integer("k"), message.text("effect"))
 
 
 def ask(control: Control, request: OperatorRequest, patience: float) -> Answer | None:

@@ -88,7 +88,7 @@ def _passed(
     return posterior, moments, evidence
 
 
-_MOST_KEPT = 4096
+_MOST_SLOTS = 4096
 _EACH = 8  # slots for each state before the first climb
 
 
@@ -134,7 +134,7 @@ class LearningEm(Learner):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """Names that are known, and a number of slots."""
-        return knowing_mistakes(given) + kept_mistakes(given)
+        return knowing_mistakes(given) + keeps_mistakes(given)
 
     def prior(self, first: int = 0) -> Belief:
         """x̂ = 0, and the covariance I for want of Σ0."""
@@ -210,9 +210,9 @@ def climbing_slots(n: int, keeps: int) -> list[int]:
     return ages
 
 
-def kept_mistakes(given: Mapping[str, Any]) -> list[tuple[str, str]]:
+def keeps_mistakes(given: Mapping[str, Any]) -> list[tuple[str, str]]:
     """A mistake in `keeps`."""
     keeps = given.get("keeps", _EACH)
     if isinstance(keeps, bool) or not isinstance(keeps, int):
-        return [("keeps", f"is {as_toml(keeps)}; expected a whole number of slots from {_EACH} to {_MOST_KEPT}")]
-    return number_mistakes(given, "keeps", _EACH, _MOST_KEPT)
+        return [("keeps", f"is {as_toml(keeps)}; expected a whole number of slots from {_EACH} to {_MOST_SLOTS}")]
+    return number_mistakes(given, "keeps", _EACH, _MOST_SLOTS)

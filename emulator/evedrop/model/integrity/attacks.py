@@ -233,12 +233,12 @@ class _Recording(MeasurementFeed):
 
     def __init__(self, recorded: int) -> None:
         self._recorded = recorded
-        self._kept: Floats | None = None
+        self._measurements: Floats | None = None
 
     def take(self, k: int, y: Floats, on: bool) -> Floats:
-        if self._kept is None:
-            self._kept = np.zeros((self._recorded, *y.shape))
+        if self._measurements is None:
+            self._measurements = np.zeros((self._recorded, *y.shape))
         if not on:
-            self._kept[k % self._recorded] = y
-        again: Floats = self._kept[k % self._recorded]
+            self._measurements[k % self._recorded] = y
+        again: Floats = self._measurements[k % self._recorded]
         return again

@@ -492,7 +492,7 @@ class NoiseTaken:
                 else:
                     taken = sigma[k] + (sigma[k] if N is None else N)
                     covariances[k] = (
-                        outcomes.kept * (A @ covariances[k - 1] @ A.T)
+                        outcomes.propagated * (A @ covariances[k - 1] @ A.T)
                         + outcomes.predicted * self.process.Q
                         + outcomes.misled * taken
                     )
@@ -511,7 +511,7 @@ class NoiseTaken:
             return np.full_like(self.process.Q, math.inf)
         sigma = limit(self.process, NOBODY)
         source = outcomes.predicted * self.process.Q + outcomes.misled * (sigma + (sigma if N is None else N))
-        return lyapunov(replace(self.process, Q=source), outcomes.kept)
+        return lyapunov(replace(self.process, Q=source), outcomes.propagated)
 
 
 @final

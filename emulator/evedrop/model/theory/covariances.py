@@ -79,7 +79,7 @@ class Outcomes:
         return replace(self, state=self.state + self.misled, misled=0.0)
 
     @property
-    def kept(self) -> float:
+    def propagated(self) -> float:
         """Probability that the error is predicted to the next slot, and set neither to 0 nor to f_k."""
         return self.predicted + self.decoded + self.leaked
 
@@ -143,7 +143,7 @@ def misled_covariances(process: Process, slots: int) -> Floats:
 class TheoreticalCovariance:
     """E P_k of a receiver, a number of slots at a time from k = 0.
 
-    E_0 = p_0 Σ0, E_k = p_k (A E_{k−1} Aᵀ) + p_d Q + p_i f_k with p_k = `kept`, solved for a block of slots at once: for
+    E_0 = p_0 Σ0, E_k = p_k (A E_{k−1} Aᵀ) + p_d Q + p_i f_k with p_k = `propagated`, solved for a block of slots at once: for
     j slots beyond s, with F = √p_k A and W_j = Σ_{l<j} A^l Q A^lᵀ,
 
         E_{s+j} = F^j E_s F^jᵀ + p_d Σ_{l<j} F^l Q F^lᵀ + 2 p_i (Σ_{l<j} p_k^l) A^j Σ_s A^jᵀ
@@ -162,7 +162,7 @@ class TheoreticalCovariance:
         self._outcomes = outcomes
         self._remaining = RemainingCovariances(process) if outcomes.leaked else None
         matrices = (np.float64(matrix).tobytes() for matrix in (process.A, process.Q))
-        key = (*matrices, n, outcomes.kept, outcomes.predicted, outcomes.misled)
+        key = (*matrices, n, outcomes.propagated, outcomes.predicted, outcomes.misled)
         self._powers, self._kept_powers, self._diffusion, self._spread, self._weights = _block_tables(*key)
         with np.errstate(over="ignore", invalid="ignore"):
             self._block: Floats = outcomes.initial * process.initial_covariance[None]
@@ -214,7 +214,7 @@ class TheoreticalCovariance:
         block, outcomes, A = np.empty(self._powers.shape), self._outcomes, self._process.A
         noise = outcomes.predicted * self._process.Q
         for j in range(len(block)):
-            E = block[j] = outcomes.kept * (A @ E @ A.T) + noise + outcomes.leaked * remaining.next()
+            E = block[j] = outcomes.propagated * (A @ E @ A.T) + noise + outcomes.leaked * remaining.next()
         return block
 
 
@@ -278,7 +278,7 @@ def limit(process: Process, outcomes: Outcomes) -> Floats:
         source = source + 2.0 * outcomes.misled * (process.A @ lyapunov(process, 1.0) @ process.A.T)
     elif outcomes.predicted + outcomes.leaked + outcomes.initial == 0.0:
         return np.zeros_like(process.Q)
-    return _stationary(process, outcomes.kept, source)
+    return _stationary(process, outcomes.propagated, source)
 
 
 def limit_trace(process: Process, outcomes: Outcomes) -> float:
@@ -437,9 +437,9 @@ def _least(outcomes: Outcomes) -> float:
     if outcomes.misled:
         return 1.0 - MARGINAL
     noise = outcomes.predicted + outcomes.leaked
-    if outcomes.kept == 0.0 or noise + outcomes.initial == 0.0:
+    if outcomes.propagated == 0.0 or noise + outcomes.initial == 0.0:
         return math.inf
-    return 1.0 / math.sqrt(outcomes.kept) + (-MARGINAL if noise else MARGINAL)
+    return 1.0 / math.sqrt(outcomes.propagated) + (-MARGINAL if noise else MARGINAL)
 
 
 def _touches(basis: Floats, v: Floats) -> bool:

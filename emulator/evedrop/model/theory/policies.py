@@ -211,7 +211,7 @@ class Front:
 
 
 @dataclass(frozen=True)
-class ScheduledLinks:
+class LinkProbabilities:
     """The links as the policies need them: of the sensor, the legitimate estimator and one eavesdropper."""
 
     mu: float
@@ -233,7 +233,7 @@ def policy_metrics(process: Process, send: NDArray[np.bool_], mu: float, mu_e: f
     return _metrics(process, legitimate, eve, sends)
 
 
-def scheduled_metrics(process: Process, links: ScheduledLinks, threshold: int) -> PolicyMetrics:
+def scheduled_metrics(process: Process, links: LinkProbabilities, threshold: int) -> PolicyMetrics:
     """The metrics of the scheme `scheduled`.
 
     Source: docs/mathematics.md, schedules by holding time.
@@ -251,7 +251,7 @@ def _metrics(
 
 
 def front(
-    process: Process, links: ScheduledLinks, weights: Sequence[float], prices: Sequence[float], states: int
+    process: Process, links: LinkProbabilities, weights: Sequence[float], prices: Sequence[float], states: int
 ) -> Front:
     """The best policy for each weight and each price of a transmission, and `scheduled` with each threshold up to `states`.
 

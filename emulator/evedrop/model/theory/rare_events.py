@@ -72,7 +72,7 @@ def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
     total = total_of(TheoreticalCovariance(process, outcomes).next_traces, slots)
     if not math.isfinite(total):
         return None
-    kept, lost, misled = outcomes.kept, outcomes.predicted, outcomes.misled
+    kept, lost, misled = outcomes.propagated, outcomes.predicted, outcomes.misled
     last = min(slots, SLOTS_AT_ONCE)
     begun, spread = _begun(process, outcomes, slots, last)
     F = math.sqrt(kept) * process.A

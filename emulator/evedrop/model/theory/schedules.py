@@ -29,7 +29,7 @@ ROUNDING = 1e-12
 class SlotRecursion:
     """E P_k of one receiver for many schedules at once, slot by slot: its map of a slot is affine in μ_d(k).
 
-    E_0 = p_0 Σ0, E_k = kept · A E_{k−1} Aᵀ + p_d Q + p_i f_k + p_l M_k, with probabilities that are affine in μ_d(k).
+    E_0 = p_0 Σ0, E_k = p_k A E_{k−1} Aᵀ + p_d Q + p_i f_k + p_l M_k, with probabilities that are affine in μ_d(k).
 
     Source: docs/mathematics.md, schedules of μ_d.
     """
@@ -71,7 +71,7 @@ class SlotRecursion:
 
 
 def _probabilities(outcomes: Outcomes) -> Floats:
-    return np.array([outcomes.kept, outcomes.predicted, outcomes.misled, outcomes.leaked])
+    return np.array([outcomes.propagated, outcomes.predicted, outcomes.misled, outcomes.leaked])
 
 
 @dataclass(frozen=True)

@@ -107,11 +107,11 @@ def mcap_recording(
 
     Raises TraceError if the recording cannot be read, or does not tell which messages are missing.
     """
-    return _Reader(path).recording(topic, period, longest)
+    return _Contents(path).recording(topic, period, longest)
 
 
 @final
-class _Reader:
+class _Contents:
     """The contents of a recording, without the messages' data."""
 
     def __init__(self, path: Path) -> None:
@@ -289,7 +289,7 @@ class _Reader:
                 "no delays: the recorder wrote its own time as the time of publication, as ros2 bag record did before Jazzy"
             )
             return np.empty(0)
-        delays: Floats = (messages.logged - messages.published)[series.kept] / 1e9
+        delays: Floats = (messages.logged - messages.published)[series.first_arrivals] / 1e9
         wrong = int((delays < 0).sum())
         if wrong or delays.max() > _LONGEST_DELAY:
             problem = f"{wrong} of {len(delays)} are negative" if wrong else f"one is {delays.max():.4g} s"

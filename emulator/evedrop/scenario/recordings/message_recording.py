@@ -60,7 +60,7 @@ class MessageSeries:
     """Seconds of each silence that was longer than allowed, and so is not counted as lost messages."""
     seconds: float | None = None
     """Median time between two consecutive messages; None if there are none."""
-    kept: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
+    first_arrivals: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, np.bool_))
     """Which of the arrivals are the first of their message, in the order of arrival, (m,)."""
 
 
@@ -76,7 +76,7 @@ def joined(series: Sequence[MessageSeries]) -> MessageSeries:
         sum(part.leaps for part in series),
         tuple(outage for part in series for outage in part.outages),
         float(np.median(times)) if times else None,
-        np.concatenate([part.kept for part in series]),
+        np.concatenate([part.first_arrivals for part in series]),
     )
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from evedrop.model.metrics.text import ShownNumber, estimate, fraction_text, number_text
 from evedrop.score.summary import RARE_FRACTION
-from evedrop.score.verdict import MARKS, SecrecyKept
+from evedrop.score.verdict import MARKS, SecrecyVerdict
 from evedrop.show.report.closing import rare_events_words
 from evedrop.show.report.text_table import TextTable
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from evedrop.results.comparison import Cell, Comparison, SimulatedError
 
 WORDS = {
-    SecrecyKept.PERFECT: "perfect",
-    SecrecyKept.RELATIVE: "relative",
-    SecrecyKept.UNDECIDED: "too few",
-    SecrecyKept.BROKEN: "broken",
+    SecrecyVerdict.PERFECT: "perfect",
+    SecrecyVerdict.RELATIVE: "relative",
+    SecrecyVerdict.UNDECIDED: "too few",
+    SecrecyVerdict.BROKEN: "broken",
 }
 """Each verdict in a word."""
 

@@ -11,19 +11,19 @@ from markupsafe import Markup
 
 from evedrop.model.metrics.text import estimate
 from evedrop.results.comparison import Cell, Comparison, read_comparison
-from evedrop.score.verdict import SecrecyKept
+from evedrop.score.verdict import SecrecyVerdict
 from evedrop.show.report.comparison import comparison_lines, pairs_table, schemes_table, verdict
 from evedrop.show.report.page import made
 from evedrop.show.view import palette
 from evedrop.show.view.palette import hexadecimal
 
 _GROUND = {
-    SecrecyKept.PERFECT: palette.PERFECT,
-    SecrecyKept.RELATIVE: palette.RELATIVE,
-    SecrecyKept.UNDECIDED: palette.UNDECIDED,
-    SecrecyKept.BROKEN: palette.BROKEN,
+    SecrecyVerdict.PERFECT: palette.PERFECT,
+    SecrecyVerdict.RELATIVE: palette.RELATIVE,
+    SecrecyVerdict.UNDECIDED: palette.UNDECIDED,
+    SecrecyVerdict.BROKEN: palette.BROKEN,
 }
-_INK = {SecrecyKept.PERFECT: "#fff"}
+_INK = {SecrecyVerdict.PERFECT: "#fff"}
 _DARK = "#16191d"
 
 
@@ -43,7 +43,7 @@ class ComparisonSource:
     def outcome(self) -> str:
         """How many pairs have each verdict, as a sentence."""
         verdicts = [cell.verdict for scheme in self.comparison.schemes.values() for cell in scheme.cells.values()]
-        counts = [(word, verdicts.count(word)) for word in SecrecyKept]
+        counts = [(word, verdicts.count(word)) for word in SecrecyVerdict]
         counted = ", ".join(f"{count:,} {word.value}" for word, count in counts if count)
         return f"Secrecy of {sum(count for _, count in counts):,} pairs of scheme and adversary: {counted}"
 

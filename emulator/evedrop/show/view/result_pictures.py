@@ -26,7 +26,7 @@ from evedrop.model.receiver import NOTHING, SILENT
 from evedrop.results.reading import Results
 from evedrop.scenario.arguments import refuse_unless
 from evedrop.scenario.recorded import recorded, recorded_noise
-from evedrop.score.verdict import MARKS, SecrecyKept
+from evedrop.score.verdict import MARKS, SecrecyVerdict
 from evedrop.show.view import palette
 from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
 from evedrop.show.view.figure_style import drawing, panels
@@ -278,22 +278,22 @@ def _positions(values: list[Any]) -> list[float]:
 
 # Blue for secrecy kept, darker where perfect; orange for broken: distinct with any colour blindness, and in greyscale.
 _GROUND = {
-    SecrecyKept.PERFECT: hexadecimal(palette.PERFECT),
-    SecrecyKept.RELATIVE: hexadecimal(palette.RELATIVE),
-    SecrecyKept.UNDECIDED: hexadecimal(palette.UNDECIDED),
-    SecrecyKept.BROKEN: hexadecimal(palette.BROKEN),
+    SecrecyVerdict.PERFECT: hexadecimal(palette.PERFECT),
+    SecrecyVerdict.RELATIVE: hexadecimal(palette.RELATIVE),
+    SecrecyVerdict.UNDECIDED: hexadecimal(palette.UNDECIDED),
+    SecrecyVerdict.BROKEN: hexadecimal(palette.BROKEN),
 }
 _INK = {
-    SecrecyKept.PERFECT: "white",
-    SecrecyKept.RELATIVE: "#10202e",
-    SecrecyKept.UNDECIDED: "#3c3c3c",
-    SecrecyKept.BROKEN: "#2a1200",
+    SecrecyVerdict.PERFECT: "white",
+    SecrecyVerdict.RELATIVE: "#10202e",
+    SecrecyVerdict.UNDECIDED: "#3c3c3c",
+    SecrecyVerdict.BROKEN: "#2a1200",
 }
 _SAID = {
-    SecrecyKept.PERFECT: "perfect: its error grows without bound",
-    SecrecyKept.RELATIVE: "relative: it stays above the legitimate error",
-    SecrecyKept.UNDECIDED: "too few trials to tell",
-    SecrecyKept.BROKEN: "broken",
+    SecrecyVerdict.PERFECT: "perfect: its error grows without bound",
+    SecrecyVerdict.RELATIVE: "relative: it stays above the legitimate error",
+    SecrecyVerdict.UNDECIDED: "too few trials to tell",
+    SecrecyVerdict.BROKEN: "broken",
 }
 _NOTABLE = 1.1  # the factor by which an attack must raise the legitimate error to be noted
 _FACTS = ("legitimate\nerror", "ACKs", "bits\na slot", "energy\na slot", "secret bits\na slot (+ once)")
@@ -375,8 +375,7 @@ def _cell(axes: Axes, column: int, row: int, scheme: SchemeResult, cell: Cell) -
     axes.add_patch(Rectangle(**box, facecolor=_GROUND[word]))
     axes.text(column + 0.5, row - 0.17, MARKS[word], ha="center", va="center", color=_INK[word], fontsize=11)
     legitimate = cell.legitimate.typical / scheme.legitimate.typical if scheme.legitimate.typical else math.inf
-    raised = f"  u×{_number(legitimate)}" if legitimate > _NOTABLE else ""
-    size = 7.2 if raised else 8.4
+    raised = f"\nlegitimate {_number(legitimate)}×" if legitimate > _NOTABLE else ""
     axes.text(
         column + 0.5,
         row + 0.24,
@@ -384,7 +383,8 @@ def _cell(axes: Axes, column: int, row: int, scheme: SchemeResult, cell: Cell) -
         ha="center",
         va="center",
         color=_INK[word],
-        fontsize=size,
+        fontsize=6.6 if raised else 8.4,
+        linespacing=1.1,
     )
 
 
@@ -398,8 +398,8 @@ def _legend(axes: Axes, comparison: Comparison, left: float) -> None:
         place += 1.0 + 0.092 * len(meaning)
     notes = [
         f"{comparison.title}: {comparison.slots:,} slots, {comparison.trials:,} trial{'s' if comparison.trials > 1 else ''}.",
-        "n×: the adversary's over the legitimate error. u×: an attack raises the legitimate error. ·: not defined."
-        + (f" Bold: dominates ({', '.join(comparison.dominant)})." if comparison.dominant else ""),
+        "n×: the adversary's error over the legitimate one. legitimate n×: an attack raises the legitimate error n-fold. "
+        "·: not defined." + (f" Bold: dominates ({', '.join(comparison.dominant)})." if comparison.dominant else ""),
     ]
     axes.text(-left - 1.9, rows + 0.55, "\n".join(notes), ha="left", va="top", fontsize=8.8, linespacing=1.5)
 

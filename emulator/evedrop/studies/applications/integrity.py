@@ -81,16 +81,10 @@ def _attack_mistakes(entries: Mapping[str, Any]) -> Iterator[Mistake]:
         problem = "is missing" if name is None else f"is {as_toml(name)}"
         yield MODEL, f"{problem}; expected {listed(sorted(SENSOR_ATTACKS))}{near(str(name), SENSOR_ATTACKS)}"
         return
-    for entry, example in attack.parameters.items():
-        if entry not in entries and entry not in attack.optional:
-            yield entry, f"is missing; the attack {name} needs it, such as {entry} = {as_toml(example)}"
-    for entry, value in entries.items():
-        if entry == MODEL:
-            continue
-        if entry not in attack.parameters:
-            yield entry, f"is not a parameter of the attack {name}; expected {listed(sorted(attack.parameters))}"
-            continue
-        example = attack.parameters[entry]
+    given = {entry: value for entry, value in entries.items() if entry != MODEL}
+    yield from parameter_mistakes("attack", str(name), attack, given)
+    for entry, value in given.items():
+        example = attack.parameters.get(entry)
         if isinstance(example, list) and not _is_matrix(value):
             yield entry, f"is {as_toml(value)}; expected a matrix, such as {as_toml(example)}"
         elif isinstance(example, int) and not (type(value) is int and 1 <= value <= 1_000_000):

@@ -58,8 +58,8 @@ def formulas() -> str:
         ("naive", Outcomes.eavesdropper(mu, mu_d, 1.0, 1.0)),
     ):
         rest = outcomes.predicted * noise + outcomes.misled * 2.0 * carried
-        printed = outcomes.kept * (carried if name == "legitimate" else start) + rest
-        corrected = outcomes.initial * outcomes.kept * carried + rest
+        printed = outcomes.propagated * (carried if name == "legitimate" else start) + rest
+        corrected = outcomes.initial * outcomes.propagated * carried + rest
         recursion = theoretical_traces(process, outcomes, 2)[1]
         lines.append(f"| {name} | {printed:.4f} | {corrected:.4f} | {recursion:.4f} |")
     return "\n".join(lines)

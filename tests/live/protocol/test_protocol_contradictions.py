@@ -1,0 +1,195 @@
+"""Messages and briefs whose entries have the right types and contradict one another, or the run."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+
+from evedrop.errors import MalformedMessage
+from evedrop.live.protocol.keys import RunKeys, low_pass, reader_of, writer_of
+from tests.live.protocol.made_briefs import BRIEFS, refusal
+from tests.live.protocol.readers import EXAMPLES, READERS, TRIALS, fields_of
+
+
+def u4(*counts: int) -> bytes:
+    """Counts as a message has them."""
+    return np.array(counts, "<u4").tobytes()
+
+
+def late_packets(fields: dict[str, Any]) -> None:
+    """More than two of every slot that a packet may come from."""
+    fields["late"] = [{"k": 4, "gamma": b"\0"}] * 100
+
+
+def more_used(fields: dict[str, Any]) -> None:
+    """More late packets used than arrived."""
+    fields["late_used"] = np.full((2, TRIALS), 2, "<u2").tobytes()
+
+
+def two_fates(fields: dict[str, Any]) -> None:
+    """A packet that was delivered and lost."""
+    reasons = fields["links"]["legitimate"]["lost"]
+    fields["links"]["legitimate"]["lost"] = {**reasons, next(iter(reasons)): u4(3, 1)}
+
+
+def many_delays(fields: dict[str, Any]) -> None:
+    """More packets by their delay than were offered."""
+    fields["links"]["eve"]["delays"] = u4(6, 1, 0, 0)
+
+
+def negative_seconds(fields: dict[str, Any]) -> None:
+    """A decision that took less than no time."""
+    fields["seconds"] = np.array([-1.0]).tobytes()
+
+
+CONTRADICTIONS = {
+    "delivery": (late_packets, "100 entries in late; expected at most two for each slot from 2 to 4"),
+    "report": (more_used, "more in late_used than in late; expected at most as many late packets used as arrived"),
+    "journal": (two_fates, "fates of legitimate's packets of slot 4; expected 3 fates"),
+    "journal of delays": (many_delays, "more delays than packets of eve; expected at most 6"),
+    "decisions": (negative_seconds, "seconds of -1; expected numbers of at least 0"),
+}
+
+
+@pytest.mark.parametrize("case", CONTRADICTIONS)
+def test_a_message_that_contradicts_itself_is_refused(case: str) -> None:
+    """With what was found and what was expected."""
+    change, message = CONTRADICTIONS[case]
+    name = case.partition(" ")[0]
+    key, read = READERS[name]
+    read(EXAMPLES[name])
+    fields = fields_of(name)
+    change(fields)
+    with pytest.raises(MalformedMessage) as raised:
+        read(msgpack.packb(fields))
+    assert raised.value.key == key
+    assert message in str(raised.value)
+
+
+def test_every_key_has_one_writer_and_a_reader() -> None:
+    """Acknowledgements go from the legitimate estimator to the router, and from there to the sensor."""
+    keys = RunKeys("r1")
+    ends = {key: (writer_of(key), reader_of(key)) for key in (keys.acknowledged, keys.acknowledgements, keys.uplink)}
+    assert ends == {
+        keys.acknowledged: ("legitimate", "router"),
+        keys.acknowledgements: ("router", "sensor"),
+        keys.uplink: ("sensor", "router"),
+    }
+
+
+def test_a_router_drops_what_is_larger_than_its_kind() -> None:
+    """Puts and deletes of a kind, whatever follows in the key; and an operator's questions and their answers."""
+    rules = low_pass("r1", {"uplink": 70, "telemetry": 900})
+    assert [(rule["id"], rule["messages"]) for rule in rules] == [
+        ("uplink", ["put", "delete"]),
+        ("telemetry", ["put", "delete"]),
+        ("question", ["query"]),
+        ("answer", ["reply"]),
+    ]
+    assert rules[0]["key_exprs"] == ["evedrop/r1/uplink", "evedrop/r1/uplink/**"]
+    assert (rules[0]["size_limit"], rules[1]["size_limit"]) == (70, 900)
+    assert all(rule["flows"] == ["ingress"] for rule in rules)
+
+
+def without_parameter(brief: dict[str, Any]) -> None:
+    """The scheme needs it."""
+    del brief["part"]["scheme"]["state_probability"]
+
+
+def other_scheme(brief: dict[str, Any]) -> None:
+    """The scheme does not know it."""
+    brief["part"]["scheme"]["colour"] = 3
+
+
+def other_controller(brief: dict[str, Any]) -> None:
+    """There is none of that name."""
+    brief["part"]["strategy"] = "pid"
+
+
+def fewer_states(brief: dict[str, Any]) -> None:
+    """The plant and the model are not of the same system."""
+    noise = brief["part"]["plant"]["noise"]
+    brief["part"]["plant"]["noise"] = [row[:-1] for row in noise[:-1]]
+
+
+def no_matrix(brief: dict[str, Any]) -> None:
+    """Its rows do not have the same length."""
+    brief["model"]["A"] = [[1.0], [0.0, 1.0]]
+
+
+def no_process(brief: dict[str, Any]) -> None:
+    """Its noise is not a covariance."""
+    brief["model"]["Q"][0][0] = -1.0
+
+
+def free_input(brief: dict[str, Any]) -> None:
+    """The controller weighs neither an input nor its change."""
+    weights = brief["part"]["assignment"]
+    weights["input_weights"] = weights["rate_weights"] = [0.0] * len(weights["input_weights"])
+
+
+def many_disturbances(brief: dict[str, Any]) -> None:
+    """One more in each slot than the plant has."""
+    plant = brief["part"]["plant"]
+    plant["disturbance_matrix"] = [[*row, 1.0] for row in plant["disturbance_matrix"]]
+
+
+def one_state(brief: dict[str, Any]) -> None:
+    """The noise and the model are not of the same system."""
+    brief["part"]["noise_covariance"] = [[1.0]]
+
+
+def no_covariance(brief: dict[str, Any]) -> None:
+    """The noise has a direction with a negative variance."""
+    brief["part"]["noise_covariance"] = [[1.0, 2.0], [2.0, 1.0]]
+
+
+UNUSABLE = {
+    "noise-before/bayesian": [
+        (one_state, "part.noise_covariance cannot be used (ValueError: it does not have 2 states"),
+        (no_covariance, "part.noise_covariance cannot be used (ValueError: not positive definite)"),
+    ],
+    "eavesdroppers/sensor": [(without_parameter, "part.scheme.state_probability is missing")],
+    "acknowledged/sensor": [(other_scheme, "part.scheme.colour is not a parameter of the scheme")],
+    "microgrid/controller": [
+        (other_controller, "part.strategy is pid, expected one of "),
+        (free_input, "part: the input_weights leave an input without weight; expected input_weights, or rate_weights"),
+    ],
+    "microgrid/sensor": [
+        (fewer_states, "part.plant"),
+        (no_matrix, "model.A, model.Q or model.initial_covariance"),
+        (no_process, "its model is not a process: model.Q has the eigenvalue -1"),
+        (many_disturbances, "disturbances in each slot, or they are not finite"),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_a_brief_whose_parts_do_not_fit_together_is_refused(name: str, tmp_path: Path) -> None:
+    """With the entry."""
+    for change, message in UNUSABLE[name]:
+        brief = copy.deepcopy(BRIEFS[name])
+        assert refusal(brief, tmp_path) is None
+        change(brief)
+        refused = refusal(brief, tmp_path)
+        assert refused is not None
+        assert message in refused, json.dumps(refused)
+
+
+def test_an_estimator_that_knows_the_inputs_has_the_plant_of_its_model(tmp_path: Path) -> None:
+    """Without the disturbances, which only sensor and controller know."""
+    brief = copy.deepcopy(BRIEFS["microgrid/legitimate"])
+    plant = copy.deepcopy(BRIEFS["microgrid/sensor"]["part"]["plant"])
+    del plant["disturbances"]
+    brief["part"]["controller"] = {"period": 1, "acts_on": "estimate", "plant": plant}
+    assert refusal(brief, tmp_path) is None
+    plant["noise"] = [[*row, 0.0] for row in plant["noise"]]
+    refused = refusal(brief, tmp_path)
+    assert refused is not None
+    assert "part.plant cannot be used (ValueError: it does not have " in refused

@@ -1,0 +1,181 @@
+"""What the conductor waits for and tells to whom, by a clock that the test hands in; no process is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from evedrop.errors import Interrupted, RunError
+from evedrop.live.protocol.codec import end_report
+from evedrop.live.protocol.commands import Abandon, Start
+from evedrop.live.recorder.conductor import Conductor, Stop
+from evedrop.names import RECORDER
+from tests.clock import TestClock
+from tests.live.recorder.test_conductor_ending import Network
+
+
+class Told(Network):
+    """Notes what is sent, to whom, and how many seconds after the start."""
+
+    patience = 30.0
+
+    def __init__(self, *absent: str) -> None:
+        super().__init__()
+        self.clock = TestClock()
+        self.absent = absent
+        self.sent: list[tuple[str, bytes, float]] = []
+        self.opened = False
+
+    def watch(self, name: str, changed: Callable[[bool], None]) -> None:
+        """Everybody is there but those that are not."""
+        self.watches[name] = changed
+        if name not in self.absent:
+            changed(True)
+
+    def publisher(self, key: str) -> Callable[[bytes], None]:
+        """Whatever is sent is noted."""
+        return lambda payload: self.sent.append((key.rpartition("/")[2], payload, self.clock.now - 1000.0))
+
+    def ready(self) -> None:
+        """The run can begin."""
+        self.opened = True
+
+
+def conducted(network: Told, *, relayed: bool = False, stop: Stop | None = None) -> Conductor:
+    """A conductor of a run of two receivers."""
+    return Conductor(network, ("legitimate", "smart"), stop or Stop(), relayed, network.clock)  # type: ignore[arg-type]
+
+
+def test_a_run_begins_when_all_are_there() -> None:
+    """Without any waiting; then the sensor alone is told to begin."""
+    network = Told()
+    conductor = conducted(network)
+    assert conductor.missing == ["router", "sensor", "legitimate", "smart"]
+    conductor.assemble()
+    assert conductor.missing == []
+    assert conductor.there("smart")
+    assert network.opened
+    assert network.clock.now == 1000.0
+    conductor.start()
+    assert network.sent == [("sensor", Start().pack(), 0.0)]
+    conductor.report_progress(7)
+    assert network.sent[-1][0] == RECORDER
+
+
+@pytest.mark.parametrize(
+    ("unread", "message"),
+    [
+        (("smart",), "smart did not appear within 30 s; start it, or look at its log"),
+        (("sensor", "smart"), "sensor, smart did not appear within 30 s; start them, or look at their logs"),
+        ((), "sensor, smart did not appear within 30 s; start them, or look at their logs"),
+    ],
+)
+def test_who_does_not_appear_is_named_after_the_patience(unread: tuple[str, ...], message: str) -> None:
+    """And not before; but not a process that is waiting for another one, unless all that are missing do."""
+    network = Told("sensor", "smart")
+    network.unread = {network.keys.control(name) for name in unread}
+    with pytest.raises(RunError) as raised:
+        conducted(network).assemble()
+    assert str(raised.value) == message
+    assert 30.0 < network.clock.now - 1000.0 < 30.2
+    assert not network.opened
+
+
+def test_a_signal_ends_the_waiting_for_processes() -> None:
+    """At once."""
+    network, stop = Told("smart"), Stop()
+    stop.wanted = True
+    with pytest.raises(Interrupted):
+        conducted(network, stop=stop).assemble()
+    assert network.clock.now == 1000.0
+
+
+def test_a_signal_is_waited_for_as_long_as_is_said() -> None:
+    """A launcher that leaves a moment later is an interruption, too; one that leaves after the patience is not."""
+    for leaves, interrupted in ((1.5, True), (2.5, False)):
+        clock = TestClock()
+
+        def gone(clock: TestClock = clock, leaves: float = leaves) -> bool:
+            return clock.now >= 1000.0 + leaves
+
+        stop = Stop(gone, clock)
+        if interrupted:
+            with pytest.raises(Interrupted):
+                stop.check(2.0)
+            assert clock.now == pytest.approx(1000.0 + leaves, abs=0.1)
+        else:
+            stop.check(2.0)
+            assert clock.now == pytest.approx(1002.0, abs=0.1)
+
+
+def test_processes_that_come_and_go_are_noted() -> None:
+    """The first moment of a loss counts; reports are passed on with the names of their senders."""
+    network = Told()
+    conductor = conducted(network)
+    conductor.assemble()
+    network.clock.now += 5.0
+    network.watches["smart"](False)
+    assert conductor.next_message() is None
+    network.clock.now += 2.0
+    network.watches["smart"](False)
+    assert conductor.next_message() is None
+    assert conductor.lost == {"smart": 1005.0}
+    assert conductor.missing == ["smart"]
+    assert conductor.processes == {"router": True, "sensor": True, "legitimate": True, "smart": False}
+    conductor.absent.add("smart")
+    assert conductor.missing == []
+    network.watches["smart"](True)
+    report = end_report(0)
+    network.reads[network.keys.telemetry("sensor")](report)
+    assert conductor.next_message() is None
+    assert conductor.lost == {}
+    assert conductor.next_message() == ("sensor", report)
+    assert conductor.misdelivered == {}
+    assert conductor.next_message() is None
+
+
+def test_the_routers_are_told_last_that_a_run_is_given_up() -> None:
+    """The others have some seconds to leave, while a router may still pass on their messages; the relay comes after it."""
+    network = Told()
+    conductor = conducted(network, relayed=True)
+    conductor.assemble()
+    conductor.abandon("a reason")
+    order = [(name, round(at)) for name, _, at in network.sent]
+    assert order == [("sensor", 0), ("legitimate", 0), ("smart", 0), ("router", 2), ("relay", 4)]
+    assert {payload for _, payload, _ in network.sent} == {Abandon("a reason").pack()}
+    # Nobody is waited for when everybody has left.
+    quick = Told()
+    quick.unread = {quick.keys.control(name) for name in ("router", "relay", "sensor", "legitimate", "smart")}
+    conducted(quick, relayed=True).abandon("a reason")
+    assert [round(at) for *_, at in quick.sent] == [0, 0, 0, 0, 0]
+
+
+def test_a_command_to_all_reaches_who_reports_and_is_there() -> None:
+    """The router, the sensor and the receivers; not a relay, nor a process that is cut off."""
+    network = Told()
+    conductor = conducted(network, relayed=True)
+    conductor.assemble()
+    network.watches["smart"](False)
+    assert conductor.next_message() is None
+    conductor.send_to_all(Start())
+    assert [name for name, *_ in network.sent] == ["router", "sensor", "legitimate"]
+
+
+def test_another_router_is_noticed_once() -> None:
+    """The one at the start of the run is not another one."""
+    network = Told()
+    conductor = conducted(network)
+    conductor.assemble()
+    assert not conductor.router_changed()
+    network.router_id = "another"
+    assert conductor.router_changed()
+    assert not conductor.router_changed()
+
+
+def test_who_is_cut_off_for_too_long_is_named() -> None:
+    """Unless a signal explains it."""
+    with pytest.raises(RunError, match=r"^sensor, smart cut off from the network for 7\.5 s; look at the logs$"):
+        conducted(Told(), stop=Stop(clock=TestClock())).fail_cut_off(["sensor", "smart"], 7.5)
+    with pytest.raises(Interrupted):
+        conducted(Told(), stop=Stop(lambda: True)).fail_cut_off(["sensor"], 7.5)

@@ -1,0 +1,201 @@
+"""When the recorder begins rounds of resending, and which outages it lists: with a clock, and connections in the test's hands."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from evedrop.live.protocol.brief import Flow
+from evedrop.live.protocol.commands import Again, ControlCommand
+from evedrop.live.recorder.conductor import Conductor, Stop
+from evedrop.live.recorder.recovery import Recovery, patience_of
+from evedrop.scenario.progress_events import ProgressEvent
+from evedrop.system.waiting import SYSTEM_CLOCK, Clock
+from tests.clock import TestClock
+from tests.live.recorder.test_conductor_ending import Network
+
+
+class Conducted:
+    """The part of a conductor and of a steering that a recovery uses, with the connections in the test's hands."""
+
+    relayed, at = False, None
+
+    def __init__(self) -> None:
+        self.lost: dict[str, float] = {}
+        self.rounds: list[int] = []
+        self.repeated: list[str | int] = []
+        """What was said again in rounds: the progress, as a number, and other commands."""
+        self.processes = dict.fromkeys(("router", "sensor", "smart"), True)
+        self.changes: dict[str, Any] = {}
+        self.another_router = False
+        self.unreached: list[str] = []
+        self.clock: Clock = SYSTEM_CLOCK
+
+    @property
+    def missing(self) -> list[str]:
+        """Those that are lost."""
+        return list(self.lost)
+
+    def lose(self, *names: str) -> None:
+        """These vanish."""
+        self.lost |= dict.fromkeys(names, self.clock.monotonic())
+
+    def router_changed(self) -> bool:
+        """As the test says."""
+        return self.another_router
+
+    def send_to(self, name: str, command: ControlCommand) -> None:
+        """Note the rounds."""
+        if name == "sensor" and isinstance(command, Again):
+            self.rounds.append(command.slot)
+
+    def start(self) -> None:
+        """Note it."""
+        self.repeated.append("start")
+
+    def report_progress(self, done: int) -> None:
+        """Note it."""
+        self.repeated.append(done)
+
+    def remind(self) -> None:
+        """Note it."""
+        self.repeated.append("the operator's commands")
+
+
+def test_losses_that_overlap_are_one_outage() -> None:
+    """One entry for each process that was cut off, from its first loss to when slots are joined again; then another."""
+    conducted, events = Conducted(), list[ProgressEvent]()
+    recovery = Recovery(
+        conducted,  # type: ignore[arg-type]
+        conducted,  # type: ignore[arg-type]
+        Flow(32, 8, 30.0),
+        0.0,
+        events.append,
+    )
+    recovery.poll(10)
+    for lost in (
+        ("smart",),
+        ("smart", "sensor"),
+        ("smart",),
+    ):  # lost and back three times, and no slot joined meanwhile
+        conducted.lose(*lost)
+        recovery.poll(10)
+        conducted.lost = {}
+        recovery.poll(10)
+    assert conducted.rounds == [10, 10, 10]
+    assert events == []
+    recovery.poll(11)
+    conducted.lose("router", "sensor", "smart")
+    recovery.poll(12)
+    conducted.lost, conducted.another_router = {}, True
+    recovery.poll(12)
+    recovery.poll(13)
+    outages = [(outage.process, outage.slot, outage.until) for outage in recovery.outages]
+    assert outages == [("smart", 10, 11), ("sensor", 10, 11), ("router", 12, 13)]
+    assert events == recovery.outages
+
+
+@pytest.mark.parametrize(("complete", "until"), [(True, 20), (False, None)])
+def test_an_outage_that_is_open_at_the_end_lasts_to_the_last_slot_of_a_complete_run(
+    complete: bool, until: int | None
+) -> None:
+    """A process that has reported all slots holds up nothing; otherwise the run did not go on."""
+    conducted = Conducted()
+    recovery = recovery_of(conducted, TestClock(), 30.0)
+    recovery.poll(10)
+    conducted.lose("smart")
+    recovery.poll(10)
+    recovery.poll(20)
+    recovery.give_up(20, complete)
+    assert [(outage.process, outage.slot, outage.until) for outage in recovery.outages] == [("smart", 10, until)]
+
+
+def recovery_of(conducted: Conducted, clock: TestClock, longest_outage: float, pace: float = 0.0) -> Recovery:
+    """With batches of 8 slots."""
+    conducted.clock = clock
+    return Recovery(
+        conducted,  # type: ignore[arg-type]
+        conducted,  # type: ignore[arg-type]
+        Flow(32, 8, longest_outage),
+        pace,
+        lambda _: None,
+        clock,
+    )
+
+
+def test_a_round_waits_for_processes_that_are_back_and_cannot_be_told_yet() -> None:
+    """A token that is back may be faster than the subscription behind it; after some seconds the round begins all the same."""
+    conducted, clock = Conducted(), TestClock()
+    recovery = recovery_of(conducted, clock, 30.0)
+    recovery.poll(10)
+    for there_after in (1.0, 9.0):
+        conducted.rounds.clear()
+        conducted.lose("router", "sensor")
+        recovery.poll(10)
+        conducted.lost, conducted.unreached = {}, ["router"]
+        recovery.poll(10)
+        clock.now += there_after
+        assert conducted.rounds == []
+        if there_after < 2.0:
+            recovery.poll(10)
+            assert conducted.rounds == []
+            conducted.unreached = []
+        recovery.poll(10)
+        assert conducted.rounds == [10]
+        conducted.unreached = []
+
+
+@pytest.mark.parametrize("done", [0, 10])
+def test_a_round_repeats_the_commands_that_may_have_been_lost(done: int) -> None:
+    """The start of a run of which nothing is joined yet, what the operator ordered, and how far the recorder is."""
+    conducted = Conducted()
+    recovery = recovery_of(conducted, TestClock(), 30.0)
+    if done:
+        recovery.poll(done)
+    conducted.lose("sensor")
+    recovery.poll(done)
+    assert conducted.repeated == []
+    conducted.lost = {}
+    recovery.poll(done)
+    assert conducted.rounds == [done]
+    assert conducted.repeated == [*(() if done else ("start",)), "the operator's commands", done]
+
+
+@pytest.mark.parametrize(("longest_outage", "pace"), [(1.0, 0.0), (8.0, 0.25), (60.0, 0.0), (60.0, 2.0)])
+@pytest.mark.parametrize("lost", [True, False])
+@pytest.mark.parametrize("gap", [0.1, 7.0, 40.0])
+def test_a_round_that_is_lost_is_repeated_before_a_process_counts_as_silent(
+    longest_outage: float, pace: float, lost: bool, gap: float
+) -> None:
+    """Also in a run whose slots were joined at long intervals before; with three rounds after an outage."""
+    conducted, clock = Conducted(), TestClock()
+    recovery = recovery_of(conducted, clock, longest_outage, pace)
+    recovery.poll(8)
+    clock.now += gap
+    recovery.poll(16)
+    if lost:
+        conducted.lose("router")
+        recovery.poll(16)
+        conducted.lost = {}
+    recovery.poll(16)
+    patience, until = patience_of(longest_outage, pace, 8), clock.now
+    while clock.now - until < patience:
+        clock.now += 0.05
+        recovery.poll(16)
+    assert len(conducted.rounds) >= (3 if lost else 1)
+    assert len(conducted.rounds) <= 6
+
+
+def test_a_process_is_reached_when_its_commands_have_a_reader() -> None:
+    """Its token alone is not enough; one that is away is not waited for."""
+    network = Network()
+    network.unread = {network.keys.control("smart"), network.keys.control("sensor")}
+    conductor = Conductor(network, ("legitimate", "smart"), Stop(), clock=TestClock())  # type: ignore[arg-type]
+    conductor.assemble()
+    assert conductor.unreached == ["sensor", "smart"]
+    network.watches["sensor"](False)
+    assert conductor.next_message() is None
+    assert conductor.unreached == ["smart"]
+    network.unread.clear()
+    assert conductor.unreached == []
