@@ -21,7 +21,7 @@ def packet(
 
 
 def read_packet(message: Reader, k: int, shape: tuple[int, int]) -> Floats:
-    """z (n, R) of the sensor's message of slot k."""
+    """Z (n, R) of the sensor's message of slot k."""
     z: Floats = read_uplink(message, k, packet_format(*shape)).z[0]
     return z
 

@@ -15,10 +15,11 @@ from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Again, Go, LinkChange
-from evedrop.model.links.loss_model import REASONS
+from evedrop.live.protocol.record_messages import packed
 from evedrop.model.slot.link import Change
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.test_router import Ear, MemoryBench
+from tests.messages import packet
 
 SLOTS, BATCH = 96, 8
 SHAPE = (2, 5)
@@ -41,7 +42,7 @@ WINDOWS = {"legitimate": 3, "eve": 0}
 def send(bench: MemoryBench, slots: range) -> None:
     """Have the sensor send the packets of these slots."""
     for k in slots:
-        bench.put("sensor", bench.keys.uplink, packets.uplink(k, bench.packet(k)))
+        bench.put("sensor", bench.keys.uplink, packet(k, bench.packet(k)))
 
 
 def announce(bench: MemoryBench, number: int, done: int, first: int) -> None:
@@ -72,12 +73,7 @@ def same_fates(journal: telemetry.Journal, other: telemetry.Journal, rows: slice
     """Check that a journal has some rows of another one."""
     for name, link in journal.links.items():
         whole = other.links[name]
-        assert np.array_equal(link.delivered, whole.delivered[rows])
-        for reason in REASONS:
-            assert np.array_equal(link.lost[reason], whole.lost[reason][rows]), reason
-        assert (link.late is None) == (whole.late is None)
-        if link.late is not None and whole.late is not None:
-            assert np.array_equal(link.late, whole.late[rows])
+        assert packed(link.slots) == packed(whole.slots.rows(rows))
 
 
 @pytest.mark.parametrize("restarted", [False, True])
@@ -184,9 +180,9 @@ def test_a_barrier_is_passed_on_and_a_changed_link_is_changed_from_there_on(kept
         after = deliveries(bench, range(at, 40))
         assert after["legitimate"] == unchanged["legitimate"][at:40]
         for k, payload in enumerate(after["eve"], at):
-            assert not packets.read_delivery(Reader("d", payload), k, SHAPE).heard.gamma.any()
+            assert not packets.read_delivery(Reader("d", payload), k, SHAPE).gamma.any()
         wanted = journals(bench, at, 40, WINDOWS)
-        assert {int(journal.links["eve"].lost["cut"].min()) for journal in wanted.values()} == {5}
+        assert {int(journal.links["eve"].slots.lost_by_reason["cut"].min()) for journal in wanted.values()} == {5}
         if kept:
             check_later(bench, done, {}, after)
     if not kept:
@@ -224,7 +220,7 @@ def test_who_is_away_gets_neither_deliveries_nor_barriers() -> None:
     assert marks == {"legitimate": [10, 15, 20, 24], "eve": [10, 24]}
     slots = {name: [k for barrier, k in all_of if not barrier] for name, all_of in heard.items()}
     assert slots == {"legitimate": [*range(24)], "eve": [*range(10), *range(20, 24)]}
-    down = np.concatenate([journal.links["eve"].lost["down"] for journal in journaled.values()])
+    down = np.concatenate([journal.links["eve"].slots.lost_by_reason["down"] for journal in journaled.values()])
     assert down.tolist() == [5 if k in away else 0 for k in range(24)]
 
 
@@ -251,12 +247,12 @@ def acknowledged(
     for k in slots:
         sent = None if rows else (np.arange(5) + k) % 3 > 0
         header = np.zeros((rows, 5), np.int64) if rows else None
-        bench.put("sensor", bench.keys.uplink, packets.uplink(k, bench.packet(k), header, sent))
+        bench.put("sensor", bench.keys.uplink, packet(k, bench.packet(k), header, sent))
         if k < done:
             continue
         gammas = []
         for name in ("legitimate", "eve"):
-            gammas.append(packets.read_delivery(Reader(*bench.downlinks[name].hear()), k, SHAPE, rows).heard.gamma)
+            gammas.append(packets.read_delivery(Reader(*bench.downlinks[name].hear()), k, SHAPE, rows).gamma[0])
             assert sent is None or not (gammas[-1] & ~sent).any()
         for slot in (max(k - 1, 0), k):  # one that comes twice is ignored
             bench.stage.callbacks[bench.keys.acknowledged](packets.acknowledgement(slot, gammas[0]))
