@@ -49,7 +49,7 @@ TABLES: dict[str, Any] = {
 @pytest.mark.parametrize("most", [1, 7])
 @pytest.mark.parametrize(("process", "slots", "first_trial"), [(DRIFTING, 300, 0), (UNSTABLE, 60, 12_345)])
 def test_same_deliveries_same_bits(process: Process, slots: int, first_trial: int, most: int) -> None:
-    """Fed with the deliveries of a run, `most` slots in a message, it has our digest, and reports what we report.slots."""
+    """Fed with the deliveries of a run, `most` slots in a message, it has our digest, and reports what we report."""
     scenario = scenario_of(process, slots=slots, first_trial=first_trial, **TABLES)
     keys, batch = StreamKeys.from_scenario(scenario), Batch(slots, 9, first_trial)
     made = briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))

@@ -17,6 +17,7 @@ from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Again, Go, LinkChange
 from evedrop.live.protocol.record_messages import packed
 from evedrop.model.slot.link import Change
+from evedrop.model.slot.records import PacketSlots
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.test_router import Ear, MemoryBench
 from tests.messages import packet
@@ -114,6 +115,73 @@ def check_round(
             batch = start - start % BATCH
             same_fates(journal, wanted[batch], slice(start - batch, BATCH))
     assert any(link.bursts[BATCH:].any() for journal in journaled.values() for link in journal.links.values())
+
+
+def send_blocks(bench: MemoryBench, slots: range, count: int) -> None:
+    """Have the sensor send the packets of these slots, `count` in a message; a batch begins a new message."""
+    k = slots.start
+    while k < slots.stop:
+        end = min(k + count, k - k % BATCH + BATCH, slots.stop)
+        z = np.array([bench.packet(slot) for slot in range(k, end)])
+        bench.put("sensor", bench.keys.uplink, packets.uplink(PacketSlots(k, z)))
+        k = end
+
+
+def received(payloads: list[bytes], first: int) -> list[tuple[bytes, bytes, list[tuple[int, bytes]]]]:
+    """What deliveries of consecutive slots say of each slot, however many slots each has: γ, z, and late packets."""
+    slots = []
+    for payload in payloads:
+        arrivals = packets.read_delivery(Reader("d", payload), first + len(slots), SHAPE, window=3, most=BATCH)
+        for row in range(len(arrivals.gamma)):
+            heard, late = arrivals.at(row)
+            slots.append(
+                (heard.gamma.tobytes(), heard.z.tobytes(), [(part.k, part.heard.z.tobytes()) for part in late])
+            )
+    return slots
+
+
+def deliveries_from(ear: Ear, first: int, stop: int) -> tuple[list[int], list[bytes]]:
+    """The first slots of the next deliveries, and the deliveries, which must cover these slots."""
+    starts, payloads = [], []
+    while first < stop:
+        key, payload = ear.hear()
+        message = Reader(key, payload)
+        assert message.integer("k") == first
+        starts.append(first)
+        payloads.append(payload)
+        first += message.integer("c")
+    assert first == stop
+    return starts, payloads
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+@pytest.mark.parametrize(("done", "count"), [(40, 3), (43, 8), (45, 3), (45, 8), (47, 7)])
+def test_a_message_is_split_at_the_first_slot_that_is_not_done(done: int, count: int, restarted: bool) -> None:
+    """Its slots that are done are counted and not delivered again; the others are delivered and journaled as before."""
+    with MemoryBench(**LATE) as single:
+        send(single, range(SLOTS))
+        wanted = {name: received(payloads, 0) for name, payloads in deliveries(single, range(SLOTS)).items()}
+        fates = journals(single, 0, SLOTS, WINDOWS)
+    with MemoryBench(**LATE) as bench:
+        if not restarted:
+            send_blocks(bench, range(SLOTS), count)
+            for name, ear in bench.downlinks.items():
+                assert received(deliveries_from(ear, 0, SLOTS)[1], 0) == wanted[name]
+            for start, journal in journals(bench, 0, SLOTS, WINDOWS).items():
+                assert journal.pack() == fates[start].pack()
+        first = done - WINDOWS["legitimate"]
+        first -= (first % BATCH) % count  # the first slot of its message
+        bench.stage.commands.put(Again(1, done, {}).pack())
+        announce(bench, 1, done, first)
+        send_blocks(bench, range(first, SLOTS), count)
+        for name, ear in bench.downlinks.items():
+            starts, payloads = deliveries_from(ear, done, SLOTS)
+            assert starts[0] == done
+            assert len(starts) < SLOTS - done
+            assert received(payloads, done) == wanted[name][done:]
+        for start, journal in journals(bench, done, SLOTS, WINDOWS).items():
+            batch = start - start % BATCH
+            same_fates(journal, fates[batch], slice(start - batch, BATCH))
 
 
 def test_packets_before_a_round_that_the_conductor_wants_are_ignored() -> None:
