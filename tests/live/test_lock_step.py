@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
 from evedrop.live.network.router import Downlink
-from evedrop.live.protocol.brief import Brief, RouterPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.packets import is_barrier, read_delivery
 from evedrop.model.slot.records import PacketSlots
@@ -28,7 +27,7 @@ def packets(slots: range, told: bool = False) -> PacketSlots:
 
 def downlink(waited: bool, put: list[bytes], betrayed: int | None = None) -> Downlink:
     """A receiver's link for the slots of a batch; betrayed: the slot whose state is told to it."""
-    brief = cast(Brief[RouterPart], MemoryBench().brief)
+    brief = MemoryBench().brief
     if betrayed is not None:
         brief = replace(brief, part=replace(brief.part, leaks={"eve": betrayed}))
     link = Downlink("eve", brief.part.links["eve"].schedule, brief, lambda payload, _: put.append(payload), waited)

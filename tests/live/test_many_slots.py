@@ -6,11 +6,11 @@ import threading
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, cast
 
-import numpy as np
 import pytest
 
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
@@ -121,9 +121,9 @@ class Run:
         works: list[Callable[[], object]] = [router.carry_on]
         for name in self.receivers:
             self.session(self.briefs[name]).subscribe(self.keys.downlink(name))
-            receive = estimate if name == "legitimate" else eavesdrop
-            works.append(lambda brief=self.briefs[name], receive=receive: receive(brief, self.session))
-        works.append(lambda: sense(cast(Brief[SensorPart], self.briefs["sensor"]), self.session))
+            receive: Callable[..., None] = estimate if name == "legitimate" else eavesdrop
+            works.append(partial(receive, self.briefs[name], self.session))
+        works.append(partial(sense, cast(Brief[SensorPart], self.briefs["sensor"]), self.session))
         threads = [threading.Thread(target=work, daemon=True) for work in works]
         for thread in threads:
             thread.start()
@@ -218,4 +218,4 @@ def test_digests_do_not_depend_on_batches_either() -> None:
             of_run[name] = {block: value for message in messages for block, value in message.map("digests").items()}
         digests.append(of_run)
     assert all(of_run == digests[0] for of_run in digests)
-    assert np.all([digests[0][name] for name in digests[0]])
+    assert all(digests[0].values())

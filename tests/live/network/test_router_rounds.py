@@ -129,7 +129,7 @@ def send_blocks(bench: MemoryBench, slots: range, count: int) -> None:
 
 def received(payloads: list[bytes], first: int) -> list[tuple[bytes, bytes, list[tuple[int, bytes]]]]:
     """What deliveries of consecutive slots say of each slot, however many slots each has: γ, z, and late packets."""
-    slots = []
+    slots: list[tuple[bytes, bytes, list[tuple[int, bytes]]]] = []
     for payload in payloads:
         arrivals = packets.read_delivery(Reader("d", payload), first + len(slots), SHAPE, window=3, most=BATCH)
         for row in range(len(arrivals.gamma)):

@@ -149,7 +149,7 @@ def test_a_large_message_may_have_4096_lists_and_maps(lists: int) -> None:
 def test_what_a_packet_carries_besides_its_payload_is_read_as_sent() -> None:
     """Header, flags and the state that a receiver learns; a payload that is not sent is 0."""
     z, header, sent = np.arange(1.0, 7.0).reshape(2, 3), np.array([[4, -1, 2**40]]), np.array([True, False, True])
-    made = packets_of(4, PacketBlock(z[None], None, header[None], sent[None]), z[None] + 1.0)
+    made = packets_of(4, PacketBlock(z[None], sent[None], header[None], sent[None]), z[None] + 1.0)
     read = read_uplink(Reader(KEY, uplink(made)), 4, packet_format(2, 3, 1))
     given = (np.where(sent, z, 0.0), header, sent, z + 1.0)
     for column, values in zip((read.z, read.header, read.sent, read.truth), given, strict=True):
