@@ -29,10 +29,15 @@ from evedrop.live.protocol.telemetry import Journal, Report
 from evedrop.live.protocol.codec import pack
 
 def change(how, honest=Report.pack):
-    Report.pack = lambda self: honest(dataclasses.replace(self, **how(self)))
+    def changed(self):
+        parts = how(self)
+        of_report = {name: parts.pop(name) for name in ("digests", "trace_sums") if name in parts}
+        return dataclasses.replace(self, slots=dataclasses.replace(self.slots, **parts), **of_report)
+
+    Report.pack = lambda self: honest(changed(self))
 
 def packets(how):
-    evedrop.peers.sensor.uplink = lambda k, *rest: how(k, *rest) if k else uplink(k, *rest)
+    evedrop.peers.sensor.uplink = lambda slots: uplink(how(slots) if slots.first else slots)
 
 """
 

@@ -40,15 +40,15 @@ def refused(live: Live, name: str) -> str:
 DENIES = """
 import numpy as np
 def one(self):
-    action = self.action.copy()
-    if self.first <= {slot} < self.first + len(action):
-        action[{slot} - self.first, 2] = 0 if action[{slot} - self.first, 2] else 3
+    action = self.slots.action.copy()
+    if self.slots.first <= {slot} < self.slots.first + len(action):
+        action[{slot} - self.slots.first, 2] = 0 if action[{slot} - self.slots.first, 2] else 3
     return dict(action=action)
 change(one)
 """
 LIES = {
     "x_hat = 7, P = 0, no digests": (
-        "change(lambda self: dict(x_hat=self.x_hat * 0.0 + 7.0, P=self.P * 0.0, trace=self.trace * 0.0,"
+        "change(lambda self: dict(x_hat=self.slots.x_hat * 0.0 + 7.0, P=self.slots.P * 0.0, trace=self.slots.trace * 0.0,"
         " digests={block: one * 0 for block, one in self.digests.items()},"
         " trace_sums={block: one * 0 for block, one in self.trace_sums.items()}))",
         r"smart contradicts itself: its digest of slots 0 to 255 of trial 0 is (00){16}, and what it reported of these slots "
@@ -68,16 +68,16 @@ LIES = {
         "smart contradicts itself: its digest of slots 512 to 599 of trial 0",
     ),
     "a better covariance than it has": (
-        "change(lambda self: dict(P=self.P * 0.5, trace=self.trace * [0.5, 0.25]))",
+        "change(lambda self: dict(P=self.slots.P * 0.5, trace=self.slots.trace * [0.5, 0.25]))",
         "smart contradicts itself: its sum of tr P over slots 0 to 255 of trial 0",
     ),
     "a better covariance than it has, in all sums too": (
-        "change(lambda self: dict(P=self.P * 0.5, trace=self.trace * [0.5, 0.25], "
+        "change(lambda self: dict(P=self.slots.P * 0.5, trace=self.slots.trace * [0.5, 0.25], "
         "trace_sums={k: one * 0.5 for k, one in self.trace_sums.items()}))",
         "smart contradicts itself: its digest of slots 0 to 255 of trial 0",
     ),
     "packets that it denies": (
-        "change(lambda self: dict(action=self.action * 0, digests={k: one for k, one in self.digests.items()}))",
+        "change(lambda self: dict(action=self.slots.action * 0, digests={k: one for k, one in self.digests.items()}))",
         "smart contradicts",
     ),
 }
@@ -102,10 +102,10 @@ def test_a_receiver_that_lies_is_found_out(evedrop: Evedrop, case: str) -> None:
     [
         ("dict(digests={2**63: np.zeros((3, 16), np.uint8)})", "digests of block 9223372036854775808"),
         (
-            "dict(P=self.P + np.array([[[[0.0], [0.0]], [[1.0], [0.0]]]]))",
+            "dict(P=self.slots.P + np.array([[[[0.0], [0.0]], [[1.0], [0.0]]]]))",
             r"P with \S+ at \[0, 0, 1, 0\] and \S+ at \[0, 1, 0, 0\]",
         ),
-        pytest.param("dict(x_hat=self.x_hat[:, :, :2])", "x_hat of", marks=pytest.mark.long),
+        pytest.param("dict(x_hat=self.slots.x_hat[:, :, :2])", "x_hat of", marks=pytest.mark.long),
         pytest.param(
             "dict(x_hat=np.zeros((601, 3, 1)), action=np.zeros((601, 3), np.uint8))",
             "c = 601; expected an integer c from 1 to",
@@ -147,19 +147,20 @@ def hang(): threading.Event().wait()
 """
 RECEIVER = """
 from evedrop.live.network.reporting import BeliefReporter
-def add_slots(self, slots, *rest, honest=BeliefReporter.add_slots): hang() if SLOT in slots else honest(self, slots, *rest)
+def add_slots(self, made, honest=BeliefReporter.add_slots): hang() if SLOT in made.slots else honest(self, made)
 BeliefReporter.add_slots = add_slots
 """
 SENSOR = """
 import evedrop.peers.sensor as sensor
-def sent(k, *rest, honest=sensor.uplink): return hang() if k == SLOT else honest(k, *rest)
+def sent(packets, honest=sensor.uplink): return hang() if SLOT in packets.slots else honest(packets)
 sensor.uplink = sent
 """
 ROUTER = """
 import evedrop.live.network.router as router
-def read(messages, first, *rest, honest=router.read_uplinks):
-    return hang() if SLOT in range(first, first + len(messages)) else honest(messages, first, *rest)
-router.read_uplinks = read
+def read(*given, honest=router.read_uplink):
+    packets = honest(*given)
+    return hang() if SLOT in packets.slots else packets
+router.read_uplink = read
 """
 CONTROLLER = """
 import evedrop.peers.controller as controller

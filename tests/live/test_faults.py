@@ -62,8 +62,8 @@ def test_a_killed_recorder_is_named_and_what_it_wrote_is_kept(evedrop: Evedrop) 
 
 
 ROGUES = {
-    "NaN estimate": ("smart", "change(lambda self: dict(x_hat=self.x_hat * float('nan')))", "NaN"),
-    "skipped slot": ("sensor", "packets(lambda k, *rest: uplink(k + 2, *rest))", "gap on"),
+    "NaN estimate": ("smart", "change(lambda self: dict(x_hat=self.slots.x_hat * float('nan')))", "NaN"),
+    "skipped slot": ("sensor", "packets(lambda slots: dataclasses.replace(slots, first=slots.first + 2))", "gap on"),
     "journal without a link": ("router", "Journal.pack = lambda self: pack({'k': 0, 'c': 1, 'links': {}})", "a map"),
     "wrong progress": ("suspicious", "reporting.progress = lambda k: b''", "not msgpack"),
 }
@@ -108,7 +108,10 @@ def test_a_router_that_lies_is_found_out(evedrop: Evedrop) -> None:
     """Packets that are delivered by the journal, but were not received, end the run; the message names slot and processes."""
     lie = (
         "import evedrop.live.network.router as router\nhonest = router.delivery\n"
-        "router.delivery = lambda k, mask, z, *rest: honest(k, bytes(len(mask)), b'') if k == 7 else honest(k, mask, z, *rest)"
+        "def lie(slots, arrivals):\n"
+        "    gamma = [[flag and k != 7 for flag in row] for k, row in zip(slots, arrivals.gamma)]\n"
+        "    return honest(slots, arrivals._replace(gamma=arrivals.gamma & gamma))\n"
+        "router.delivery = lie"
     )
     live = evedrop.live("eavesdroppers", "--slots", "40", env=with_rogue(evedrop, "router", lie))
     done = live.end()

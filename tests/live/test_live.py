@@ -20,7 +20,6 @@ import zenoh
 
 from evedrop import montecarlo
 from evedrop.live.protocol import codec as wire
-from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import AnyBrief, read_brief
 from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.commands import EndRun
@@ -33,6 +32,7 @@ from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import Ear, connect
+from tests.messages import packet
 from tests.processes import descendants, parent_of, words_of
 
 SCENARIO = """
@@ -140,7 +140,7 @@ def disturb(eve: AnyBrief, keys: RunKeys) -> None:
             if key in own:
                 continue
             attacker.declare_queryable(key, lambda query: query.reply(query.key_expr, b"\xc1"))
-            for payload in (EndRun().pack(), wire.progress(10**9), packets.uplink(0, np.zeros((2, 3))), b"\xc1"):
+            for payload in (EndRun().pack(), wire.progress(10**9), packet(0, np.zeros((2, 3))), b"\xc1"):
                 attacker.put(key, enclosed(key, payload), congestion_control=zenoh.CongestionControl.BLOCK)
             attacker.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
             if key.rpartition("/")[2] in PROCESSES and "/alive/" in key:

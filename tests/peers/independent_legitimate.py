@@ -166,14 +166,25 @@ class Estimator:
         self.take(msgpack.unpackb(payload))
 
     def take(self, message: dict[str, Any]) -> None:
-        """A delivery: step all trials."""
-        k = message["k"]
-        if k != self.due:
-            raise ValueError(f"slot {k} arrived, slot {self.due} was due")
+        """A delivery: step all trials, slot by slot."""
+        if message["k"] != self.due:
+            raise ValueError(f"slot {message['k']} arrived, slot {self.due} was due")
+        mask_bytes, z = (self.R + 7) // 8, message.get("z", b"")
+        if len(message["gamma"]) != mask_bytes * message["c"]:
+            raise ValueError(f"gamma of {len(message['gamma'])} bytes for {message['c']} slots")
+        for row in range(message["c"]):
+            mask = message["gamma"][row * mask_bytes : (row + 1) * mask_bytes]
+            got = [(mask[r // 8] >> (r % 8)) & 1 for r in range(self.R)]
+            size = 8 * self.n * sum(got)
+            self.pass_slot(got, struct.unpack(f"<{size // 8}d", z[:size]))
+            z = z[size:]
+        if z:
+            raise ValueError(f"{len(z)} bytes of z for nobody")
+
+    def pass_slot(self, got: list[int], z: tuple[float, ...]) -> None:
+        """The next slot: which trials received, and their payloads."""
+        k, heard = self.due, sum(got)
         self.due += 1
-        got = [(message["gamma"][r // 8] >> (r % 8)) & 1 for r in range(self.R)]
-        heard = sum(got)
-        z = struct.unpack(f"<{self.n * heard}d", message.get("z", b""))
         noise_factor: Matrix = []
         if k > 0:
             noise_factor = times(self.A, self.L)
@@ -288,13 +299,14 @@ def take_part(brief: dict[str, Any]) -> str:
         while not (is_read(telemetry) and is_read(progress)):
             time.sleep(0.005)
         token = session.liveliness().declare_token(under + f"alive/{name}")
-        for k in range(brief["slots"]):
+        while estimator.due < brief["slots"]:  # a message ends where a report ends, or before
             estimator.take(received(deliveries))
-            ends = (k + 1) % batch == 0 or k + 1 == brief["slots"]
-            if ends or (k + 1) % 256 == 0:
+            done = estimator.due
+            ends = done % batch == 0 or done == brief["slots"]
+            if ends or done % 256 == 0:
                 put(telemetry, estimator.report())
             if ends:
-                put(progress, msgpack.packb({"k": k + 1}))
+                put(progress, msgpack.packb({"k": done}))
         while received(commands)["do"] != "end":
             pass
         put(telemetry, msgpack.packb({"over": True}))

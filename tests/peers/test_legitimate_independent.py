@@ -15,11 +15,13 @@ import pytest
 from evedrop import montecarlo
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.protocol import codec as wire
-from evedrop.live.protocol import packets, telemetry
+from evedrop.live.protocol import telemetry
+from evedrop.live.protocol.packets import delivery
 from evedrop.model.digest import BlockDigests, Blocks, Digests, RunDigest
 from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.schemes import SCHEMES
+from evedrop.model.slot.link_core import Arrivals
 from evedrop.model.streams import Batch
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
@@ -27,6 +29,7 @@ from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.system.ports import free_port
 from tests.builders import DRIFTING, one_slot, scenario_of
 from tests.conftest import LIMIT
+from tests.messages import delivered
 from tests.peers.independent_legitimate import Estimator
 
 PEER = Path(__file__).with_name("independent_legitimate.py")
@@ -43,9 +46,10 @@ TABLES: dict[str, Any] = {
 """Of a scenario without eavesdroppers."""
 
 
+@pytest.mark.parametrize("most", [1, 7])
 @pytest.mark.parametrize(("process", "slots", "first_trial"), [(DRIFTING, 300, 0), (UNSTABLE, 60, 12_345)])
-def test_same_deliveries_same_bits(process: Process, slots: int, first_trial: int) -> None:
-    """Fed with the deliveries of a run, it has our digest, and reports what we report."""
+def test_same_deliveries_same_bits(process: Process, slots: int, first_trial: int, most: int) -> None:
+    """Fed with the deliveries of a run, `most` slots in a message, it has our digest, and reports what we report."""
     scenario = scenario_of(process, slots=slots, first_trial=first_trial, **TABLES)
     keys, batch = StreamKeys.from_scenario(scenario), Batch(slots, 9, first_trial)
     made = briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
@@ -57,20 +61,25 @@ def test_same_deliveries_same_bits(process: Process, slots: int, first_trial: in
     estimator = SCHEMES["innovation"](model, 0.4).estimator(secret, batch)
     belief, log, digest = estimator.prior(), BlockDigests(9, slots), RunDigest()
     gammas = np.random.default_rng(1).random((slots, 9)) < 0.7
-    beliefs = []
+    beliefs, payloads = [], []
     blocks: dict[int, Digests] = {}
     for k, gamma in enumerate(gammas):
         z = encoder.encode(k, trajectory.advance(), trajectory.predicted).z
         belief = estimator.step(k, belief, Reception(gamma, z))
         beliefs.append(belief)
         blocks |= log.add(range(k, k + 1), one_slot(belief))
-        peer.receive(packets.delivery(k, np.packbits(gamma, bitorder="little").tobytes(), z[:, gamma].tobytes()))
+        payloads.append(z)
+    for first in range(0, slots, most):
+        part = slice(first, min(first + most, slots))
+        peer.receive(delivery(range(part.start, part.stop), Arrivals(gammas[part], np.array(payloads[part]))))
     extent = telemetry.Extent(slots, slots, model.n, 9, 2)
     report = telemetry.read_report(wire.Reader("telemetry", peer.report()), 0, extent, Blocks(slots))
-    assert np.array_equal(report.x_hat, [belief.x_hat for belief in beliefs])
-    assert np.array_equal(report.action, [belief.action for belief in beliefs])
-    assert np.array_equal(report.P, [belief.P[:, :, :2] for belief in beliefs])
-    assert np.allclose(report.trace[:, 0], [np.trace(belief.P).sum() for belief in beliefs], rtol=1e-12)
+    assert np.array_equal(report.slots.x_hat, [belief.x_hat for belief in beliefs])
+    assert np.array_equal(report.slots.action, [belief.action for belief in beliefs])
+    assert np.array_equal(report.slots.P, [belief.P[:, :, :2] for belief in beliefs])
+    traces = report.slots.trace
+    assert traces is not None
+    assert np.allclose(traces[:, 0], [np.trace(belief.P).sum() for belief in beliefs], rtol=1e-12)
     digest.add(blocks)
     assert peer.digest() == digest.hexadecimal
 
@@ -81,7 +90,7 @@ def test_it_refuses_a_gap() -> None:
     made = briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
     peer = Estimator(json.loads(made["legitimate"].text))
     with pytest.raises(ValueError, match="slot 1 arrived, slot 0 was due"):
-        peer.receive(packets.delivery(1, b"\0\0", b""))
+        peer.receive(delivered(1, np.zeros(9, np.bool_), np.zeros((2, 9))))
 
 
 def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:

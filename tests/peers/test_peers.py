@@ -24,7 +24,6 @@ from evedrop.live.protocol.commands import EndRun, Start
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.digest import Blocks, Digests
 from evedrop.model.process import Process
-from evedrop.model.receiver import packed_flags
 from evedrop.peers.eavesdropper import eavesdrop
 from evedrop.peers.legitimate import estimate
 from evedrop.peers.sensor import Window, sense
@@ -32,6 +31,7 @@ from tests.builders import listener, part_of, scenario_of
 from tests.clock import T, TestClock
 from tests.conftest import LIMIT
 from tests.live.in_memory import Stage
+from tests.messages import delivered, read_packet
 
 WINDOW, BATCH, SLOTS = 12, 4, 50
 EXTENT = telemetry.Extent(SLOTS, 300, 2, 3)
@@ -70,7 +70,7 @@ def deliveries(count: int = SLOTS) -> list[bytes]:
     made = []
     for k in range(count):
         gamma = np.arange(3) != k % 3
-        made.append(packets.delivery(k, packed_flags(gamma).tobytes(), np.full((2, 2), float(k)).tobytes()))
+        made.append(delivered(k, gamma, np.full((2, 3), float(k))))
     return made
 
 
@@ -99,9 +99,9 @@ def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
     for key, payload in put:
         if key == keys.telemetry(name):
             report = telemetry.read_report(wire.Reader(key, payload), end, EXTENT, Blocks(SLOTS))
-            end, blocks = end + report.count, {**blocks, **report.digests}
-            lost = (np.arange(end - report.count, end) % 3)[:, None] == np.arange(3)
-            assert np.array_equal(report.action == 0, lost)
+            end, blocks = end + report.slots.count, {**blocks, **report.digests}
+            lost = (np.arange(end - report.slots.count, end) % 3)[:, None] == np.arange(3)
+            assert np.array_equal(report.slots.action == 0, lost)
         else:
             assert key == keys.progress(name)
             assert wire.read_progress(key, payload, SLOTS) == end
@@ -123,13 +123,18 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
         blocks: dict[int, bytes] = {}
         for payload in stage.all(RunKeys("r").telemetry(name)):
             report = telemetry.read_report(wire.Reader("", payload), end, replace(EXTENT, slots=600), Blocks(600))
-            end += report.count
-            x_hat.append(report.x_hat)
-            P.append(report.P)
+            end += report.slots.count
+            x_hat.append(report.slots.x_hat)
+            P.append(report.slots.P)
             blocks |= {block: digests.tobytes() for block, digests in report.digests.items()}
         reports.append((end, np.concatenate(x_hat).tobytes(), np.concatenate(P).tobytes(), blocks))
     assert reports[0] == reports[1]
     assert set(reports[0][3]) == {0, 256, 512}
+
+
+def wrong(**fields: bytes | int) -> bytes:
+    """A delivery of slot 0 with these fields."""
+    return bytes(msgpack.packb({"k": 0, "c": 1, **fields}))
 
 
 GOOD = deliveries()
@@ -141,10 +146,11 @@ BAD: dict[str, tuple[list[bytes], type[EvedropError], str]] = {
     ),
     "no msgpack": ([b"\xc1"], MalformedMessage, r"malformed message on evedrop/.*/downlink/\w+: not msgpack"),
     "z too short": ([GOOD[0][:-8]], MalformedMessage, "not msgpack"),
-    "mask too long": ([packets.delivery(0, b"\1\0", b"")], MalformedMessage, "gamma of 2 bytes; expected 1 bytes"),
-    "z missing": ([packets.delivery(0, b"\1", b"")], MalformedMessage, "z of None; expected 16 bytes"),
-    "z for nobody": ([packets.delivery(0, b"\0", bytes(16))], MalformedMessage, "z although nothing was received"),
-    "not finite": ([packets.delivery(0, b"\1", np.full(2, np.inf).tobytes())], MalformedMessage, "NaN or infinity"),
+    "mask too long": ([wrong(gamma=b"\1\0")], MalformedMessage, "gamma of 2 bytes; expected 1 bytes"),
+    "z missing": ([wrong(gamma=b"\1")], MalformedMessage, "z of None; expected 16 bytes"),
+    "z for nobody": ([wrong(gamma=b"\0", z=bytes(16))], MalformedMessage, "z although nothing was received"),
+    "not finite": ([wrong(gamma=b"\1", z=np.full(2, np.inf).tobytes())], MalformedMessage, "NaN or infinity"),
+    "more slots than a report has": ([wrong(c=BATCH + 1, gamma=bytes(BATCH + 1))], MalformedMessage, "c = 5; expected"),
     "slot as text": ([msgpack.packb({"k": "0", "gamma": b"\0"})], MalformedMessage, "k = '0'"),
     "slot as truth": ([msgpack.packb({"k": False, "gamma": b"\0"})], MalformedMessage, "k = False"),
 }
@@ -195,13 +201,11 @@ def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
         run="r",
     )
 
-    def delivered(k: int) -> bytes:
-        gamma = np.arange(3) != k % 3
-        header = np.full((1, 2), -1).astype("<i8").tobytes()
-        return packets.delivery(k, packed_flags(gamma).tobytes(), bytes(32), header=header)
+    def with_header(k: int) -> bytes:
+        return delivered(k, np.arange(3) != k % 3, np.zeros((2, 3)), header=np.full((1, 3), -1))
 
     slots = [0, 1, 2, 0, 1, 2, *range(3, SLOTS)]
-    stage.fill(RunKeys("r").downlink("legitimate"), [delivered(k) for k in slots])
+    stage.fill(RunKeys("r").downlink("legitimate"), [with_header(k) for k in slots])
     stage.commands.put(EndRun().pack())
     part_of(brief, LegitimatePart)
     RECEIVERS["legitimate"](brief, stage.session)
@@ -246,7 +250,7 @@ class SensorThread:
         for k in range(first, end):
             key, payload = self.next()
             assert key == self.keys.uplink
-            packets.read_uplink(wire.Reader(key, payload), k, (2, 3))
+            read_packet(wire.Reader(key, payload), k, (2, 3))
             if (k + 1) % BATCH == 0 or k + 1 == SLOTS:
                 key, payload = self.next()
                 assert key == self.keys.telemetry("sensor")
@@ -299,11 +303,11 @@ def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
     key, payload = sensor.next()
     assert (key, payload) == (sensor.keys.uplink, packets.resend(4, 10, 7))
     for k in range(7, WINDOW + 8):
-        packets.read_uplink(wire.Reader(*sensor.next()), k, (2, 3))
+        read_packet(wire.Reader(*sensor.next()), k, (2, 3))
     stage.buffers[sensor.keys.uplink].again(5, 8)
     assert wire.Reader(*sensor.next()).integer("k") == 5
     for k in range(5, WINDOW + 8):
-        packets.read_uplink(wire.Reader(*sensor.next()), k, (2, 3))
+        read_packet(wire.Reader(*sensor.next()), k, (2, 3))
     assert stage.put.empty()
 
 

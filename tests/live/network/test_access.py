@@ -20,11 +20,13 @@ import zenoh
 
 from evedrop.live.network.access import Grant, access_control, grants
 from evedrop.live.protocol import codec as wire
-from evedrop.live.protocol import packets, telemetry
+from evedrop.live.protocol import telemetry
 from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.commands import EndRun, Unknown
+from evedrop.live.protocol.packets import read_delivery
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
+from tests.messages import packet
 
 EVE = "eve"
 PROCESSES = ("sensor", "legitimate", "eve", "mallory", "nadia")
@@ -43,12 +45,12 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 def flow(stage: Bench) -> None:
     """Let one slot pass: each process gets exactly the messages that it should, and no others came first."""
     k, stage.due = stage.due, stage.due + 1
-    stage.put("sensor", stage.keys.uplink, packets.uplink(k, stage.packet(k)))
+    stage.put("sensor", stage.keys.uplink, packet(k, stage.packet(k)))
     for name, ear in stage.downlinks.items():
         key, payload = ear.hear()
-        (gamma, z, *_), late = packets.read_delivery(wire.Reader(key, payload), k, SHAPE)
-        assert np.array_equal(z, np.where(gamma, stage.packet(k), 0.0)), name
-        assert late == (), name
+        arrivals = read_delivery(wire.Reader(key, payload), k, SHAPE)
+        assert np.array_equal(arrivals.z[0], np.where(arrivals.gamma[0], stage.packet(k), 0.0)), name
+        assert not arrivals.late, name
     if stage.due % BATCH == 0:
         windows, extent = dict.fromkeys(stage.scenario.receivers, 0), telemetry.Extent(100_000, BATCH, *SHAPE)
         journal = telemetry.read_journal(wire.Reader(*stage.journal.hear()), stage.due - BATCH, windows, extent)
@@ -219,7 +221,7 @@ def test_eavesdropper_can_write_only_its_telemetry_and_progress(mode: str, stage
     """Its messages on any other key, and all its deletions, reach no process; the run goes on undisturbed."""
     keys = all_keys(stage)
     own = {keys[f"telemetry/{EVE}"], keys[f"progress/{EVE}"]}
-    payloads = (packets.uplink(stage.due, np.zeros(SHAPE)), EndRun().pack(), wire.progress(10**9), b"\xc1")
+    payloads = (packet(stage.due, np.zeros(SHAPE)), EndRun().pack(), wire.progress(10**9), b"\xc1")
     block = zenoh.CongestionControl.BLOCK
     with attacking(stage, mode) as attacker:
         for key in [*keys.values(), f"evedrop/{stage.keys.run}/**", "**"]:

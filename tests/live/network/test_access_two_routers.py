@@ -18,7 +18,6 @@ from evedrop.live.network.access import Grant, access_control, at_relay, at_rout
 from evedrop.live.network.operator import is_there
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol import codec as wire
-from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import AnyBrief, RelayPart, RouterPart
 from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.commands import EndRun, Unknown
@@ -27,6 +26,7 @@ from evedrop.names import RELAY
 from tests.builders import part_of
 from tests.conftest import wait_until
 from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
+from tests.messages import packet
 
 EVE = "eve"
 RECEIVERS = ("legitimate", "eve", "mallory", "nadia")
@@ -44,7 +44,7 @@ def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 def flow(stage: Bench) -> None:
     """Let one slot pass, in which everybody gets a delivery across the link."""
     k, stage.due = stage.due, stage.due + 1
-    stage.put("sensor", stage.keys.uplink, packets.uplink(k, stage.packet(k)))
+    stage.put("sensor", stage.keys.uplink, packet(k, stage.packet(k)))
     for ear in stage.downlinks.values():
         assert wire.Reader(*ear.hear()).integer("k") == k
 

@@ -26,11 +26,11 @@ from evedrop.live.network.connecting import RouterAddress, connected
 from evedrop.live.network.control_file import Control, read_control
 from evedrop.live.network.session import client_config, router_address_of
 from evedrop.live.protocol import codec as wire
-from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import AnyBrief, Identity, RecorderPart, read_brief
 from evedrop.system.ports import free_port
 from tests.conftest import wait_until
 from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
+from tests.messages import packet
 
 EVE, MALLORY = "eve", "mallory"
 NOW = datetime.datetime(2026, 5, 4, 12, tzinfo=datetime.UTC)
@@ -47,7 +47,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 def flow(stage: Bench) -> None:
     """Let one slot pass, in which everybody gets a delivery."""
     k, stage.due = stage.due, stage.due + 1
-    stage.put("sensor", stage.keys.uplink, packets.uplink(k, stage.packet(k)))
+    stage.put("sensor", stage.keys.uplink, packet(k, stage.packet(k)))
     for ear in stage.downlinks.values():
         assert wire.Reader(*ear.hear()).integer("k") == k
 

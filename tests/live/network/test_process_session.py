@@ -86,6 +86,59 @@ def test_a_buffer_with_a_span_keeps_the_slots_of_the_span() -> None:
     assert sent == [head(1, 5, 4), *(slot_message(k) for k in range(4, 10))]
 
 
+BLOCKS = st.lists(st.integers(1, 7), max_size=12)
+"""How many slots each message has."""
+
+
+def block_message(first: int, count: int) -> bytes:
+    """A message of several slots."""
+    return bytes(msgpack.packb({"k": first, "c": count}))
+
+
+@given(BLOCKS, st.integers(0, 90), st.integers(0, 90), st.integers(0, 5))
+def test_a_message_of_several_slots_is_kept_until_all_of_them_are_done(
+    counts: list[int], done: int, asked: int, back: int
+) -> None:
+    """A resend begins with the first slot of the oldest message that is sent again, and no slot that is needed is missing."""
+    sent: list[bytes] = []
+    kept = ReplayBuffer(sent.append, head=head, back=back)
+    slots = 0
+    for count in counts:
+        kept(slots + count - 1, block_message(slots, count), slots)
+        slots += count
+    done = min(done, slots)
+    kept.forget(done)
+    del sent[:]
+    kept.again(3, asked)
+    announced, *messages = [msgpack.unpackb(payload) for payload in sent]
+    needed = max(0, max(done, asked) - back)
+    assert announced["from"] == max(done, asked)
+    if needed < slots:
+        ks = [k for message in messages for k in range(message["k"], message["k"] + message["c"])]
+        assert ks == [*range(announced["first"], slots)]
+        assert messages[0]["k"] == announced["first"] <= needed < messages[0]["k"] + messages[0]["c"]
+
+
+def test_a_message_with_a_slot_that_is_not_done_is_sent_again_as_it_was() -> None:
+    """With its slots that are done, which the announcement says."""
+    sent: list[bytes] = []
+    kept = ReplayBuffer(sent.append, head=head, back=1)
+    for first in range(0, 24, 8):
+        kept(first + 7, block_message(first, 8), first)
+    kept.forget(11)
+    del sent[:]
+    kept.again(1, 11)
+    assert sent == [head(1, 11, 8), block_message(8, 8), block_message(16, 8)]
+    kept.forget(16)  # slot 15 is still needed, for what is under way
+    del sent[:]
+    kept.again(2, 16)
+    assert sent == [head(2, 16, 8), block_message(8, 8), block_message(16, 8)]
+    kept.forget(17)
+    del sent[:]
+    kept.again(3, 17)
+    assert sent == [head(3, 17, 16), block_message(16, 8)]
+
+
 KEY = "evedrop/r/uplink"
 
 

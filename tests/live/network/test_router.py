@@ -21,14 +21,16 @@ from evedrop.errors import RunError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol import codec as wire
-from evedrop.live.protocol import packets, telemetry
+from evedrop.live.protocol import telemetry
 from evedrop.live.protocol.brief import Brief, Flow, RouterPart
 from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.packets import read_delivery
 from evedrop.model.process import Floats
 from tests.conftest import LIMIT
 from tests.live.in_memory import Stage
 from tests.live.network.bench import Bench, small_network
+from tests.messages import packet
 
 
 def uniforms_of(key: bytes, slots: int, trials: range) -> np.ndarray:
@@ -103,13 +105,13 @@ def run_through(bench: Bench | MemoryBench) -> tuple[dict[str, np.ndarray], dict
     shape = (2, scenario.trials)
     gammas = {name: np.zeros((scenario.slots, scenario.trials), bool) for name in scenario.receivers}
     for k in range(scenario.slots):
-        bench.put("sensor", keys.uplink, packets.uplink(k, bench.packet(k)))
+        bench.put("sensor", keys.uplink, packet(k, bench.packet(k)))
     for name in scenario.receivers:
         for k in range(scenario.slots):
-            (gamma, z, *_), late = packets.read_delivery(wire.Reader(*bench.downlinks[name].hear()), k, shape)
-            assert np.array_equal(z, np.where(gamma, bench.packet(k), 0.0))
-            assert late == ()
-            gammas[name][k] = gamma
+            arrivals = read_delivery(wire.Reader(*bench.downlinks[name].hear()), k, shape)
+            assert np.array_equal(arrivals.z[0], np.where(arrivals.gamma[0], bench.packet(k), 0.0))
+            assert not arrivals.late
+            gammas[name][k] = arrivals.gamma[0]
     lost = {name: np.zeros(scenario.slots, int) for name in scenario.receivers}
     k = 0
     while k < scenario.slots:
@@ -117,8 +119,8 @@ def run_through(bench: Bench | MemoryBench) -> tuple[dict[str, np.ndarray], dict
         journal = telemetry.read_journal(wire.Reader(*bench.journal.hear()), k, windows, extent)
         rows = slice(k, k + journal.count)
         for name in scenario.receivers:
-            assert np.array_equal(journal.links[name].delivered, gammas[name][rows])
-            lost[name][rows] = sum(journal.links[name].lost.values())
+            assert np.array_equal(journal.links[name].slots.delivered, gammas[name][rows])
+            lost[name][rows] = journal.links[name].slots.lost.sum(axis=1)
         k += journal.count
     return gammas, lost
 
@@ -152,16 +154,16 @@ def test_passwords_do_not_outlast_the_opening(bench: Callable[..., Bench]) -> No
     assert list(bench().private.iterdir()) == []
 
 
-GOOD = packets.uplink(0, np.zeros((2, 5)))
+GOOD = packet(0, np.zeros((2, 5)))
 BAD = {
     "gap": (
-        [packets.uplink(k, np.zeros((2, 5))) for k in (1, 2)],
+        [packet(k, np.zeros((2, 5))) for k in (1, 2)],
         "gap on .*/uplink: slot 2 arrived where slot 0 was due",
     ),
     "not msgpack": ([b"\xc1"], "malformed message on .*/uplink: not msgpack .*c1"),
     "too short": ([GOOD[:-1]], "malformed message on .*/uplink"),
-    "other shape": ([packets.uplink(0, np.zeros((2, 4)))], "malformed .*z of 64 bytes; expected 80 bytes"),
-    "not finite": ([packets.uplink(0, np.full((2, 5), np.nan))], "malformed .*z with a NaN or infinity"),
+    "other shape": ([packet(0, np.zeros((2, 4)))], "malformed .*z of 64 bytes; expected 80 bytes"),
+    "not finite": ([packet(0, np.full((2, 5), np.nan))], "malformed .*z with a NaN or infinity"),
     "not a map": ([msgpack.packb([0])], "malformed .*a list; expected a msgpack map"),
     "slot below 0": ([msgpack.packb({"k": -1, "z": bytes(80)})], "malformed .*k = -1"),
 }
@@ -198,10 +200,10 @@ def test_a_doubled_packet_is_delivered_once() -> None:
     """A slot that comes twice, and one that comes too early, are ignored."""
     with MemoryBench() as bench:
         for k in (0, 0, 2, 1):
-            bench.put("sensor", bench.keys.uplink, packets.uplink(k, np.zeros((2, 5))))
+            bench.put("sensor", bench.keys.uplink, packet(k, np.zeros((2, 5))))
         for ear in bench.downlinks.values():
             assert [wire.Reader(*ear.hear()).integer("k") for _ in range(2)] == [0, 1]
-        bench.put("sensor", bench.keys.uplink, packets.uplink(2, np.zeros((2, 5))))
+        bench.put("sensor", bench.keys.uplink, packet(2, np.zeros((2, 5))))
         for ear in bench.downlinks.values():
             assert wire.Reader(*ear.hear()).integer("k") == 2
 
@@ -213,7 +215,7 @@ def test_a_part_of_a_slot_is_waited_for_in_real_time(bench: Callable[..., Bench]
     stage = bench(slots=3, pace=0.1, legitimate={"link": delayed}, eavesdroppers={"eve": eve})
     for k in range(3):
         began = time.monotonic()
-        stage.put("sensor", stage.keys.uplink, packets.uplink(k, stage.packet(k)))
+        stage.put("sensor", stage.keys.uplink, packet(k, stage.packet(k)))
         stage.downlinks["eve"].hear()
         stage.downlinks["legitimate"].hear()
         assert time.monotonic() - began >= 0.05

@@ -15,10 +15,12 @@ from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Again, Go, LinkChange
-from evedrop.model.links.loss_model import REASONS
+from evedrop.live.protocol.record_messages import packed
 from evedrop.model.slot.link import Change
+from evedrop.model.slot.records import PacketSlots
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.test_router import Ear, MemoryBench
+from tests.messages import packet
 
 SLOTS, BATCH = 96, 8
 SHAPE = (2, 5)
@@ -41,7 +43,7 @@ WINDOWS = {"legitimate": 3, "eve": 0}
 def send(bench: MemoryBench, slots: range) -> None:
     """Have the sensor send the packets of these slots."""
     for k in slots:
-        bench.put("sensor", bench.keys.uplink, packets.uplink(k, bench.packet(k)))
+        bench.put("sensor", bench.keys.uplink, packet(k, bench.packet(k)))
 
 
 def announce(bench: MemoryBench, number: int, done: int, first: int) -> None:
@@ -72,12 +74,7 @@ def same_fates(journal: telemetry.Journal, other: telemetry.Journal, rows: slice
     """Check that a journal has some rows of another one."""
     for name, link in journal.links.items():
         whole = other.links[name]
-        assert np.array_equal(link.delivered, whole.delivered[rows])
-        for reason in REASONS:
-            assert np.array_equal(link.lost[reason], whole.lost[reason][rows]), reason
-        assert (link.late is None) == (whole.late is None)
-        if link.late is not None and whole.late is not None:
-            assert np.array_equal(link.late, whole.late[rows])
+        assert packed(link.slots) == packed(whole.slots.rows(rows))
 
 
 @pytest.mark.parametrize("restarted", [False, True])
@@ -118,6 +115,73 @@ def check_round(
             batch = start - start % BATCH
             same_fates(journal, wanted[batch], slice(start - batch, BATCH))
     assert any(link.bursts[BATCH:].any() for journal in journaled.values() for link in journal.links.values())
+
+
+def send_blocks(bench: MemoryBench, slots: range, count: int) -> None:
+    """Have the sensor send the packets of these slots, `count` in a message; a batch begins a new message."""
+    k = slots.start
+    while k < slots.stop:
+        end = min(k + count, k - k % BATCH + BATCH, slots.stop)
+        z = np.array([bench.packet(slot) for slot in range(k, end)])
+        bench.put("sensor", bench.keys.uplink, packets.uplink(PacketSlots(k, z)))
+        k = end
+
+
+def received(payloads: list[bytes], first: int) -> list[tuple[bytes, bytes, list[tuple[int, bytes]]]]:
+    """What deliveries of consecutive slots say of each slot, however many slots each has: γ, z, and late packets."""
+    slots: list[tuple[bytes, bytes, list[tuple[int, bytes]]]] = []
+    for payload in payloads:
+        arrivals = packets.read_delivery(Reader("d", payload), first + len(slots), SHAPE, window=3, most=BATCH)
+        for row in range(len(arrivals.gamma)):
+            heard, late = arrivals.at(row)
+            slots.append(
+                (heard.gamma.tobytes(), heard.z.tobytes(), [(part.k, part.heard.z.tobytes()) for part in late])
+            )
+    return slots
+
+
+def deliveries_from(ear: Ear, first: int, stop: int) -> tuple[list[int], list[bytes]]:
+    """The first slots of the next deliveries, and the deliveries, which must cover these slots."""
+    starts, payloads = [], []
+    while first < stop:
+        key, payload = ear.hear()
+        message = Reader(key, payload)
+        assert message.integer("k") == first
+        starts.append(first)
+        payloads.append(payload)
+        first += message.integer("c")
+    assert first == stop
+    return starts, payloads
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+@pytest.mark.parametrize(("done", "count"), [(40, 3), (43, 8), (45, 3), (45, 8), (47, 7)])
+def test_a_message_is_split_at_the_first_slot_that_is_not_done(done: int, count: int, restarted: bool) -> None:
+    """Its slots that are done are counted and not delivered again; the others are delivered and journaled as before."""
+    with MemoryBench(**LATE) as single:
+        send(single, range(SLOTS))
+        wanted = {name: received(payloads, 0) for name, payloads in deliveries(single, range(SLOTS)).items()}
+        fates = journals(single, 0, SLOTS, WINDOWS)
+    with MemoryBench(**LATE) as bench:
+        if not restarted:
+            send_blocks(bench, range(SLOTS), count)
+            for name, ear in bench.downlinks.items():
+                assert received(deliveries_from(ear, 0, SLOTS)[1], 0) == wanted[name]
+            for start, journal in journals(bench, 0, SLOTS, WINDOWS).items():
+                assert journal.pack() == fates[start].pack()
+        first = done - WINDOWS["legitimate"]
+        first -= (first % BATCH) % count  # the first slot of its message
+        bench.stage.commands.put(Again(1, done, {}).pack())
+        announce(bench, 1, done, first)
+        send_blocks(bench, range(first, SLOTS), count)
+        for name, ear in bench.downlinks.items():
+            starts, payloads = deliveries_from(ear, done, SLOTS)
+            assert starts[0] == done
+            assert len(starts) < SLOTS - done
+            assert received(payloads, done) == wanted[name][done:]
+        for start, journal in journals(bench, done, SLOTS, WINDOWS).items():
+            batch = start - start % BATCH
+            same_fates(journal, fates[batch], slice(start - batch, BATCH))
 
 
 def test_packets_before_a_round_that_the_conductor_wants_are_ignored() -> None:
@@ -184,9 +248,9 @@ def test_a_barrier_is_passed_on_and_a_changed_link_is_changed_from_there_on(kept
         after = deliveries(bench, range(at, 40))
         assert after["legitimate"] == unchanged["legitimate"][at:40]
         for k, payload in enumerate(after["eve"], at):
-            assert not packets.read_delivery(Reader("d", payload), k, SHAPE).heard.gamma.any()
+            assert not packets.read_delivery(Reader("d", payload), k, SHAPE).gamma.any()
         wanted = journals(bench, at, 40, WINDOWS)
-        assert {int(journal.links["eve"].lost["cut"].min()) for journal in wanted.values()} == {5}
+        assert {int(journal.links["eve"].slots.lost_by_reason["cut"].min()) for journal in wanted.values()} == {5}
         if kept:
             check_later(bench, done, {}, after)
     if not kept:
@@ -224,7 +288,7 @@ def test_who_is_away_gets_neither_deliveries_nor_barriers() -> None:
     assert marks == {"legitimate": [10, 15, 20, 24], "eve": [10, 24]}
     slots = {name: [k for barrier, k in all_of if not barrier] for name, all_of in heard.items()}
     assert slots == {"legitimate": [*range(24)], "eve": [*range(10), *range(20, 24)]}
-    down = np.concatenate([journal.links["eve"].lost["down"] for journal in journaled.values()])
+    down = np.concatenate([journal.links["eve"].slots.lost_by_reason["down"] for journal in journaled.values()])
     assert down.tolist() == [5 if k in away else 0 for k in range(24)]
 
 
@@ -251,12 +315,12 @@ def acknowledged(
     for k in slots:
         sent = None if rows else (np.arange(5) + k) % 3 > 0
         header = np.zeros((rows, 5), np.int64) if rows else None
-        bench.put("sensor", bench.keys.uplink, packets.uplink(k, bench.packet(k), header, sent))
+        bench.put("sensor", bench.keys.uplink, packet(k, bench.packet(k), header, sent))
         if k < done:
             continue
         gammas = []
         for name in ("legitimate", "eve"):
-            gammas.append(packets.read_delivery(Reader(*bench.downlinks[name].hear()), k, SHAPE, rows).heard.gamma)
+            gammas.append(packets.read_delivery(Reader(*bench.downlinks[name].hear()), k, SHAPE, rows).gamma[0])
             assert sent is None or not (gammas[-1] & ~sent).any()
         for slot in (max(k - 1, 0), k):  # one that comes twice is ignored
             bench.stage.callbacks[bench.keys.acknowledged](packets.acknowledgement(slot, gammas[0]))

@@ -11,11 +11,14 @@ import pytest
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.protocol.codec import Reader, pack, read_refusal, refusal
-from evedrop.live.protocol.packets import delivery, packed_header, read_delivery, read_extras, read_uplink, uplink
-from evedrop.live.protocol.telemetry import Extent, Truth, read_truth
+from evedrop.live.protocol.packets import packet_format, packets_of, read_delivery, read_uplink, uplink
+from evedrop.live.protocol.telemetry import Extent, read_truth, truth
 from evedrop.model.receiver import Reception
+from evedrop.model.schemes.scheme import PacketBlock
 from evedrop.model.slot.link_core import Late
+from evedrop.model.slot.records import SensorSlots
 from tests.live.protocol.readers import EXAMPLES, READERS, TRIALS, fields_of
+from tests.messages import delivered, packet, read_packet
 
 KEY = "evedrop/r1/telemetry/eve"
 
@@ -43,7 +46,7 @@ WRONG: list[tuple[str, dict[str, Any], str]] = [
     ("report", {"digests": {}}, "digests of blocks []; expected those of [0], which end in these slots"),
     ("report", {"digests": {7: b""}}, "digests of block 7; expected of the blocks that end in these slots, [0]"),
     ("report", {"digests": {0: b"short"}}, "digests of block 0; expected 48 bytes a block"),
-    ("report", {"k": 4, "c": 1}, "action of 6 bytes; expected 3 bytes"),
+    ("report", {"k": 4, "c": 1}, "x_hat of 96 bytes; expected 48 bytes"),
     ("delivery", {"gamma": b"\x00"}, "z although nothing was received; expected no z"),
     ("acknowledgement", {"gamma": b"\x08"}, "gamma with a bit beyond trial 2; expected unused bits that are 0"),
 ]
@@ -86,15 +89,15 @@ def test_only_a_key_that_the_process_reads_can_be_refused(key: str) -> None:
 def test_the_reasons_and_the_alarms_of_the_sensor_are_read_as_sent() -> None:
     """Whether it sent, and whether it raised an alarm; each may be absent."""
     sent, alarms = np.array([[True, False, True]]), np.array([[False, False, True]])
-    truth = Truth(4, np.ones((1, 2, 3)), np.zeros((1, 3), np.bool_), sent, alarms)
-    result = read_truth(Reader(KEY, truth.pack()), 4, Extent(9, 3, 2, 3))
+    slots = SensorSlots(4, np.ones((1, 2, 3)), np.zeros((1, 3), np.bool_), sent, alarms)
+    result = read_truth(Reader(KEY, truth(slots)), 4, Extent(9, 3, 2, 3))
     assert result.sent is not None
     assert result.alarms is not None
     assert np.array_equal(result.sent, sent)
     assert np.array_equal(result.alarms, alarms)
     assert (result.u, result.failed, result.true) == (None, None, None)
     assert (result.statistic, result.watermark) == (None, None)
-    bare = read_truth(Reader(KEY, Truth(4, truth.x, truth.nu).pack()), 4, Extent(9, 3, 2, 3))
+    bare = read_truth(Reader(KEY, truth(SensorSlots(4, slots.x, slots.nu))), 4, Extent(9, 3, 2, 3))
     assert (bare.sent, bare.alarms) == (None, None)
 
 
@@ -104,31 +107,32 @@ def test_statistic_and_watermark_of_a_detector_are_read_as_sent() -> None:
     u, failed = np.zeros((1, 1, 3)), np.zeros((1, 3), np.bool_)
     given = (4, np.ones((1, 2, 3)), failed, None, None, u, failed, np.ones((1, 2, 3)))
     extent = Extent(9, 3, 2, 3, inputs=1, measures=True, monitored=True)
-    truth = read_truth(Reader(KEY, Truth(*given, statistic, watermark).pack()), 4, extent)
-    assert truth.statistic is not None
-    assert truth.watermark is not None
-    assert np.array_equal(truth.statistic, statistic)
-    assert np.array_equal(truth.watermark, watermark)
+    slots = read_truth(Reader(KEY, truth(SensorSlots(*given, statistic, watermark))), 4, extent)
+    assert slots.statistic is not None
+    assert slots.watermark is not None
+    assert np.array_equal(slots.statistic, statistic)
+    assert np.array_equal(slots.watermark, watermark)
     with pytest.raises(MalformedMessage, match="statistic"):
-        read_truth(Reader(KEY, Truth(*given).pack()), 4, extent)
+        read_truth(Reader(KEY, truth(SensorSlots(*given))), 4, extent)
 
 
 def test_a_delivery_of_nothing_has_an_empty_header() -> None:
     """The header is 0 where nothing was received, as z is."""
-    heard, late = read_delivery(Reader(KEY, delivery(4, b"\x00", b"")), 4, (2, 3), header=1)
-    assert heard.header is not None
-    assert late == ()
-    assert not heard.gamma.any()
-    assert not heard.header.any()
-    assert not heard.z.any()
+    payload = delivered(4, np.zeros(3, np.bool_), np.ones((2, 3)), header=np.ones((1, 3), np.int64))
+    arrivals = read_delivery(Reader(KEY, payload), 4, (2, 3), header=1)
+    assert arrivals.header is not None
+    assert not arrivals.late
+    assert not arrivals.gamma.any()
+    assert not arrivals.header.any()
+    assert not arrivals.z.any()
 
 
 def test_infinite_numbers_are_refused_wherever_finite_ones_are_expected() -> None:
     """With the field."""
     for value in (np.inf, -np.inf, np.nan):
-        payload = pack({"k": 4, "z": np.full((2, 3), value).tobytes()})
+        payload = packet(4, np.full((2, 3), value))
         with pytest.raises(MalformedMessage, match="z with a NaN or infinity; expected finite numbers"):
-            read_uplink(Reader(KEY, payload), 4, (2, 3))
+            read_packet(Reader(KEY, payload), 4, (2, 3))
 
 
 @pytest.mark.parametrize("lists", [4094, 4095])
@@ -145,21 +149,22 @@ def test_a_large_message_may_have_4096_lists_and_maps(lists: int) -> None:
 def test_what_a_packet_carries_besides_its_payload_is_read_as_sent() -> None:
     """Header, flags and the state that a receiver learns; a payload that is not sent is 0."""
     z, header, sent = np.arange(1.0, 7.0).reshape(2, 3), np.array([[4, -1, 2**40]]), np.array([True, False, True])
-    message = Reader(KEY, uplink(4, z, header, sent, z + 1.0))
-    assert np.array_equal(read_uplink(message, 4, (2, 3)), np.where(sent, z, 0.0))
-    extras = read_extras(message, (2, 3), 1)
-    for extra, given in zip(extras, (header, sent, z + 1.0), strict=True):
-        assert extra is not None
-        assert np.array_equal(extra, given)
-    assert read_extras(Reader(KEY, uplink(4, z)), (2, 3)) == (None, None, None)
+    made = packets_of(4, PacketBlock(z[None], sent[None], header[None], sent[None]), z[None] + 1.0)
+    read = read_uplink(Reader(KEY, uplink(made)), 4, packet_format(2, 3, 1))
+    given = (np.where(sent, z, 0.0), header, sent, z + 1.0)
+    for column, values in zip((read.z, read.header, read.sent, read.truth), given, strict=True):
+        assert column is not None
+        assert np.array_equal(column[0], values)
+    bare = read_uplink(Reader(KEY, packet(4, z)), 4, packet_format(2, 3))
+    assert (bare.header, bare.sent, bare.truth) == (None, None, None)
 
 
 def test_the_header_of_a_delivery_is_read_for_the_trials_that_received() -> None:
     """Of the slot's own packet, and of a late one; 0 elsewhere."""
     header, received = np.array([[4, -1, 2**40]]), np.array([True, False, True])
     late = (Late(3, Reception(~received, np.ones((2, 3)), header)),)
-    payload = delivery(4, b"\x05", np.ones((2, 2)).tobytes(), late, packed_header(header, received))
-    heard, late_packets = read_delivery(Reader(KEY, payload), 4, (2, 3), header=1)
+    payload = delivered(4, received, np.ones((2, 3)), late, header)
+    heard, late_packets = read_delivery(Reader(KEY, payload), 4, (2, 3), header=1).at(0)
     for reception, gamma in ((heard, received), (late_packets[0].heard, ~received)):
         assert reception.header is not None
         assert np.array_equal(reception.header, np.where(gamma, header, 0))

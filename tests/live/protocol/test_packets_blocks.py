@@ -1,10 +1,12 @@
-"""Messages of many slots are read as one by one: the same packets, and the same errors."""
+"""Packets of many slots in one message: read back bit by bit, row for row as in messages of single slots; else refused."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,60 +14,47 @@ from hypothesis import strategies as st
 
 from evedrop.errors import Gap, MalformedMessage
 from evedrop.live.protocol.codec import Reader, pack
-from evedrop.live.protocol.packets import (
-    delivery,
-    packed_header,
-    read_deliveries,
-    read_delivery,
-    read_extras,
-    read_uplink,
-    read_uplinks,
-    uplink,
-)
-from evedrop.model.receiver import Reception, packed_flags
-from evedrop.model.slot.link_core import Late
+from evedrop.live.protocol.keys import writer_of
+from evedrop.live.protocol.packets import delivery, packet_format, read_delivery, read_uplink, uplink
+from evedrop.live.protocol.record_messages import packed
+from evedrop.model.receiver import Reception
+from evedrop.model.slot.link_core import NOTHING, Arrivals, Late
+from evedrop.model.slot.records import PacketSlots
 from tests.examples import examples
+from tests.messages import delivered, packet
 
 UP, DOWN = "evedrop/r/uplink", "evedrop/r/downlink/eve"
-FIRST, WINDOW = 7, 3
+FIRST, WINDOW, MOST = 7, 3, 6
 SHAPES = st.tuples(st.integers(1, 3), st.integers(1, 17))
 RANDOM = st.builds(np.random.default_rng, st.integers(0, 2**32))
 
 
-def uplinks(random: np.random.Generator, shape: tuple[int, int], header: int, odd: bool) -> list[bytes]:
-    """Packets of some slots; odd: some of them were not sent in every trial, or betray the state."""
-    uplinks = []
-    for k in range(FIRST, FIRST + int(random.integers(1, 6))):
-        extra = random.integers(0, 5, (header, shape[1])) if header else None
-        sent = random.random(shape[1]) < 0.5 if odd and random.random() < 0.5 else None
-        truth = random.normal(size=shape) if odd and random.random() < 0.3 else None
-        uplinks.append(uplink(k, random.normal(size=shape), extra, sent, truth))
-    return uplinks
+def made_packets(random: np.random.Generator, shape: tuple[int, int], header: int, odd: bool) -> PacketSlots:
+    """Packets of some slots; odd: some of them were not sent, and the state is betrayed."""
+    n, trials = shape
+    c = int(random.integers(1, MOST + 1))
+    return PacketSlots(
+        FIRST,
+        random.normal(size=(c, n, trials)),
+        random.integers(-5, 5, (c, header, trials)) if header else None,
+        random.random((c, trials)) < 0.5 if odd else None,
+        random.normal(size=(c, n, trials)) if odd else None,
+    )
 
 
-def deliveries(random: np.random.Generator, shape: tuple[int, int], header: int, odd: bool) -> list[bytes]:
-    """Deliveries of some slots; odd: with late packets, or a betrayed state."""
-    _n, trials = shape
-    deliveries = []
-    for k in range(FIRST, FIRST + int(random.integers(1, 6))):
-        gamma, z = random.random(trials) < random.choice([0.0, 0.5, 1.0]), random.normal(size=shape)
-        extra = random.integers(0, 5, (header, trials))
-        late: tuple[Late, ...] = ()
-        if odd and not gamma.all() and random.random() < 0.5:
-            late = (Late(k - 2, Reception(~gamma, z, extra if header else None)),)
-        truth = random.normal(size=shape).tobytes() if odd and random.random() < 0.3 else b""
-        some = z[:, gamma].tobytes()
-        deliveries.append(
-            delivery(
-                k, packed_flags(gamma).tobytes(), some, late, packed_header(extra, gamma) if header else b"", truth
-            )
-        )
-    return deliveries
-
-
-def readers(key: str, payloads: Sequence[bytes]) -> list[Reader]:
-    """The messages, as they arrive."""
-    return [Reader(key, payload) for payload in payloads]
+def made_arrivals(random: np.random.Generator, shape: tuple[int, int], header: int, odd: bool) -> Arrivals:
+    """Arrivals in some slots; odd: with late packets, and a betrayed state."""
+    n, trials = shape
+    c = int(random.integers(1, MOST + 1))
+    gamma = np.array([random.random(trials) < random.choice([0.0, 0.5, 1.0]) for _ in range(c)])
+    z = random.normal(size=(c, n, trials))
+    headers = random.integers(-5, 5, (c, header, trials)) if header else None
+    late = {}
+    if odd:
+        for row in np.flatnonzero(~gamma.all(axis=1)).tolist():
+            heard = Reception(~gamma[row], z[row], None if headers is None else headers[row])
+            late[row] = tuple(Late(FIRST + row - back, heard) for back in (2, 1))
+    return Arrivals(gamma, z, headers, late, {0: random.normal(size=shape)} if odd and c == 1 else NOTHING)
 
 
 @settings(deadline=None, max_examples=examples(60))
@@ -74,7 +63,7 @@ def test_packets_of_many_slots_are_those_of_each(
     random: np.random.Generator, shape: tuple[int, int], header: int, odd: bool
 ) -> None:
     """Payloads, headers, what was not sent, and a betrayed state."""
-    expect_same_packets(uplinks(random, shape, header, odd), shape, header)
+    expect_same_packets(made_packets(random, shape, header, odd), shape, header)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -82,25 +71,18 @@ def test_packets_of_many_slots_are_those_of_each(
 @pytest.mark.parametrize("odd", [False, True])
 def test_packets_of_many_slots_are_those_of_each_in_some_cases(seed: int, header: int, odd: bool) -> None:
     """The same cases in every run of the tests."""
-    expect_same_packets(uplinks(np.random.default_rng(seed), (2, 9), header, odd), (2, 9), header)
+    expect_same_packets(made_packets(np.random.default_rng(seed), (2, 9), header, odd), (2, 9), header)
 
 
-def expect_same_packets(payloads: list[bytes], shape: tuple[int, int], header: int) -> None:
-    """Packets that are read together are those that are read one by one."""
-    uplinks = read_uplinks(readers(UP, payloads), FIRST, shape, header)
-    for row, message in enumerate(readers(UP, payloads)):
-        z, extras = read_uplink(message, FIRST + row, shape), read_extras(message, shape, header)
-        assert uplinks.z[row].tobytes() == z.tobytes() == uplinks.whole[row]
-        assert (uplinks.header is None) == (extras.header is None)
-        if uplinks.header is not None and extras.header is not None:
-            assert np.array_equal(uplinks.header[row], extras.header)
-        if uplinks.sent is None:
-            assert extras.sent is None
-        else:
-            assert np.array_equal(uplinks.sent[row], np.ones(shape[1]) if extras.sent is None else extras.sent)
-        assert (row in uplinks.truth) == (extras.truth is not None)
-        if extras.truth is not None:
-            assert np.array_equal(uplinks.truth[row], extras.truth)
+def expect_same_packets(made: PacketSlots, shape: tuple[int, int], header: int) -> None:
+    """A message is read as it was written, and each of its rows as a message of this slot alone."""
+    packets = packet_format(*shape, header)
+    read = read_uplink(Reader(UP, uplink(made)), FIRST, packets, MOST)
+    assert (read.slots, packed(read)) == (made.slots, packed(made))
+    for row in range(made.count):
+        of_slot = made.rows(slice(row, row + 1))
+        alone = read_uplink(Reader(UP, uplink(of_slot)), FIRST + row, packets)
+        assert packed(alone) == packed(read.rows(slice(row, row + 1)))
 
 
 @settings(deadline=None, max_examples=examples(60))
@@ -109,7 +91,7 @@ def test_deliveries_of_many_slots_are_those_of_each(
     random: np.random.Generator, shape: tuple[int, int], header: int, odd: bool
 ) -> None:
     """γ, packets, headers, late packets, and a betrayed state."""
-    expect_same_deliveries(deliveries(random, shape, header, odd), shape, header)
+    expect_same_deliveries(made_arrivals(random, shape, header, odd), shape, header)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -117,72 +99,119 @@ def test_deliveries_of_many_slots_are_those_of_each(
 @pytest.mark.parametrize("odd", [False, True])
 def test_deliveries_of_many_slots_are_those_of_each_in_some_cases(seed: int, header: int, odd: bool) -> None:
     """The same cases in every run of the tests."""
-    expect_same_deliveries(deliveries(np.random.default_rng(seed), (2, 9), header, odd), (2, 9), header)
+    expect_same_deliveries(made_arrivals(np.random.default_rng(seed), (2, 9), header, odd), (2, 9), header)
 
 
-def expect_same_deliveries(payloads: list[bytes], shape: tuple[int, int], header: int) -> None:
-    """Deliveries that are read together are those that are read one by one."""
-    deliveries = read_deliveries(readers(DOWN, payloads), FIRST, shape, header, WINDOW)
-    for row, message in enumerate(readers(DOWN, payloads)):
-        expected, single = read_delivery(message, FIRST + row, shape, header, WINDOW), deliveries.at(row)
-        for mine, other in zip(single.heard, expected.heard, strict=True):
-            assert (mine is None) == (other is None)
-            if mine is not None and other is not None:
-                assert np.array_equal(mine, other)
-        assert len(single.late) == len(expected.late)
-        for late, like in zip(single.late, expected.late, strict=True):
-            assert late.k == like.k
-            assert np.array_equal(late.heard.z, like.heard.z)
+def expect_same_deliveries(made: Arrivals, shape: tuple[int, int], header: int) -> None:
+    """A message is read as it was written, 0 where nothing was received, and each row as a message of this slot alone."""
+    slots = range(FIRST, FIRST + len(made.gamma))
+    read = read_delivery(Reader(DOWN, delivery(slots, made)), FIRST, shape, header, WINDOW, MOST)
+    for row, k in enumerate(slots):
+        (gamma, z, headers, truth), late = made.at(row)
+        alone = read_delivery(Reader(DOWN, delivered(k, gamma, z, late, headers, truth)), k, shape, header, WINDOW)
+        for arrival in (read.at(row), alone.at(0)):
+            expect_same_reception(arrival.heard, Reception(gamma, z, headers, truth))
+            assert [packets.k for packets in arrival.late] == [packets.k for packets in late]
+            for packets, other in zip(arrival.late, late, strict=True):
+                expect_same_reception(packets.heard, other.heard)
 
 
-SPOILT: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
-    "another slot": lambda fields: {**fields, "k": 99},
-    "a slot that is not a number": lambda fields: {**fields, "k": "8"},
-    "NaN": lambda fields: {**fields, "z": np.full(2, np.nan).tobytes() + fields["z"][16:]},
-    "too short": lambda fields: {**fields, "z": fields["z"][:-8]},
-    "no bytes": lambda fields: {**fields, "z": [1.0]},
-    "no packet": lambda fields: {name: value for name, value in fields.items() if name != "z"},
+def expect_same_reception(heard: Reception, made: Reception) -> None:
+    """Bit by bit, where anything was received."""
+    assert np.array_equal(heard.gamma, made.gamma)
+    assert heard.z.tobytes() == np.where(made.gamma, made.z, 0.0).tobytes()
+    for mine, other in ((heard.header, made.header), (heard.truth, made.truth)):
+        assert (mine is None) == (other is None)
+    if made.header is not None and heard.header is not None:
+        assert np.array_equal(heard.header, np.where(made.gamma, made.header, 0))
+    if made.truth is not None and heard.truth is not None:
+        assert np.array_equal(heard.truth, made.truth)
+
+
+SPOILT: dict[str, tuple[dict[str, Any], str]] = {
+    "another slot": ({"k": 99}, "slot 99 arrived where slot 7 was due"),
+    "a slot that is not a number": ({"k": "8"}, "k = '8'"),
+    "no slots": ({"c": 0}, "c = 0"),
+    "more slots than there may be": ({"c": MOST + 1}, f"c = {MOST + 1}"),
+    "slots that are not there": ({"c": 4}, "expected"),
+    "NaN in the last slot": ({"z": np.full((3, 2, 3), [[[0.0]], [[0.0]], [[np.nan]]]).tobytes()}, "z with a NaN"),
+    "too short": ({"z": bytes(8 * 17)}, "z of 136 bytes; expected 144 bytes"),
+    "no bytes": ({"z": [1.0]}, "z of "),
+    "no packet": ({"z": None}, "z of None; expected 144 bytes"),
 }
-SPOILT_DELIVERIES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+SPOILT_DELIVERIES: dict[str, tuple[dict[str, Any], str]] = {
     **SPOILT,
-    "a bit beyond the last trial": lambda fields: {**fields, "gamma": b"\xff"},
-    "no mask": lambda fields: {name: value for name, value in fields.items() if name != "gamma"},
-    "a mask that is too long": lambda fields: {**fields, "gamma": b"\x07\x00"},
-    "packets for nobody": lambda fields: {**fields, "gamma": b"\x00"},
+    "a bit beyond the last trial": ({"gamma": b"\x07\xff\x07"}, "gamma with a bit beyond trial 2"),
+    "no mask": ({"gamma": None}, "gamma of None; expected 3 bytes"),
+    "a mask that is too long": ({"gamma": b"\x07\x07\x07\x00"}, "gamma of 4 bytes; expected 3 bytes"),
+    "packets for nobody": ({"gamma": bytes(3)}, "z although nothing was received"),
+    "fewer packets than received": ({"gamma": b"\x07\x06\x07"}, "z of 144 bytes; expected 128 bytes"),
+    "a late packet in a slot of another message": ({"late": [{"at": 10, "k": 7}]}, "at = 10"),
+    "a late packet that is too old": ({"late": [{"at": 9, "k": 5}]}, "a late packet of slot 5; expected one of slot 9"),
+    "a late packet of a later slot": ({"late": [{"at": 8, "k": 9}]}, "a late packet of slot 9; expected one of slot 8"),
 }
 
 
-@pytest.mark.parametrize("place", [0, 2])
 @pytest.mark.parametrize("case", SPOILT)
-def test_the_malformed_packet_among_many_is_refused(case: str, place: int) -> None:
-    """With the words in which it is refused alone."""
-    fields = [{"k": FIRST + row, "z": np.ones((2, 3)).tobytes()} for row in range(4)]
-    fields[place] = SPOILT[case](fields[place])
-    messages = readers(UP, [pack(field) for field in fields])
-    with pytest.raises((MalformedMessage, Gap)) as alone:
-        read_uplink(messages[place], FIRST + place, (2, 3))
-    with pytest.raises((MalformedMessage, Gap)) as among:
-        read_uplinks(messages, FIRST, (2, 3))
-    assert str(among.value) == str(alone.value)
+def test_malformed_packets_are_refused(case: str) -> None:
+    """With the key, the writer, the field, and the expected value."""
+    changes, message = SPOILT[case]
+    fields = {"k": FIRST, "c": 3, "z": np.ones((3, 2, 3)).tobytes(), **changes}
+    expect_refused(UP, fields, message, lambda reader: read_uplink(reader, FIRST, packet_format(2, 3), MOST))
 
 
-@pytest.mark.parametrize("place", [0, 2])
 @pytest.mark.parametrize("case", SPOILT_DELIVERIES)
-def test_the_malformed_delivery_among_many_is_refused(case: str, place: int) -> None:
-    """With the words in which it is refused alone."""
-    fields = [{"k": FIRST + row, "gamma": b"\x07", "z": np.ones((2, 3)).tobytes()} for row in range(4)]
-    fields[place] = SPOILT_DELIVERIES[case](fields[place])
-    messages = readers(DOWN, [pack(field) for field in fields])
-    with pytest.raises((MalformedMessage, Gap)) as alone:
-        read_delivery(messages[place], FIRST + place, (2, 3))
-    with pytest.raises((MalformedMessage, Gap)) as among:
-        read_deliveries(messages, FIRST, (2, 3))
-    assert str(among.value) == str(alone.value)
+def test_malformed_deliveries_are_refused(case: str) -> None:
+    """With the key, the writer, the field, and the expected value."""
+    changes, message = SPOILT_DELIVERIES[case]
+    fields = {"k": FIRST, "c": 3, "gamma": b"\x07\x07\x07", "z": np.ones((3, 2, 3)).tobytes(), **changes}
+    expect_refused(DOWN, fields, message, lambda reader: read_delivery(reader, FIRST, (2, 3), 0, WINDOW, MOST))
+
+
+def expect_refused(key: str, fields: dict[str, Any], message: str, read: Callable[[Reader], object]) -> None:
+    """The reader refuses the message in these words."""
+    payload = pack({name: value for name, value in fields.items() if value is not None})
+    with pytest.raises((MalformedMessage, Gap)) as refused:
+        read(Reader(key, payload))
+    assert message in str(refused.value)
+    assert key in str(refused.value)
+    if isinstance(refused.value, MalformedMessage):
+        assert refused.value.at_fault == (writer_of(key),)
+
+
+@settings(deadline=None, max_examples=examples(200))
+@given(
+    st.binary(max_size=64)
+    | st.dictionaries(
+        st.sampled_from(["k", "c", "z", "gamma", "header", "sent", "truth", "late", "at"]),
+        st.integers(0, 9) | st.binary(max_size=50) | st.lists(st.integers(0, 9), max_size=2) | st.none(),
+    ).map(lambda fields: bytes(msgpack.packb(fields)))
+)
+def test_any_bytes_are_refused_with_key_and_writer(payload: bytes) -> None:
+    """Or read, if they are a message: nothing else comes of them."""
+    for key, read in (
+        (UP, lambda reader: read_uplink(reader, 0, packet_format(1, 2, 1), MOST)),
+        (DOWN, lambda reader: read_delivery(reader, 0, (1, 2), 1, WINDOW, MOST)),
+    ):
+        refused: MalformedMessage | None = None
+        try:
+            with suppress(Gap):
+                read(Reader(key, payload))
+        except MalformedMessage as error:
+            refused = error
+        assert refused is None or (key in str(refused) and refused.at_fault == (writer_of(key),))
 
 
 def test_the_headers_of_slots_in_which_nothing_arrives_are_0() -> None:
-    """The messages have no header then, like those of a scheme without one."""
-    messages = readers(DOWN, [pack({"k": FIRST + row, "gamma": b"\x00"}) for row in range(3)])
-    deliveries = read_deliveries(messages, FIRST, (2, 3), 1)
-    assert deliveries.header is not None
-    assert np.array_equal(deliveries.header, np.zeros((3, 1, 3)))
+    """The message has no header then, like those of a scheme without one."""
+    nothing = pack({"k": FIRST, "c": 3, "gamma": bytes(3)})
+    arrivals = read_delivery(Reader(DOWN, nothing), FIRST, (2, 3), 1, most=3)
+    assert arrivals.header is not None
+    assert np.array_equal(arrivals.header, np.zeros((3, 1, 3)))
+
+
+def test_headers_and_sent_slots_must_be_there_as_the_scheme_says() -> None:
+    """A scheme with a header has one in every message."""
+    payload = packet(FIRST, np.ones((2, 3)))
+    with pytest.raises(MalformedMessage, match="header of None; expected 24 bytes"):
+        read_uplink(Reader(UP, payload), FIRST, packet_format(2, 3, 1))

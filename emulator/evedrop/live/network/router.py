@@ -117,7 +117,7 @@ class Downlink:
         else:
             if packets.truth is not None:
                 self.flush()
-            self._held.append(packets)
+            self._held.append(replace(packets, sent=None))  # unsent packets are silenced already
             if packets.truth is not None:
                 self.flush()
 
