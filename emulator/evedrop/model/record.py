@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class Column(NamedTuple):
+class RecordColumn(NamedTuple):
     """A column of a record."""
 
     name: str
@@ -51,16 +51,16 @@ def column(axes: str, meaning: str, dtype: str = "<f8", **default: None) -> Any:
     return field(**default, metadata=metadata)  # type: ignore[call-overload]
 
 
-def columns(kind: type[Record]) -> tuple[Column, ...]:
+def columns(kind: type[Record]) -> tuple[RecordColumn, ...]:
     """The columns of a kind of record, in the order of their declaration."""
     hashable: Any = kind  # mypy takes a class whose instances cannot be hashed for one
     return _columns(hashable)
 
 
 @cache
-def _columns(kind: Any) -> tuple[Column, ...]:
+def _columns(kind: Any) -> tuple[RecordColumn, ...]:
     return tuple(
-        Column(entry.name, **entry.metadata, optional=entry.default is None)
+        RecordColumn(entry.name, **entry.metadata, optional=entry.default is None)
         for entry in fields(kind)
         if "axes" in entry.metadata
     )
@@ -88,7 +88,7 @@ class Record:
         values = (getattr(self, entry.name) for entry in columns(type(self)))
         return (array for array in values if array is not None)
 
-    def mapped(self, change: Callable[[Column, NDArray[Any]], NDArray[Any]], first: int | None = None) -> Self:
+    def mapped(self, change: Callable[[RecordColumn, NDArray[Any]], NDArray[Any]], first: int | None = None) -> Self:
         """The record with every column that is there changed; first: its first slot, if that changes."""
         changed = {
             entry.name: change(entry, array)
@@ -127,7 +127,7 @@ class Record:
 
 
 def largest_bytes(kind: type[Record], count: int, extent: Mapping[str, int]) -> int:
-    """The bytes of all columns of some slots as they are in messages, with their names; extent: as for `Column.shape`."""
+    """The bytes of all columns of some slots as they are in messages, with their names; extent: as for `RecordColumn.shape`."""
     return sum(len(entry.name) + _COLUMN_BYTES + count * entry.slot_bytes(extent) for entry in columns(kind))
 
 

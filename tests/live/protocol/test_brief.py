@@ -252,6 +252,7 @@ OPTIONAL = {
     "singular_noise",
     "longest_outage",
     "largest_message",
+    "message",
     "measurement",
     "noise_covariance",
     "output_matrix",

@@ -14,7 +14,7 @@ import numpy as np
 
 from evedrop.live.protocol.codec import Reader
 from evedrop.model.receiver import packed_flags
-from evedrop.model.record import Column, Record, columns
+from evedrop.model.record import Record, RecordColumn, columns
 
 Kind = TypeVar("Kind", bound=Record)
 
@@ -63,7 +63,7 @@ class RecordFormat(Generic[Kind]):
                 values[entry.name] = self._column(message, entry, (count, *shape))
         return self._kind(first, **values)
 
-    def _column(self, message: Reader, entry: Column, shape: tuple[int, ...]) -> Any:
+    def _column(self, message: Reader, entry: RecordColumn, shape: tuple[int, ...]) -> Any:
         if entry.is_flag:
             return message.flags(entry.name, shape)
         if entry.dtype.kind == "f":
