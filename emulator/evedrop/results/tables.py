@@ -5,6 +5,8 @@ Source: docs/results.md, tables.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,8 @@ from evedrop.model.digest import DIGEST_BYTES
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
-from evedrop.model.slot.records import SensorSlots
+from evedrop.model.record import Record, columns
+from evedrop.model.slot.records import ReceiverSlots, SensorSlots
 from evedrop.score.slots import Slots
 from evedrop.score.sums import LEVELS
 from evedrop.system.files import opened
@@ -59,6 +62,28 @@ NULLABLE = {
 """Columns in which NaN means that there is no value."""
 
 
+_TYPES = {"b": pa.bool_(), "f": pa.float64(), "i": pa.int64(), "u": pa.int64()}
+
+
+def fields_of(kind: type[Record], names: Sequence[str], extent: Mapping[str, int]) -> list[pa.Field]:
+    """The fields of columns of a record in a table with a row per slot and trial; extent: axis → its length.
+
+    Where a trial has several numbers in a slot, they are a list.
+    """
+    by_name, fields = {entry.name: entry for entry in columns(kind)}, []
+    for name in names:
+        value, inner = _TYPES[by_name[name].dtype.kind], by_name[name].shape(extent)[:-1]
+        fields.append(pa.field(name, pa.list_(value, math.prod(inner)) if inner else value))
+    return fields
+
+
+def rows_of(record: Record, names: Sequence[str], recorded: int) -> list[NDArray[Any]]:
+    """These columns of a record, if they are there, with a row per slot and recorded trial."""
+    arrays = [array for name in names if (array := getattr(record, name)) is not None]
+    rows = [np.moveaxis(array[..., :recorded], -1, 1) for array in arrays]
+    return [array.reshape(array.shape[0] * array.shape[1], *([-1] if array.ndim > 2 else [])) for array in rows]
+
+
 def trials_schema(n: int) -> pa.Schema:
     """The schema of the recorded trials of a process with n states."""
     return pa.schema(
@@ -70,9 +95,8 @@ def trials_schema(n: int) -> pa.Schema:
             ("action", pa.dictionary(pa.int8(), pa.string())),
             ("squared_error", pa.float64()),
             ("trace_covariance", pa.float64()),
-            ("x", pa.list_(pa.float64(), n)),
-            ("x_hat", pa.list_(pa.float64(), n)),
-            ("P", pa.list_(pa.float64(), n * n)),
+            *fields_of(SensorSlots, ("x",), {"n": n, "R": 1}),
+            *fields_of(ReceiverSlots, ("x_hat", "P"), {"n": n, "R": 1, "S": 1}),
         ]
     )
 
@@ -87,17 +111,21 @@ DIGESTS = pa.schema(
 )
 
 
+_OF_A_MONITOR = ("watermark", "statistic")
+
+
 def inputs_schema(inputs: int, disturbances: int, monitored: bool = False) -> pa.Schema:
     """The schema for these numbers of inputs and disturbances; monitored: whether there are a watermark and a detector."""
+    axes = {"m": inputs, "R": 1}
     return pa.schema(
         [
             ("slot", pa.int64()),
             ("trial", pa.int64()),
-            ("u", pa.list_(pa.float64(), inputs)),
+            *fields_of(SensorSlots, ("u",), axes),
             *([("d", pa.list_(pa.float64(), disturbances))] if disturbances else []),
-            ("failed", pa.bool_()),
+            *fields_of(SensorSlots, ("failed",), axes),
             ("clipped", pa.bool_()),
-            *([("watermark", pa.list_(pa.float64(), inputs)), ("statistic", pa.float64())] if monitored else []),
+            *(fields_of(SensorSlots, _OF_A_MONITOR, axes) if monitored else []),
         ]
     )
 
@@ -118,21 +146,14 @@ def inputs_schema_in(path: Path) -> pa.Schema:
 def input_columns(slots: Slots, plant: Plant, disturbances: Floats, first_trial: int) -> list[NDArray[Any]]:
     """A row per slot and recorded trial, from first_trial on; disturbances (slots, q) are of the whole run."""
     sensor, recorded = slots.sensor, slots.recorded
-    assert sensor.u is not None and sensor.failed is not None  # noqa: S101, PT018 - asked by the caller
+    assert sensor.u is not None  # noqa: S101 - asked by the caller
     u, some = sensor.u[:, :, :recorded], slice(slots.first, slots.first + slots.count)
     return [
         np.repeat(np.arange(some.start, some.stop), recorded),
         np.tile(np.arange(first_trial, first_trial + recorded), slots.count),
         np.stack([plant.limited(inputs) for inputs in u]).transpose(0, 2, 1).reshape(slots.count * recorded, -1),
         *([np.repeat(disturbances[some], recorded, axis=0)] if disturbances.shape[1] else []),
-        sensor.failed[:, :recorded].reshape(-1),
+        *rows_of(sensor, ("failed",), recorded),
         plant.clips(u).reshape(-1),
-        *_monitored_columns(sensor, recorded),
+        *rows_of(sensor, _OF_A_MONITOR, recorded),
     ]
-
-
-def _monitored_columns(sensor: SensorSlots, recorded: int) -> list[NDArray[Any]]:
-    if sensor.watermark is None or sensor.statistic is None:
-        return []
-    e = sensor.watermark[:, :, :recorded].transpose(0, 2, 1)
-    return [e.reshape(-1, e.shape[2]), sensor.statistic[:, :recorded].reshape(-1)]

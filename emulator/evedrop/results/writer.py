@@ -26,7 +26,7 @@ from evedrop.results.folder import HeldFolder
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish, write_metrics
 from evedrop.results.resolved_scenario import TakenStates
 from evedrop.results.summary_file import summary_text
-from evedrop.results.tables import DIGESTS, JOURNAL, SLOTS, input_columns, inputs_schema, trials_schema
+from evedrop.results.tables import DIGESTS, JOURNAL, SLOTS, input_columns, inputs_schema, rows_of, trials_schema
 from evedrop.scenario.closed_loop import monitor_of
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.process import ProcessTable
@@ -253,7 +253,7 @@ class ResultsWriter:
         trials = np.tile(np.arange(first_trial, first_trial + recorded), slots.count)
         nu = sensor.nu[:, :recorded]
         packets = nu if sensor.sent is None else np.where(sensor.sent[:, :recorded], nu, TYPES.index(NOTHING))
-        x = self._levels(sensor.x[:, :, :recorded])
+        x = self._levels(*rows_of(sensor, ("x",), recorded))
         for name, receiver in slots.receivers.items():
             self._add(
                 "trials",
@@ -266,8 +266,8 @@ class ResultsWriter:
                     squared_errors[name][:, :recorded].reshape(-1),
                     np.trace(receiver.P, axis1=1, axis2=2).reshape(-1),
                     x,
-                    self._levels(receiver.x_hat[:, :, :recorded]),
-                    np.moveaxis(receiver.P, 3, 1).reshape(count, -1),
+                    self._levels(*rows_of(receiver, ("x_hat",), recorded)),
+                    *rows_of(receiver, ("P",), recorded),
                 ],
             )
 
@@ -277,9 +277,8 @@ class ResultsWriter:
             self._taken.add(slots.sensor.x[:, :, 0])
 
     def _levels(self, x: Floats) -> Floats:
-        """States (c, n, r) as rows, (c r, n), with the reference added, from which they are deviations."""
-        rows = x.transpose(0, 2, 1).reshape(-1, x.shape[1])
-        return rows if self._around is None else rows + self._around
+        """States as rows, (c r, n), with the reference added, from which they are deviations."""
+        return x if self._around is None else x + self._around
 
     def input_rows(self, slots: Slots, first_trial: int) -> None:
         """A row per slot and recorded trial, from first_trial on: the inputs and disturbances of the plant."""
