@@ -604,6 +604,11 @@ class Brief(Generic[P_co]):
         return {name: bytes.fromhex(key) for name, key in self.keys.items()}
 
     @property
+    def entries(self) -> Mapping[str, Any]:
+        """The brief as plain tables, lists, texts and numbers."""
+        return dict(json.loads(self.text))
+
+    @property
     def text(self) -> str:
         """The brief as JSON."""
         return json.dumps(self, default=plain, indent=1)
