@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from msgspec import convert, to_builtins
+from msgspec import Struct, convert, structs, to_builtins
 
 from evedrop.errors import UnknownName
 from evedrop.model.metrics import METRICS
@@ -412,11 +412,17 @@ class Summary:
         own = {name: entries[name] for name in names}
         others = {name: value for name, value in entries.items() if name not in own}
         peers = {name: _peer_fields(peer) for name, peer in own["peers"].items()}
-        own["events"] = convert(own["events"], list[RunEvent])
-        own["outages"] = convert(own["outages"], list[ConnectionOutage])
-        summary = _adapter().validate_python({**own, "peers": peers, _OPEN: others})
+        happened = structs.asdict(convert({name: own[name] for name in ("events", "outages")}, _Happened))
+        summary = _adapter().validate_python({**own, **happened, "peers": peers, _OPEN: others})
         _expect_possible(summary)
         return summary
+
+
+class _Happened(Struct):
+    """The entries that msgspec reads."""
+
+    events: list[RunEvent]
+    outages: list[ConnectionOutage]
 
 
 _OPEN = "applications"

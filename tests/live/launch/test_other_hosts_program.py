@@ -172,7 +172,7 @@ def test_a_malformed_order_ends_the_program_with_a_sentence(evedrop: Evedrop, or
 
 def test_a_malformed_brief_names_the_entry(tmp_path: Path) -> None:
     """And nothing is started."""
-    with pytest.raises(ValueError, match="run is missing"):
+    with pytest.raises(ValueError, match="role is None, expected one of router, relay"):
         HostProcesses(tmp_path, unable, len).obey(StartProcess(7, {}, {}))
     assert [*tmp_path.iterdir()] == []
 

@@ -15,6 +15,7 @@ import contextlib
 import errno
 import importlib.metadata
 import itertools
+import json
 import os
 import select
 import shlex
@@ -29,9 +30,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Annotated, Any, TypeVar, final
+from typing import IO, Annotated, Any, final
 
-from msgspec import Meta, Struct, json
+from msgspec import Meta, Struct, convert, to_builtins
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.hosts_file import HostsPlan, HostTable
@@ -116,37 +117,34 @@ Order = StartProcess | SendSignal | LauncherHeartbeat
 """What a launcher sends."""
 Answer = LogText | ProcessEnded
 """What a host sends after its greeting."""
-M = TypeVar("M")
 
 
 def line_of(message: HostMessage | Greeting) -> bytes:
     """A message as a line."""
-    return json.encode(message) + b"\n"
+    return json.dumps(to_builtins(message)).encode() + b"\n"
 
 
 def order_in(line: bytes) -> Order:
     """The order of a line. Raises ValueError if it is not one."""
-    return _message_in(line, _ORDERS)
+    order: Order = _message_in(line, Order)
+    return order
 
 
 def answer_in(line: bytes) -> Answer:
     """The answer of a line. Raises ValueError if it is not one."""
-    return _message_in(line, _ANSWERS)
+    answer: Answer = _message_in(line, Answer)
+    return answer
 
 
 def greeting_in(line: bytes) -> Greeting:
     """The greeting of a line, of any version of the program. Raises ValueError if it is not one."""
-    return _message_in(line, _GREETINGS)
+    greeting: Greeting = _message_in(line, Greeting)
+    return greeting
 
 
-_ORDERS: json.Decoder[Order] = json.Decoder(Order)
-_ANSWERS: json.Decoder[Answer] = json.Decoder(Answer)
-_GREETINGS: json.Decoder[Greeting] = json.Decoder(Greeting)
-
-
-def _message_in(line: bytes, decoder: json.Decoder[M]) -> M:
+def _message_in(line: bytes, kind: Any) -> Any:
     try:
-        return decoder.decode(line)
+        return convert(json.loads(line), kind)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{line[:80]!r} is not a message ({error})") from error
 

@@ -34,10 +34,9 @@ from evedrop.model.links.loss_model import REASONS
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, prior
 from evedrop.model.slot.cores import Absence
-from evedrop.model.slot.link import Account
+from evedrop.model.slot.link import Account, ReceiverOutage
 from evedrop.names import CONTROLLER, ROUTER, SENSOR
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.timeline import Away
 from evedrop.score.slots import InputSlots, ReceiverSlots, Slots, all_set
 
 Message = TypeVar("Message")
@@ -238,7 +237,13 @@ class AbsenceReporter:
     """
 
     def __init__(
-        self, brief: AnyBrief, scenario: Scenario, receiver: str, away: Away, left: Belief, put: Callable[[bytes], None]
+        self,
+        brief: AnyBrief,
+        scenario: Scenario,
+        receiver: str,
+        away: ReceiverOutage,
+        left: Belief,
+        put: Callable[[bytes], None],
     ) -> None:
         process = scenario.process.process
         fresh = prior(process, scenario.trials, away.start)
