@@ -32,7 +32,7 @@ from wire_peers import Carried, Traffic, carry, session_to
 from evedrop.errors import UsageError
 from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
-from evedrop.live.protocol.requests import StatusRequest, WireStatus
+from evedrop.live.protocol.requests import StatusRequest
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.records import Records, WireFate
@@ -282,8 +282,8 @@ def _looked_at(process: subprocess.Popen[str], out: Path, heard: int = 0) -> tup
         time.sleep(0.1)
         with suppress(UsageError, zenoh.ZError):  # it has not begun yet
             answer = ask(read_control(out), StatusRequest(), 60.0)
-            status = None if answer is None else answer.status
-            if isinstance(status, WireStatus) and sum(link.heard for link in status.links.values()) >= heard:
+            status = None if answer is None else answer.wire
+            if status is not None and sum(link.heard for link in status.links.values()) >= heard:
                 [now] = processes_of(process.pid)
                 return now.cpu_seconds, now.private
         if time.monotonic() > deadline or process.poll() is not None:

@@ -19,8 +19,7 @@ from evedrop.peers.closed_loop import kept_decisive
 def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
     """Run the controller of a brief; connect: opens its session."""
     part, process = brief.part, brief.model.process
-    plant = part.plant.plant
-    assignment = part.assignment.assignment(process, plant)
+    assignment = part.assignment
     disturbances = decoded(part.disturbances, brief.slots)
     controller = ControllerCore(part.strategy, assignment, disturbances, brief.trials)
     on_truth = part.acts_on == "truth"
@@ -31,7 +30,7 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSes
         kept = brief.flow.window + 1 + assignment.period
         telemetry = session.replaying_publisher(session.keys.telemetry(CONTROLLER), kept, back=kept)
         due = GapDetector(key, brief.flow.longest_outage)
-        reporter = DecisionReporter(brief, telemetry, plant.inputs, assignment.period)
+        reporter = DecisionReporter(brief, telemetry, assignment.plant.inputs, assignment.period)
         session.ready()
         for k in range(0, brief.slots, assignment.period):
             session.status.slot = k

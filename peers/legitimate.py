@@ -23,6 +23,6 @@ def estimate(brief: Brief[LegitimatePart], connect: Callable[[AnyBrief], Process
     problem = Problem(brief.model.process, brief.batch)
     receiver, loop = checked_estimator(estimator, brief.part.scheme["scheme"], problem), brief.part.controller
     if loop is not None and loop.plant is not None:
-        receiver = InputAwareEstimator(receiver, loop.plant.plant, brief.part.window)
+        receiver = InputAwareEstimator(receiver, loop.plant, brief.part.window)
     consult = partial(Consultation, brief, loop, receiver=receiver) if loop is not None else None
     follow(brief, receiver, scheme.needs_acknowledgements, consult, connect)

@@ -194,7 +194,7 @@ class SensorLoop:
         self._back = Acknowledgements(brief, session) if scheme.needs_acknowledgements else None
         self._steered = None
         if part.plant is not None and part.controller is not None:
-            self._steered = Steered(brief, part.plant.plant.inputs, part.controller, session)
+            self._steered = Steered(brief, part.plant.inputs, part.controller, session)
         telemetry = session.replaying_publisher(session.keys.telemetry(SENSOR), brief.flow.window + 1)
         self._reporter = TruthReporter(brief, telemetry)
         self._barriers = Barriers(brief, session, self._window, telemetry, self._reporter.flush)
@@ -264,16 +264,15 @@ class SensorLoop:
 
 
 def _core_of(brief: Brief[SensorPart], scheme: Scheme, program: ProgramStates | None) -> SensorCore:
-    process, keys, entry = brief.model.process, brief.stream_keys, brief.part.plant
-    plant = None if entry is None else entry.plant
-    disturbances = None if entry is None else decoded(entry.disturbances, brief.slots)
+    process, keys, plant = brief.model.process, brief.stream_keys, brief.part.plant
+    disturbances = None if brief.part.disturbances is None else decoded(brief.part.disturbances, brief.slots)
     initial = scheme.initial_state(keys, brief.batch)
     local, monitor, spoofing = None, None, None
-    if brief.part.monitor is not None:
-        plan = brief.part.monitor.plan
+    plan = brief.part.monitor
+    if plan is not None:
         monitor = Monitor(plan, keys.get("watermark", b""), brief.batch)
         spoofing = plan.spoofing(keys.get("spoofing", b""), brief.batch)
-    if plant is not None and plant.output_matrix is not None:
+    if plant is not None and brief.part.filters:
         local = LocalFilter(process, plant, keys.get("measurement", b""), brief.batch, spoofing)
     given = None
     if program is not None:

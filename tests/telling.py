@@ -37,7 +37,7 @@ def on_event(self: ProgressLine, event: ProgressEvent) -> None:
     if (path := os.environ.get("EVEDROP_TEST_NEWS")) is not None:
         with open(path, "a") as file:
             done = event.before if isinstance(event, Held) else getattr(event, "done", 0)
-            file.write(f"{done} {event.kind}\n")
+            file.write(f"{done} {event.__struct_config__.tag}\n")
     show(self, event)
 
 

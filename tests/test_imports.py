@@ -79,12 +79,16 @@ def loaded_without_network() -> dict[str, set[str]]:
     return loaded_by("evedrop.live.launch.launcher", "evedrop.simulate.montecarlo", "evedrop.cli.api")
 
 
+MESSAGES = {"zenoh", "msgpack", "msgspec", "typing_extensions"}
+"""What carries and checks messages; msgspec loads the last one where it is installed."""
+
+
 def test_peers_and_network_stay_light(loaded: dict[str, set[str]]) -> None:
-    """Peers, network and protocol load five packages and their own, and neither results nor the tables of scenarios."""
+    """Peers, network and protocol load six packages and their own, and neither results nor the tables of scenarios."""
     modules = (*modules_of("peers"), *modules_of("live.network"), *modules_of("live.protocol"))
     for module in modules:
         names = loaded[module]
-        assert packages(names) <= {"zenoh", "msgpack", "numpy", "cryptography", "xxhash", "_cffi_backend"}, module
+        assert packages(names) <= MESSAGES | {"numpy", "cryptography", "xxhash", "_cffi_backend"}, module
         assert ours(names) <= {
             f"evedrop.{name}" for name in ("live", "model", "peers", "scenario", "system", "names", "errors")
         }
@@ -135,7 +139,7 @@ def test_launcher_and_memory_load_neither_zenoh_nor_rerun(
 
 
 STARTS = {
-    "evedrop.live.launch.launcher": {"numpy", "xxhash", "pydantic", "cryptography", "tomli_w"},
+    "evedrop.live.launch.launcher": {"msgspec", "numpy", "xxhash", "pydantic", "cryptography", "tomli_w"},
     "evedrop.live.recorder.recorder": {
         "numpy",
         "xxhash",
@@ -143,10 +147,11 @@ STARTS = {
         "cryptography",
         "zenoh",
         "msgpack",
+        "msgspec",
         "pyarrow",
         "tomli_w",
     },
-    "evedrop.live.network.operator": {"numpy", "xxhash", "cryptography", "zenoh", "msgpack"},
+    "evedrop.live.network.operator": {"numpy", "xxhash", "cryptography", "zenoh", "msgpack", "msgspec"},
 }
 """Module → the packages, besides those that these need themselves, whose imports a run's first slot or a command may wait for."""
 THEIRS = {"pydantic_core", "annotated_types", "typing_extensions", "typing_inspection", "_cffi_backend", "cloudpickle"}

@@ -16,7 +16,6 @@ from evedrop.errors import EvedropError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.network.control_file import Control, read_controls
 from evedrop.live.protocol.brief import read_brief
-from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
 from evedrop.results.resolved_scenario import write_resolved
@@ -127,7 +126,7 @@ def _brief(data: bytes, folder: Path) -> None:
     path.chmod(0o600)
     brief = read_brief(path)
     if not any(named_in(json.loads(brief.text)["part"])):
-        expect_usable(brief)
+        brief.expect_usable()
 
 
 def _control(data: bytes, folder: Path) -> None:

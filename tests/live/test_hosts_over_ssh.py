@@ -98,7 +98,7 @@ def test_over_ssh_it_is_the_same_run(evedrop: Evedrop, server: Sshd) -> None:
     assert "schedule" not in received["beta"]
     for host, text in received.items():
         orders = [order_in(line.encode()) for line in text.splitlines()]
-        assert {order.brief.process for order in orders if isinstance(order, StartProcess)} == set(PLACES[host])
+        assert {order.brief["process"] for order in orders if isinstance(order, StartProcess)} == set(PLACES[host])
 
 
 def running(evedrop: Evedrop, server: Sshd, direct: bool = False) -> Live:

@@ -30,7 +30,7 @@ def downlink(waited: bool, put: list[bytes], betrayed: int | None = None) -> Dow
     brief = MemoryBench().brief
     if betrayed is not None:
         brief = replace(brief, part=replace(brief.part, leaks={"eve": betrayed}))
-    link = Downlink("eve", brief.part.links["eve"].schedule, brief, lambda payload, _: put.append(payload), waited)
+    link = Downlink("eve", brief.part.links["eve"], brief, lambda payload, _: put.append(payload), waited)
     link.plan(range(BATCH))
     return link
 

@@ -102,7 +102,7 @@ class Run:
         self.briefs["sensor"] = replace(self.briefs["sensor"], part=replace(sensor, holds=holding))
         self.receivers, links = tuple(of.receivers), part_of(self.briefs["router"], RouterPart).links
         self.absences = {
-            name: [range(away.start, away.stop) for away in links[name].schedule.outages] for name in self.receivers
+            name: [range(away.start, away.stop) for away in links[name].outages] for name in self.receivers
         }
         self.keys, self.stage = RunKeys("r"), Stage()
         self.commands = {name: SimpleQueue[bytes]() for name in ("sensor", "router", *self.receivers)}

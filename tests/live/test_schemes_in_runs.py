@@ -182,11 +182,11 @@ def test_a_queue_and_silence_do_not_go_together() -> None:
 def test_an_attack_is_on_in_its_slots_alone() -> None:
     """Without events always; with them from slot to slot, or to the end."""
     assert running("scheduled", event=[]).timeline.jams is None
-    assert running("scheduled").timeline.jams == [[10, 20]]
+    assert running("scheduled").timeline.jams == [(10, 20)]
     later = [dict(JAM), {"at": 25, "jam": "acknowledgements"}]
     spans = running("scheduled", event=later).timeline.jams
     assert spans is not None
-    assert spans[0] == [10, 20]
+    assert spans[0] == (10, 20)
     assert spans[1][0] == 25
     assert spans[1][1] > 10**9
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from evedrop.live.protocol.brief import AssignmentEntry, PlantEntry
+from evedrop.live.protocol.json_tables import plain, read
 from evedrop.model.controllers import CONTROLLERS, Assignment, Lqr, gain, held
 from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.plant import Drive, InputAwareEstimator, Offset, Plant
@@ -165,12 +166,13 @@ def test_a_semidefinite_matrix_is_factored() -> None:
 def test_a_plant_survives_its_brief() -> None:
     """Numbers, and absent limits, come back from the text of a brief."""
     of = plant(input_lower=np.array([-1.0, -np.inf]), disturbance_matrix=np.ones((2, 3)))
-    again = PlantEntry.of(of).plant
+    again = read(Plant, json.loads(json.dumps(of, default=plain)))
     assert all(np.array_equal(getattr(of, name), getattr(again, name)) for name in Plant.__dataclass_fields__)
     asked = assignment(np.eye(2), of, period=3, limit=0.5)
-    back = AssignmentEntry.of(asked).assignment(asked.process, of)
+    text = json.dumps(asked, default=plain)
+    back = read(Assignment, json.loads(text))
     assert np.array_equal(back.rate_limits, asked.rate_limits)
-    assert AssignmentEntry.of(back) == AssignmentEntry.of(asked)
+    assert json.dumps(back, default=plain) == text
 
 
 def test_who_is_told_the_inputs_predicts_with_them() -> None:

@@ -72,10 +72,8 @@ def test_a_wire_is_steered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert command("status").startswith("2 evedrop: no run is going on in")
 
 
-class NoEvent(OperatorRequest):
+class NoEvent(OperatorRequest, frozen=True, tag="link"):
     """A change without an event."""
-
-    do = "link"
 
 
 def test_what_cannot_be_done_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
-from evedrop.live.protocol.requests import StatusRequest, WireStatus
+from evedrop.live.protocol.requests import StatusRequest
 from evedrop.wire.file import load_wire
 from evedrop.wire.journal import journal_tables
 from evedrop.wire.run import continuation, run_wire
@@ -47,8 +47,8 @@ def started(evedrop: Evedrop, path: Path) -> tuple[Live, Mapping[str, Sequence[s
     wait_until(lambda: control.exists() or wire.process.poll() is not None, "a wire that can be asked")
     answer = ask(read_control(wire.folder), StatusRequest(), 30.0)
     assert answer is not None
-    assert isinstance(answer.status, WireStatus)
-    return wire, answer.status.sides
+    assert answer.wire is not None
+    return wire, answer.wire.sides
 
 
 def carrying(evedrop: Evedrop, path: Path, numbers: range, arrived: list[int]) -> Live:

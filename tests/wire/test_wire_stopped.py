@@ -19,7 +19,7 @@ import zenoh
 
 from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
-from evedrop.live.protocol.requests import StatusRequest, WireStatus
+from evedrop.live.protocol.requests import StatusRequest
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.on_disk import scorekeeper_on_disk
 from evedrop.wire.publications import Message
@@ -201,8 +201,8 @@ def test_a_wire_ends_although_programs_have_stopped_reading(evedrop: Evedrop) ->
     wait_until(lambda: control.exists() or wire.process.poll() is not None, "a wire that can be asked")
     answer = ask(read_control(wire.folder), StatusRequest(), LIMIT)
     assert answer is not None
-    assert isinstance(answer.status, WireStatus)
-    sides = answer.status.sides
+    assert answer.wire is not None
+    sides = answer.wire.sides
     arrived: list[zenoh.Sample] = []
     with stopping("reads", sides["third"][0]), program(sides["robot"]) as robot, program(sides["base"]) as base:
         base.declare_subscriber("scan", arrived.append)

@@ -13,6 +13,7 @@ from typing import NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.model.checks import expect_slots
 from evedrop.model.receiver import Flags
 from evedrop.model.streams import Ahead, Batch, BlockReader
 
@@ -112,12 +113,15 @@ class AckChannelSpec:
     quality: float
     attack: str
     jammer: str | None
-    spans: Sequence[Sequence[int]] | None
+    spans: Sequence[tuple[int, int]] | None
     """Slots [from, to) in which the attack is on; None: in all slots."""
     flip: float = 0.0
     """The probability of a flip, for the attack `flip`."""
     overheard: float = 1.0
     """The probability that the jammer hears a packet, for the attack `hijack`."""
+
+    def __post_init__(self) -> None:
+        expect_slots(*(slot for span in self.spans or () for slot in span))
 
     @property
     def memory(self) -> int:

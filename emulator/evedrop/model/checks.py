@@ -9,6 +9,8 @@ from typing import Any
 
 _SHOWN = 80  # characters of a value that messages repeat
 MOST_SLOTS = 1_000_000
+LAST_SLOT = 2**62
+"""The largest number of a slot: others can be added to it without leaving 64 bits."""
 
 
 def toml_of(value: Any) -> str:
@@ -32,6 +34,21 @@ def is_number(value: Any, least: float = -math.inf, most: float = math.inf) -> b
     """Whether a value is a finite number from `least` to `most`."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return number and least <= value <= most and abs(value) < math.inf
+
+
+def expect_slots(*slots: int) -> None:
+    """Raise ValueError unless each is a slot: a number from 0 to `LAST_SLOT`."""
+    beyond = next((slot for slot in slots if not 0 <= slot <= LAST_SLOT), None)
+    if beyond is not None:
+        raise ValueError(f"{beyond} is not a slot, expected a number from 0 to {LAST_SLOT}")
+
+
+def expect_shapes(of: object, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise ValueError unless the arrays under these names have these shapes."""
+    for name, shape in shapes.items():
+        own = getattr(getattr(of, name), "shape", None)
+        if own != shape:
+            raise ValueError(f"{name} has the shape {own}, expected {shape}")
 
 
 def is_probability(value: Any) -> bool:

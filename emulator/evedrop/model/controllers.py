@@ -27,9 +27,10 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
+from evedrop.model.checks import expect_shapes
 from evedrop.model.kernels.elementary import inverse
 from evedrop.model.plant import Plant
-from evedrop.model.process import Floats, Process, product
+from evedrop.model.process import Floats, Limits, Process, product
 from evedrop.model.receiver import Flags
 
 
@@ -50,10 +51,18 @@ class Assignment:
     """Diagonal of the weight of the inputs, (m,)."""
     rate_weights: Floats
     """Diagonal of the weight of the inputs' change between decisions, (m,)."""
-    rate_limits: Floats
+    rate_limits: Limits
     """The largest change of each input between decisions, (m,); inf where there is no limit."""
     parameters: Mapping[str, Any]
     """The strategy's own parameters."""
+
+    def __post_init__(self) -> None:
+        n, m = self.plant.input_matrix.shape
+        expect_shapes(
+            self, {"state_weights": (n,), **dict.fromkeys(("input_weights", "rate_weights", "rate_limits"), (m,))}
+        )
+        if self.period < 1 or self.slot_seconds < 0.0:
+            raise ValueError(f"period is {self.period} and slot_seconds {self.slot_seconds}, expected 1, 0 or more")
 
 
 class Controller(ABC):

@@ -15,6 +15,7 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.model.checks import expect_slots
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 
@@ -33,6 +34,9 @@ class Chart:
     missing: int
     """Score of a packet that is not acknowledged."""
     threshold: int
+
+    def __post_init__(self) -> None:
+        expect_slots(*map(abs, (self.acknowledged, self.missing, self.threshold)))  # S has 64 bits
 
     def start(self, trials: int) -> Statistic:
         """S before anything is sent, (R,)."""

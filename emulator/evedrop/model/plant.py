@@ -11,7 +11,8 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.process import Floats, Process, product
+from evedrop.model.checks import expect_shapes
+from evedrop.model.process import Floats, Limits, Process, product
 from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception
 
 
@@ -27,16 +28,25 @@ class Plant:
     """Covariance of w, (n, n); it may be singular, or 0."""
     start: Floats
     """Mean of x_0, (n,)."""
-    input_lower: Floats
+    input_lower: Limits
     """(m,); −inf where there is no limit. The limits below are the same."""
-    input_upper: Floats
-    state_lower: Floats
+    input_upper: Limits
+    state_lower: Limits
     """(n,)."""
-    state_upper: Floats
+    state_upper: Limits
     output_matrix: Floats | None = None
     """C, (p, n), for a sensor that measures y = C x + v and filters; None for a sensor that knows x."""
     measurement_noise: Floats | None = None
     """Covariance of v, (p, p)."""
+
+    def __post_init__(self) -> None:
+        n, m, q = self.start.size, self.input_matrix.shape[-1], self.disturbance_matrix.shape[-1]
+        shapes = {"input_matrix": (n, m), "disturbance_matrix": (n, q), "noise": (n, n), "start": (n,)}
+        shapes |= {"input_lower": (m,), "input_upper": (m,), "state_lower": (n,), "state_upper": (n,)}
+        if self.output_matrix is not None:
+            p = len(self.output_matrix)
+            shapes |= {"output_matrix": (p, n), "measurement_noise": (p, p)}
+        expect_shapes(self, shapes)
 
     @property
     def inputs(self) -> int:

@@ -23,6 +23,8 @@ from evedrop.model.kernels.reference import carry
 from evedrop.model.streams import Ahead, Batch, BlockReader
 
 Floats = NDArray[np.float64]
+Limits = np.ndarray[tuple[int], np.dtype[np.float64]]
+"""Numbers that may be infinite: no limit."""
 
 MARGINAL = 1e-7
 """An eigenvalue of A within this distance of the unit circle counts as on it: computing a double one has errors of 1e-8."""
@@ -55,6 +57,11 @@ class Process:
     def noise_factor(self) -> Floats:
         """Lower triangular G with G Gᵀ = Q, (n, n)."""
         return semidefinite_factor(self.Q) if self.singular_noise else cholesky(self.Q)
+
+    @property
+    def matrices(self) -> tuple[Floats, Floats, Floats]:
+        """A, Q and Σ0."""
+        return self.A, self.Q, self.initial_covariance
 
     @property
     def n(self) -> int:

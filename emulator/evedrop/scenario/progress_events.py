@@ -6,105 +6,79 @@ The recorder sends it to its launcher as lines of JSON: `event`, and the entries
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated
 
-from evedrop.model.entries import SLOT, Check, entry, listed, maybe, named, plain, text, whole
+from msgspec import Meta, Struct, to_builtins
 
-
-def _real(path: str, value: Any) -> Iterator[str]:
-    """Check that a value is a number; errors of an estimate may be infinite."""
-    if type(value) not in (int, float):
-        yield f"{path} is {value!r:.40}, expected a number"
+from evedrop.system.fields import Slot
 
 
-_TEXTS: Check = listed(text)
-
-
-@dataclass(frozen=True)
-class ProgressEvent:
+class ProgressEvent(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True, tag_field="event"):
     """Something that a command or function reports while it works."""
-
-    kind: ClassVar[str]
-
-    @property
-    def plain(self) -> dict[str, object]:
-        """The event as a JSON object."""
-        return {"event": self.kind, **plain(self)}
 
     @property
     def line(self) -> bytes:
         """The event as a line for the launcher."""
-        return json.dumps(self.plain, ensure_ascii=False).encode() + b"\n"
+        # Errors of an estimate may be infinite, for which msgspec would write null.
+        return json.dumps(to_builtins(self), ensure_ascii=False).encode() + b"\n"
 
 
-@dataclass(frozen=True)
-class Started(ProgressEvent):
+class Started(ProgressEvent, frozen=True, tag="started"):
     """All processes are present, and the sensor begins."""
 
-    kind = "started"
 
-
-@dataclass(frozen=True)
-class Held(ProgressEvent):
+class Held(ProgressEvent, frozen=True, tag="held"):
     """The operator holds the run."""
 
-    kind = "held"
-    before: int = field(metadata=entry(SLOT))
+    before: Slot
     """The slot before which the run is held."""
 
 
-@dataclass(frozen=True)
-class ConnectionOutage(ProgressEvent):
+class ConnectionOutage(ProgressEvent, frozen=True, tag="reconnected"):
     """A process was cut off, and the run has gone on or ended since."""
 
-    kind = "reconnected"
-    process: str = field(metadata=entry(text))
+    process: str
     """The process whose connection was lost; the router if it was restarted, because every connection goes through it."""
-    slot: int = field(metadata=entry(SLOT))
+    slot: Slot
     """The first slot that was not joined when the loss was noticed."""
-    until: int | None = field(metadata=entry(maybe(SLOT)))
+    until: Slot | None
     """The first slot that was not joined when the run went on; None if it did not."""
-    seconds: float = field(metadata=entry(_real))
+    seconds: float
     """From the last joined slot before the loss until the run went on: the loss itself may be noticed late."""
-    shard: int | None = field(default=None, metadata=entry(maybe(SLOT), left_out=True))
+    shard: Slot | None = None
     """The shard whose process it is; None if the run is not in shards."""
 
 
-@dataclass(frozen=True)
-class RunProgress(ProgressEvent):
+class RunProgress(ProgressEvent, frozen=True, tag="progress"):
     """How far a run has come."""
 
-    kind = "progress"
-    done: int = field(metadata=entry(SLOT))
+    done: Slot
     """Slots in a live run; slots times trials in memory."""
-    rate: float = field(metadata=entry(_real))
+    rate: float
     """Of progress, in `rate_unit`."""
-    rate_unit: str = field(metadata=entry(text))
+    rate_unit: str
     """`slots/s` or `trial-slots/s`."""
-    squared_errors: Mapping[str, float] = field(metadata=entry(named(_real)))
+    squared_errors: Mapping[str, float]
     """Receiver → its squared error, mean over the trials and the latest slots; empty in memory."""
-    total: int | None = field(default=None, metadata=entry(maybe(SLOT), left_out=True))
+    total: Slot | None = None
     """The value of `done` at the end; None in a live run, where it is the scenario's number of slots."""
 
 
-@dataclass(frozen=True)
-class RunEnded(ProgressEvent):
+class RunEnded(ProgressEvent, frozen=True, tag="ended"):
     """The end of a run, as the recorder sees it."""
 
-    kind = "ended"
-    status: int = field(metadata=entry(whole(0, 255)))
+    status: Annotated[int, Meta(ge=0, le=255)]
     """Its exit status."""
-    how: str = field(metadata=entry(text))
+    how: str
     """`complete`, `interrupted`, or the reason for a failure."""
-    suspects: Sequence[str] = field(default=(), metadata=entry(_TEXTS))
+    suspects: Sequence[str] = ()
     """Processes that were missing."""
-    accused: Sequence[str] = field(default=(), metadata=entry(_TEXTS))
+    accused: Sequence[str] = ()
     """Processes whose misbehaviour ended the run."""
-    view: str | None = field(default=None, metadata=entry(maybe(text)))
+    view: str | None = None
     """Why the view stopped early, if it did."""
-    broken_by: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    broken_by: str | None = None
     """The process whose message broke the protocol, if that ended the run."""
 
     @property
@@ -113,31 +87,26 @@ class RunEnded(ProgressEvent):
         return self.status in {0, 1}
 
 
-@dataclass(frozen=True)
-class ViewOpened(ProgressEvent):
+class ViewOpened(ProgressEvent, frozen=True, tag="view"):
     """A live view is open, or there is a warning about it."""
 
-    kind = "view"
-    address: str | None = field(metadata=entry(maybe(text)))
+    address: str | None
     """The address to open in a browser; None for a window."""
-    warning: str | None = field(default=None, metadata=entry(maybe(text)))
+    warning: str | None = None
 
 
-@dataclass(frozen=True)
-class FolderMoved(ProgressEvent):
+class FolderMoved(ProgressEvent, frozen=True, tag="moved"):
     """The results folder was renamed while the run went on."""
 
-    kind = "moved"
-    folder: str = field(metadata=entry(text))
+    folder: str
 
 
-@dataclass(frozen=True)
-class RunEvent:
+class RunEvent(Struct, frozen=True, forbid_unknown_fields=True):
     """An event that took place during the run."""
 
-    slot: int = field(metadata=entry(SLOT))
-    event: str = field(metadata=entry(text))
-    by: str = field(metadata=entry(text))
+    slot: Slot
+    event: str
+    by: str
     """`scenario` or `operator`."""
 
     @property

@@ -17,14 +17,6 @@ Changed = Callable[[str, Mapping[str, Any]], dict[str, Any]]
 
 
 @dataclass(frozen=True)
-class Away(ReceiverOutage):
-    """An outage of a receiver, and whether the receiver keeps its state."""
-
-    keeps_state: bool = True
-    """Whether it continues from its last belief; otherwise from the prior of the slot in which it went away."""
-
-
-@dataclass(frozen=True)
 class Timeline:
     """The effects of a scenario's events."""
 
@@ -32,7 +24,7 @@ class Timeline:
     """In order of slots."""
     changes: Mapping[str, tuple[Change, ...]]
     """Receiver → changes of its link."""
-    outages: Mapping[str, tuple[Away, ...]]
+    outages: Mapping[str, tuple[ReceiverOutage, ...]]
     """Receiver → its outages."""
 
     @property
@@ -44,23 +36,23 @@ class Timeline:
         return held
 
     @property
-    def jams(self) -> list[list[int]] | None:
+    def jams(self) -> list[tuple[int, int]] | None:
         """Slots [from, to) in which acknowledgements are attacked; None without such events: an attack then lasts all run."""
         return self._spans(Jamming.attacked) or None
 
     @property
-    def spoofs(self) -> list[list[int]]:
+    def spoofs(self) -> list[tuple[int, int]]:
         """Slots [from, to) of events in which measurements are attacked."""
         return self._spans(Spoofing.attacked)
 
-    def _spans(self, attacked: str) -> list[list[int]]:
-        spans: list[list[int]] = []
+    def _spans(self, attacked: str) -> list[tuple[int, int]]:
+        spans: list[tuple[int, int]] = []
         for act in self.acts:
             if act.effect.attacked == attacked:
                 if act.effect.on:
-                    spans.append([act.at, NEVER])
+                    spans.append((act.at, NEVER))
                 else:
-                    spans[-1][1] = act.at
+                    spans[-1] = (spans[-1][0], act.at)
         return spans
 
     @classmethod
@@ -98,7 +90,7 @@ def _over(entries: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
     return {**{name: value for name, value in entries.items() if name not in gone}, **changes}
 
 
-def _outages(name: str, acts: Sequence[Act]) -> Iterator[Away]:
+def _outages(name: str, acts: Sequence[Act]) -> Iterator[ReceiverOutage]:
     began: Act | None = None
     for act in acts:
         if name not in act.names or act.effect.present is None:
@@ -106,7 +98,7 @@ def _outages(name: str, acts: Sequence[Act]) -> Iterator[Away]:
         if not act.effect.present:
             began = act
         elif began is not None:
-            yield Away(began.at, act.at, began.effect.reason, act.effect.keeps_state)
+            yield ReceiverOutage(began.at, act.at, began.effect.reason, act.effect.keeps_state)
             began = None
     if began is not None:
-        yield Away(began.at, NEVER, began.effect.reason, began.effect.keeps_state)
+        yield ReceiverOutage(began.at, NEVER, began.effect.reason, began.effect.keeps_state)

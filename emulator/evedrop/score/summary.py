@@ -12,10 +12,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from msgspec import Struct, convert, structs, to_builtins
 
 from evedrop.errors import UnknownName
-from evedrop.model.entries import plain
 from evedrop.model.metrics import METRICS
 from evedrop.model.metrics.built_in import LinkAccount
 from evedrop.model.metrics.text import estimate
@@ -350,6 +351,8 @@ def failed(expectations: Iterable[Judged]) -> list[Judged]:
 class Summary:
     """The summary of a run."""
 
+    __pydantic_config__: ClassVar[Mapping[str, bool]] = {"arbitrary_types_allowed": True}  # those that msgspec reads
+
     scenario: str
     mode: str
     seed: int
@@ -409,9 +412,17 @@ class Summary:
         own = {name: entries[name] for name in names}
         others = {name: value for name, value in entries.items() if name not in own}
         peers = {name: _peer_fields(peer) for name, peer in own["peers"].items()}
-        summary = _adapter().validate_python({**own, "peers": peers, _OPEN: others})
+        happened = structs.asdict(convert({name: own[name] for name in ("events", "outages")}, _Happened))
+        summary = _adapter().validate_python({**own, **happened, "peers": peers, _OPEN: others})
         _expect_possible(summary)
         return summary
+
+
+class _Happened(Struct):
+    """The entries that msgspec reads."""
+
+    events: list[RunEvent]
+    outages: list[ConnectionOutage]
 
 
 _OPEN = "applications"
@@ -431,7 +442,9 @@ def _entry(value: Any) -> Any:
     if isinstance(value, (PeerSummary, Judged)):
         return value.as_dict()
     if isinstance(value, ConnectionOutage):
-        return plain(value)
+        return {name: entry for name, entry in to_builtins(value).items() if name != "event"}  # which says its class
+    if isinstance(value, RunEvent):
+        return to_builtins(value)
     if isinstance(value, Mapping):
         return {name: _entry(inner) for name, inner in value.items()}
     if isinstance(value, (list, tuple)):

@@ -30,6 +30,7 @@ from evedrop.model.slot.cores import (
     Sent,
     recorded,
 )
+from evedrop.model.slot.link import ReceiverOutage
 from evedrop.model.slot.link_core import Arrivals, LinkCore
 from evedrop.model.slot.records import ReceiverSlots
 from evedrop.model.streams import Batch
@@ -38,7 +39,6 @@ from evedrop.scenario.closed_loop import monitor_of
 from evedrop.scenario.input_files import disturbances_of, states_of
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.timeline import Away
 from evedrop.score.closed_loop_tally import SolveTimes
 from evedrop.score.filtering import local_filter_of
 from evedrop.score.links import ack_channel_of, chart_of
@@ -227,10 +227,10 @@ class _ControlLoop:
 class SimulatedReceiver:
     """A receiver that follows the slots from 0 on, and may be away in some of them."""
 
-    def __init__(self, receiver: Receiver, window: int, outages: Sequence[Away]) -> None:
+    def __init__(self, receiver: Receiver, window: int, outages: Sequence[ReceiverOutage]) -> None:
         self._receiver, self._window = receiver, window
         self._outages = {away.start: away for away in outages}
-        self._away: Away | None = None
+        self._away: ReceiverOutage | None = None
         self._absence: Absence
         self._core = ReceiverCore(receiver, window)
 
@@ -253,7 +253,7 @@ class SimulatedReceiver:
         self._away = None
         return self._core.take_slots(slots, arrivals)
 
-    def _leave(self, away: Away) -> None:
+    def _leave(self, away: ReceiverOutage) -> None:
         process, trials = self._receiver.process, self._receiver.trials
         left = self._core.belief if away.keeps_state else prior(process, trials, away.start)
         self._away, self._absence = away, Absence(process, left, self._window)

@@ -171,8 +171,8 @@ class RunningWire:
 
     def status(self) -> WireStatus:
         """The state of the wire now. Raises UsageError if it does not run."""
-        status = self._ask(StatusRequest()).status
-        if not isinstance(status, WireStatus):
+        status = self._ask(StatusRequest()).wire
+        if status is None:
             raise UsageError(f"{self.folder} is the folder of a run; expected that of a wire")
         return status
 

@@ -191,7 +191,7 @@ class WireControl:
 
     def _carry_out(self, request: OperatorRequest) -> Answer:
         if isinstance(request, StatusRequest):
-            return Answer(status=self._status())
+            return Answer(wire=self._status())
         if not isinstance(request, LinkRequest):
             why = "programs that know nothing of a wire do not wait for it"
             return Answer(

@@ -263,16 +263,16 @@ def test_news_are_read_as_they_were_written(event: ProgressEvent) -> None:
 
 MALFORMED = {
     b"{": "Expecting",
-    b"[1]": "not an object with an event",
-    b'{"event": 3}': "not an object with an event",
-    b'{"event": "dance"}': "not an object with an event",
+    b"[1]": "Expected `object`, got `array`",
+    b'{"event": 3}': "Expected `str`, got `int` - at `$.event`",
+    b'{"event": "dance"}': "Invalid value 'dance' - at `$.event`",
     b"[" * 100_000: "nested too deeply",
-    b'{"event": "ended", "status": 0}': "how is missing",
-    b'{"event": "ended", "status": "0", "how": ""}': "status is '0', expected a whole number",
-    b'{"event": "started", "k": 1}': "k is an unknown entry",
-    b'{"event": "act", "do": "dance", "process": "eve", "first": 0, "number": 1}': "do is 'dance', expected one of end, start",
-    b'{"event": "progress", "done": 1, "rate": true, "rate_unit": "", "squared_errors": {}}': "rate is True, expected",
-    b'{"event": "progress", "done": -1, "rate": 1, "rate_unit": "", "squared_errors": {}}': "done is -1, expected",
+    b'{"event": "ended", "status": 0}': "missing required field `how`",
+    b'{"event": "ended", "status": "0", "how": ""}': "Expected `int`, got `str` - at `$.status`",
+    b'{"event": "started", "k": 1}': "unknown field `k`",
+    b'{"event": "act", "do": "dance", "process": "eve", "first": 0, "number": 1}': "Invalid enum value 'dance'",
+    b'{"event": "progress", "done": 1, "rate": true, "rate_unit": "", "squared_errors": {}}': "got `bool` - at `$.rate`",
+    b'{"event": "progress", "done": -1, "rate": 1, "rate_unit": "", "squared_errors": {}}': "Expected `int` >= 0 - at `$.done`",
 }
 """A line → what is wrong with it."""
 

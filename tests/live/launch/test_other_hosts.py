@@ -29,6 +29,7 @@ from evedrop.live.launch.other_hosts import (
     own_version,
 )
 from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST
+from evedrop.live.protocol.brief import brief_from
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 from evedrop.system.environment import own_environment
 from tests.conftest import LIMIT, wait_until
@@ -77,7 +78,7 @@ def test_a_host_gets_the_brief_and_what_differs_from_its_own_environment(connect
     assert process.poll() is None
     host.close(time.monotonic() + LIMIT)
     (order,) = (order for order in told(tmp_path) if isinstance(order, StartProcess))
-    assert order.brief.text == brief.text.replace("/srv/here", "/srv/classes")
+    assert brief_from(order.brief).text == brief.text.replace("/srv/here", "/srv/classes")
     assert (order.number, order.environment) == (7, {"OMP_NUM_THREADS": "one"})
     assert process.wait(LIMIT) == CONNECTION_LOST
     assert log.read_text() == "evedrop: the connection with host beta ended: ssh ended with status 0\n"
@@ -92,7 +93,7 @@ def test_a_brief_without_classes_gets_no_folder_of_classes(connect: Connect, tmp
         host.start(7, path, file, {})
     host.close(time.monotonic() + LIMIT)
     (order,) = (order for order in told(tmp_path) if isinstance(order, StartProcess))
-    assert order.brief.part == brief_of_eve().part
+    assert brief_from(order.brief).part == brief_of_eve().part
 
 
 def test_a_process_whose_fork_server_is_gone_is_lost_with_its_host(connect: Connect, tmp_path: Path) -> None:

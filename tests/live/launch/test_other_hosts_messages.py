@@ -24,7 +24,8 @@ from evedrop.live.launch.other_hosts import (
 from evedrop.live.protocol.last_word import Cause, LastWord
 from tests.live.network.bench import brief_of_eve
 
-START = StartProcess(2**32, brief_of_eve(modules="/srv"), {"A": "ä\n"})
+START = StartProcess(2**32, brief_of_eve(modules="/srv").entries, {"A": "ä\n"})
+Message = HostMessage | Greeting
 DEEP = b"[" * 100_000
 
 
@@ -40,7 +41,7 @@ DEEP = b"[" * 100_000
         (Greeting("1.2.3"), greeting_in),
     ],
 )
-def test_a_message_is_a_line_and_read_as_it_was(message: HostMessage, read: Callable[[bytes], HostMessage]) -> None:
+def test_a_message_is_a_line_and_read_as_it_was(message: Message, read: Callable[[bytes], Message]) -> None:
     """Whatever its texts contain."""
     line = line_of(message)
     assert line.count(b"\n") == 1
@@ -56,22 +57,21 @@ def test_a_greeting_of_another_version_is_understood() -> None:
 
 @pytest.mark.parametrize("read", [order_in, answer_in, greeting_in])
 @pytest.mark.parametrize("line", [b"", b"Welcome", b"7", b"[1]", b"{}", b'"evedrop"', b'{"evedrop": 7}', DEEP, b"\xff"])
-def test_other_lines_are_no_messages(line: bytes, read: Callable[[bytes], HostMessage]) -> None:
+def test_other_lines_are_no_messages(line: bytes, read: Callable[[bytes], Message]) -> None:
     """Nor are those of a login shell."""
-    with pytest.raises(ValueError, match=r"is not a message|evedrop is (missing|7)"):
+    with pytest.raises(ValueError, match="is not a message"):
         read(line)
 
 
 @pytest.mark.parametrize(
     ("change", "mistake"),
     [
-        ({"number": -1}, "start.number is -1"),
-        ({"number": None}, "start.number is None"),
-        ({"brief": {}}, "run is missing"),
-        ({"brief": None}, "it is None, expected a table"),
-        ({"environment": {"A": 1}}, "start.environment.A is 1"),
-        ({"more": 1}, "start.more is an unknown entry"),
-        ({"kind": "stop"}, "is not a message"),
+        ({"number": -1}, r"`int` >= 0 - at `\$.number`"),
+        ({"number": None}, r"got `null` - at `\$.number`"),
+        ({"brief": None}, r"got `null` - at `\$.brief`"),
+        ({"environment": {"A": 1}}, r"got `int` - at `\$.environment"),
+        ({"more": 1}, "unknown field `more`"),
+        ({"kind": "stop"}, "is not a message .*'stop'"),
         ({"kind": "log"}, "is not a message"),
         ({"kind": None}, "is not a message"),
     ],

@@ -24,7 +24,7 @@ from tests.conftest import LIMIT, Evedrop, wait_until
 from tests.examples import mostly_long
 from tests.live.network.bench import brief_of_eve
 
-ORDER = StartProcess(7, brief_of_eve(), {})
+ORDER = StartProcess(7, brief_of_eve().entries, {})
 
 
 def unable(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
@@ -80,7 +80,7 @@ def test_a_process_has_its_files_in_the_private_folder(tmp_path: Path) -> None:
     given = replace(brief_of_eve(state_file="/launcher/eve.state"), last_word="/launcher/eve.last-word")
     word = LastWord(Cause.NO_CONNECTION, "why")
     word.leave(tmp_path / "eve.last-word")  # of an earlier start
-    host.obey(StartProcess(7, given, {"TMPDIR": "/launcher", "A": "1"}))
+    host.obey(StartProcess(7, given.entries, {"TMPDIR": "/launcher", "A": "1"}))
     ((brief, environment, mode),) = started
     assert brief["part"]["state_file"] == str(tmp_path / "eve.state")
     assert brief["last_word"] == str(tmp_path / "eve.last-word")
@@ -170,10 +170,17 @@ def test_a_malformed_order_ends_the_program_with_a_sentence(evedrop: Evedrop, or
     assert [*evedrop.temporary.iterdir()] == []
 
 
+def test_a_malformed_brief_names_the_entry(tmp_path: Path) -> None:
+    """And nothing is started."""
+    with pytest.raises(ValueError, match="role is None, expected one of router, relay"):
+        HostProcesses(tmp_path, unable, len).obey(StartProcess(7, {}, {}))
+    assert [*tmp_path.iterdir()] == []
+
+
 @pytest.mark.parametrize("name", ["../eve", "/etc/eve"])
 def test_a_brief_is_written_only_into_the_folder_of_the_run(name: str, tmp_path: Path) -> None:
     """The launcher's name of a process is not a path."""
-    order = replace(ORDER, brief=replace(ORDER.brief, process=name))
+    order = StartProcess(7, {**ORDER.brief, "process": name}, {})
     (tmp_path / "private").mkdir()
     with pytest.raises(ValueError, match="is not the name of a process"):
         HostProcesses(tmp_path / "private", unable, len).obey(order)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import convert, to_builtins
 
 from evedrop.live.network import operator
 from evedrop.live.protocol import codec, commands, packets, telemetry
@@ -18,7 +18,6 @@ from evedrop.live.protocol import telemetry as loop_wire
 from evedrop.live.protocol.commands import ProcessStatus, read_process_status
 from evedrop.live.protocol.requests import REQUESTS, RunStatus, read_request
 from evedrop.model.digest import Blocks
-from evedrop.model.entries import read
 from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.link import COUNTED_BURSTS, Account, Change
 from evedrop.model.slot.link_core import Arrivals, Late
@@ -325,14 +324,14 @@ def encode_request(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 def decode_request(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the recorder reads it."""
     request = read_request(KEY, raw)
-    return {"do": request.do, **vars(request)}
+    return dict(to_builtins(request))
 
 
 def encode_answer(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     """As the recorder makes it."""
     refused = tuple(value.get("refused", ()))
-    status = read(RunStatus, value["status"]) if "status" in value else None
-    return operator.Answer(value.get("k"), value.get("effect", ""), refused, status).pack()
+    status = convert(value["status"], RunStatus) if "status" in value else None
+    return operator.Answer(value.get("k"), value.get("effect"), refused, status).pack()
 
 
 def decode_answer(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -340,7 +339,7 @@ def decode_answer(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> d
     answer = operator.read_answer(KEY, raw)
     if answer.refused:
         return {"refused": list(answer.refused)}
-    return {"k": answer.slot, "effect": answer.effect} if answer.status is None else {"status": asdict(answer.status)}
+    return {"k": answer.slot, "effect": answer.effect} if answer.status is None else to_builtins(answer)
 
 
 CODECS: dict[str, tuple[Encode, Decode]] = {

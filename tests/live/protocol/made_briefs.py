@@ -9,7 +9,6 @@ from typing import Any
 from evedrop.errors import BriefError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.protocol.brief import AnyBrief, Brief, EavesdropperPart, Flow, Model, read_brief
-from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
 from tests.builders import listener, scenario_of
@@ -79,7 +78,7 @@ def refusal(brief: dict[str, Any], folder: Path) -> str | None:
     path.write_text(json.dumps(brief))
     path.chmod(0o600)
     try:
-        expect_usable(read_brief(path))
+        read_brief(path).expect_usable()
     except BriefError as error:
         return str(error)
     return None

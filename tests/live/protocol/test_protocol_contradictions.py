@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,19 @@ def test_a_router_drops_what_is_larger_than_its_kind() -> None:
     assert all(rule["flows"] == ["ingress"] for rule in rules)
 
 
+def set_in(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    """A change of the entry at a dotted path."""
+
+    def change(brief: dict[str, Any]) -> None:
+        *tables, name = path.split(".")
+        table = brief
+        for inner in tables:
+            table = table[inner]
+        table[name] = value
+
+    return change
+
+
 def without_parameter(brief: dict[str, Any]) -> None:
     """The scheme needs it."""
     del brief["part"]["scheme"]["state_probability"]
@@ -150,22 +164,50 @@ def no_covariance(brief: dict[str, Any]) -> None:
     brief["part"]["noise_covariance"] = [[1.0, 2.0], [2.0, 1.0]]
 
 
-UNUSABLE = {
+UNUSABLE: dict[str, list[tuple[Callable[[dict[str, Any]], None], str]]] = {
     "noise-before/bayesian": [
         (one_state, "part.noise_covariance cannot be used (ValueError: it does not have 2 states"),
         (no_covariance, "part.noise_covariance cannot be used (ValueError: not positive definite)"),
     ],
     "eavesdroppers/sensor": [(without_parameter, "part.scheme.state_probability is missing")],
-    "acknowledged/sensor": [(other_scheme, "part.scheme.colour is not a parameter of the scheme")],
+    "acknowledged/router": [
+        (set_in("part.acknowledgements.spans", [[-1, 3]]), "-1 is not a slot, expected a number from 0 to"),
+        (set_in("part.acknowledgements.attack", "smile"), "part.acknowledgements.attack is smile"),
+        (set_in("part.links.legitimate.window", 10**9), "its window is above 100000000 slots"),
+        (set_in("part.links.legitimate.settings", {}), "or its settings have no loss"),
+        (set_in("part.links.legitimate.outages", [[1, 2, 77]]), "Invalid enum value 77"),
+        (set_in("part.links.legitimate.changes", [{"at": -1}]), "-1 is not a slot"),
+        (
+            set_in("part.links.legitimate.changes", [{"at": 1, "colour": "red"}]),
+            "Object contains unknown field `colour` - at `$.part.links.legitimate.changes[0]`",
+        ),
+        (set_in("part.limits.colour", 3), "`colour` of part.limits is missing, or no kind of key"),
+    ],
+    "acknowledged/sensor": [
+        (set_in("part.chart", {"acknowledged": 0, "missing": 1, "threshold": 2**63}), "is not a slot"),
+        (set_in("part.scheme", {}), "part.scheme.scheme is missing, or no name"),
+        (other_scheme, "part.scheme.colour is not a parameter of the scheme"),
+    ],
     "microgrid/controller": [
+        (set_in("part.assignment.period", 0), "period is 0 and slot_seconds "),
+        (set_in("part.assignment.rate_limits", []), "rate_limits has the shape (0,), expected "),
+        (set_in("part.assignment.process.Q", [[1.0]]), "its process is not that of the model"),
         (other_controller, "part.strategy is pid, expected one of "),
         (free_input, "part: the input_weights leave an input without weight; expected input_weights, or rate_weights"),
     ],
     "microgrid/sensor": [
-        (fewer_states, "part.plant"),
-        (no_matrix, "model.A, model.Q or model.initial_covariance"),
-        (no_process, "its model is not a process: model.Q has the eigenvalue -1"),
-        (many_disturbances, "disturbances in each slot, or they are not finite"),
+        (fewer_states, "noise has the shape "),
+        (set_in("part.plant.start", [["inf"]]), "Expected `float`, got `str` - at `$[0][0]` - at `$.part.plant.start`"),
+        (
+            set_in("part.plant.input_lower", ["nan"]),
+            "Invalid enum value 'nan' - at `$[0]` - at `$.part.plant.input_lower`",
+        ),
+        (set_in("part.plant.noise", [[True]]), "Expected `float`, got `bool`"),
+        (set_in("part.plant.colour", "red"), "Object contains unknown field `colour` - at `$.part.plant`"),
+        (set_in("part.disturbances", None), "part.disturbances is missing"),
+        (no_matrix, "A, Q or initial_covariance is not a matrix - at `$.model`"),
+        (no_process, "it is not a process: Q has the eigenvalue -1"),
+        (many_disturbances, "part.disturbances cannot be used (ValueError: it has "),
     ],
 }
 
@@ -185,11 +227,14 @@ def test_a_brief_whose_parts_do_not_fit_together_is_refused(name: str, tmp_path:
 def test_an_estimator_that_knows_the_inputs_has_the_plant_of_its_model(tmp_path: Path) -> None:
     """Without the disturbances, which only sensor and controller know."""
     brief = copy.deepcopy(BRIEFS["microgrid/legitimate"])
-    plant = copy.deepcopy(BRIEFS["microgrid/sensor"]["part"]["plant"])
-    del plant["disturbances"]
+    plant: dict[str, Any] = copy.deepcopy(BRIEFS["microgrid/sensor"]["part"]["plant"])
     brief["part"]["controller"] = {"period": 1, "acts_on": "estimate", "plant": plant}
     assert refusal(brief, tmp_path) is None
     plant["noise"] = [[*row, 0.0] for row in plant["noise"]]
     refused = refusal(brief, tmp_path)
     assert refused is not None
-    assert "part.plant cannot be used (ValueError: it does not have " in refused
+    assert "noise has the shape " in refused
+    assert "`$.part.controller.plant`" in refused
+    plant |= {"start": [0.0], "noise": [[1.0]], "state_lower": [-1.0], "state_upper": [1.0]}
+    plant |= {"input_matrix": plant["input_matrix"][:1], "disturbance_matrix": plant["disturbance_matrix"][:1]}
+    assert "part.plant cannot be used (ValueError: it does not have " in str(refusal(brief, tmp_path))

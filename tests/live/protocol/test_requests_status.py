@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
 from typing import Any
 
 import pytest
+from msgspec import to_builtins
+from msgspec.structs import replace
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.network.operator import Answer, read_answer
@@ -33,22 +34,22 @@ def test_a_status_is_read_as_it_was_sent() -> None:
 @pytest.mark.parametrize(
     ("entry", "value", "message"),
     [
-        ("slot", -1, "status.slot is -1, expected a whole number"),
-        ("slots", "80", "status.slots is '80', expected a whole number"),
-        ("slots_per_second", float("nan"), "status.slots_per_second is nan, expected a finite number"),
-        ("state", 3, "status.state is 3, expected a string"),
-        ("processes", {"sensor": 1}, "status.processes.sensor is 1, expected true or false"),
-        ("processes", {7: True}, "status.processes has the name 7, expected a string"),
-        ("links", {"smart": {"offered": 1}}, "status.links.smart.delivered is missing"),
-        ("links", [], "status.links is list of 0, expected a table"),
-        ("events", [{"slot": 1, "event": "x", "by": None}], "status.events.0.by is None, expected a string"),
-        ("colour", "red", "status.colour is an unknown entry"),
+        ("slot", -1, "Expected `int` >= 0 - at `$.status.slot`"),
+        ("slots", "80", "Expected `int`, got `str` - at `$.status.slots`"),
+        ("slots_per_second", float("nan"), "Expected `float` >= 0.0 - at `$.status.slots_per_second`"),
+        ("state", 3, "Expected `str`, got `int` - at `$.status.state`"),
+        ("processes", {"sensor": 1}, "Expected `bool`, got `int` - at `$.status.processes[...]`"),
+        ("processes", {7: True}, "Expected `str`, got `int` - at `key` in `$.status.processes`"),
+        ("links", {"smart": {"offered": 1}}, "Object missing required field `delivered` - at `$.status.links[...]`"),
+        ("links", [], "Expected `object`, got `array` - at `$.status.links`"),
+        ("events", [{"slot": 1, "event": "x", "by": None}], "Expected `str`, got `null` - at `$.status.events[0].by`"),
+        ("colour", "red", "Object contains unknown field `colour` - at `$.status`"),
     ],
 )
 def test_a_malformed_status_is_refused(entry: str, value: Any, message: str) -> None:
     """With the place and what was expected there."""
     with pytest.raises(MalformedMessage) as raised:
-        read_answer(KEY, pack({"status": {**asdict(STATUS), entry: value}}))
+        read_answer(KEY, pack({"status": {**to_builtins(STATUS), entry: value}}))
     assert message in str(raised.value)
 
 
@@ -86,7 +87,7 @@ WIRE = WireStatus(
 
 def test_the_status_of_a_wire_is_read_as_it_was_sent() -> None:
     """And shown a line for each side, link, event, and way past the wire."""
-    assert read_answer(KEY, Answer(status=WIRE).pack()).status == WIRE
+    assert read_answer(KEY, Answer(wire=WIRE).pack()).wire == WIRE
     assert list(WIRE.lines) == [
         "12.5 s, journal complete",
         "side robot: tcp/127.0.0.1:7448",
@@ -95,5 +96,7 @@ def test_the_status_of_a_wire_is_read_as_it_was_sent() -> None:
         "no verdict: a program is in mode peer",
     ]
     assert str(WireLinkStatus(0, 0, True)) == "0 of 0 messages delivered, –, cut"
-    with pytest.raises(MalformedMessage, match=r"wire.seconds is -1, expected .* the status of a wire"):
-        read_answer(KEY, pack({"wire": {**asdict(WIRE), "seconds": -1}}))
+    with pytest.raises(
+        MalformedMessage, match=r"Expected `float` >= 0.0 - at `\$.wire.seconds`; expected the fields of Answer"
+    ):
+        read_answer(KEY, pack({"wire": {**to_builtins(WIRE), "seconds": -1}}))

@@ -13,7 +13,6 @@ import pytest
 
 from evedrop.errors import BriefError
 from evedrop.live.protocol.brief import AnyBrief, ProgramEntry, SensorPart, decoded, encoded, read_brief
-from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.live.protocol.state_message import MOST_BYTES, read_state
 from evedrop.scenario.loading import checked
 from tests.builders import part_of
@@ -90,7 +89,7 @@ def test_a_brief_has_what_its_sensor_needs(source: str, tmp_path: Path) -> None:
         assert np.array_equal(decoded(part.states, 2), ROWS)
     result = read_brief(brief.write(tmp_path))
     assert result.text == brief.text
-    expect_usable(result)
+    result.expect_usable()
 
 
 @pytest.mark.parametrize(
@@ -109,4 +108,4 @@ def test_a_brief_with_other_states_is_refused(change: dict[str, Any], message: s
     """It is refused before the process joins the run."""
     brief = sensor_of("file")
     with pytest.raises(BriefError, match=message):
-        expect_usable(replace(brief, part=replace(part_of(brief, SensorPart), **change)))
+        replace(brief, part=replace(part_of(brief, SensorPart), **change)).expect_usable()

@@ -9,6 +9,7 @@ import pytest
 
 from evedrop.live.network.operator import Answer, Order, read_answer
 from evedrop.live.protocol.commands import ControlCommand, Go, Hold, LinkChange
+from evedrop.live.protocol.launcher_events import ProcessRequest
 from evedrop.live.protocol.requests import REQUESTS
 from evedrop.live.recorder.steering import Steering
 from evedrop.model.slot.link import Change
@@ -133,7 +134,7 @@ def test_two_operators_are_served_in_the_order_they_came() -> None:
     run = Run()
     first, second, third = (run.asks("link", event=event) for event in (SET, {"cut": "smart"}, {"cut": "smart"}))
     assert run.conductor.told() == [("sensor", Hold())]
-    assert [sent.do for _, sent in run.holds(8)] == ["change", "change", "go", "go"]
+    assert [type(sent) for _, sent in run.holds(8)] == [LinkChange, LinkChange, Go, Go]
     assert first.answers[0].slot == second.answers[0].slot == 8
     assert third.answers[0].refused == ("cut: smart is cut already, from slot 8 on; expected a heal before",)
 
@@ -173,7 +174,7 @@ def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
     assert run.events == []
     run.steering.left("smart", 30)
     run.steering.carry_on(30)
-    assert [event.kind for event in run.progress] == ["act"]
+    assert [type(event) for event in run.progress] == [ProcessRequest]
     asked = run.asks("link", event=SET)
     run.steering.carry_on(30)
     assert run.conductor.told() == []
@@ -181,7 +182,7 @@ def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
     run.steering.done(1)
     run.conductor.away.add("smart")
     run.steering.carry_on(30)
-    assert [sent.do for _, sent in run.conductor.told()] == ["change", "go", "go"]
+    assert [type(sent) for _, sent in run.conductor.told()] == [LinkChange, Go, Go]
     assert asked.answers[0].slot == 30
     assert [event[1] for event in run.events] == ["kill smart", "link legitimate: quality = 0.2"]
 
@@ -190,7 +191,7 @@ def test_a_wish_to_hold_that_meets_one_of_the_scenario_is_done_there() -> None:
     """The hold that was asked for and the scenario's are one; the scenario's event comes first, and nothing is held twice."""
     run = Run({"at": 30, "cut": "smart"})
     asked = run.asks("link", event={"heal": "smart"})
-    assert [sent.do for _, sent in run.holds(30)] == ["change", "go", "go"]
+    assert [type(sent) for _, sent in run.holds(30)] == [LinkChange, Go, Go]
     assert asked.answers[0].slot == 30
     assert [event[1] for event in run.events] == ["cut smart", "heal smart"]
 
@@ -204,7 +205,7 @@ def test_a_pause_lasts_until_it_is_ended() -> None:
     second = run.asks("pause")
     changed = run.asks("link", event=SET)
     run.steering.carry_on(12)
-    assert [sent.do for _, sent in run.conductor.told()] == ["change"]
+    assert [type(sent) for _, sent in run.conductor.told()] == [LinkChange]
     assert second.answers == [Answer(12, "held already, before slot 12")]
     assert changed.answers[0].slot == 12
     resumed = run.asks("resume")
@@ -248,7 +249,7 @@ def test_a_step_lets_slots_pass_and_holds_again() -> None:
     assert run.conductor.told() == go(12, until=17)
     assert run.holds(14) == go(14, until=17)
     changed = run.asks("link", event=SET)
-    assert [sent.do for _, sent in run.holds(15)] == ["change", "go", "go"]
+    assert [type(sent) for _, sent in run.holds(15)] == [LinkChange, Go, Go]
     assert changed.answers[0].slot == 15
     assert stepped.answers == []
     assert run.holds(17) == []

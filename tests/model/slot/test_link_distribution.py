@@ -18,7 +18,6 @@ from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
 from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.scenario.theory import Expectation
-from evedrop.scenario.timeline import Away
 
 WALK = Process(np.eye(1), np.array([[0.3]]), np.array([[2.0]]))
 SLOTS = 60
@@ -101,7 +100,7 @@ def test_a_quality_that_differs_from_slot_to_slot() -> None:
 @pytest.mark.parametrize(("start", "stop"), [(0, 5), (10, 25), (30, NEVER)])
 def test_a_receiver_that_goes_away(start: int, stop: int, keeps: bool) -> None:
     """Its last estimate is carried on, or it starts from 0 and Σ."""
-    schedule = LinkSchedule(PLAIN, 0, (), (Away(start, stop, Fate.DOWN, keeps),))
+    schedule = LinkSchedule(PLAIN, 0, (), (ReceiverOutage(start, stop, Fate.DOWN, keeps),))
     if keeps:
         expected = aged(lambda k: 0.0 if start <= k < stop else 0.6, lambda _: 1.0, 0)
     else:

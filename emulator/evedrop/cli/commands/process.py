@@ -107,8 +107,7 @@ def process(options: argparse.Namespace) -> int:
 
 def _play(brief: AnyBrief, serve: str | None) -> int:
     """Run the process of a brief; returns its exit status. serve: where a recorder shows the run to browsers."""
-    from evedrop.live.protocol.brief import RecorderPart, has_part
-    from evedrop.live.protocol.brief_use import classes_known, expect_usable
+    from evedrop.live.protocol.brief import RecorderPart, classes_known, has_part
 
     if brief.identity is not None:
         from evedrop.live.network.certificates import check_identity
@@ -119,7 +118,7 @@ def _play(brief: AnyBrief, serve: str | None) -> int:
 
         with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
             return _record(brief, serve)
-    expect_usable(brief)
+    brief.expect_usable()
     from evedrop.live.network.zenoh_log import zenoh_log_apart
 
     with classes_known(), zenoh_log_apart() if _listens(brief) else contextlib.nullcontext():

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,18 +76,17 @@ def step(options: argparse.Namespace) -> int:
 
 def status(options: argparse.Namespace) -> int:
     """Print the run's status."""
+    from msgspec import to_builtins
+
     from evedrop.live.network.control_file import read_controls
-    from evedrop.live.protocol.requests import RunStatus, StatusRequest, status_of_shards
+    from evedrop.live.protocol.requests import StatusRequest, status_of_shards
 
     answers = [
-        _answer(options.run, control, StatusRequest(), "status", _PATIENCE).status
-        for control in read_controls(options.run)
+        _answer(options.run, control, StatusRequest(), "status", _PATIENCE) for control in read_controls(options.run)
     ]
-    of_runs = [answer for answer in answers if isinstance(answer, RunStatus)]
-    of_wires = [answer for answer in answers if answer is not None and not isinstance(answer, RunStatus)]
-    merged = of_wires[0] if of_wires else status_of_shards(of_runs)
+    merged = answers[0].wire or status_of_shards([answer.status for answer in answers if answer.status is not None])
     if options.json:
-        print_json(asdict(merged))
+        print_json(to_builtins(merged))
     else:
         print("\n".join(merged.lines))
     return 0

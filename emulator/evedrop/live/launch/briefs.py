@@ -17,25 +17,20 @@ from evedrop.errors import NoAnswer, UsageError
 from evedrop.live.launch.ports import RouterEndpoints, Routers, endpoints_at, identities_of
 from evedrop.live.protocol.brief import (
     AnyBrief,
-    AssignmentEntry,
     Brief,
     ControllerPart,
     EavesdropperPart,
     EstimatorLoopPart,
     Flow,
     LegitimatePart,
-    LinkEntry,
     Model,
-    MonitorEntry,
     Part,
-    PlantEntry,
     ProgramEntry,
     RecorderPart,
     RelayPart,
     RouterPart,
     SensorLoopPart,
     SensorPart,
-    SensorPlantEntry,
     Wiring,
     encoded,
 )
@@ -188,7 +183,7 @@ def briefs_of(
     if channel is not None:
         link_keys[f"link/{ACKNOWLEDGEMENTS}"] = keys.acknowledgements
     router = RouterPart(
-        links={name: LinkEntry.of(schedule) for name, schedule in schedules.items()},
+        links=schedules,
         pace=scenario.pace,
         users=routers.at_router,
         leaks=leaks,
@@ -213,7 +208,8 @@ def briefs_of(
         history=history_of(scenario),
         leaks=leaks,
         chart=chart,
-        plant=loop.plant,
+        plant=scenario.driven,
+        disturbances=loop.disturbances,
         controller=loop.of_sensor,
         modules=modules(scheme=spec),
         monitor=loop.monitor,
@@ -318,16 +314,14 @@ class LoopBriefs:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        self._disturbances = encoded(disturbances_of(scenario))
-        table, driven = scenario.controller, scenario.driven
+        self.disturbances = None if scenario.driven is None else encoded(disturbances_of(scenario))
+        """Of the plant, for sensor and controller."""
+        table = scenario.controller
         self.wiring = None if table is None else Wiring(table.acts_on, scenario.legitimate.knows_input)
         """The controller's connections, for the router."""
         self.of_sensor = None if table is None else SensorLoopPart(table.period, table.acts_on)
         """For the sensor: the slots in which it waits for inputs, and whether it sends the state to the controller."""
-        self.plant = None if driven is None else SensorPlantEntry.of(driven, disturbances=self._disturbances)
-        """The plant with its disturbances, for the sensor."""
-        plan = monitor_of(scenario)
-        self.monitor = None if plan is None else MonitorEntry.of(plan)
+        self.monitor = monitor_of(scenario)
         """Watermark, detector and attack, for the sensor."""
 
     def sensor_keys(self, keys: StreamKeys) -> dict[str, bytes]:
@@ -343,16 +337,14 @@ class LoopBriefs:
         wiring, loop, driven = self.wiring, self.of_sensor, self._scenario.driven
         if wiring is None or loop is None or (wiring.on_truth and not wiring.knows_input):
             return None
-        plant = PlantEntry.of(driven) if wiring.knows_input and driven is not None else None
+        plant = driven if wiring.knows_input else None
         return EstimatorLoopPart(loop.period, loop.acts_on, plant)
 
     @property
     def of_controller(self) -> ControllerPart | None:
-        """The controller's part: its strategy, assignment, plant and disturbances."""
+        """The controller's part: its strategy, assignment and disturbances."""
         scenario = self._scenario
-        assignment, table, driven = scenario.assignment, scenario.controller, scenario.driven
-        if assignment is None or table is None or driven is None:
+        assignment, table = scenario.assignment, scenario.controller
+        if assignment is None or table is None or self.disturbances is None:
             return None
-        return ControllerPart(
-            table.strategy, AssignmentEntry.of(assignment), table.acts_on, PlantEntry.of(driven), self._disturbances
-        )
+        return ControllerPart(table.strategy, assignment, table.acts_on, self.disturbances)

@@ -21,7 +21,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
 from typing import Any, final
@@ -30,6 +30,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from msgspec import structs
 from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
@@ -190,7 +191,9 @@ def _events(summaries: Mapping[int, Summary]) -> list[RunEvent]:
 
 def _outages(summaries: Mapping[int, Summary]) -> list[ConnectionOutage]:
     """The outages of all shards, each with its shard, in order of slots."""
-    outages = [replace(outage, shard=shard) for shard, summary in summaries.items() for outage in summary.outages]
+    outages = [
+        structs.replace(outage, shard=shard) for shard, summary in summaries.items() for outage in summary.outages
+    ]
     return sorted(outages, key=lambda outage: outage.slot)
 
 

@@ -26,11 +26,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, ClassVar, TypeVar, final
+from typing import IO, Annotated, Any, final
+
+from msgspec import Meta, Struct, convert, to_builtins
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.hosts_file import HostsPlan, HostTable
@@ -46,95 +48,68 @@ from evedrop.live.launch.starter import (
 )
 from evedrop.live.protocol.brief import AnyBrief, ImportingPart, ReceiverPart, brief_from, read_brief
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
-from evedrop.model.entries import (
-    SLOT,
-    anything,
-    entry,
-    expect,
-    inner,
-    named,
-    not_negative,
-    plain,
-    read,
-    table,
-    table_of,
-    text,
-    whole,
-)
 from evedrop.system.environment import own_environment
+from evedrop.system.fields import NotNegative, Slot
 from evedrop.system.processes import continue_when_parent_dies, kill, signalled_when_parent_dies, wait_for
 from evedrop.system.signals import raise_on_signals
 
 MOST_NOISE = 200
 """The most lines that the login shell of a host may print before the program begins."""
-_KIND = "kind"
-_NUMBER = entry(SLOT)
 
 
-@dataclass(frozen=True)
-class HostMessage:
-    """The base class of all messages."""
-
-    kind: ClassVar[str]
+class HostMessage(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
+    """The base class of all messages but the first."""
 
 
-@dataclass(frozen=True)
-class StartProcess(HostMessage):
+class StartProcess(HostMessage, frozen=True, tag="start"):
     """To the host: start a process."""
 
-    kind = "start"
-    number: int = field(metadata=_NUMBER)
+    number: Slot
     """Distinguishes it from all other processes of the run."""
-    brief: AnyBrief = field(repr=False, metadata=entry(anything, brief_from))
-    environment: Mapping[str, str] = field(metadata=entry(named(text)))
+    brief: Mapping[str, Any]
+    """The entries of its brief."""
+    environment: Mapping[str, str]
     """Variables in addition to those of the host."""
 
+    def __repr__(self) -> str:
+        return f"StartProcess({self.number})"  # without keys and passwords
 
-@dataclass(frozen=True)
-class SendSignal(HostMessage):
+
+class SendSignal(HostMessage, frozen=True, tag="signal"):
     """To the host: send a signal to a process."""
 
-    kind = "signal"
-    number: int = field(metadata=_NUMBER)
-    signal: int = field(metadata=entry(whole(1, 64)))
+    number: Slot
+    signal: Annotated[int, Meta(ge=1, le=64)]
 
 
-@dataclass(frozen=True)
-class LauncherHeartbeat(HostMessage):
+class LauncherHeartbeat(HostMessage, frozen=True, tag="heartbeat"):
     """To the host: the launcher is still there."""
 
-    kind = "heartbeat"
-    silence: float = field(metadata=entry(not_negative))
+    silence: NotNegative
     """Seconds after which the host may consider a silent launcher gone."""
 
 
-@dataclass(frozen=True)
-class Greeting(HostMessage):
-    """To the launcher, before all else: the program runs."""
+class Greeting(Struct, frozen=True):
+    """To the launcher, before all else: the program runs. That of another version may have other fields, too."""
 
-    kind = "greeting"
-    evedrop: str = field(metadata=entry(text))
+    evedrop: str
     """Its version."""
 
 
-@dataclass(frozen=True)
-class LogText(HostMessage):
+class LogText(HostMessage, frozen=True, tag="log"):
     """To the launcher: what a process has written to its log."""
 
-    kind = "log"
-    number: int = field(metadata=_NUMBER)
-    written: str = field(metadata=entry(text))
+    number: Slot
+    written: str
 
 
-@dataclass(frozen=True)
-class ProcessEnded(HostMessage):
+class ProcessEnded(HostMessage, frozen=True, tag="ended"):
     """To the launcher: a process has ended."""
 
-    kind = "ended"
-    number: int = field(metadata=_NUMBER)
-    status: int = field(metadata=entry(whole(-64, FORK_SERVER_LOST)))
+    number: Slot
+    status: Annotated[int, Meta(ge=-64, le=FORK_SERVER_LOST)]
     """Negative: the signal that ended it. `FORK_SERVER_LOST`: it ended with its fork server."""
-    last_word: LastWord | None = field(default=None, metadata=inner(LastWord, left_out=True))
+    last_word: LastWord | None = None
     """Why it ended, if it could tell."""
 
 
@@ -142,55 +117,36 @@ Order = StartProcess | SendSignal | LauncherHeartbeat
 """What a launcher sends."""
 Answer = LogText | ProcessEnded
 """What a host sends after its greeting."""
-_ORDERS: tuple[type[Order], ...] = (StartProcess, SendSignal, LauncherHeartbeat)
-_ANSWERS: tuple[type[Answer], ...] = (LogText, ProcessEnded)
-M = TypeVar("M", bound=HostMessage)
 
 
-def line_of(message: HostMessage) -> bytes:
+def line_of(message: HostMessage | Greeting) -> bytes:
     """A message as a line."""
-    return json.dumps({_KIND: message.kind, **plain(message)}, default=plain).encode() + b"\n"
+    return json.dumps(to_builtins(message)).encode() + b"\n"
 
 
 def order_in(line: bytes) -> Order:
     """The order of a line. Raises ValueError if it is not one."""
-    return _message_in(line, _ORDERS)
+    order: Order = _message_in(line, Order)
+    return order
 
 
 def answer_in(line: bytes) -> Answer:
     """The answer of a line. Raises ValueError if it is not one."""
-    return _message_in(line, _ANSWERS)
+    answer: Answer = _message_in(line, Answer)
+    return answer
 
 
 def greeting_in(line: bytes) -> Greeting:
     """The greeting of a line, of any version of the program. Raises ValueError if it is not one."""
-    entries = _object_in(line)
-    expect(table({"evedrop": text}, strict=False), "", entries)
-    return Greeting(entries["evedrop"])
+    greeting: Greeting = _message_in(line, Greeting)
+    return greeting
 
 
-def _message_in(line: bytes, kinds: Collection[type[M]]) -> M:
-    entries = _object_in(line)
-    name = entries.pop(_KIND, None)
-    kind = next((kind for kind in kinds if kind.kind == name), None)
-    if kind is None:
-        raise _no_message(line)
-    expect(table_of(kind), kind.kind, entries)
-    return read(kind, entries)
-
-
-def _object_in(line: bytes) -> dict[str, Any]:
+def _message_in(line: bytes, kind: Any) -> Any:
     try:
-        entries = json.loads(line)
+        return convert(json.loads(line), kind)
     except (ValueError, RecursionError) as error:
-        raise _no_message(line) from error
-    if not isinstance(entries, dict):
-        raise _no_message(line)
-    return entries
-
-
-def _no_message(line: bytes) -> ValueError:
-    return ValueError(f"{line[:80]!r} is not a message")
+        raise ValueError(f"{line[:80]!r} is not a message ({error})") from error
 
 
 def own_version() -> str:
@@ -332,7 +288,7 @@ class SshHost:
             self._processes[number] = process
         own = own_environment()
         added = {name: value for name, value in environment.items() if own.get(name) != value}
-        self.send(StartProcess(number, brief, added))
+        self.send(StartProcess(number, brief.entries, added))
         return process
 
     def send(self, order: Order) -> None:
@@ -570,7 +526,7 @@ class HostProcesses:
                 left = left[self._send(left) :]
 
     def obey(self, order: Order) -> None:
-        """Start a process, or send a signal to one. Raises ValueError if the name of a process cannot be that of a file."""
+        """Start a process, or send a signal to one. Raises ValueError for an unusable brief, and a name that no file can have."""
         if isinstance(order, StartProcess):
             self._begin(order)
         elif isinstance(order, SendSignal) and (process := self._processes.get(order.number)) is not None:
@@ -583,7 +539,7 @@ class HostProcesses:
         end_all(self._processes.values())
 
     def _begin(self, order: StartProcess) -> None:
-        number, brief = order.number, self._with_local_files(order.brief)
+        number, brief = order.number, self._with_local_files(brief_from(order.brief))
         if Path(brief.process).name != brief.process:
             raise ValueError(f"{brief.process} is not the name of a process")
         environment = {**own_environment(), **order.environment}

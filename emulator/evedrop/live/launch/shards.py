@@ -17,6 +17,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import final
 
+from msgspec import structs
+
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.gathering import SHARDS_FOLDER, Shard, shards_of
 from evedrop.live.launch.ports import RouterEndpoints, loopback_endpoints
@@ -78,11 +80,11 @@ class OneProgress:
             case FolderMoved():
                 pass  # a shard's folder moves with the run's, which is reported separately
             case ConnectionOutage():
-                self._on_event(replace(event, shard=number))
+                self._on_event(structs.replace(event, shard=number))
             case _:
                 if isinstance(event, RunEnded) and event.well and number in self._latest:
                     # Its last slots were too few for a progress report.
-                    self._latest[number] = replace(self._latest[number], done=self._slots)
+                    self._latest[number] = structs.replace(self._latest[number], done=self._slots)
                 self._on_event(event)
 
     def _all(self) -> RunProgress:
@@ -96,7 +98,7 @@ class OneProgress:
             / trials
             for name in slowest.squared_errors
         }
-        return replace(slowest, squared_errors=errors)
+        return structs.replace(slowest, squared_errors=errors)
 
 
 @final

@@ -172,7 +172,7 @@ _SILENT = (errno.ETIMEDOUT, f"its fork server did not respond within {_START_SEC
 _EVERY_ROLE = (
     "evedrop.cli.commands.process",
     "evedrop.cli.main",
-    "evedrop.live.protocol.brief_use",
+    "evedrop.live.protocol.brief",
     "evedrop.scenario.plugins",
     "evedrop.system.signals",
 )

@@ -11,8 +11,11 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+import msgspec
+
 from evedrop.errors import UsageError
 from evedrop.live.protocol.brief import Identity
+from evedrop.live.protocol.json_tables import read
 from evedrop.system.files import Unreadable, is_folder, is_there, text_of
 
 _NAME = "control.json"
@@ -62,19 +65,12 @@ def read_control(folder: Path) -> Control:
     """Read the control file of a run in progress. Raises UsageError if there is none, or it is malformed."""
     path = folder / _NAME
     try:
-        settings = json.loads(text_of(path, _MOST_BYTES))
-        identity = settings.get("identity")
-        control = Control(**{**settings, "identity": None if identity is None else Identity(**identity)})
+        return read(Control, msgspec.json.decode(text_of(path, _MOST_BYTES)))
     except Unreadable as error:
         if is_there(path):
             raise no_run(folder, f"{path.name} cannot be read ({error})") from error
         over = is_there(folder / "summary.json")
         why = "it is over" if over else f"it has no {_NAME} (yet)" if is_folder(folder) else "there is no such folder"
         raise no_run(folder, why) from error
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise no_run(folder, f"{path.name} is not a control file ({error})") from error
-    entries = asdict(control)
-    texts = [*(entries.pop("identity") or {}).values(), *entries.values()]
-    if not all(isinstance(value, str) for value in texts):
-        raise no_run(folder, f"{path.name} is not a control file (an entry is not a string)")
-    return control

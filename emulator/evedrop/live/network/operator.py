@@ -8,11 +8,11 @@ Source: docs/protocol.md, request and answer.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import final
 
 import zenoh
+from msgspec import Struct, field, to_builtins
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.network.connecting import open_session
@@ -24,32 +24,31 @@ from evedrop.live.protocol.brief import AnyBrief, RelayPart, RoutingPart
 from evedrop.live.protocol.codec import Reader, enclosed, pack, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import OperatorRequest, RunStatus, WireStatus, read_request
-from evedrop.model.entries import expect, read, table_of
 from evedrop.names import OPERATOR, RECORDER
+from evedrop.system.fields import Slot
 
-_STATUSES: Mapping[str, type[RunStatus | WireStatus]] = {"status": RunStatus, "wire": WireStatus}
 
-
-@dataclass(frozen=True)
-class Answer:
+class Answer(Struct, frozen=True, omit_defaults=True):
     """The answer to a request."""
 
-    slot: int | None = None
+    slot: Slot | None = field(default=None, name="k")
     """The slot from which on the request takes effect."""
-    effect: str = ""
+    effect: str | None = None
     """The effect, as a sentence."""
     refused: tuple[str, ...] = ()
     """The mistakes in the request, a line each; then nothing has changed."""
-    status: RunStatus | WireStatus | None = None
-    """The status of the run or the wire, if the request was `status`."""
+    status: RunStatus | None = None
+    """The status of the run, if the request was `status`."""
+    wire: WireStatus | None = None
+    """The status of the wire, if the request was `status`."""
+
+    def __post_init__(self) -> None:
+        if None in {self.slot, self.effect} and not (self.refused or self.status or self.wire):
+            raise ValueError("it has neither k and effect nor refused, status or wire")
 
     def pack(self) -> bytes:
         """Encode it as a message."""
-        if self.refused:
-            return pack({"refused": list(self.refused)})
-        if self.status is not None:
-            return pack({"wire" if isinstance(self.status, WireStatus) else "status": asdict(self.status)})
-        return pack({"k": self.slot, "effect": self.effect})
+        return pack(to_builtins(self))
 
 
 @final
@@ -84,18 +83,7 @@ class Order:
 
 def read_answer(key: str, payload: bytes) -> Answer:
     """Decode an answer. Raises MalformedMessage if the message is not an answer."""
-    message = Reader(key, payload)
-    if message.has("refused"):
-        return Answer(refused=message.names("refused"))
-    for name, kind in _STATUSES.items():
-        if message.has(name):
-            entries = message.map(name)
-            try:
-                expect(table_of(kind), name, entries)
-            except ValueError as error:
-                raise message.malformed(str(error), f"the status of a {'run' if name == 'status' else name}") from error
-            return Answer(status=read(kind, entries))
-    return Answer(message.integer("k"), message.text("effect"))
+    return Reader(key, payload).read(Answer)
 
 
 def ask(control: Control, request: OperatorRequest, patience: float) -> Answer | None:

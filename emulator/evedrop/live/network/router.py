@@ -234,7 +234,7 @@ class RouterLoop:
                 (lambda payload, _: put(payload)) if delayed_sender is None or not delays else delayed_sender.round(put)
             )
 
-        self._schedules = {name: entry.schedule for name, entry in brief.part.links.items()}
+        self._schedules = dict(brief.part.links)
         self._publishers = {name: publisher(name, schedule) for name, schedule in self._schedules.items()}
         acknowledgements = brief.part.acknowledgements
         self._ack_link = AckLink(brief, session, acknowledgements) if acknowledgements is not None else None

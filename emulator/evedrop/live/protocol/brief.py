@@ -4,6 +4,9 @@ A brief is `<process>.json`, mode 0600. It holds the keys of the streams that th
 the scenario's seed. A part of it depends on the role: what a process of this role may know of the scenario, and, in a closed
 loop, of the plant, its disturbances, and the controller's assignment and connections.
 
+A process makes the objects that it needs once, before it takes part in a run (`expect_usable`): a brief that it cannot use is
+refused with the entry that is to blame.
+
 Source: docs/protocol.md, the brief.
 """
 
@@ -12,55 +15,42 @@ from __future__ import annotations
 import json
 import os
 from base64 import b64decode, b64encode
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Self, TypeGuard, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, TypeGuard, TypeVar
 
 import numpy as np
+from msgspec import Meta
 
-from evedrop.errors import BriefError
+from evedrop.errors import BriefError, NotRegistered
+from evedrop.live.protocol.json_tables import plain, read
 from evedrop.live.protocol.keys import KINDS
-from evedrop.model.acknowledgements import AckChannelSpec
-from evedrop.model.controllers import Assignment
+from evedrop.model.acknowledgements import ATTACKS, AckChannelSpec
+from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.detection import Chart
-from evedrop.model.entries import (
-    LIMITS,
-    MATRIX,
-    NUMBERS,
-    SLOT,
-    Check,
-    anything,
-    entry,
-    expect,
-    flag,
-    inner,
-    key,
-    listed,
-    maybe,
-    named,
-    not_negative,
-    number,
-    plain,
-    read,
-    row,
-    table,
-    table_of,
-    text,
-    whole,
-)
-from evedrop.model.integrity.monitor import MonitorPlan, Suspicion
-from evedrop.model.links.loss_model import Fate
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.integrity.monitor import Monitor, MonitorPlan
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, mistakes_of
 from evedrop.model.schedule import NoiseDistribution
-from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
-from evedrop.model.streams import MOST_SLOTS, Batch
+from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.slot.link import Link, LinkSchedule, streams_of
+from evedrop.model.streams import KEY_BYTES, MOST_SLOTS, Batch
+from evedrop.names import ACKNOWLEDGEMENTS
+from evedrop.system.fields import Finite, NotNegative, Slot
 from evedrop.system.files import Unreadable, opened, why_of
 
-Matrix = Sequence[Sequence[float]]
-Limits = Sequence[float | None]
-"""None for a limit that does not exist."""
+Positive = Annotated[int, Meta(ge=1, le=2**62)]
+Window = Annotated[int, Meta(ge=0, le=MOST_SLOTS)]
+Trials = Annotated[int, Meta(ge=1, le=1_000_000)]
+Key = Annotated[str, Meta(pattern=rf"\A[0-9a-fA-F]{{{2 * KEY_BYTES}}}\Z")]
+"""The key of a stream, in hexadecimal."""
+Outage = tuple[Slot, Slot, bool]
+"""A receiver's outage: first slot, first slot after, and whether it keeps its state."""
+Matrix = Sequence[Sequence[Finite]]
 
 
 def encoded(disturbances: Floats) -> str:
@@ -73,164 +63,13 @@ def decoded(disturbances: str, slots: int) -> Floats:
     return np.frombuffer(b64decode(disturbances), "<f8").reshape(slots, -1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlantEntry:
-    """A plant as plain numbers."""
-
-    input_matrix: Matrix = field(metadata=entry(MATRIX))
-    disturbance_matrix: Matrix = field(metadata=entry(MATRIX))
-    noise: Matrix = field(metadata=entry(MATRIX))
-    start: Sequence[float] = field(metadata=entry(NUMBERS))
-    output_matrix: Matrix | None = field(default=None, metadata=entry(MATRIX, left_out=True))
-    """Only if the sensor filters."""
-    measurement_noise: Matrix | None = field(default=None, metadata=entry(MATRIX, left_out=True))
-    input_lower: Limits = field(metadata=entry(LIMITS))
-    input_upper: Limits = field(metadata=entry(LIMITS))
-    state_lower: Limits = field(metadata=entry(LIMITS))
-    state_upper: Limits = field(metadata=entry(LIMITS))
-
-    @classmethod
-    def of(cls, plant: Plant, **own: str) -> Self:
-        """The entry of a plant; own: further entries of a subclass."""
-        measured = ("output_matrix", "measurement_noise") if plant.output_matrix is not None else ()
-        matrices = ("input_matrix", "disturbance_matrix", "noise", "start", *measured)
-        limits = ("input_lower", "input_upper", "state_lower", "state_upper")
-        entries: dict[str, Any] = {name: getattr(plant, name).tolist() for name in matrices}
-        entries |= {name: _with_none(getattr(plant, name)) for name in limits} | own
-        return cls(**entries)
-
-    @property
-    def plant(self) -> Plant:
-        """The plant. Raises ValueError if its matrices do not fit together."""
-        n = len(self.start)
-        measured = {
-            name: np.array(value)
-            for name in ("output_matrix", "measurement_noise")
-            if (value := getattr(self, name)) is not None
-        }
-        return Plant(
-            input_lower=_limits(self.input_lower, -np.inf),
-            input_upper=_limits(self.input_upper, np.inf),
-            state_lower=_limits(self.state_lower, -np.inf),
-            state_upper=_limits(self.state_upper, np.inf),
-            input_matrix=np.array(self.input_matrix, np.float64).reshape(n, -1),
-            disturbance_matrix=np.array(self.disturbance_matrix, np.float64).reshape(n, -1),
-            noise=np.array(self.noise),
-            start=np.array(self.start),
-            **measured,
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class SensorPlantEntry(PlantEntry):
-    """The plant of a sensor, which knows the disturbances."""
-
-    disturbances: str = field(metadata=entry(text))
-    """As `encoded`."""
-
-
-@dataclass(frozen=True)
-class MonitorEntry:
-    """The watermark, the detector for the sensor's filter and the attack on its measurements, as plain numbers."""
-
-    watermark: Matrix = field(metadata=entry(MATRIX))
-    """Σ_e."""
-    shift: Matrix = field(metadata=entry(MATRIX))
-    """G, as in `MonitorPlan`."""
-    unmarked: Matrix = field(metadata=entry(MATRIX))
-    """T⁻¹ after a slot without watermark."""
-    unmarked_log_det: float = field(metadata=entry(number))
-    marked: Matrix = field(metadata=entry(MATRIX))
-    """T⁻¹ after a slot with one."""
-    marked_log_det: float = field(metadata=entry(number))
-    policy: str = field(metadata=entry(text))
-    parameters: Mapping[str, float] = field(metadata=entry(named(number)))
-    attack: str | None = field(metadata=entry(maybe(text)))
-    """None if nobody attacks."""
-    attack_data: Mapping[str, Any] = field(metadata=entry(named(anything)))
-    spans: Sequence[tuple[int, int]] = field(metadata=entry(listed(row(SLOT, SLOT))))
-    """The slots [from, to) of the attack."""
-
-    @classmethod
-    def of(cls, plan: MonitorPlan) -> MonitorEntry:
-        """The entry of a plan."""
-        return cls(
-            plan.watermark.tolist(),
-            plan.shift.tolist(),
-            plan.unmarked.precision.tolist(),
-            plan.unmarked.log_det,
-            plan.marked.precision.tolist(),
-            plan.marked.log_det,
-            plan.policy,
-            dict(plan.parameters),
-            plan.attack,
-            dict(plan.attack_data),
-            [(start, stop) for start, stop in plan.spans],
-        )
-
-    @property
-    def plan(self) -> MonitorPlan:
-        """The plan."""
-        return MonitorPlan(
-            np.array(self.watermark, np.float64),
-            np.array(self.shift, np.float64),
-            Suspicion(np.array(self.unmarked, np.float64), self.unmarked_log_det),
-            Suspicion(np.array(self.marked, np.float64), self.marked_log_det),
-            self.policy,
-            self.parameters,
-            self.attack,
-            self.attack_data,
-            self.spans,
-        )
-
-
-@dataclass(frozen=True)
-class AssignmentEntry:
-    """A controller's assignment as plain numbers, without process and plant."""
-
-    period: int = field(metadata=entry(whole(1)))
-    slot_seconds: float = field(metadata=entry(not_negative))
-    state_weights: Sequence[float] = field(metadata=entry(NUMBERS))
-    input_weights: Sequence[float] = field(metadata=entry(NUMBERS))
-    rate_weights: Sequence[float] = field(metadata=entry(NUMBERS))
-    rate_limits: Limits = field(metadata=entry(LIMITS))
-    parameters: Mapping[str, Any] = field(metadata=entry(named(anything)))
-
-    @classmethod
-    def of(cls, assignment: Assignment) -> AssignmentEntry:
-        """The entry of an assignment."""
-        return cls(
-            assignment.period,
-            assignment.slot_seconds,
-            assignment.state_weights.tolist(),
-            assignment.input_weights.tolist(),
-            assignment.rate_weights.tolist(),
-            _with_none(assignment.rate_limits),
-            dict(assignment.parameters),
-        )
-
-    def assignment(self, process: Process, plant: Plant) -> Assignment:
-        """The assignment for a process and a plant."""
-        return Assignment(
-            process,
-            plant,
-            self.period,
-            self.slot_seconds,
-            np.array(self.state_weights, np.float64),
-            np.array(self.input_weights, np.float64),
-            np.array(self.rate_weights, np.float64),
-            _limits(self.rate_limits, np.inf),
-            self.parameters,
-        )
-
-
 @dataclass(frozen=True)
 class Wiring:
     """A controller's connections, for the routers."""
 
-    acts_on: str = field(metadata=entry(text))
+    acts_on: str
     """`estimate` or `truth`."""
-    knows_input: bool = field(metadata=entry(flag))
+    knows_input: bool
     """Whether the legitimate estimator receives the inputs."""
 
     @property
@@ -243,9 +82,9 @@ class Wiring:
 class SensorLoopPart:
     """The sensor's part in the loop."""
 
-    period: int = field(metadata=entry(whole(1)))
+    period: Positive
     """Slots between decisions."""
-    acts_on: str = field(metadata=entry(text))
+    acts_on: str
     """As in `Wiring`."""
 
 
@@ -253,81 +92,25 @@ class SensorLoopPart:
 class EstimatorLoopPart(SensorLoopPart):
     """The legitimate estimator's part in the loop."""
 
-    plant: PlantEntry | None = field(metadata=inner(PlantEntry, or_null=True))
+    plant: Plant | None
     """None if it does not know the inputs."""
-
-
-def _with_none(limits: Floats) -> Limits:
-    return [value if np.isfinite(value) else None for value in limits.tolist()]
-
-
-def _limits(limits: Limits, without: float) -> Floats:
-    return np.array([without if value is None else value for value in limits], np.float64)
-
-
-_TEXTS = listed(text)
-_SCHEME = table({"scheme": text}, strict=False)
-_SIZES = table(dict.fromkeys(KINDS, whole(1)))
-_WINDOW = whole(0, MOST_SLOTS)
-_OUTAGES = listed(row(SLOT, SLOT, flag))
-_SCORE = whole(-NEVER)
-_CHART: Check = maybe(table(dict.fromkeys(("acknowledged", "missing", "threshold"), _SCORE)))
-_ACK_CHANNEL: Check = maybe(
-    table(
-        {
-            "quality": number,
-            "attack": text,
-            "jammer": maybe(text),
-            "spans": maybe(listed(row(SLOT, SLOT))),
-            "flip": number,
-            "overheard": number,
-        }
-    )
-)
-_CHANGES = listed(table({"at": SLOT, "settings": maybe(named(anything)), "cut": maybe(flag)}))
-
-
-def _noise(path: str, value: Any) -> Iterator[str]:
-    """Check that a value is a matrix or a word."""
-    yield from (text if isinstance(value, str) else MATRIX)(path, value)
 
 
 @dataclass(frozen=True)
 class Identity:
     """A process's certificate and key, and the authority that it trusts; each in PEM."""
 
-    authority: str = field(metadata=entry(text))
+    authority: str
     """The certificate of the run's authority, which made all certificates of the run."""
-    certificate: str = field(metadata=entry(text))
-    key: str = field(repr=False, metadata=entry(text))
+    certificate: str
+    key: str = field(repr=False)
     """The private key of the certificate."""
 
 
-@dataclass(frozen=True)
-class LinkEntry:
-    """The schedule of a link as plain values."""
-
-    settings: Mapping[str, Any] = field(metadata=entry(table({"loss": named(anything)}, strict=False)))
-    window: int = field(metadata=entry(_WINDOW))
-    changes: Sequence[Change] = field(metadata=entry(_CHANGES, lambda found: [Change(**one) for one in found]))
-    outages: Sequence[Sequence[int]] = field(metadata=entry(listed(row(SLOT, SLOT, SLOT))))
-    """For each: first slot, first slot after, and the `Fate` of its packets."""
-    correlation: tuple[str, float] | None = field(
-        metadata=entry(maybe(row(text, number)), lambda found: None if found is None else tuple(found))
-    )
-    """The receiver whose link's losses these are tied to, and the strength; None if they are independent."""
-
-    @classmethod
-    def of(cls, schedule: LinkSchedule) -> LinkEntry:
-        """The entry of a link's schedule."""
-        outages = [[outage.start, outage.stop, int(outage.reason)] for outage in schedule.outages]
-        return cls(schedule.settings, schedule.window, schedule.changes, outages, schedule.correlation)
-
-    @property
-    def schedule(self) -> LinkSchedule:
-        """The link's schedule. Raises ValueError if an outage has no such `Fate`."""
-        outages = tuple(ReceiverOutage(start, stop, Fate(reason)) for start, stop, reason in self.outages)
-        return LinkSchedule(self.settings, self.window, tuple(self.changes), outages, self.correlation)
+def _expect_kinds(limits: Mapping[str, int]) -> None:
+    """Raise ValueError unless there is a limit for each kind of key."""
+    for kind in set(KINDS) ^ set(limits):
+        raise ValueError(f"`{kind:.40}` of part.limits is missing, or no kind of key")
 
 
 @dataclass(frozen=True)
@@ -335,28 +118,37 @@ class RouterPart:
     """The router's part: all links, and the credentials of all users."""
 
     role: ClassVar[str] = "router"
-    links: Mapping[str, LinkEntry] = field(
-        metadata=entry(
-            named(table_of(LinkEntry)), lambda found: {name: read(LinkEntry, one) for name, one in found.items()}
-        )
-    )
+    links: Mapping[str, LinkSchedule]
     """Receiver → the schedule of its link."""
-    pace: float = field(metadata=entry(not_negative))
+    pace: NotNegative
     """Seconds per slot; 0: as fast as possible."""
-    users: Mapping[str, str] = field(repr=False, metadata=entry(named(text)))
+    users: Mapping[str, str] = field(repr=False)
     """User → password."""
-    leaks: Mapping[str, int] = field(metadata=entry(named(SLOT)))
+    leaks: Mapping[str, Slot]
     """Receiver → the slot whose state it learns."""
-    acknowledgements: AckChannelSpec | None = field(
-        metadata=entry(_ACK_CHANNEL, lambda found: None if found is None else AckChannelSpec(**found))
-    )
-    controller: Wiring | None = field(metadata=inner(Wiring, or_null=True))
-    zid: str | None = field(metadata=entry(maybe(text)))
+    acknowledgements: AckChannelSpec | None
+    controller: Wiring | None
+    zid: str | None
     """The router's Zenoh id, if there is a relay."""
-    limits: Mapping[str, int] = field(metadata=entry(_SIZES))
+    limits: Mapping[str, Positive]
     """Kind of key → bytes of its largest message."""
-    modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    modules: str | None = None
     """The folder in which modules of classes that are not built in are looked for, after everything installed."""
+
+    def __post_init__(self) -> None:
+        _expect_kinds(self.limits)
+
+    def expect_usable(self, brief: AnyBrief) -> None:
+        """Make the links, and look for the keys of their streams."""
+        for name, schedule in self.links.items():
+            brief.expect_keys(streams_of(name, schedule))
+            with _using(f"part.links.{name}"):
+                keys = brief.stream_keys
+                Link(schedule, name, {stream: keys[stream] for stream in streams_of(name, schedule)}, brief.batch)
+        if self.acknowledgements is not None:
+            brief.expect_keys([f"link/{ACKNOWLEDGEMENTS}"])
+            if self.acknowledgements.attack not in ATTACKS:
+                raise BriefError(f"part.acknowledgements.attack is {self.acknowledgements.attack:.40}; {WRITE_AGAIN}")
 
 
 @dataclass(frozen=True)
@@ -364,33 +156,46 @@ class RelayPart:
     """The relay's part."""
 
     role: ClassVar[str] = "relay"
-    users: Mapping[str, str] = field(repr=False, metadata=entry(named(text)))
+    users: Mapping[str, str] = field(repr=False)
     """User of its site → password."""
-    receivers: Sequence[str] = field(metadata=entry(_TEXTS))
-    listen: str = field(metadata=entry(text))
+    receivers: Sequence[str]
+    listen: str
     """The endpoint where it listens."""
-    zid: str = field(metadata=entry(text))
+    zid: str
     """The router's Zenoh id."""
-    controller: Wiring | None = field(metadata=inner(Wiring, or_null=True))
-    limits: Mapping[str, int] = field(metadata=entry(_SIZES))
+    controller: Wiring | None
+    limits: Mapping[str, Positive]
     """As the router's."""
+
+    def __post_init__(self) -> None:
+        _expect_kinds(self.limits)
+
+    def expect_usable(self, brief: AnyBrief) -> None:
+        """There is nothing to make."""
 
 
 @dataclass(frozen=True)
 class ProgramEntry:
     """The program that publishes the states, and the form of its messages."""
 
-    key: str = field(metadata=entry(text))
-    states: Sequence[str] = field(metadata=entry(_TEXTS))
+    key: str
+    states: Sequence[str]
     """The names of the states."""
-    reference: Sequence[float] = field(metadata=entry(NUMBERS))
+    reference: Sequence[Finite]
     """The states' reference, from which deviations are transmitted."""
-    connect: str | None = field(default=None, metadata=entry(text, left_out=True))
+    connect: str | None = None
     """The endpoint to connect to; None to listen."""
-    listen: str | None = field(default=None, metadata=entry(text, left_out=True))
+    listen: str | None = None
     """The endpoint to listen on."""
-    offsets: Sequence[int] | None = field(default=None, metadata=entry(listed(whole(0)), left_out=True))
+    offsets: Sequence[Slot] | None = None
     """Where in a message each state is, in bytes, as f8; None: messages are JSON."""
+
+    def expect_usable(self, n: int) -> None:
+        """Raise ValueError unless it gives n states, and there is one way to connect with it."""
+        if {len(self.states), len(self.reference), len(self.offsets or self.states)} != {n}:
+            raise ValueError(f"it does not have {n} states, as the model does")
+        if (self.connect is None) == (self.listen is None):
+            raise ValueError("it needs connect or listen, and not both")
 
 
 @dataclass(frozen=True)
@@ -398,29 +203,59 @@ class SensorPart:
     """The sensor's part."""
 
     role: ClassVar[str] = "sensor"
-    scheme: Mapping[str, Any] = field(metadata=entry(_SCHEME))
+    scheme: Mapping[str, Any]
     """`scheme`, its name, and its parameters."""
-    pace: float = field(metadata=entry(not_negative))
+    pace: NotNegative
     """As the router's."""
-    receivers: Sequence[str] = field(metadata=entry(_TEXTS))
-    holds: Sequence[int] = field(metadata=entry(listed(SLOT)))
+    receivers: Sequence[str]
+    holds: Sequence[Slot]
     """Slots before which it holds."""
-    history: int = field(metadata=entry(_WINDOW))
+    history: Window
     """How many slots before the first that is not done a restarted router must receive again."""
-    leaks: Mapping[str, int] = field(metadata=entry(named(SLOT)))
+    leaks: Mapping[str, Slot]
     """As the router's."""
-    chart: Chart | None = field(metadata=entry(_CHART, lambda found: None if found is None else Chart(**found)))
+    chart: Chart | None
     """The chart with which it detects attacks on acknowledgements; None if it does not."""
-    plant: SensorPlantEntry | None = field(metadata=inner(SensorPlantEntry, or_null=True))
-    controller: SensorLoopPart | None = field(metadata=inner(SensorLoopPart, or_null=True))
-    modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    plant: Plant | None
+    controller: SensorLoopPart | None
+    disturbances: str | None = None
+    """Of the plant, as `encoded`; None without a plant."""
+    modules: str | None = None
     """As the router's."""
-    monitor: MonitorEntry | None = field(default=None, metadata=inner(MonitorEntry, left_out=True))
+    monitor: MonitorPlan | None = None
     """None without a detector for its filter."""
-    states: str | None = field(default=None, metadata=entry(text, left_out=True))
-    """Given states of all slots, as deviations, as `brief_closed_loop.encoded`; None if they are not known before the run."""
-    program: ProgramEntry | None = field(default=None, metadata=inner(ProgramEntry, left_out=True))
+    states: str | None = None
+    """Given states of all slots, as deviations, as `encoded`; None if they are not known before the run."""
+    program: ProgramEntry | None = None
     """The program that gives the states; None if none does."""
+
+    @property
+    def filters(self) -> bool:
+        """Whether it filters."""
+        return self.plant is not None and self.plant.output_matrix is not None
+
+    def expect_usable(self, brief: AnyBrief) -> None:
+        """Make the scheme and the monitor, and look for the keys of all streams."""
+        scheme, n = _scheme(brief, self.scheme), brief.model.process.n
+        own = ["process", *(["measurement"] if self.filters else [])]
+        brief.expect_keys([*own, *(["watermark", "spoofing"] if self.monitor else []), *scheme.secret_streams])
+        if self.plant is not None:
+            if self.disturbances is None:
+                raise BriefError(f"part.disturbances is missing, which moves the plant; {WRITE_AGAIN}")
+            _expect_plant(brief, self.plant, self.disturbances)
+        with _using("part.monitor"):
+            if self.monitor is not None:
+                if self.plant is None or self.plant.output_matrix is None:
+                    raise ValueError("there is no filter whose innovations could be tested")
+                self.monitor.expect_sizes(len(self.plant.output_matrix), self.plant.inputs)
+                Monitor(self.monitor, bytes(KEY_BYTES), brief.batch)
+                self.monitor.spoofing(bytes(KEY_BYTES), brief.batch)
+        with _using("part.states"):
+            if self.states is not None:
+                _expect_numbers(decoded(self.states, brief.slots), n, "states")
+        with _using("part.program"):
+            if self.program is not None:
+                self.program.expect_usable(n)
 
 
 @dataclass(frozen=True)
@@ -428,18 +263,23 @@ class LegitimatePart:
     """The legitimate estimator's part."""
 
     role: ClassVar[str] = "legitimate"
-    scheme: Mapping[str, Any] = field(metadata=entry(_SCHEME))
+    scheme: Mapping[str, Any]
     """As the sensor's."""
-    window: int = field(metadata=entry(_WINDOW))
+    window: Window
     """Slots by which a packet may be late."""
-    outages: Sequence[tuple[int, int, bool]] = field(metadata=entry(_OUTAGES))
-    """For each: first slot, first slot after, and whether it keeps its state."""
-    controller: EstimatorLoopPart | None = field(metadata=inner(EstimatorLoopPart, or_null=True))
+    outages: Sequence[Outage]
+    controller: EstimatorLoopPart | None
     """None if it has no part in the loop."""
-    modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    modules: str | None = None
     """As the router's."""
-    state_file: str | None = field(default=None, metadata=entry(text, left_out=True))
+    state_file: str | None = None
     """The file in which it keeps its state."""
+
+    def expect_usable(self, brief: AnyBrief) -> None:
+        """Make the scheme, and look for the keys of its streams."""
+        brief.expect_keys(_scheme(brief, self.scheme).estimator_streams)
+        if self.controller is not None and self.controller.plant is not None:
+            _expect_plant(brief, self.controller.plant)
 
 
 @dataclass(frozen=True)
@@ -447,18 +287,17 @@ class EavesdropperPart:
     """An eavesdropper's part."""
 
     role: ClassVar[str] = "eavesdropper"
-    strategy: str = field(metadata=entry(text))
-    parameters: Mapping[str, Any] = field(metadata=entry(named(anything)))
+    strategy: str
+    parameters: Mapping[str, Any]
     """The strategy's parameters."""
-    window: int = field(metadata=entry(_WINDOW))
+    window: Window
     """As the legitimate estimator's."""
-    outages: Sequence[tuple[int, int, bool]] = field(metadata=entry(_OUTAGES))
-    """As the legitimate estimator's."""
-    noise_covariance: Any = field(default=None, metadata=entry(_noise, left_out=True))
+    outages: Sequence[Outage]
+    noise_covariance: str | Matrix | None = None
     """The covariance of packets that hold noise in place of a state, as in the scenario; None if the scheme sends none."""
-    modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    modules: str | None = None
     """As the router's."""
-    state_file: str | None = field(default=None, metadata=entry(text, left_out=True))
+    state_file: str | None = None
     """As the legitimate estimator's."""
 
     @property
@@ -466,19 +305,45 @@ class EavesdropperPart:
         """The distribution of these packets; None if there are none."""
         return None if self.noise_covariance is None else NoiseDistribution(self.noise_covariance)
 
+    def expect_usable(self, brief: AnyBrief) -> None:
+        """Look for the class, its parameters and the keys of its streams, and make the distribution of noise."""
+        kind, n, noise = STRATEGIES[self.strategy], brief.model.process.n, self.noise_distribution
+        lacking = sorted(set(kind.parameters) - set(self.parameters))
+        if lacking:
+            raise BriefError(f"part.parameters.{lacking[0]} is missing, which the strategy needs; {WRITE_AGAIN}")
+        with _using("part.parameters"):
+            streams = kind.streams(self.parameters)
+        brief.expect_keys(streams)
+        with _using("part.noise_covariance"):
+            if noise is not None and noise.factors(brief.model.process).block(range(1, 2)).shape[1:] != (n, n):
+                raise ValueError(f"it does not have {n} states, as the model does")
+
 
 @dataclass(frozen=True)
 class ControllerPart:
     """The controller's part."""
 
     role: ClassVar[str] = "controller"
-    strategy: str = field(metadata=entry(text))
-    assignment: AssignmentEntry = field(metadata=inner(AssignmentEntry))
-    acts_on: str = field(metadata=entry(text))
+    strategy: str
+    assignment: Assignment
+    acts_on: str
     """As in `Wiring`."""
-    plant: PlantEntry = field(metadata=inner(PlantEntry))
-    disturbances: str = field(metadata=entry(text))
-    """As `brief_closed_loop.encoded`."""
+    disturbances: str
+    """As `encoded`."""
+
+    def expect_usable(self, brief: AnyBrief) -> None:
+        """Look for the class, and ask it whether it can do the assignment."""
+        if self.strategy not in CONTROLLERS:
+            names = ", ".join(sorted(CONTROLLERS))
+            raise BriefError(f"part.strategy is {self.strategy:.40}, expected one of {names}; {WRITE_AGAIN}")
+        _expect_plant(brief, self.assignment.plant, self.disturbances)
+        with _using("part.assignment"):
+            given, own = brief.model.process, self.assignment.process
+            if not all(np.array_equal(*two) for two in zip(given.matrices, own.matrices, strict=True)):
+                raise ValueError("its process is not that of the model")
+            objections = CONTROLLERS[self.strategy].objections(self.assignment)
+        if objections:
+            raise BriefError(f"part: the {objections[0][0]} {objections[0][1]}")
 
 
 @dataclass(frozen=True)
@@ -486,21 +351,24 @@ class RecorderPart:
     """The recorder's part: everything about the run."""
 
     role: ClassVar[str] = "recorder"
-    scenario: Mapping[str, Any] = field(repr=False, metadata=entry(named(anything)))
+    scenario: Mapping[str, Any] = field(repr=False)
     """The whole scenario, with its seed."""
-    results: str = field(metadata=entry(text))
+    results: str
     """The results folder."""
-    recording: bool = field(metadata=entry(flag))
+    recording: bool
     """Whether to write a recording for the view."""
-    operator: str = field(repr=False, metadata=entry(text))
+    operator: str = field(repr=False)
     """The operator's password."""
-    shard: bool = field(metadata=entry(flag))
+    shard: bool
     """Whether the run is a shard of a larger one."""
-    paused: bool = field(metadata=entry(flag))
+    paused: bool
     """Whether it holds the run before slot 0, until the operator lets it continue."""
-    operator_identity: Identity | None = field(metadata=inner(Identity, or_null=True))
-    classes: Mapping[str, Mapping[str, Any]] = field(metadata=entry(named(named(anything))))
+    operator_identity: Identity | None
+    classes: Mapping[str, Mapping[str, Any]]
     """Question → answer, of eavesdroppers' classes that are not built in."""
+
+    def expect_usable(self, brief: AnyBrief) -> None:
+        """The recorder checks the scenario itself."""
 
 
 RoutingPart = RouterPart | RelayPart
@@ -515,7 +383,56 @@ PARTS: Mapping[str, type[Part]] = {
 """Role → its part."""
 
 
-_MOST_TRIALS, _LAST_TRIAL = 1_000_000, 2**48
+def _scheme(brief: AnyBrief, spec: Mapping[str, Any]) -> Scheme:
+    name = spec.get("scheme")
+    if not isinstance(name, str):
+        raise BriefError(f"part.scheme.scheme is missing, or no name; {WRITE_AGAIN}")
+    kind = SCHEMES[name]
+    for parameter in sorted(set(kind.parameters) ^ (set(spec) - {"scheme"})):
+        problem = "missing" if parameter in kind.parameters else "not a parameter of the scheme"
+        raise BriefError(f"part.scheme.{parameter} is {problem}; {WRITE_AGAIN}")
+    with _using("part.scheme"):
+        return scheme_of(brief.model.process, spec)
+
+
+def _expect_plant(brief: AnyBrief, plant: Plant, disturbances: str | None = None) -> None:
+    n = brief.model.process.n
+    with _using("part.plant"):
+        if plant.start.shape != (n,):
+            raise ValueError(f"it does not have {n} states, as the model does")
+    with _using("part.disturbances"):
+        if disturbances is not None:
+            _expect_numbers(decoded(disturbances, brief.slots), plant.disturbance_matrix.shape[1], "disturbances")
+
+
+def _expect_numbers(series: Floats, count: int, names: str) -> None:
+    """Raise ValueError unless there are finite numbers, this many in each slot; names: of what they are."""
+    if series.shape[1] != count or not np.isfinite(series).all():
+        raise ValueError(f"it has {series.shape[1]} {names}, not {count}, or they are not finite")
+
+
+@contextmanager
+def _using(path: str) -> Iterator[None]:
+    """Turn any error in the block into a BriefError that names the part of the brief."""
+    try:
+        yield
+    except (BriefError, NotRegistered):
+        raise
+    except Exception as error:
+        reason = f"{type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
+        raise BriefError(f"{path} cannot be used ({reason}); {WRITE_AGAIN}") from error
+
+
+@contextmanager
+def classes_known() -> Iterator[None]:
+    """Turn a NotRegistered of the block into a BriefError: the brief names a class that this process does not have."""
+    try:
+        yield
+    except NotRegistered as error:
+        name = str(error.name).encode("unicode_escape").decode()
+        raise BriefError(f"it names {name}{error.why or ', which is not a class here'}") from error
+
+
 _MOST_BYTES = 2**30  # the recorder's brief holds the complete scenario
 WRITE_AGAIN = "write it again with `evedrop brief`"
 
@@ -524,15 +441,15 @@ WRITE_AGAIN = "write it again with `evedrop brief`"
 class Flow:
     """End-to-end flow control, both in slots."""
 
-    window: int = field(metadata=entry(whole(1)))
+    window: Positive
     """The sensor is at most this far ahead of the slowest receiver and of the recorder."""
-    batch: int = field(metadata=entry(whole(1)))
+    batch: Positive
     """Telemetry, journal and progress are sent at least this often."""
-    longest_outage: float = field(default=30.0, metadata=entry(not_negative))
+    longest_outage: NotNegative = 30.0
     """Seconds for which a process may be cut off before that ends the run."""
-    largest_message: int = field(default=2**30, metadata=entry(whole(1)))
+    largest_message: Positive = 2**30
     """Bytes of the largest message of the run: larger ones are not accepted."""
-    message: int = field(default=1, metadata=entry(whole(1)))
+    message: Positive = 1
     """A message carries the packets of at most this many slots."""
 
 
@@ -540,17 +457,25 @@ class Flow:
 class Model:
     """The public model, which every process may know."""
 
-    A: list[list[float]] = field(metadata=entry(MATRIX))
-    Q: list[list[float]] = field(metadata=entry(MATRIX))
-    initial_covariance: list[list[float]] = field(metadata=entry(MATRIX))
-    state_probability: float = field(metadata=entry(number))
+    A: list[list[Finite]]
+    Q: list[list[Finite]]
+    initial_covariance: list[list[Finite]]
+    state_probability: Annotated[float, Meta(ge=0.0, le=1.0)]
     """μ_d; its mean over the slots if it differs from slot to slot."""
-    header: int = field(default=0, metadata=entry(whole(0, 64)))
+    header: Annotated[int, Meta(ge=0, le=64)] = 0
     """How many unencrypted numbers a packet has in addition to its payload."""
-    singular_noise: bool = field(default=False, metadata=entry(flag))
+    singular_noise: bool = False
     """Whether Q may be singular."""
-    state_probabilities: tuple[float, ...] | None = field(default=None, metadata=entry(NUMBERS, tuple, left_out=True))
+    state_probabilities: tuple[Annotated[float, Meta(ge=0.0, le=1.0)], ...] | None = None
     """μ_d(k) for every slot; None if it is the same in all slots."""
+
+    def __post_init__(self) -> None:
+        try:
+            A, Q, covariance = (np.array(M, np.float64) for M in (self.A, self.Q, self.initial_covariance))
+        except ValueError as error:
+            raise ValueError("A, Q or initial_covariance is not a matrix") from error
+        if mistakes := mistakes_of(A, Q, covariance, self.singular_noise):
+            raise ValueError(f"it is not a process: {mistakes[0][0]} {mistakes[0][1]}")
 
     @property
     def process(self) -> Process:
@@ -566,34 +491,39 @@ P = TypeVar("P", bound=Part)
 class Brief(Generic[P_co]):
     """Everything one process may know."""
 
-    run: str = field(metadata=entry(text))
-    process: str = field(metadata=entry(text))
-    role: str = field(metadata=entry(text))
-    router: str = field(metadata=entry(text))
+    run: str
+    process: str
+    role: str
+    router: str
     """Zenoh endpoint, such as unixsock-stream/PATH or tls/127.0.0.1:17460."""
-    user: str = field(metadata=entry(text))
-    password: str = field(repr=False, metadata=entry(text))
-    slots: int = field(metadata=entry(whole(1, MOST_SLOTS)))
-    trials: int = field(metadata=entry(whole(1, _MOST_TRIALS)))
-    first_trial: int = field(metadata=entry(whole(0, _LAST_TRIAL)))
-    recorded: int = field(metadata=entry(whole(1, _MOST_TRIALS)))
+    user: str
+    password: str = field(repr=False)
+    slots: Annotated[int, Meta(ge=1, le=MOST_SLOTS)]
+    trials: Trials
+    first_trial: Annotated[int, Meta(ge=0, le=2**48)]
+    recorded: Trials
     """How many of the first trials are recorded in full."""
-    flow: Flow = field(metadata=inner(Flow))
-    model: Model = field(metadata=inner(Model))
-    keys: Mapping[str, str] = field(repr=False, metadata=entry(named(key)))
+    flow: Flow
+    model: Model
+    keys: Mapping[str, Key] = field(repr=False)
     """Stream name → key, hexadecimal: the streams this process owns."""
-    part: P_co = field(metadata=entry(named(anything)))
+    part: P_co
     """The role's part of the scenario."""
-    first: int = field(default=0, metadata=entry(whole(0, MOST_SLOTS)))
+    first: Window = 0
     """The first slot that this process handles; above 0 for a restarted receiver."""
-    ends_with_stdin: bool = field(metadata=entry(flag))
+    ends_with_stdin: bool
     """End when standard input closes: the launcher holds its other end, so nothing outlives a killed launcher."""
-    patience: int = field(default=30, metadata=entry(whole(1)))
+    patience: Positive = 30
     """Seconds for which it waits for the other processes to appear."""
-    identity: Identity | None = field(default=None, metadata=inner(Identity, or_null=True))
+    identity: Identity | None = None
     """Its identity, if the run's router takes certificates."""
-    last_word: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    last_word: str | None = None
     """The file for its last word (`evedrop.live.protocol.last_word`); None for a process that is started by hand."""
+
+    def __post_init__(self) -> None:
+        probabilities = self.model.state_probabilities
+        if probabilities is not None and len(probabilities) != self.slots:
+            raise ValueError(f"model.state_probabilities are not {self.slots} numbers, one for each slot")
 
     @property
     def batch(self) -> Batch:
@@ -606,6 +536,11 @@ class Brief(Generic[P_co]):
         return {name: bytes.fromhex(key) for name, key in self.keys.items()}
 
     @property
+    def entries(self) -> Mapping[str, Any]:
+        """The brief as plain tables, lists, texts and numbers."""
+        return dict(json.loads(self.text))
+
+    @property
     def text(self) -> str:
         """The brief as JSON."""
         return json.dumps(self, default=plain, indent=1)
@@ -616,6 +551,17 @@ class Brief(Generic[P_co]):
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
             file.write(self.text)
         return path
+
+    @classes_known()
+    def expect_usable(self) -> None:
+        """Raise BriefError if a process cannot work with it: a key, a class or a number is missing or unusable."""
+        self.part.expect_usable(self)
+
+    def expect_keys(self, names: Iterable[str]) -> None:
+        """Raise BriefError unless there are the keys of all these streams."""
+        for name in names:
+            if name not in self.keys:
+                raise BriefError(f"keys.{name} is missing, and {self.process} cannot work without it; {WRITE_AGAIN}")
 
 
 AnyBrief = Brief[Part]
@@ -651,23 +597,9 @@ def read_brief(path: Path, role: str | None = None) -> AnyBrief:
 
 def brief_from(entries: Any) -> AnyBrief:
     """The brief of a decoded JSON text. Raises ValueError if it is not one."""
-    expect(table_of(Brief), "", entries)
-    if entries["role"] not in PARTS:
-        raise ValueError(f"unknown role {entries['role']:.40}, expected one of {', '.join(PARTS)}")
-    kind = PARTS[entries["role"]]
-    expect(table_of(kind), "part", entries["part"])
-    brief: AnyBrief = read(Brief, {**entries, "part": read(kind, entries["part"])})
-    model = brief.model
-    try:
-        matrices = [np.array(M, np.float64) for M in (model.A, model.Q, model.initial_covariance)]
-    except (ValueError, OverflowError) as error:
-        raise ValueError("model.A, model.Q or model.initial_covariance is not a matrix") from error
-    if wrong := mistakes_of(matrices[0], matrices[1], matrices[2], model.singular_noise):
-        raise ValueError(f"its model is not a process: model.{wrong[0][0]} {wrong[0][1]}")
-    if not 0.0 <= model.state_probability <= 1.0:
-        raise ValueError(f"model.state_probability is {model.state_probability}, expected a number from 0 to 1")
-    if model.state_probabilities is not None:
-        wrong_number = len(model.state_probabilities) != brief.slots
-        if wrong_number or not all(0.0 <= probability <= 1.0 for probability in model.state_probabilities):
-            raise ValueError(f"model.state_probabilities are not {brief.slots} numbers from 0 to 1, one for each slot")
+    role = entries.get("role") if isinstance(entries, dict) else None
+    kind = PARTS.get(role) if isinstance(role, str) else None
+    if kind is None:
+        raise ValueError(f"role is {role!r:.40}, expected one of {', '.join(PARTS)}")
+    brief: AnyBrief = read(Brief[kind], entries)  # type: ignore[valid-type]
     return brief

@@ -13,9 +13,10 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Mapping
 from reprlib import Repr
-from typing import Any, final
+from typing import Any, TypeVar, final
 
 import msgpack
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +29,8 @@ _LARGEST = 2**62  # the default bound of integers: slots can be added to it with
 _SMALL_BYTES = 1 << 16  # objects that msgpack unpacks from this few bytes take some megabytes at most
 _WHY_CHARACTERS = 1000
 _PARTS = 4096  # lists and maps in a message; enough for many processes
+
+S = TypeVar("S", bound=msgspec.Struct)
 
 
 def pack(fields: Mapping[str, Any]) -> bytes:
@@ -81,6 +84,13 @@ class Reader:
     def has(self, name: str) -> bool:
         """Whether an optional field is present."""
         return name in self._fields
+
+    def read(self, kind: type[S]) -> S:
+        """All fields, as an object of this kind, whose declaration says what they may be."""
+        try:
+            return msgspec.convert(self._fields, kind)
+        except msgspec.ValidationError as error:
+            raise self.malformed(str(error), f"the fields of {kind.__name__}") from error
 
     def integer(self, name: str, least: int = 0, most: int | None = None) -> int:
         """An integer field, from `least` to `most`."""

@@ -13,12 +13,15 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from queue import SimpleQueue
-from typing import Any, ClassVar, Self, final
+from typing import Annotated, Any, final
+
+from msgspec import Meta, Struct, field, to_builtins
 
 from evedrop.live.protocol.codec import Reader, pack, shown
 from evedrop.live.protocol.keys import reader_of
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
+from evedrop.system.fields import Slot
 
 
 @dataclass(frozen=True)
@@ -31,109 +34,66 @@ class Bounds:
     """The names that it may have: of receivers, and to the sensor also the recorder; None: any."""
 
 
-@dataclass(frozen=True)
-class ControlCommand:
+class ControlCommand(Struct, frozen=True, omit_defaults=True, tag_field="do"):
     """A command without fields; the others add theirs."""
 
-    do: ClassVar[str]
-
     def pack(self) -> bytes:
         """Encode it as a message."""
-        return pack({"do": self.do})
+        return pack(to_builtins(self))
 
-    @classmethod
-    def read(cls, message: Reader, bounds: Bounds) -> Self:  # noqa: ARG003 - for kinds with fields
-        """Decode a command of this kind. Raises MalformedMessage."""
-        return cls()
+    def expect(self, message: Reader, bounds: Bounds) -> None:
+        """Raise MalformedMessage if it names what the run does not have, or lacks what its reader needs."""
 
 
-@dataclass(frozen=True)
-class Start(ControlCommand):
+class Start(ControlCommand, frozen=True, tag="start"):
     """To the sensor: all processes are present; begin."""
 
-    do = "start"
 
-
-@dataclass(frozen=True)
-class EndRun(ControlCommand):
+class EndRun(ControlCommand, frozen=True, tag="end"):
     """To all: the run is over; confirm it and leave."""
 
-    do = "end"
 
-
-@dataclass(frozen=True)
-class ReportStatus(ControlCommand):
+class ReportStatus(ControlCommand, frozen=True, tag="where"):
     """To all: report your status."""
 
-    do = "where"
 
-
-@dataclass(frozen=True)
-class Hold(ControlCommand):
+class Hold(ControlCommand, frozen=True, tag="hold"):
     """To the sensor: stop before the next slot."""
 
-    do = "hold"
 
-
-@dataclass(frozen=True)
-class Unknown(ControlCommand):
+class Unknown(ControlCommand, frozen=True, tag="unknown"):
     """A command that this version does not know, and ignores."""
 
-    do = "unknown"
 
-
-@dataclass(frozen=True)
-class Abandon(ControlCommand):
+class Abandon(ControlCommand, frozen=True, tag="abandon"):
     """To all: the run was given up."""
 
-    do = "abandon"
     why: str
 
-    def pack(self) -> bytes:
-        """Encode it as a message."""
-        return pack({"do": self.do, "why": self.why})
 
-    @classmethod
-    def read(cls, message: Reader, bounds: Bounds) -> Self:  # noqa: ARG003 - for kinds that name receivers or slots
-        """Decode it."""
-        return cls(message.text("why"))
-
-
-@dataclass(frozen=True)
-class Go(ControlCommand):
+class Go(ControlCommand, frozen=True, tag="go"):
     """To router and sensor: continue after a hold."""
 
-    do = "go"
-    slot: int
+    slot: Slot = field(name="k")
     """The slot before which the run is held."""
     absent: tuple[str, ...] | None = None
     """To the sensor: the receivers that it does not wait for from now on. None to the router."""
-    until: int | None = None
+    until: Slot | None = None
     """To the sensor: the slot before which it holds again, if any."""
 
-    def pack(self) -> bytes:
-        """Encode it as a message."""
-        absent = {} if self.absent is None else {"absent": list(self.absent)}
-        until = {} if self.until is None else {"until": self.until}
-        return pack({"do": self.do, "k": self.slot, **absent, **until})
-
-    @classmethod
-    def read(cls, message: Reader, bounds: Bounds) -> Self:
-        """Decode it."""
-        slot = message.integer("k")
+    def expect(self, message: Reader, bounds: Bounds) -> None:
+        """The sensor needs the absent, which are processes of the run."""
         if reader_of(message.key) != SENSOR:
-            return cls(slot)
-        absent = message.names("absent")
-        if bounds.receivers is not None and not set(absent) <= set(bounds.receivers):
-            raise message.malformed(f"absent = {shown(absent)}", f"some of {', '.join(bounds.receivers)}")
-        return cls(slot, absent, message.integer("until") if message.has("until") else None)
+            return
+        if self.absent is None:
+            raise message.malformed("absent = None", "a list absent of strings")
+        if bounds.receivers is not None and not set(self.absent) <= set(bounds.receivers):
+            raise message.malformed(f"absent = {shown(self.absent)}", f"some of {', '.join(bounds.receivers)}")
 
 
-@dataclass(frozen=True)
-class LinkChange(ControlCommand):
+class LinkChange(ControlCommand, frozen=True, tag="change"):
     """To the router: change a link."""
 
-    do = "change"
     link: str
     """The receiver of the link."""
     changes: tuple[Change, ...]
@@ -141,96 +101,78 @@ class LinkChange(ControlCommand):
 
     def pack(self) -> bytes:
         """Encode it as a message."""
-        return pack({"do": self.do, "link": self.link, "changes": _packed(self.changes)})
+        return pack(to_builtins(self) | {"changes": _packed(self.changes)})
 
-    @classmethod
-    def read(cls, message: Reader, bounds: Bounds) -> Self:
-        """Decode it."""
-        link = message.text("link") if bounds.receivers is None else message.choice("link", bounds.receivers)
-        return cls(link, _changes(message, "changes", bounds.slots))
+    def expect(self, message: Reader, bounds: Bounds) -> None:
+        """The link is one of the run's, and so are the slots."""
+        _expect_changes(message, bounds, {self.link: self.changes})
 
 
-@dataclass(frozen=True)
-class Again(ControlCommand):
+class Again(ControlCommand, frozen=True, tag="again"):
     """To all: send the messages again that may have been lost with a connection."""
 
-    do = "again"
-    round: int
+    round: Slot = field(name="n")
     """Counted from 1."""
-    slot: int
+    slot: Slot = field(name="k")
     """The first slot that is not joined."""
     links: Mapping[str, tuple[Change, ...]] | None = None
     """To the router: receiver → all changes of its link, for the links that the operator has changed. None to others."""
 
     def pack(self) -> bytes:
         """Encode it as a message."""
-        links = (
-            {} if self.links is None else {"links": {name: _packed(changes) for name, changes in self.links.items()}}
-        )
-        return pack({"do": self.do, "n": self.round, "k": self.slot, **links})
+        links = {name: _packed(changes) for name, changes in (self.links or {}).items()}
+        return pack(to_builtins(self) | ({} if self.links is None else {"links": links}))
 
-    @classmethod
-    def read(cls, message: Reader, bounds: Bounds) -> Self:
-        """Decode it."""
-        number, slot = message.integer("n"), message.integer("k")
-        if reader_of(message.key) != ROUTER:
-            return cls(number, slot)
-        names, links = message.map("links"), message.nested("links")
-        for name in names:
-            if bounds.receivers is not None and name not in bounds.receivers:
-                raise message.malformed(f"the link {shown(name)}", f"one of {', '.join(bounds.receivers)}")
-        return cls(number, slot, {name: _changes(links, name, bounds.slots) for name in names})
+    def expect(self, message: Reader, bounds: Bounds) -> None:
+        """The router needs the changed links, which are of the run."""
+        if reader_of(message.key) == ROUTER:
+            if self.links is None:
+                raise message.malformed("links = None", "a map links")
+            _expect_changes(message, bounds, self.links)
 
 
 def _packed(changes: Sequence[Change]) -> list[dict[str, Any]]:
-    """Changes of a link as in a message."""
-    return [
-        {
-            "at": change.at,
-            **({} if change.settings is None else {"settings": change.settings}),
-            **({} if change.cut is None else {"cut": change.cut}),
-        }
-        for change in changes
-    ]
+    """Changes of a link as in a message, without what they keep."""
+    return [{name: value for name, value in to_builtins(change).items() if value is not None} for change in changes]
 
 
-def _changes(message: Reader, name: str, slots: int) -> tuple[Change, ...]:
-    """The changes of a link in a field of a message; slots: of the run."""
-    return tuple(
-        Change(
-            change.integer("at", 0, slots),
-            change.map("settings") if change.has("settings") else None,
-            change.flag("cut") if change.has("cut") else None,
-        )
-        for change in message.maps(name)
-    )
+def _expect_changes(message: Reader, bounds: Bounds, links: Mapping[str, Sequence[Change]]) -> None:
+    """Raise MalformedMessage for a link or a slot that the run does not have."""
+    for name, changes in links.items():
+        if bounds.receivers is not None and name not in bounds.receivers:
+            raise message.malformed(f"the link {shown(name)}", f"one of {', '.join(bounds.receivers)}")
+        for change in changes:
+            if not 0 <= change.at <= bounds.slots:
+                raise message.malformed(f"at = {change.at}", f"an integer at from 0 to {bounds.slots}")
 
 
 _KINDS: Mapping[str, type[ControlCommand]] = {
-    kind.do: kind for kind in (Start, EndRun, ReportStatus, Hold, Abandon, Go, LinkChange, Again)
+    str(kind.__struct_config__.tag): kind
+    for kind in (Start, EndRun, ReportStatus, Hold, Abandon, Go, LinkChange, Again)
 }
 
 
 def read_command(message: Reader, bounds: Bounds) -> ControlCommand:
     """Decode a command. Raises MalformedMessage."""
-    return _KINDS.get(message.text("do"), Unknown).read(message, bounds)
+    kind = _KINDS.get(message.text("do"))
+    if kind is None:
+        return Unknown()
+    command = message.read(kind)
+    command.expect(message, bounds)
+    return command
 
 
-_MOST_KEYS = 4096
-
-
-@dataclass(frozen=True)
-class ProcessStatus:
+class ProcessStatus(Struct, frozen=True):
     """What a process reports of itself."""
 
-    slot: int
+    slot: Slot = field(name="k")
     """The slot that it is at."""
-    waits: tuple[str, ...]
+    waits: Annotated[tuple[str, ...], Meta(max_length=4096)]
     """The keys on which it waits for a message; empty if it does not wait."""
 
     def pack(self) -> bytes:
         """Encode it as a message."""
-        return pack({"k": self.slot, "waits": list(self.waits)})
+        return pack(to_builtins(self))
 
 
 def is_process_status(message: Reader) -> bool:
@@ -240,10 +182,8 @@ def is_process_status(message: Reader) -> bool:
 
 def read_process_status(message: Reader, slots: int) -> ProcessStatus:
     """Decode a process's status; slots: of the run."""
-    waits = message.names("waits")
-    if len(waits) > _MOST_KEYS:
-        raise message.malformed(f"{len(waits)} keys in waits", f"{_MOST_KEYS} at most")
-    return ProcessStatus(message.integer("k", 0, slots), waits)
+    message.integer("k", 0, slots)
+    return message.read(ProcessStatus)
 
 
 @final

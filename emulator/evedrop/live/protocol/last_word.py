@@ -7,15 +7,14 @@ Source: docs/protocol.md, the brief.
 
 from __future__ import annotations
 
-import json
 from contextlib import suppress
-from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
+from msgspec import Struct, json
+
 from evedrop.errors import EvedropError, Gap, MalformedMessage, MissingProcesses, Refusal
 from evedrop.live.protocol.keys import writer_of
-from evedrop.model.entries import choice, entry, expect, listed, plain, read, table_of, text
 from evedrop.system.files import Unreadable, contents
 from evedrop.system.output import escaped
 
@@ -35,13 +34,12 @@ class Cause(StrEnum):
     """Anything else."""
 
 
-@dataclass(frozen=True)
-class LastWord:
+class LastWord(Struct, frozen=True, forbid_unknown_fields=True):
     """Why a process ended by itself."""
 
-    cause: Cause = field(metadata=entry(choice(Cause), Cause))
-    sentence: str = field(metadata=entry(text))
-    blamed: tuple[str, ...] = field(default=(), metadata=entry(listed(text), tuple))
+    cause: Cause
+    sentence: str
+    blamed: tuple[str, ...] = ()
     """The processes that it blames."""
 
     @classmethod
@@ -57,7 +55,7 @@ class LastWord:
         """Write it into a file, if that is possible; None: nobody asks for it."""
         if file is not None:
             with suppress(OSError):
-                Path(file).write_text(json.dumps(plain(self)), encoding="utf-8")
+                Path(file).write_bytes(json.encode(self))
 
 
 def protocol_breaker(error: EvedropError) -> str | None:
@@ -73,8 +71,6 @@ def last_word_file(folder: Path, process: str) -> Path:
 def read_last_word(file: Path) -> LastWord | None:
     """The last word in a file; None if there is none that can be read."""
     with suppress(Unreadable, ValueError, RecursionError):
-        entries = json.loads(contents(file, _MOST_BYTES))
-        expect(table_of(LastWord), "", entries)
-        word = read(LastWord, entries)
+        word = json.decode(contents(file, _MOST_BYTES), type=LastWord)
         return LastWord(word.cause, escaped(word.sentence), word.blamed)
     return None

@@ -7,10 +7,9 @@ to be shown.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 
-from evedrop.model.entries import SLOT, choice, entry, expect, read, table_of, text
+import msgspec
+
 from evedrop.names import ProcessAction
 from evedrop.scenario.progress_events import (
     ConnectionOutage,
@@ -21,76 +20,57 @@ from evedrop.scenario.progress_events import (
     Started,
     ViewOpened,
 )
+from evedrop.system.fields import Slot
 
 
-@dataclass(frozen=True)
-class Alive(ProgressEvent):
+class Alive(ProgressEvent, frozen=True, tag="alive"):
     """The recorder's heartbeat."""
 
-    kind = "alive"
 
-
-@dataclass(frozen=True)
-class RouterListens(ProgressEvent):
+class RouterListens(ProgressEvent, frozen=True, tag="listening"):
     """From a router or relay, its only event: it listens, so the processes that connect to it may be started."""
 
-    kind = "listening"
-    process: str = field(metadata=entry(text))
+    process: str
 
 
-@dataclass(frozen=True)
-class ProcessRequest(ProgressEvent):
+class ProcessRequest(ProgressEvent, frozen=True, tag="act"):
     """The recorder asks the launcher to act on a process, and to confirm it."""
 
-    kind = "act"
-    do: ProcessAction = field(metadata=entry(choice(ProcessAction), ProcessAction))
-    process: str = field(metadata=entry(text))
-    first: int = field(metadata=entry(SLOT))
+    do: ProcessAction
+    process: str
+    first: Slot
     """The first slot that a restarted process handles."""
-    number: int = field(metadata=entry(SLOT))
+    number: Slot
     """The number with which the launcher confirms it."""
 
 
-@dataclass(frozen=True)
-class SlotsDone(ProgressEvent):
+class SlotsDone(ProgressEvent, frozen=True, tag="over"):
     """All slots are done, and the processes will be told to leave."""
 
-    kind = "over"
 
-
-@dataclass(frozen=True)
-class SaveStarted(ProgressEvent):
+class SaveStarted(ProgressEvent, frozen=True, tag="finishing"):
     """The recorder begins to write the results."""
 
-    kind = "finishing"
 
-
-_KINDS: Mapping[str, type[ProgressEvent]] = {
-    one.kind: one
-    for one in (
-        Alive,
-        RouterListens,
-        Started,
-        Held,
-        ProcessRequest,
-        ConnectionOutage,
-        RunProgress,
-        SlotsDone,
-        SaveStarted,
-        RunEnded,
-        ViewOpened,
-    )
-}
+_ReadByLauncher = (
+    Alive
+    | RouterListens
+    | Started
+    | Held
+    | ProcessRequest
+    | ConnectionOutage
+    | RunProgress
+    | SlotsDone
+    | SaveStarted
+    | RunEnded
+    | ViewOpened
+)
 
 
 def read_event(line: bytes) -> ProgressEvent:
     """Read a line of the recorder or a router. Raises ValueError if it is malformed."""
     try:
-        entries = json.loads(line)
+        event: ProgressEvent = msgspec.convert(json.loads(line), _ReadByLauncher)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
-    if not isinstance(entries, dict) or not isinstance(event := entries.pop("event", None), str) or event not in _KINDS:
-        raise ValueError(f"it is not an object with an event of {', '.join(_KINDS)}")
-    kind = _KINDS[event]
-    expect(table_of(kind), "", entries)
-    return read(kind, entries)
+    return event

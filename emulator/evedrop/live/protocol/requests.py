@@ -6,96 +6,57 @@ Source: docs/protocol.md, request and answer.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
+
+from msgspec import Meta, Struct, structs, to_builtins
 
 from evedrop.live.protocol.codec import Reader, pack
-from evedrop.model.entries import SLOT, entry, flag, listed, maybe, named, not_negative, read, table_of, text
 from evedrop.scenario.progress_events import RunEvent
+from evedrop.system.fields import NotNegative, Slot
 
 
-@dataclass(frozen=True)
-class OperatorRequest:
+class OperatorRequest(Struct, frozen=True, tag_field="do"):
     """A request without fields; the others add theirs."""
 
-    do: ClassVar[str]
     repeatable: ClassVar[bool] = True
     """Whether nothing else happens if it is carried out twice."""
 
     def pack(self) -> bytes:
         """Encode it as a message."""
-        return pack({"do": self.do})
-
-    @classmethod
-    def read(cls, message: Reader) -> Self:  # noqa: ARG003 - for kinds with fields
-        """Decode a request of this kind. Raises MalformedMessage."""
-        return cls()
+        return pack(to_builtins(self))
 
 
-@dataclass(frozen=True)
-class LinkRequest(OperatorRequest):
+class LinkRequest(OperatorRequest, frozen=True, tag="link"):
     """Change, cut or heal a link; on a wire also a partition of two sides."""
 
-    do = "link"
     repeatable = False
     event: Mapping[str, Any]
     """The entries of an [[event]] of a scenario or a wire, except its time; on a wire also `heal` and `join`, which end a cut
     and a partition."""
 
-    def pack(self) -> bytes:
-        """Encode it as a message."""
-        return pack({"do": self.do, "event": self.event})
 
-    @classmethod
-    def read(cls, message: Reader) -> Self:
-        """Decode it."""
-        event = message.map("event")
-        if not all(isinstance(name, str) for name in event):
-            raise message.malformed(f"event = {event!r:.60}", "a map event with strings as keys")
-        return cls(event)
-
-
-@dataclass(frozen=True)
-class PauseRequest(OperatorRequest):
+class PauseRequest(OperatorRequest, frozen=True, tag="pause"):
     """Hold the run before its next slot."""
 
-    do = "pause"
 
-
-@dataclass(frozen=True)
-class ResumeRequest(OperatorRequest):
+class ResumeRequest(OperatorRequest, frozen=True, tag="resume"):
     """Let a held run continue."""
 
-    do = "resume"
 
-
-@dataclass(frozen=True)
-class StepRequest(OperatorRequest):
+class StepRequest(OperatorRequest, frozen=True, tag="step"):
     """Let the run continue for some slots, and hold it again."""
 
-    do = "step"
     repeatable = False
-    slots: int
-
-    def pack(self) -> bytes:
-        """Encode it as a message."""
-        return pack({"do": self.do, "slots": self.slots})
-
-    @classmethod
-    def read(cls, message: Reader) -> Self:
-        """Decode it."""
-        return cls(message.integer("slots", 1))
+    slots: Annotated[int, Meta(ge=1, le=2**62)]
 
 
-@dataclass(frozen=True)
-class StatusRequest(OperatorRequest):
+class StatusRequest(OperatorRequest, frozen=True, tag="status"):
     """Say how the run or wire is."""
-
-    do = "status"
 
 
 REQUESTS: Mapping[str, type[OperatorRequest]] = {
-    kind.do: kind for kind in (LinkRequest, PauseRequest, ResumeRequest, StepRequest, StatusRequest)
+    str(kind.__struct_config__.tag): kind
+    for kind in (LinkRequest, PauseRequest, ResumeRequest, StepRequest, StatusRequest)
 }
 """The word in the message → the request."""
 
@@ -103,19 +64,15 @@ REQUESTS: Mapping[str, type[OperatorRequest]] = {
 def read_request(key: str, payload: bytes) -> OperatorRequest:
     """Decode a request. Raises MalformedMessage if the message is not a request."""
     message = Reader(key, payload)
-    do = message.text("do")
-    if do not in REQUESTS:
-        raise message.malformed(f"do = {do!r}", f"one of {', '.join(REQUESTS)}")
-    return REQUESTS[do].read(message)
+    return message.read(REQUESTS[message.choice("do", REQUESTS)])
 
 
-@dataclass(frozen=True)
-class LinkStatus:
+class LinkStatus(Struct, frozen=True, forbid_unknown_fields=True):
     """The packets of a link so far."""
 
-    offered: int = field(metadata=entry(SLOT))
-    delivered: int = field(metadata=entry(SLOT))
-    fraction: float | None = field(metadata=entry(maybe(not_negative)))
+    offered: Slot
+    delivered: Slot
+    fraction: NotNegative | None
     """The fraction of the offered packets that was delivered; None if none was offered."""
 
     @classmethod
@@ -128,30 +85,21 @@ class LinkStatus:
         return f"{self.delivered} of {self.offered} packets delivered, {fraction}"
 
 
-def _links(tables: Mapping[str, Any]) -> dict[str, LinkStatus]:
-    return {name: read(LinkStatus, table) for name, table in tables.items()}
-
-
-def _events(events: Sequence[Mapping[str, Any]]) -> list[RunEvent]:
-    return [read(RunEvent, happening) for happening in events]
-
-
-@dataclass(frozen=True)
-class RunStatus:
+class RunStatus(Struct, frozen=True, forbid_unknown_fields=True):
     """The state of a run in progress."""
 
-    slot: int = field(metadata=entry(SLOT))
+    slot: Slot
     """The first slot that is not scored."""
-    slots: int = field(metadata=entry(SLOT))
+    slots: Slot
     """The number of slots of the run."""
-    slots_per_second: float = field(metadata=entry(not_negative))
-    state: str = field(metadata=entry(text))
+    slots_per_second: NotNegative
+    state: str
     """`running`, `held` or `paused`."""
-    processes: Mapping[str, bool] = field(metadata=entry(named(flag)))
+    processes: Mapping[str, bool]
     """Process → whether it is on the network."""
-    links: Mapping[str, LinkStatus] = field(metadata=entry(named(table_of(LinkStatus)), _links))
+    links: Mapping[str, LinkStatus]
     """Receiver → its link."""
-    events: Sequence[RunEvent] = field(metadata=entry(listed(table_of(RunEvent)), _events))
+    events: Sequence[RunEvent]
 
     @property
     def lines(self) -> Iterator[str]:
@@ -175,16 +123,15 @@ def status_of_shards(statuses: Sequence[RunStatus]) -> RunStatus:
         )
         for name in slowest.links
     }
-    return replace(slowest, processes=processes, links=links)
+    return structs.replace(slowest, processes=processes, links=links)
 
 
-@dataclass(frozen=True)
-class WireLinkStatus:
+class WireLinkStatus(Struct, frozen=True, forbid_unknown_fields=True):
     """The messages of a wire's link so far."""
 
-    heard: int = field(metadata=entry(SLOT))
-    delivered: int = field(metadata=entry(SLOT))
-    cut: bool = field(metadata=entry(flag))
+    heard: Slot
+    delivered: Slot
+    cut: bool
     """Whether nothing passes now."""
 
     def __str__(self) -> str:
@@ -192,24 +139,19 @@ class WireLinkStatus:
         return f"{self.delivered} of {self.heard} messages delivered, {fraction}" + (", cut" if self.cut else "")
 
 
-def _wire_links(entries: Mapping[str, Any]) -> dict[str, WireLinkStatus]:
-    return {name: read(WireLinkStatus, entry) for name, entry in entries.items()}
-
-
-@dataclass(frozen=True)
-class WireStatus:
+class WireStatus(Struct, frozen=True, forbid_unknown_fields=True):
     """The state of a wire."""
 
-    seconds: float = field(metadata=entry(not_negative))
+    seconds: NotNegative
     """Since it began."""
-    sides: Mapping[str, Sequence[str]] = field(metadata=entry(named(listed(text))))
+    sides: Mapping[str, Sequence[str]]
     """Side → the endpoints at which programs connect."""
-    links: Mapping[str, WireLinkStatus] = field(metadata=entry(named(table_of(WireLinkStatus)), _wire_links))
-    events: Sequence[str] = field(metadata=entry(listed(text)))
+    links: Mapping[str, WireLinkStatus]
+    events: Sequence[str]
     """The events so far, a line each."""
-    journal: str = field(metadata=entry(text))
+    journal: str
     """Whether the journal is complete, in words."""
-    bypasses: Sequence[str] = field(metadata=entry(listed(text)))
+    bypasses: Sequence[str]
     """The ways past the wire that it noticed, a line each."""
 
     @property

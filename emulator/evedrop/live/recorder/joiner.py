@@ -27,11 +27,10 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, prior
 from evedrop.model.record import Record, columns
 from evedrop.model.slot.cores import Absence
-from evedrop.model.slot.link import Account
+from evedrop.model.slot.link import Account, ReceiverOutage
 from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
 from evedrop.names import CONTROLLER, ROUTER, SENSOR
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.timeline import Away
 from evedrop.score.slots import Slots
 
 Kind = TypeVar("Kind", bound=Record)
@@ -181,7 +180,13 @@ class AbsenceReporter:
     """
 
     def __init__(
-        self, brief: AnyBrief, scenario: Scenario, receiver: str, away: Away, left: Belief, put: Callable[[bytes], None]
+        self,
+        brief: AnyBrief,
+        scenario: Scenario,
+        receiver: str,
+        away: ReceiverOutage,
+        left: Belief,
+        put: Callable[[bytes], None],
     ) -> None:
         process = scenario.process.process
         fresh = prior(process, scenario.trials, away.start)

@@ -11,6 +11,7 @@ from typing import Any, final
 
 import numpy as np
 
+from evedrop.model.checks import expect_slots
 from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
 from evedrop.model.integrity.attacks import SensorAttack
 from evedrop.model.integrity.loop import Source, WatermarkedLoop, spread
@@ -61,6 +62,15 @@ class MonitorPlan:
     """As `SensorAttack.plain`."""
     spans: Sequence[tuple[int, int]]
     """The slots [from, to) of the attack."""
+
+    def __post_init__(self) -> None:
+        expect_slots(*(slot for span in self.spans for slot in span))
+
+    def expect_sizes(self, p: int, m: int) -> None:
+        """Raise ValueError unless it is for p measurements and m inputs."""
+        shapes = [M.shape for M in (self.watermark, self.shift, self.marked.precision, self.unmarked.precision)]
+        if shapes != [(m, m), (p, m), (p, p), (p, p)]:
+            raise ValueError(f"its matrices are {shapes}, and there are {m} inputs and {p} measurements")
 
     @classmethod
     def of(

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.model.checks import LAST_SLOT, expect_slots
 from evedrop.model.delays import delay_of
 from evedrop.model.kernels.current import kernels
 from evedrop.model.links import loss_of
@@ -21,9 +22,9 @@ from evedrop.model.links.loss_model import REASONS, Fate, LossModel
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 from evedrop.model.slot.records import LinkSlots
-from evedrop.model.streams import Batch, BlockReader, StreamReader
+from evedrop.model.streams import MOST_SLOTS, Batch, BlockReader, StreamReader
 
-NEVER = 2**62
+NEVER = LAST_SLOT
 """A slot that no run reaches."""
 
 
@@ -65,13 +66,14 @@ class Fates(NamedTuple):
         )
 
 
-@dataclass(frozen=True)
-class ReceiverOutage:
+class ReceiverOutage(NamedTuple):
     """Slots start ≤ k < stop in which a receiver is away."""
 
     start: int
     stop: int
     reason: Fate
+    keeps_state: bool = True
+    """Whether it continues from its last belief; otherwise from the prior of the slot in which it went away."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,12 @@ class LinkSchedule:
     outages: tuple[ReceiverOutage, ...] = ()
     correlation: tuple[str, float] | None = None
     """The receiver whose losses these are tied to, and how strongly."""
+
+    def __post_init__(self) -> None:
+        outages = (slot for outage in self.outages for slot in (outage.start, outage.stop))
+        expect_slots(self.window, *(change.at for change in self.changes), *outages)
+        if self.window > MOST_SLOTS or not isinstance(self.settings.get("loss"), Mapping):
+            raise ValueError(f"its window is above {MOST_SLOTS} slots, or its settings have no loss")
 
 
 def streams_of(receiver: str, schedule: LinkSchedule) -> tuple[str, ...]:

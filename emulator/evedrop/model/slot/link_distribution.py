@@ -111,7 +111,7 @@ def distribution_of(schedule: LinkSchedule) -> LinkDistribution | None:
         return None
     if not late:
         segments = [replace(segment, arrived=segment.arrived[-1:]) for segment in segments]
-    outages = tuple((outage.start, outage.stop, getattr(outage, "keeps_state", True)) for outage in schedule.outages)
+    outages = tuple((outage.start, outage.stop, outage.keeps_state) for outage in schedule.outages)
     return LinkDistribution(tuple(segments), outages)
 
 
