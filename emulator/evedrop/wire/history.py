@@ -9,7 +9,6 @@ Source: docs/wire.md, a wire that starts again.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,7 @@ from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.slot.link import NEVER, Change
 from evedrop.scenario.table import model_mistakes
-from evedrop.system.files import write_all
+from evedrop.system.files import LineFile, lines_in
 from evedrop.wire.plan import WirePlan, numbered_as
 
 Numbered = tuple[str, str, str]
@@ -76,7 +75,7 @@ class WireHistory:
         history = cls(folder)
         path = folder / _FILE
         try:
-            lines = path.read_bytes().split(b"\n")[:-1]  # the last line may be torn
+            lines = lines_in(path)
         except FileNotFoundError:
             return history
         except OSError as error:
@@ -153,16 +152,8 @@ class WireHistory:
             )
 
     def _write(self, entry: Mapping[str, Any]) -> None:
-        line = json.dumps(entry).encode() + b"\n"
-        path = self.folder / _FILE
-        with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600), "r+b", buffering=0) as file:
-            whole = file.readall().rfind(b"\n") + 1
-            file.truncate(whole)  # a line that was torn must not begin this one
-            try:
-                write_all(file.fileno(), line, str(path))
-            except OSError:
-                file.truncate(whole)
-                raise
+        with LineFile(self.folder / _FILE) as file:
+            line = file.append(entry)
         self._take(json.loads(line))
 
     def _take(self, entry: Mapping[str, Any]) -> None:

@@ -41,7 +41,7 @@ from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER, Change
 from evedrop.results.folder import make_private
 from evedrop.results.wire_summary import JournalState
-from evedrop.system.files import try_lock
+from evedrop.system.files import lines_in, try_lock
 from evedrop.system.output import warn
 from evedrop.system.waiting import wait_for_thread
 from evedrop.wire.history import NotedEvent, Numbered, WireHistory, highest
@@ -524,8 +524,8 @@ def words_in(unfinished: Path, start: int, links: list[str]) -> Words:
     """The words of a start that has not ended, from its file."""
     words = Words(links, {}, {})
     with contextlib.suppress(FileNotFoundError):
-        for line in _path(unfinished, start).read_bytes().splitlines():
-            with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):  # the last line may be torn
+        for line in lines_in(_path(unfinished, start)):
+            with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):  # a line may be damaged
                 kind, code, text = json.loads(line)
                 (words.keys if kind == "key" else words.sources)[int(code)] = (
                     str(text).encode("utf-8", "replace").decode()

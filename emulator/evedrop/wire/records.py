@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.links.loss_model import Fate
 from evedrop.results.folder import private_replacement
+from evedrop.results.growing_tables import parquet_writer
 from evedrop.system.files import write_all
 
 
@@ -329,8 +330,8 @@ def _codes(column: pa.ChunkedArray, codes: Mapping[str, int], none: int) -> NDAr
 
 def write_parquet(path: Path, table: pa.Table) -> None:
     """Write a Parquet file, which is complete under its name. Raises OSError if the disk is full."""
-    with private_replacement(path) as unfinished, unfinished.open("wb") as file:
-        pq.write_table(table, file, compression="zstd", compression_level=1)
+    with private_replacement(path) as unfinished, parquet_writer(unfinished, table.schema) as writer:
+        writer.write_table(table)
 
 
 def amend_parquet(path: Path, fates: Mapping[int, WireFate]) -> pa.Table:
