@@ -9,7 +9,9 @@ Source: docs/wire.md, a wire that starts again.
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, final
@@ -49,7 +51,10 @@ class _Settings:
 @final
 @dataclass
 class WireHistory:
-    """What was written so far in the file `history.jsonl` of a journal's folder, and its continuation."""
+    """What was written so far in the file `history.jsonl` of a journal's folder, and its continuation.
+
+    Threads may call its methods at the same time.
+    """
 
     folder: Path
     start: int = 0
@@ -68,6 +73,7 @@ class WireHistory:
     _settings: dict[str, list[_Settings]] = field(default_factory=dict)
     _of_new_keys: dict[str, tuple[Change, ...]] = field(default_factory=dict)
     """Link → the changes of all streams that had no message at any of them."""
+    _lock: AbstractContextManager[bool] = field(default_factory=threading.Lock, repr=False, compare=False)
 
     @classmethod
     def read(cls, folder: Path) -> WireHistory:
@@ -90,7 +96,8 @@ class WireHistory:
     @property
     def events(self) -> list[NotedEvent]:
         """The events since the latest start, with seconds since it began."""
-        return [event._replace(time=round(event.time - self.began, 3)) for event in self.noted]
+        with self._lock:
+            return [event._replace(time=round(event.time - self.began, 3)) for event in self.noted]
 
     def begin(self, plan: WirePlan, now: float) -> None:
         """Begin the next start, which has the seed of the earlier ones. Raises OSError if the disk is full."""
@@ -152,9 +159,10 @@ class WireHistory:
             )
 
     def _write(self, entry: Mapping[str, Any]) -> None:
-        with LineFile(self.folder / _FILE) as file:
-            line = file.append(entry)
-        self._take(json.loads(line))
+        with self._lock:
+            with LineFile(self.folder / _FILE) as file:
+                line = file.append(entry)
+            self._take(json.loads(line))
 
     def _take(self, entry: Mapping[str, Any]) -> None:
         if "start" in entry:
