@@ -19,7 +19,6 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER
-from evedrop.wire import journal as journal_module
 from evedrop.wire.journal import WireJournal, journal_tables, part_names, unfinished_table
 from evedrop.wire.records import (
     AGAIN,
@@ -114,17 +113,16 @@ def test_the_journal_goes_on_when_a_part_is_made_while_it_looks_at_all_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A thread that records makes a part if the journal's own thread has not made one in time."""
+    holds = JournalPart.holds
 
-    class Patience:
-        """No patience; but while a full part is looked at, another thread fills parts, unless it must wait for its turn."""
+    def looked_at(part: JournalPart) -> bool:
+        """While the first full part is looked at, another thread fills parts, unless it must wait for its turn."""
+        monkeypatch.setattr(JournalPart, "holds", holds)
+        recording.start()
+        recording.join(0.2)
+        return part.holds
 
-        def __radd__(self, settled: float) -> float:
-            monkeypatch.setattr(journal_module, "_PATIENCE", 0.0)
-            recording.start()
-            recording.join(0.2)
-            return settled
-
-    monkeypatch.setattr(journal_module, "_PATIENCE", Patience())
+    monkeypatch.setattr(JournalPart, "holds", property(looked_at))
     with WireJournal(tmp_path, wire_plan(), part_rows=2) as journal:
         recording = threading.Thread(target=lambda: [put(journal, n) for n in range(2, 12)])
         for n in range(2):
@@ -165,9 +163,8 @@ def test_another_wire_on_the_same_folder_is_refused(tmp_path: Path) -> None:
     assert [row["n"] for row in rows_of(tmp_path)] == [0, 1]
 
 
-def test_amended_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before the listeners had the row, after, and when it is in Parquet already: they add up to what the journal says."""
-    monkeypatch.setattr(journal_module, "_PATIENCE", 0.0)
+def test_amended_rows(tmp_path: Path) -> None:
+    """Before the listeners had the row, after, and when only it still waits: they add up to what the journal says."""
     tally = dict.fromkeys(WireFate, 0)
 
     def add(block: Records) -> None:
@@ -183,18 +180,21 @@ def test_amended_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with WireJournal(tmp_path, wire_plan(), part_rows=4) as journal:
         journal.listeners.append(add)
         journal.amendment_listeners.append(amend)
-        late = [put(journal, 2) for _ in range(4)]
-        wait_until((tmp_path / "journal" / "001-0001.parquet").exists, "a Parquet file")
-        journal.records.amend(late[1], WireFate.REFUSED)
+        held = journal.records.record(1002.0, 2, -1, 0.0, journal.words.key_code("scan/1"), 0, 64, 0, Kind.PUT, HELD)
+        for _ in range(7):
+            put(journal, 2)
+        wait_until((tmp_path / "journal" / "001-0002.parquet").exists, "a Parquet file")
+        journal.records.amend(held, WireFate.REFUSED)
+        wait_until((tmp_path / "journal" / "001-0001.parquet").exists, "the one before")
         handed, fresh = put(journal, 2), put(journal, 2)
         journal.flush()
         journal.records.amend(handed, WireFate.UNDERWAY)
         journal.records.amend(fresh, WireFate.REFUSED)
         journal.records.amend(put(journal, 2), WireFate.UNDERWAY)
     reasons = [row["reason"] for row in rows_of(tmp_path)]
-    assert reasons == [None, "refused", None, None, "underway", "refused", "underway"]
+    assert reasons == ["refused", *[None] * 7, "underway", "refused", "underway"]
     assert {fate: count for fate, count in tally.items() if count} == {
-        WireFate.DELIVERED: 3, WireFate.REFUSED: 2, WireFate.UNDERWAY: 2,
+        WireFate.DELIVERED: 7, WireFate.REFUSED: 2, WireFate.UNDERWAY: 2,
     }  # fmt: skip
 
 
@@ -238,9 +238,8 @@ def test_what_a_killed_wire_had_not_sent_is_underway(tmp_path: Path) -> None:
     assert [row["reason"] for row in rows_of(killed)] == ["underway", None, "underway", None]
 
 
-def test_a_file_of_rows_stays_while_one_of_them_was_not_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_of_rows_stays_while_one_of_them_was_not_sent(tmp_path: Path) -> None:
     """Its Parquet file would no longer know which; it is made as soon as all are sent, or when the wire ends."""
-    monkeypatch.setattr(journal_module, "_PATIENCE", 0.0)
     with WireJournal(tmp_path, wire_plan(), part_rows=2) as journal:
         rows = []
         for n in range(6):

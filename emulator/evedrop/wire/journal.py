@@ -59,11 +59,9 @@ from evedrop.wire.records import (
     Records,
     WireFate,
     Words,
-    amend_parquet,
     mapped_end,
     next_numbers,
     records_in,
-    records_of,
     table_of,
     write_parquet,
 )
@@ -71,7 +69,7 @@ from evedrop.wire.records import (
 PART_ROWS = 2**17
 """Records in a file: at 70 000 messages a second it is full after two seconds."""
 _TICK = 0.1  # seconds between two blocks for the listeners
-_PATIENCE = 10.0  # seconds after the last delay of a part, until its Parquet file is made, and after a full disk
+_PATIENCE = 10.0  # seconds after a full disk
 
 Listener = Callable[[Records], None]
 """Gets each block of new records."""
@@ -229,7 +227,6 @@ class WireJournal:
                 f"{self.place.unfinished}, where all commands read them; make room, and the next start of the wire makes the "
                 "files"
             )
-        self.flush()  # the amendments that came after the Parquet file of their part
 
     def __enter__(self) -> WireJournal:
         return self
@@ -268,18 +265,16 @@ class JournalRecords:
         self._number = itertools.count()
         self._next = 0  # the part whose rows are handed over now
         self._amended: deque[tuple[Records, WireFate]] = deque()
-        self._amended_late: deque[tuple[int, WireFate]] = deque()
         self._full_until = 0.0  # when to try again to write to a disk that was full
         self._add_part(0)
         self.record = self._recorder()
 
     def amend(self, row: int, fate: WireFate) -> None:
-        """Change the fate of a row that was recorded."""
+        """Change the fate of a row that was recorded as `HELD`, for which its part has waited; after the wire, nothing."""
         at, place = divmod(row, self._rows)
         with self._lock:
             part = self._parts.get(at)
             if part is None:
-                self._amended_late.append((row, fate))
                 return
             before = part.amend(place, fate)
             if place < part.handed:
@@ -306,20 +301,18 @@ class JournalRecords:
             return amended, block
 
     def tend(self, now: float) -> None:
-        """Make room for the next records, and the Parquet file of a part whose messages are all sent or lost."""
+        """Make room for the next records, and the Parquet file of a full part of which no message is `HELD`."""
         with self._lock, contextlib.suppress(OSError):  # `_room` tries again, and reports it
             part = self._parts.get(self._next)
             if part is not None and 2 * part.handed > self._rows and self._next + 1 not in self._buffers:
                 self._add_part(self._next + 1)
         with self._lock:  # a thread that records may make a part
-            settled = [at for at, part in self._parts.items() if part.full and part.settled + _PATIENCE < now]
-        over = sorted(at for at in settled if not self._parts[at].holds)
+            over = sorted(at for at, part in self._parts.items() if part.full and not part.holds)
         for at in [at for at in over if self._parts[at].path is None]:  # many parts would need too much memory
             self._convert(at)
         if now < self._full_until:
             return
         try:
-            self._amend_converted()
             for at in over[:1]:
                 if at in self._parts:
                     self._convert(at)
@@ -332,7 +325,6 @@ class JournalRecords:
 
     def write_all(self) -> None:
         """Make the Parquet files of all parts. Raises OSError if the disk is full: the parts stay as they are."""
-        self._amend_converted()
         for at in sorted(self._parts):
             self._convert(at)
 
@@ -387,36 +379,17 @@ class JournalRecords:
         Raises OSError if the disk is full: the part stays as it is. A part in memory is forgotten all the same.
         """
         part = self._parts[at]
-        while True:
-            with self._lock:
-                amendments, records = part.amendments, part.whole()
-            try:
-                self._files.write(at, records)
-                written = len(records)
-            except OSError:
-                if part.path is not None:
-                    raise
-                written = 0
-            with self._lock:
-                if amendments == part.amendments:
-                    if part.path is None:
-                        self.missing -= written
-                    part.remove()
-                    del self._parts[at], self._buffers[at]
-                    return
-
-    def _amend_converted(self) -> None:
-        """Change fates in Parquet files. Raises OSError if the disk is full."""
-        parts: dict[int, dict[int, WireFate]] = {}
-        for row, fate in [self._amended_late.popleft() for _ in range(len(self._amended_late))]:
-            at, place = divmod(row, self._rows)
-            parts.setdefault(at, {})[place] = fate
-        for at, fates in parts.items():
-            try:
-                self._amended += self._files.amend(at, fates)
-            except OSError:
-                self._amended_late.extend((at * self._rows + place, fate) for place, fate in fates.items())
+        records = part.whole()
+        try:
+            self._files.write(at, records)
+            if part.path is None:
+                self.missing -= len(records)
+        except OSError:
+            if part.path is not None:
                 raise
+        with self._lock:
+            part.remove()
+            del self._parts[at], self._buffers[at]
 
 
 @final
@@ -435,17 +408,6 @@ class PartFiles:
         """Make the Parquet file of a part; none for no records. Raises OSError if the disk is full."""
         if len(records):
             write_parquet(self._parquet(at), table_of(records, self._words.words(self._links)))
-
-    def amend(self, at: int, fates: Mapping[int, WireFate]) -> list[tuple[Records, WireFate]]:
-        """Change the fates of some rows in a part's Parquet file; returns each row as it was, (1,), and its new fate.
-
-        Raises OSError if the disk is full.
-        """
-        path, links = self._parquet(at), {name: code for code, name in enumerate(self._links)}
-        if not path.exists():  # the disk had no room for this part
-            return []
-        before = records_of(amend_parquet(path, fates), links, self._words.key_codes)
-        return [(before[i : i + 1], fate) for i, fate in enumerate(fates.values())]
 
     def _name(self, at: int) -> str:
         return f"{self._start:03d}-{at + 1:04d}"
@@ -498,11 +460,6 @@ class JournalWords:
     def key_of(self, code: int) -> str:
         """The key that has a code."""
         return self._texts["key"][code]
-
-    @property
-    def key_codes(self) -> Mapping[str, int]:
-        """Key → code."""
-        return self._codes["key"]
 
     def words(self, links: Sequence[str]) -> Words:
         """All codes so far and what they stand for. links: the names of the links, in the order of their codes."""

@@ -205,7 +205,8 @@ class PublicationRelay:
         """The function that is called for every message: it looks up as little as possible."""
         ways_of: dict[str, _Ways] = {}
         now, clock, way_to = time.time, time.monotonic, self._way_to
-        record, amend = self._journal.records.record, self._journal.records.amend
+        records = self._journal.records
+        record, amend, sent = records.record, records.amend, records.sent
         read = SenderReader(self._journal.words.source_code)
         put, put_kind, delete_kind = zenoh.SampleKind.PUT, int(Kind.PUT), int(Kind.DELETE)
         unlinked, underway, zenoh_error = int(WireFate.UNLINKED), int(WireFate.UNDERWAY), zenoh.ZError
@@ -245,7 +246,7 @@ class PublicationRelay:
                     size,
                     way.link,
                     kind | AGAIN if again else kind,
-                    fate or (0 if at_once else HELD),
+                    fate or HELD,
                 )
                 if fate:
                     continue
@@ -259,6 +260,7 @@ class PublicationRelay:
                         continue
                     begun = clock()
                     message()
+                    sent(row)
                     if clock() - begun > LONG_SECONDS:
                         send_queue.took(clock() - begun, way.alone)
                 except zenoh_error:
