@@ -70,6 +70,7 @@ PART_ROWS = 2**17
 """Records in a file: at 70 000 messages a second it is full after two seconds."""
 _TICK = 0.1  # seconds between two blocks for the listeners
 _PATIENCE = 10.0  # seconds after a full disk
+_NOT_HELD = ~HELD & 0xFF
 
 Listener = Callable[[Records], None]
 """Gets each block of new records."""
@@ -250,6 +251,8 @@ class JournalRecords:
 
     record: (time, n, sequence, delay, key code, source code, size, link code, kind, fate) → the row's number, for `amend`; the
     arguments are as in `RECORD`.
+
+    sent: (row) → None: a message whose row was recorded as `HELD` has been delivered.
     """
 
     def __init__(self, files: PartFiles, part_rows: int, miss: Callable[[OSError], None]) -> None:
@@ -267,7 +270,7 @@ class JournalRecords:
         self._amended: deque[tuple[Records, WireFate]] = deque()
         self._full_until = 0.0  # when to try again to write to a disk that was full
         self._add_part(0)
-        self.record = self._recorder()
+        self.record, self.sent = self._recorder(), self._sender()
 
     def amend(self, row: int, fate: WireFate) -> None:
         """Change the fate of a row that was recorded as `HELD`, for which its part has waited; after the wire, nothing."""
@@ -279,12 +282,6 @@ class JournalRecords:
             before = part.amend(place, fate)
             if place < part.handed:
                 self._amended.append((before, fate))
-
-    def sent(self, row: int) -> None:
-        """Note that a message whose row was recorded as `HELD` has been delivered."""
-        at, place = divmod(row, self._rows)
-        if (buffer := self._buffers.get(at)) is not None:  # its Parquet file never has the mark
-            buffer[(place + 1) * RECORD.itemsize - 1] &= ~HELD & 0xFF
 
     def take(self) -> tuple[list[tuple[Records, WireFate]], Records]:
         """The rows (1,) that were taken before and amended since, with the fates that they have now; and the next new rows."""
@@ -358,6 +355,17 @@ class JournalRecords:
             return row
 
         return record
+
+    def _sender(self) -> Callable[[int], None]:
+        """The function `sent`, which looks nothing up in the object either."""
+        rows, width, fate, part_of = self._rows, RECORD.itemsize, RECORD.itemsize - 1, self._buffers.get
+
+        def sent(row: int) -> None:
+            buffer = part_of(row // rows)
+            if buffer is not None:  # it is None after the wire
+                buffer[row % rows * width + fate] &= _NOT_HELD
+
+        return sent
 
     def _room(self, at: int) -> None:
         """Make a part in the thread that records, because the journal's own thread could not do so in time."""
