@@ -358,12 +358,12 @@ class JournalRecords:
 
     def _sender(self) -> Callable[[int], None]:
         """The function `sent`, which looks nothing up in the object either."""
-        rows, width, fate, part_of = self._rows, RECORD.itemsize, RECORD.itemsize - 1, self._buffers.get
+        rows, width, last, part_of = self._rows, RECORD.itemsize, RECORD.itemsize - 1, self._buffers.get
 
         def sent(row: int) -> None:
             buffer = part_of(row // rows)
             if buffer is not None:  # it is None after the wire
-                buffer[row % rows * width + fate] &= _NOT_HELD
+                buffer[row % rows * width + last] &= _NOT_HELD
 
         return sent
 
