@@ -146,8 +146,8 @@ def _killed_wire() -> dict[str, bytes]:
         for start in range(2):
             journal = WireJournal(Path(name), wire_plan(), part_rows=8)
             for n in range(8 * start, 8 * start + 12):
-                key, source = journal.key_code(f"scan/{n % 2}"), journal.source_code("gid")
-                journal.record(1e9 + n, n // 2, n, 0.25, key, source, 64, 0, 0, n % 3)
+                key, source = journal.words.key_code(f"scan/{n % 2}"), journal.words.source_code("gid")
+                journal.records.record(1e9 + n, n // 2, n, 0.25, key, source, 64, 0, 0, n % 3)
             journal.change("scan", {"loss": {"model": "bernoulli", "quality": 0.5}}, {("scan/0", "put"): 4})
             if start == 0:
                 journal.close()
@@ -169,7 +169,7 @@ def _in_wire(file: str) -> Callable[[bytes, Path], None]:
         with contextlib.suppress(EvedropError):
             [*wire_failures(scorekeeper_on_disk(folder, wire_plan()).summary())]
         with WireJournal(folder, wire_plan()) as journal:
-            journal.changes_of("scan", "scan/0", "put")
+            journal.history.changes_of("scan", "scan/0", "put")
 
     return look
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.system.files import whole_file, write_all
+from evedrop.system.files import LineFile, lines_in, whole_file
 
 
 def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
@@ -27,19 +27,43 @@ def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
     assert sorted(tmp_path.iterdir()) == [path, link]
 
 
-def test_a_line_of_which_only_a_part_fits_is_an_error(tmp_path: Path) -> None:
-    """A pipe that nobody reads has only so much room, as a full disk has."""
-    reading, writing = os.pipe()
-    os.set_blocking(writing, False)
-    try:
-        write_all(writing, b"whole\n")
-        assert os.read(reading, 100) == b"whole\n"
-        with pytest.raises(OSError, match="No space left") as caught:
-            write_all(writing, bytes(2**22), tmp_path)
-    finally:
-        os.close(reading)
-        os.close(writing)
-    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, tmp_path)
+@pytest.mark.parametrize("room", range(9))
+def test_a_line_for_which_the_disk_has_no_room_does_not_count(
+    room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever part of it fits: the file stays as it was, and goes on when there is room again."""
+    write = os.write
+
+    def write_some(file: int, data: memoryview) -> int:
+        nonlocal room
+        if not room:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written = write(file, data[: min(room, 3)])
+        room -= written
+        return written
+
+    path = tmp_path / "lines"
+    with LineFile(path) as file:
+        file.append(["first"])
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "write", write_some)
+            with pytest.raises(OSError, match="No space left"):
+                file.append(["second"])
+        assert lines_in(path) == [b'["first"]']
+        file.append(["third"])
+    assert lines_in(path) == [b'["first"]', b'["third"]']
+
+
+@pytest.mark.parametrize("torn", ["", "[", '["second"'])
+def test_a_file_of_lines_goes_on_after_a_kill(torn: str, tmp_path: Path) -> None:
+    """A line that was being written is not read, and does not become the beginning of the next."""
+    path = tmp_path / "lines"
+    path.write_text(f'["first"]\n{torn}')
+    assert lines_in(path) == [b'["first"]']
+    with LineFile(path) as file:
+        file.append({"third": 3})
+    assert path.read_text() == '["first"]\n{"third": 3}\n'
+    assert lines_in(path, last=13) == [b'{"third": 3}']
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("no")])

@@ -19,7 +19,6 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER
-from evedrop.wire import journal as journal_module
 from evedrop.wire.journal import WireJournal, journal_tables, part_names, unfinished_table
 from evedrop.wire.records import (
     AGAIN,
@@ -79,7 +78,7 @@ def put(
     journal: WireJournal, n: int, fate: WireFate = WireFate.DELIVERED, *, key: str = "scan/1", delay: float = 0.0
 ) -> int:
     """Record a put on the first link."""
-    return int(journal.record(1000.0 + n, n, -1, delay, journal.key_code(key), 0, 64, 0, Kind.PUT, fate))
+    return int(journal.records.record(1000.0 + n, n, -1, delay, journal.words.key_code(key), 0, 64, 0, Kind.PUT, fate))
 
 
 def test_every_record_of_many_threads_is_in_parquet_exactly_once(tmp_path: Path) -> None:
@@ -114,17 +113,16 @@ def test_the_journal_goes_on_when_a_part_is_made_while_it_looks_at_all_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A thread that records makes a part if the journal's own thread has not made one in time."""
+    holds = JournalPart.holds
 
-    class Patience:
-        """No patience; but while a full part is looked at, another thread fills parts, unless it must wait for its turn."""
+    def looked_at(part: JournalPart) -> bool:
+        """While the first full part is looked at, another thread fills parts, unless it must wait for its turn."""
+        monkeypatch.setattr(JournalPart, "holds", holds)
+        recording.start()
+        recording.join(0.2)
+        return part.holds
 
-        def __radd__(self, settled: float) -> float:
-            monkeypatch.setattr(journal_module, "_PATIENCE", 0.0)
-            recording.start()
-            recording.join(0.2)
-            return settled
-
-    monkeypatch.setattr(journal_module, "_PATIENCE", Patience())
+    monkeypatch.setattr(JournalPart, "holds", property(looked_at))
     with WireJournal(tmp_path, wire_plan(), part_rows=2) as journal:
         recording = threading.Thread(target=lambda: [put(journal, n) for n in range(2, 12)])
         for n in range(2):
@@ -137,10 +135,10 @@ def test_the_journal_goes_on_when_a_part_is_made_while_it_looks_at_all_parts(
 def test_a_row_says_all_that_was_recorded(tmp_path: Path) -> None:
     """Names in place of codes, null where there is nothing, and sizes that do not fit as the largest."""
     with WireJournal(tmp_path, wire_plan()) as journal:
-        key, source = journal.key_code("scan/ä"), journal.source_code("gid")
-        journal.record(1.5, 3, 2**40, 0.25, key, source, 64, 0, Kind.PUT | AGAIN, WireFate.DELIVERED)
-        journal.record(2.5, -1, -1, 0.0, key, 0, 2**33, UNLINKED, Kind.QUERY, WireFate.UNLINKED)
-        journal.record(3.5, 4, -1, 0.0, key, 0, 0, 0, Kind.DELETE, WireFate.LOST)
+        key, source = journal.words.key_code("scan/ä"), journal.words.source_code("gid")
+        journal.records.record(1.5, 3, 2**40, 0.25, key, source, 64, 0, Kind.PUT | AGAIN, WireFate.DELIVERED)
+        journal.records.record(2.5, -1, -1, 0.0, key, 0, 2**33, UNLINKED, Kind.QUERY, WireFate.UNLINKED)
+        journal.records.record(3.5, 4, -1, 0.0, key, 0, 0, 0, Kind.DELETE, WireFate.LOST)
     first = {"time": 1.5, "link": "scan", "key": "scan/ä", "size": 64, "source": "gid", "sequence": 2**40, "fate": "delivered",
              "reason": None, "delay": 0.25, "n": 3, "kind": "put", "again": True}  # fmt: skip
     second = {"time": 2.5, "link": None, "key": "scan/ä", "size": 2**32 - 1, "source": None, "sequence": None,
@@ -165,9 +163,8 @@ def test_another_wire_on_the_same_folder_is_refused(tmp_path: Path) -> None:
     assert [row["n"] for row in rows_of(tmp_path)] == [0, 1]
 
 
-def test_amended_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before the listeners had the row, after, and when it is in Parquet already: they add up to what the journal says."""
-    monkeypatch.setattr(journal_module, "_PATIENCE", 0.0)
+def test_amended_rows(tmp_path: Path) -> None:
+    """Before the listeners had the row, after, and when only it still waits: they add up to what the journal says."""
     tally = dict.fromkeys(WireFate, 0)
 
     def add(block: Records) -> None:
@@ -183,18 +180,21 @@ def test_amended_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with WireJournal(tmp_path, wire_plan(), part_rows=4) as journal:
         journal.listeners.append(add)
         journal.amendment_listeners.append(amend)
-        late = [put(journal, 2) for _ in range(4)]
-        wait_until((tmp_path / "journal" / "001-0001.parquet").exists, "a Parquet file")
-        journal.amend(late[1], WireFate.REFUSED)
+        held = journal.records.record(1002.0, 2, -1, 0.0, journal.words.key_code("scan/1"), 0, 64, 0, Kind.PUT, HELD)
+        for _ in range(7):
+            put(journal, 2)
+        wait_until((tmp_path / "journal" / "001-0002.parquet").exists, "a Parquet file")
+        journal.records.amend(held, WireFate.REFUSED)
+        wait_until((tmp_path / "journal" / "001-0001.parquet").exists, "the one before")
         handed, fresh = put(journal, 2), put(journal, 2)
         journal.flush()
-        journal.amend(handed, WireFate.UNDERWAY)
-        journal.amend(fresh, WireFate.REFUSED)
-        journal.amend(put(journal, 2), WireFate.UNDERWAY)
+        journal.records.amend(handed, WireFate.UNDERWAY)
+        journal.records.amend(fresh, WireFate.REFUSED)
+        journal.records.amend(put(journal, 2), WireFate.UNDERWAY)
     reasons = [row["reason"] for row in rows_of(tmp_path)]
-    assert reasons == [None, "refused", None, None, "underway", "refused", "underway"]
+    assert reasons == ["refused", *[None] * 7, "underway", "refused", "underway"]
     assert {fate: count for fate, count in tally.items() if count} == {
-        WireFate.DELIVERED: 3, WireFate.REFUSED: 2, WireFate.UNDERWAY: 2,
+        WireFate.DELIVERED: 7, WireFate.REFUSED: 2, WireFate.UNDERWAY: 2,
     }  # fmt: skip
 
 
@@ -205,7 +205,7 @@ def test_numbers_go_on_after_a_kill_whatever_the_killed_wire_heard(tmp_path: Pat
         for n in range(5):
             put(journal, n, key="scan/old")
     with WireJournal(folder, wire_plan()) as journal:
-        journal.record(1.0, 3, -1, 0.0, journal.key_code("scan/new"), 0, 0, 0, Kind.DELETE, WireFate.LOST)
+        journal.records.record(1.0, 3, -1, 0.0, journal.words.key_code("scan/new"), 0, 0, 0, Kind.DELETE, WireFate.LOST)
         shutil.copytree(folder, killed)  # as the disk is when the wire is killed now
     with WireJournal(killed, wire_plan()) as journal:
         assert journal.counts == {("scan", "scan/old", "put"): 5, ("scan", "scan/new", "put"): 4}
@@ -227,10 +227,10 @@ def test_what_a_killed_wire_had_not_sent_is_underway(tmp_path: Path) -> None:
     folder, killed = tmp_path / "wire", tmp_path / "killed"
     with WireJournal(folder, wire_plan()) as journal:
         for n, delay in enumerate((3600.0, 3600.0, 0.0, 0.0)):
-            code = journal.key_code("scan/1")
-            row = journal.record(time.time(), n, -1, delay, code, 0, 0, 0, Kind.PUT, WireFate.DELIVERED | HELD)
+            code = journal.words.key_code("scan/1")
+            row = journal.records.record(time.time(), n, -1, delay, code, 0, 0, 0, Kind.PUT, WireFate.DELIVERED | HELD)
             if n % 2:
-                journal.sent(row)
+                journal.records.sent(row)
         assert [row["reason"] for row in rows_of(folder)] == [None] * 4
         shutil.copytree(folder, killed)
     with WireJournal(killed, wire_plan()):
@@ -238,18 +238,21 @@ def test_what_a_killed_wire_had_not_sent_is_underway(tmp_path: Path) -> None:
     assert [row["reason"] for row in rows_of(killed)] == ["underway", None, "underway", None]
 
 
-def test_a_file_of_rows_stays_while_one_of_them_was_not_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_of_rows_stays_while_one_of_them_was_not_sent(tmp_path: Path) -> None:
     """Its Parquet file would no longer know which; it is made as soon as all are sent, or when the wire ends."""
-    monkeypatch.setattr(journal_module, "_PATIENCE", 0.0)
     with WireJournal(tmp_path, wire_plan(), part_rows=2) as journal:
         rows = []
         for n in range(6):
             fate = WireFate.DELIVERED | HELD if n in (0, 4) else WireFate.DELIVERED
-            rows.append(journal.record(time.time() - 60.0, n, -1, 0.0, journal.key_code("a"), 0, 0, 0, Kind.PUT, fate))
+            rows.append(
+                journal.records.record(
+                    time.time() - 60.0, n, -1, 0.0, journal.words.key_code("a"), 0, 0, 0, Kind.PUT, fate
+                )
+            )
         made = tmp_path / "journal"
         wait_until((made / "001-0002.parquet").exists, "the file of the rows that are sent")
         assert not (made / "001-0001.parquet").exists()
-        journal.sent(rows[0])
+        journal.records.sent(rows[0])
         wait_until((made / "001-0001.parquet").exists, "the file, after all are sent")
         assert not (made / "001-0003.parquet").exists()
     assert [row["reason"] for row in rows_of(tmp_path)] == [None] * 6
@@ -288,17 +291,19 @@ def test_the_settings_that_each_message_had_are_known_after_a_restart(tmp_path: 
         put(first, n)
     first.change("scan", BETTER, {("scan/1", "put"): 6})
     first.close()
-    assert [(change.at, change.settings) for change in first.changes_of("scan", "scan/1", "put")] == [
+    assert [(change.at, change.settings) for change in first.history.changes_of("scan", "scan/1", "put")] == [
         (0, LOSSY),
         (6, BETTER),
     ]
-    assert [(change.at, change.settings) for change in first.changes_of("scan", "scan/2", "put")] == [(0, BETTER)]
+    assert [(change.at, change.settings) for change in first.history.changes_of("scan", "scan/2", "put")] == [
+        (0, BETTER)
+    ]
     history = tmp_path / "journal" / "history.jsonl"
     history.write_bytes(history.read_bytes() + b'{"change": "sc')  # torn
     with WireJournal(tmp_path, wire_plan()) as second:
-        changes = [(change.at, change.settings) for change in second.changes_of("scan", "scan/1", "put")]
+        changes = [(change.at, change.settings) for change in second.history.changes_of("scan", "scan/1", "put")]
         assert changes == [(0, LOSSY), (6, BETTER), (10, LOSSY)]
-        assert [change.at for change in second.changes_of("scan", "scan/2", "put")] == [0]
+        assert [change.at for change in second.history.changes_of("scan", "scan/2", "put")] == [0]
     assert [json.loads(line).get("start") for line in history.read_text().splitlines()] == [1, None, None, 2, None]
     history.write_text("nonsense\n")
     with pytest.raises(UsageError, match=r"history.jsonl, line 1, is not the history of a wire; give another folder"):
@@ -310,16 +315,16 @@ def test_a_history_goes_on_although_its_session_has_another_id(killed: bool, tmp
     """After the end of the wire or of its process: messages of `KEY/@adv/…` have one number after another."""
     folder, plan = tmp_path / "wire", wire_plan()
     with WireJournal(folder, plan) as first:
-        code = first.key_code("scan/1/@adv/pub/aa/1/_")
+        code = first.words.key_code("scan/1/@adv/pub/aa/1/_")
         for n in range(3):
-            first.record(time.time(), n, -1, 0.0, code, 0, 8, 0, Kind.QUERY, WireFate.DELIVERED)
+            first.records.record(time.time(), n, -1, 0.0, code, 0, 8, 0, Kind.QUERY, WireFate.DELIVERED)
         first.change("scan", BETTER, {("scan/1/@adv", "query"): 2})
         if killed:
             shutil.copytree(folder, tmp_path / "killed")
     with WireJournal(tmp_path / "killed" if killed else folder, plan) as second:
         decide = RunningLink(plan.links[0], plan, second).lane("query", "scan/1/@adv/pub/bb/1/_", lossless=False)
         assert decide(time.time(), 8)[0] == 3
-        changes = second.changes_of("scan", "scan/1/@adv/*/cc/9/**", "query")
+        changes = second.history.changes_of("scan", "scan/1/@adv/*/cc/9/**", "query")
         assert [(change.at, change.settings) for change in changes] == [(0, LOSSY), (2, BETTER), (3, LOSSY)]
 
 
@@ -341,9 +346,9 @@ def write(first):
     journal = WireJournal(folder, wire_plan(), part_rows=3000)
     assert journal.counts.get(("scan", "scan/1", "put"), 0) >= first
     n = first = journal.counts.get(("scan", "scan/1", "put"), 0)
-    key = journal.key_code("scan/1")
+    key = journal.words.key_code("scan/1")
     while True:
-        journal.record(time.time(), n, n, 0.0 if n % 2 else 3600.0, key, 0, 64, 0, Kind.PUT, 0 if n % 2 else HELD)
+        journal.records.record(time.time(), n, n, 0.0 if n % 2 else 3600.0, key, 0, 64, 0, Kind.PUT, 0 if n % 2 else HELD)
         n += 1
         recorded[0] = n
 
@@ -412,21 +417,21 @@ if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "none", disk], stder
 told, heard = [], []
 with WireJournal(disk / "run", wire_plan(), tell=told.append, part_rows=1000) as journal:
     journal.listeners.append(lambda block: heard.extend(block["n"].tolist()))
-    key = journal.key_code("scan/1")
+    key = journal.words.key_code("scan/1")
     for n in range(20_000):
-        journal.record(time.time(), n, -1, 0.0, key, 0, 64, 0, Kind.PUT, 0)
+        journal.records.record(time.time(), n, -1, 0.0, key, 0, 64, 0, Kind.PUT, 0)
     fill("rest")
     for code in range(3000):
-        journal.key_code(f"scan/a/long/name/of/a/key/{code}")
-    assert [journal.key_code("scan/1"), journal.key_code("scan/a/long/name/of/a/key/2999")] == [1, 3001]
+        journal.words.key_code(f"scan/a/long/name/of/a/key/{code}")
+    assert [journal.words.key_code("scan/1"), journal.words.key_code("scan/a/long/name/of/a/key/2999")] == [1, 3001]
     journal.flush()
     assert heard == list(range(20_000))
-    assert journal.incomplete_since is not None and 10_000 < journal.missing < 20_000, journal.missing
+    assert journal.place.incomplete_since is not None and 10_000 < journal.records.missing < 20_000, journal.records.missing
     if room_again:
         (disk / "other").unlink()
-assert (journal.missing == 0) == room_again, journal.missing
+assert (journal.records.missing == 0) == room_again, journal.records.missing
 rows = [row for table in journal_tables(disk / "run") for row in table.to_pylist()]
-assert [row["n"] for row in rows] == list(range(20_000 - journal.missing))
+assert [row["n"] for row in rows] == list(range(20_000 - journal.records.missing))
 assert {row["key"] for row in rows} == {"scan/1"}
 print(*told, sep="\\n")
 """

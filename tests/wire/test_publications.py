@@ -106,7 +106,7 @@ def test_the_nth_message_of_a_key_has_the_fate_that_the_seed_gives(tmp_path: Pat
 
         def rows() -> Any:
             rows = wire.rows
-            return rows[rows["key"] == wire.journal.key_code("scan")]
+            return rows[rows["key"] == wire.journal.words.key_code("scan")]
 
         wait_until(lambda: len(rows()) == 200, "the wire hears all")
         fates = KeyFates(plan.links[0], "scan", "put", plan.seed)
@@ -165,9 +165,9 @@ def test_deletes_puts_and_sizes_are_recorded(tmp_path: Path) -> None:
         sender.put("a", b"12345", attachment=b"67", source_info=zenoh.SourceInfo(sender.id, 12))
         sender.delete("a")
         wait_until(lambda: len(wire.rows) >= before + 2, "the wire hears")
-        put, delete = [row for row in wire.rows if row["key"] == wire.journal.key_code("a")]
+        put, delete = [row for row in wire.rows if row["key"] == wire.journal.words.key_code("a")]
         assert (put["kind"], put["size"], put["sequence"], put["n"]) == (Kind.PUT, 7, 12, 0)
-        assert put["source"] == wire.journal.source_code(f"{sender.zid()}/{sender.id.eid}")
+        assert put["source"] == wire.journal.words.source_code(f"{sender.zid()}/{sender.id.eid}")
         assert (delete["kind"], delete["size"], delete["sequence"], delete["n"]) == (Kind.DELETE, 0, -1, 1)
 
 

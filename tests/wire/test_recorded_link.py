@@ -60,15 +60,15 @@ def carried(
                     n,
                     n + 1,
                     delay,
-                    journal.key_code(key),
-                    journal.source_code("a"),
+                    journal.words.key_code(key),
+                    journal.words.source_code("a"),
                     64,
                     0,
                     kind,
                     fate,
                 )
-                journal.record(*row)
-            journal.record(1e9, 0, 1, 0.0, journal.key_code(key), 0, 64, 1, Kind.PUT, WireFate.DELIVERED)
+                journal.records.record(*row)
+            journal.records.record(1e9, 0, 1, 0.0, journal.words.key_code(key), 0, 64, 1, Kind.PUT, WireFate.DELIVERED)
 
 
 def test_the_models_of_a_link_are_found_again(tmp_path: Path) -> None:
@@ -135,11 +135,13 @@ def test_missing_numbers_are_what_was_lost_before_the_wire(tmp_path: Path) -> No
         n = 0
         for (key, source), word in words.items():
             for number in np.flatnonzero(word).tolist():
-                codes = (journal.key_code(key), journal.source_code(source))
+                codes = (journal.words.key_code(key), journal.words.source_code(source))
                 fate = WireFate.LOST if n % 3 == 0 else WireFate.DELIVERED
-                journal.record(1e9 + 0.1 * number, n, number + 1, 0.0, *codes, 64, 0, Kind.PUT, fate)
+                journal.records.record(1e9 + 0.1 * number, n, number + 1, 0.0, *codes, 64, 0, Kind.PUT, fate)
                 n += 1
-        journal.record(1e9, 0, 5, 0.0, journal.key_code("0/scan/q"), 0, 64, 0, Kind.QUERY, WireFate.DELIVERED)
+        journal.records.record(
+            1e9, 0, 5, 0.0, journal.words.key_code("0/scan/q"), 0, 64, 0, Kind.QUERY, WireFate.DELIVERED
+        )
     result = journal_recording(tmp_path, gaps=True)
     expected: list[int] = []
     for word in words.values():

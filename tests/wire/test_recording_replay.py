@@ -42,12 +42,12 @@ def folder(tmp_path: Path, rows: NDArray[Any]) -> Path:
     (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
     for _ in range(2):  # only the second start is shown
         with WireJournal(tmp_path, plan, part_rows=1000) as journal:
-            key, later = journal.key_code("robot/scan"), time.time() - START
+            key, later = journal.words.key_code("robot/scan"), time.time() - START
             for now, n, sequence, delay, _, _, size, link, kind, fate in rows.tolist():
-                journal.record(now + later, n, sequence, delay, key, 0, size, link, kind, fate)
+                journal.records.record(now + later, n, sequence, delay, key, 0, size, link, kind, fate)
             journal.note("partition robot, base")
             journal.note("heal robot, base")
-            journal.record(START + later + 1.0, -1, -1, 0.0, key, 0, 5, UNLINKED, Kind.PUT, WireFate.UNLINKED)
+            journal.records.record(START + later + 1.0, -1, -1, 0.0, key, 0, 5, UNLINKED, Kind.PUT, WireFate.UNLINKED)
     return tmp_path
 
 

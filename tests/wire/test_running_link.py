@@ -113,7 +113,9 @@ def test_other_settings_hold_from_the_next_message_on(tmp_path: Path) -> None:
         assert [scan(0.0, 10), pose(0.0, 10)] == [(3, 0, 2.0, False), (0, 0, 3.0, False)]
         state.change(SLOW)
         assert scan(0.0, 10) == (4, 0, 0.25, True)
-        messages = [[change.at for change in journal.changes_of("robot-base", key, "put")] for key in ("scan", "pose")]
+        messages = [
+            [change.at for change in journal.history.changes_of("robot-base", key, "put")] for key in ("scan", "pose")
+        ]
     assert [at[-2:] for at in messages] == [[3, 4], [0, 1]]
 
 
@@ -215,7 +217,7 @@ def test_a_key_that_only_the_journal_remembers_goes_on(lossy: RunningLink, tmp_p
     decide = lossy.lane("put", "scan", lossless)
     journal = lossy._journal
     for n in range(50):
-        journal.record(1.0, decide(float(n), 1)[0], -1, 0.0, journal.key_code("scan"), 0, 1, 0, 0, 0)
+        journal.records.record(1.0, decide(float(n), 1)[0], -1, 0.0, journal.words.key_code("scan"), 0, 1, 0, 0, 0)
     journal.flush()
     lossy.forget("put", "scan")
     assert not lossy._numbers

@@ -29,15 +29,17 @@ class Queue:
         self.told: list[str] = []
         self.sent: list[int] = []
         self.lost: list[int] = []
-        self.send_queue = SendQueue("base", plan, self.journal, self.told.append, **limits)
+        self.send_queue = SendQueue("base", plan, self.journal.records, self.told.append, **limits)
         self._takes = threading.Semaphore(0)
         self._count = 0
 
     def give(self, size: int = 1, patient: bool = False, delay: float = 0.0) -> int:
         """Send a message; returns its row."""
         n, self._count = self._count, self._count + 1
-        code = self.journal.key_code("scan")
-        row = self.journal.record(time.time(), n, -1, delay, code, 0, size, 0, Kind.PUT, WireFate.DELIVERED | HELD)
+        code = self.journal.words.key_code("scan")
+        row = self.journal.records.record(
+            time.time(), n, -1, delay, code, 0, size, 0, Kind.PUT, WireFate.DELIVERED | HELD
+        )
 
         def task() -> None:
             if not self._takes.acquire(timeout=LIMIT):
@@ -180,8 +182,8 @@ def test_a_delayed_message_is_held_up_or_congested(tmp_path: Path) -> None:
 
 def test_an_error_stops_one_message_only(queue: Queue) -> None:
     """What must follow is carried out in its turn."""
-    code, order = queue.journal.key_code("scan"), list[str]()
-    row = queue.journal.record(time.time(), 0, -1, 0.0, code, 0, 1, 0, Kind.PUT, WireFate.DELIVERED | HELD)
+    code, order = queue.journal.words.key_code("scan"), list[str]()
+    row = queue.journal.records.record(time.time(), 0, -1, 0.0, code, 0, 1, 0, Kind.PUT, WireFate.DELIVERED | HELD)
     queue.send_queue.send(0.0, 1, row, lambda: 1 / 0, patient=False)
     queue.send_queue.follow(lambda: 1 / 0)
     queue.give()

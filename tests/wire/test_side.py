@@ -128,7 +128,9 @@ def test_a_router_that_joins_two_sides_is_reported_and_nothing_goes_round(tmp_pa
             robot.put("stop", b"")
             wait_until(lambda: len(wire.rows_of("stop")), "the wire hears a lossless one")
             assert set(wire.rows_of("stop")["fate"]) == {WireFate.LOOPED}
-            (bypass,) = [event.line for event in wire.journal.events if event.bypass]  # programs speak past the wire
+            (bypass,) = [
+                event.line for event in wire.journal.history.events if event.bypass
+            ]  # programs speak past the wire
             assert "outside the wire, through the router " in bypass
         wait_until(lambda: any("no longer pass between the sides" in line for line in wire.told), "its end is reported")
         got = reader(base, "y")

@@ -104,7 +104,7 @@ def is_on_disk(wire: Wire) -> None:
     assert not (wire.out / "control.json").exists()
     with WireJournal(wire.out, load_wire(wire.file)) as journal:
         assert journal.recovered == summary.heard
-        assert journal.start == 2
+        assert journal.history.start == 2
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def multicast(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 def bypasses(at: WireAtWork) -> list[str]:
     """The ways past the wire that its journal has."""
-    return [event.line for event in at.journal.events if event.bypass]
+    return [event.line for event in at.journal.history.events if event.bypass]
 
 
 def told(at: WireAtWork, beginning: str) -> bool:

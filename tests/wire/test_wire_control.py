@@ -50,7 +50,7 @@ def test_a_wire_is_steered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
             command("link", "robot-base", "quality=0.9")
             == '0 link robot-base: loss = { model = "bernoulli", quality = 0.9 }'
         )
-        assert wire.journal.changes_of("robot-base", "new", "put")[-1].settings["loss"]["quality"] == 0.9  # type: ignore[index]
+        assert wire.journal.history.changes_of("robot-base", "new", "put")[-1].settings["loss"]["quality"] == 0.9  # type: ignore[index]
         assert command("link", "robot-base", "cut") == "0 cut robot-base"
         assert wire.relay.links["robot-base"].cut
         assert command("partition", "robot", "base") == "0 partition robot, base"

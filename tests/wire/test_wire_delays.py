@@ -172,7 +172,7 @@ def test_an_advanced_reader_recovers_what_a_link_lost(tmp_path: Path) -> None:
 
             def delivered() -> int:
                 rows = wire.rows
-                of_scan = (rows["key"] == wire.journal.key_code("scan")) & (rows["kind"] == Kind.PUT)
+                of_scan = (rows["key"] == wire.journal.words.key_code("scan")) & (rows["kind"] == Kind.PUT)
                 return int((of_scan & (rows["fate"] == WireFate.DELIVERED)).sum())
 
             wait_until(lambda: len(wire.rows) >= 30 and len(got) > delivered(), "it gets lost ones too")

@@ -78,14 +78,18 @@ def test_what_cannot_be_written_into_a_removed_folder_is_told_once(tmp_path: Pat
     told: list[str] = []
     with WireJournal(tmp_path, wire_plan(), tell=told.append, part_rows=4) as journal:
         for n in range(3):
-            journal.record(1.0, n, -1, 0.0, journal.key_code("scan"), 0, 8, 0, Kind.PUT, WireFate.DELIVERED)
+            journal.records.record(
+                1.0, n, -1, 0.0, journal.words.key_code("scan"), 0, 8, 0, Kind.PUT, WireFate.DELIVERED
+            )
         shutil.rmtree(tmp_path / "journal")
         journal.note("cut scan")
-        assert journal.removed
-        assert journal.incomplete_since is not None
+        assert journal.place.removed
+        assert journal.place.incomplete_since is not None
         for n in range(3, 20):
-            journal.record(1.0, n, -1, 0.0, journal.key_code("scan"), 0, 8, 0, Kind.PUT, WireFate.DELIVERED)
+            journal.records.record(
+                1.0, n, -1, 0.0, journal.words.key_code("scan"), 0, 8, 0, Kind.PUT, WireFate.DELIVERED
+            )
         journal.note("heal scan")
     (line,) = told
     assert "was removed or moved while the wire runs" in line
-    assert (journal.recorded, journal.missing) == (20, 20)
+    assert (journal.recorded, journal.records.missing) == (20, 20)

@@ -232,19 +232,21 @@ def test_metrics_from_the_disk_are_those_of_the_wire(tmp_path: Path) -> None:
         fates = [*WireFate]
         for n in range(600):
             kind = list(Kind)[n % 4] | (AGAIN if n % 7 == 0 and fates[n % 5] == WireFate.DELIVERED else 0)
-            key = journal.key_code(f"scan/{n % 3}")
-            row = journal.record(1e9 + n, n // 12, -1, 0.01 * n, key, 0, n, n % 2, kind, fates[n % 5])
+            key = journal.words.key_code(f"scan/{n % 3}")
+            row = journal.records.record(1e9 + n, n // 12, -1, 0.01 * n, key, 0, n, n % 2, kind, fates[n % 5])
             if n == 300:
                 journal.change("scan", {"loss": {"model": "bernoulli", "quality": 0.9}}, {("scan/0", "put"): 25})
             if n == 500:
-                journal.amend(row, WireFate.UNDERWAY)
+                journal.records.amend(row, WireFate.UNDERWAY)
         journal.flush()
         live, on_disk = keeper.summary(), scorekeeper_on_disk(tmp_path, plan).summary()
         assert on_disk.links == live.links
         assert on_disk.heard == 600
     assert scorekeeper_on_disk(tmp_path, plan).summary().links == keeper.summary().links
     with WireJournal(tmp_path, plan) as journal:
-        journal.record(1e9, 50, -1, 0.0, journal.key_code("scan/0"), 0, 64, 0, Kind.PUT, WireFate.DELIVERED)
+        journal.records.record(
+            1e9, 50, -1, 0.0, journal.words.key_code("scan/0"), 0, 64, 0, Kind.PUT, WireFate.DELIVERED
+        )
         journal.flush()
         summary = scorekeeper_on_disk(tmp_path, plan).summary()
     assert (summary.start, summary.heard, summary.links["scan"].delivered) == (2, 1, 1)
@@ -255,7 +257,7 @@ def test_a_journal_with_two_fates_of_a_message_is_refused(tmp_path: Path) -> Non
     plan = wire_plan()
     with WireJournal(tmp_path, plan) as journal:
         for n in (4, 5, 4, 6):
-            journal.record(1e9, n, -1, 0.0, journal.key_code("scan/0"), 0, 64, 0, Kind.PUT, WireFate.LOST)
+            journal.records.record(1e9, n, -1, 0.0, journal.words.key_code("scan/0"), 0, 64, 0, Kind.PUT, WireFate.LOST)
         journal.flush()
         with pytest.raises(UsageError, match="two fates for message 4 of 'scan/0' on the link 'scan'"):
             scorekeeper_on_disk(tmp_path, plan).summary()

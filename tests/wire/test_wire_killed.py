@@ -36,13 +36,17 @@ def folders(tmp_path: Path) -> Iterator[dict[str, Path]]:
     plan, out = both_ways(LOSSY), tmp_path / "running"
     folders_ = {"running": out, "killed": tmp_path / "killed"}
     with WireJournal(out, plan) as journal:
-        journal.record(time.time(), 0, -1, 0.0, journal.key_code("scan"), 0, 8, 0, Kind.PUT, WireFate.LOST)
+        journal.records.record(
+            time.time(), 0, -1, 0.0, journal.words.key_code("scan"), 0, 8, 0, Kind.PUT, WireFate.LOST
+        )
     with WireJournal(out, plan) as journal:
         (out / WIRE_FILE).write_text(resolved_wire(plan))
         fates = [WireFate.DELIVERED] * (DELIVERED + DELAYED) + [WireFate.LOST] * LOST
         for n, fate in enumerate(fates):
             delay, held = (1000.0, HELD) if n < DELAYED else (0.0, 0)
-            journal.record(time.time(), 1 + n, -1, delay, journal.key_code("scan"), 0, 8, 0, Kind.PUT, fate | held)
+            journal.records.record(
+                time.time(), 1 + n, -1, delay, journal.words.key_code("scan"), 0, 8, 0, Kind.PUT, fate | held
+            )
         shutil.copytree(out, folders_["killed"])
         yield folders_
 

@@ -45,7 +45,9 @@ def run(
                 for n in range(fates.n, fates.n + messages):
                     fate, delay, again = fates.next()
                     kind = Kind.PUT | AGAIN if again else Kind.PUT
-                    journal.record(n / 10, n, -1, delay, journal.key_code(key), 0, 10, link.number, kind, fate)
+                    journal.records.record(
+                        n / 10, n, -1, delay, journal.words.key_code(key), 0, 10, link.number, kind, fate
+                    )
         journal.close()
         status = keeper.finish(folder)
     path = folder / "summary.json"
@@ -106,14 +108,14 @@ def test_changes_and_cuts_are_part_of_the_distribution(tmp_path: Path) -> None:
     other = {"loss": {"model": "bernoulli", "quality": 0.3}}
     with WireJournal(tmp_path, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
-        fates, key = KeyFates(plan.links[0], "link/1", "put", 7), journal.key_code("link/1")
+        fates, key = KeyFates(plan.links[0], "link/1", "put", 7), journal.words.key_code("link/1")
         for n in range(4000):
             if n == 2000:
                 journal.change("link", other, {("link/1", "put"): fates.change(other)})
             fate = fates.next()[0]
             if 1000 <= n < 1500:
                 fate = WireFate.CUT
-            journal.record(time.time(), n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
+            journal.records.record(time.time(), n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
     link = keeper.links()["link"]
     assert link.expected_rate == pytest.approx((1500 * 0.2 / 0.22 + 2000 * 0.3) / 3500)
     assert link.within_bounds is True
@@ -126,11 +128,11 @@ def test_gaps_of_a_wire_have_first_fates_and_those_of_its_journal_the_last_ones(
     (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
     with WireJournal(tmp_path, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
-        key = journal.key_code("scan")
-        rows = [journal.record(journal_time(n), n, -1, 0.1, key, 0, 1, 0, Kind.PUT, 0) for n in range(9)]
+        key = journal.words.key_code("scan")
+        rows = [journal.records.record(journal_time(n), n, -1, 0.1, key, 0, 1, 0, Kind.PUT, 0) for n in range(9)]
         journal.flush()
         for row in rows[4:]:
-            journal.amend(row, WireFate.UNDERWAY)
+            journal.records.amend(row, WireFate.UNDERWAY)
     keeper.finish(tmp_path)
     written, later = read(tmp_path).links["link"], scorekeeper_on_disk(tmp_path, plan).summary().links["link"]
     for link in (written, later):
@@ -149,11 +151,11 @@ def test_a_link_on_many_of_whose_messages_no_model_decides_is_judged_as_a_sample
     plan, messages, quality = wire_plan(link={"loss": {"model": "bernoulli", "quality": 0.7}}), 12_000, 0.7
     with WireJournal(tmp_path, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
-        fates, key = KeyFates(plan.links[0], "link/1", "put", 7), journal.key_code("link/1")
+        fates, key = KeyFates(plan.links[0], "link/1", "put", 7), journal.words.key_code("link/1")
         for n in range(messages):
             fate = fates.next()[0]
             fate = WireFate.CUT if n % 4 else fate
-            journal.record(n / 10, n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
+            journal.records.record(n / 10, n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
     link, tried = keeper.links()["link"], messages // 4
     assert link.expected_rate == pytest.approx(quality)
     assert link.within_bounds is True
@@ -170,14 +172,16 @@ def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
     )
     with WireJournal(tmp_path, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
-        keys = [journal.key_code(key) for key in ("link/1", "link/stop", "other")]
+        keys = [journal.words.key_code(key) for key in ("link/1", "link/stop", "other")]
         for n, fate in enumerate(WireFate):
-            journal.record(1.0 * n, n, -1, 0.1, keys[0], 0, 1, 0, Kind.DELETE if n % 2 else Kind.PUT, fate)
-            journal.record(1.0 * n, n, -1, 0.0, keys[1], 0, 1, 0, Kind.PUT, WireFate.DELIVERED)
-        journal.record(20.0, -1, -1, 0.0, keys[2], 0, 1, UNLINKED, Kind.QUERY, WireFate.UNLINKED)
-        row = journal.record(21.0, len(WireFate), -1, 0.2, keys[0], 0, 1, 0, Kind.PUT | AGAIN, WireFate.DELIVERED)
+            journal.records.record(1.0 * n, n, -1, 0.1, keys[0], 0, 1, 0, Kind.DELETE if n % 2 else Kind.PUT, fate)
+            journal.records.record(1.0 * n, n, -1, 0.0, keys[1], 0, 1, 0, Kind.PUT, WireFate.DELIVERED)
+        journal.records.record(20.0, -1, -1, 0.0, keys[2], 0, 1, UNLINKED, Kind.QUERY, WireFate.UNLINKED)
+        row = journal.records.record(
+            21.0, len(WireFate), -1, 0.2, keys[0], 0, 1, 0, Kind.PUT | AGAIN, WireFate.DELIVERED
+        )
         journal.flush()
-        journal.amend(row, WireFate.REFUSED)
+        journal.records.amend(row, WireFate.REFUSED)
     assert keeper.finish(tmp_path) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
     link = summary["links"]["link"]
@@ -300,7 +304,7 @@ def test_a_metric_without_a_value_has_failed(fate: WireFate, text: str, why: str
     plan = expecting(text)
     with WireJournal(tmp_path, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
-        journal.record(1.0, 0, -1, 0.0, journal.key_code("a"), 0, 0, 0, Kind.PUT, fate)
+        journal.records.record(1.0, 0, -1, 0.0, journal.words.key_code("a"), 0, 0, 0, Kind.PUT, fate)
     summary = keeper.summary()
     assert keeper.finish(tmp_path) == 1
     assert summary.failed_expectations == 1
@@ -428,7 +432,9 @@ def test_a_latency_is_that_of_its_quantile(tmp_path: Path) -> None:
     with WireJournal(tmp_path, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
         for n in range(100):
-            journal.record(1.0, n, -1, (n + 1) / 1000, journal.key_code("a"), 0, 0, 0, Kind.PUT, WireFate.DELIVERED)
+            journal.records.record(
+                1.0, n, -1, (n + 1) / 1000, journal.words.key_code("a"), 0, 0, 0, Kind.PUT, WireFate.DELIVERED
+            )
     (judged,) = keeper.judged(keeper.links())
     assert judged.value == 0.09
 
@@ -439,14 +445,14 @@ def test_the_exit_status_tells_of_an_incomplete_journal_and_of_unaccounted_messa
         keeper = WireScorekeeper(wire_plan(), journal)
     assert keeper.finish(tmp_path) == 0
     assert list(wire_failures(keeper.summary())) == []
-    journal._place.incomplete_since = 5.0
+    journal.place.incomplete_since = 5.0
     assert keeper.finish(tmp_path) == 1
     assert "the journal has all messages" in "".join(wire_failures(keeper.summary()))
-    journal.missing = 7
+    journal.records.missing = 7
     assert list(wire_failures(keeper.summary())) == [
         "the journal lacks 7 messages, because its folder could not be written"
     ]
-    journal.recorded += 1
+    journal.records.recorded += 1
     assert keeper.finish(tmp_path) == 3
     assert "unaccounted for: 1 message; this is a fault of Evedrop" in wire_failures(keeper.summary())
 

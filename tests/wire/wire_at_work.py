@@ -69,7 +69,7 @@ class WireAtWork:
     def rows_of(self, key: str) -> Records:
         """The rows of a key so far."""
         rows = self.rows
-        rows_of_key: Records = rows[rows["key"] == self.journal.key_code(key)]
+        rows_of_key: Records = rows[rows["key"] == self.journal.words.key_code(key)]
         return rows_of_key
 
     def fates(self, link_name: str | None = None) -> list[WireFate]:

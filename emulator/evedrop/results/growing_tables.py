@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from evedrop.results.folder import make_private, private_opener, replace_private
 from evedrop.results.tables import NULLABLE
-from evedrop.system.files import is_locked, try_lock, write_all
+from evedrop.system.files import LineFile, is_locked, lines_in, try_lock, write_all
 
 UNFINISHED = "unfinished"
 """The folder inside a results folder that contains unfinished tables."""
@@ -127,9 +127,8 @@ class _Sink:
         return len(self._waiting[-1])
 
     def flush(self) -> None:
-        left, self._waiting = memoryview(b"".join(self._waiting)), []
-        while left:
-            left = left[os.write(self._descriptor, left) :]
+        waiting, self._waiting = self._waiting, []
+        write_all(self._descriptor, b"".join(waiting))
 
     def close(self) -> None:
         if not self.closed:
@@ -158,7 +157,7 @@ class Unfinished:
         make_private(place, exist_ok=False)
         self._descriptor = os.open(place, os.O_RDONLY)
         try_lock(self._descriptor)  # on a file system without locks, a run in progress looks killed
-        self._rounds = os.open(place / _ROUNDS, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
+        self._rounds = LineFile(place / _ROUNDS)
 
     def round(
         self, at: str, slots: int, streams: Mapping[str, TableStream], before: Callable[[], None] = lambda: None
@@ -171,12 +170,11 @@ class Unfinished:
             stream.write()
         before()
         tables = {name: (stream.file, stream.rows) for name, stream in streams.items()}
-        line = json.dumps({"at": at, "slots": slots, "tables": tables}).encode() + b"\n"
-        write_all(self._rounds, line, _ROUNDS)
+        self._rounds.append({"at": at, "slots": slots, "tables": tables})
 
     def close(self) -> None:
         """Release the lock; the files stay."""
-        os.close(self._rounds)
+        self._rounds.close()
         os.close(self._descriptor)
 
 
@@ -193,9 +191,7 @@ def goes_on(folder: Path) -> bool:
 def last_round(folder: Path) -> TableRound:
     """The last round that was written completely; empty if there was none."""
     try:
-        with (folder / UNFINISHED / _ROUNDS).open("rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL_BYTES))
-            lines = file.read().rpartition(b"\n")[0].splitlines()
+        lines = lines_in(folder / UNFINISHED / _ROUNDS, last=_TAIL_BYTES)
     except OSError:
         return TableRound()
     for line in reversed(lines):
@@ -265,7 +261,9 @@ def finish(folder: Path) -> None:
             continue
         unfinished = folder / UNFINISHED / f"{name}.parquet"
         try:
-            _write_parquet(unfinished, schema, batches_of(folder, name))
+            with parquet_writer(unfinished, schema) as writer:
+                for group in _groups(batches_of(folder, name)):
+                    writer.write_table(pa.Table.from_batches(group, schema).combine_chunks())
         except (OSError, pa.ArrowException):
             unfinished.unlink(missing_ok=True)
             raise
@@ -273,14 +271,16 @@ def finish(folder: Path) -> None:
         (folder / UNFINISHED / file).unlink()
 
 
-def _write_parquet(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> None:
+@contextlib.contextmanager
+def parquet_writer(path: Path, schema: pa.Schema) -> Iterator[pq.ParquetWriter]:
+    """Write a Parquet file that only this user can read. Raises OSError."""
+    # A dictionary of numbers, most of which differ, takes longer to make, and more room.
     names = [column.name for column in schema if pa.types.is_dictionary(column.type)]
     with (
         open(path, "wb", opener=private_opener) as file,
         pq.ParquetWriter(file, schema, compression="zstd", compression_level=1, use_dictionary=names) as writer,
     ):
-        for group in _groups(batches):
-            writer.write_table(pa.Table.from_batches(group, schema).combine_chunks())
+        yield writer
 
 
 def _groups(batches: Iterator[pa.RecordBatch]) -> Iterator[list[pa.RecordBatch]]:

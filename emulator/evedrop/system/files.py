@@ -6,19 +6,19 @@ stops as soon as it has read more than its limit, and reports the limit.
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import gzip
 import io
+import json
 import os
 import stat
 import tempfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, Self, final
 
 from evedrop.errors import UsageError
 
@@ -164,10 +164,64 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_all(file: int, data: bytes, path: object = None) -> None:
-    """Write bytes to a file's end, all of them or, on a full disk, perhaps some. Raises OSError, for `path`."""
-    if os.write(file, data) != len(data):  # only a full disk accepts a part
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+def write_all(file: int, data: bytes) -> None:
+    """Write bytes to an open file. Raises OSError, such as for a full disk; some of them may have been written then."""
+    left = memoryview(data)
+    while left:  # a disk with little room accepts a part, and says so only when it is asked again
+        left = left[os.write(file, left) :]
+
+
+@final
+class LineFile:
+    """A file of JSON values, one a line, that grows. A line counts only if it is complete.
+
+    So `lines_in` reads everything that was appended, wherever the process was killed or the disk became full.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file, which is new or continues after its last complete line. Only this user can read it. Raises OSError."""
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+        try:
+            self._size = os.fstat(self._file).st_size
+            if self._size and os.pread(self._file, 1, self._size - 1) != b"\n":
+                self._size = os.pread(self._file, self._size, 0).rfind(b"\n") + 1
+                os.ftruncate(self._file, self._size)
+        except BaseException:
+            self.close()
+            raise
+
+    def append(self, value: Any) -> bytes:
+        """Add a line; returns it. Raises OSError if the disk has no room for it, and leaves the file as it was."""
+        line = json.dumps(value).encode() + b"\n"
+        try:
+            write_all(self._file, line)
+        except OSError:
+            with suppress(OSError):
+                os.ftruncate(self._file, self._size)
+            raise
+        self._size += len(line)
+        return line
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._file)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def lines_in(path: Path, last: int | None = None) -> list[bytes]:
+    """The complete lines of a file to which another process may be adding. Raises OSError if it cannot be read.
+
+    last: read only so many bytes at its end, in which the first line may not be whole.
+    """
+    with path.open("rb") as file:
+        if last is not None:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - last))
+        return file.read().split(b"\n")[:-1]
 
 
 def try_lock(descriptor: int, *, shared: bool = False) -> bool:

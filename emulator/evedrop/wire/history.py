@@ -9,8 +9,9 @@ Source: docs/wire.md, a wire that starts again.
 from __future__ import annotations
 
 import json
-import os
+import threading
 from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, final
@@ -21,7 +22,7 @@ from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.slot.link import NEVER, Change
 from evedrop.scenario.table import model_mistakes
-from evedrop.system.files import write_all
+from evedrop.system.files import LineFile, lines_in
 from evedrop.wire.plan import WirePlan, numbered_as
 
 Numbered = tuple[str, str, str]
@@ -50,7 +51,10 @@ class _Settings:
 @final
 @dataclass
 class WireHistory:
-    """What was written so far in the file `history.jsonl` of a journal's folder, and its continuation."""
+    """What was written so far in the file `history.jsonl` of a journal's folder, and its continuation.
+
+    Threads may call its methods at the same time.
+    """
 
     folder: Path
     start: int = 0
@@ -69,6 +73,7 @@ class WireHistory:
     _settings: dict[str, list[_Settings]] = field(default_factory=dict)
     _of_new_keys: dict[str, tuple[Change, ...]] = field(default_factory=dict)
     """Link → the changes of all streams that had no message at any of them."""
+    _lock: AbstractContextManager[bool] = field(default_factory=threading.Lock, repr=False, compare=False)
 
     @classmethod
     def read(cls, folder: Path) -> WireHistory:
@@ -76,7 +81,7 @@ class WireHistory:
         history = cls(folder)
         path = folder / _FILE
         try:
-            lines = path.read_bytes().split(b"\n")[:-1]  # the last line may be torn
+            lines = lines_in(path)
         except FileNotFoundError:
             return history
         except OSError as error:
@@ -91,7 +96,8 @@ class WireHistory:
     @property
     def events(self) -> list[NotedEvent]:
         """The events since the latest start, with seconds since it began."""
-        return [event._replace(time=round(event.time - self.began, 3)) for event in self.noted]
+        with self._lock:
+            return [event._replace(time=round(event.time - self.began, 3)) for event in self.noted]
 
     def begin(self, plan: WirePlan, now: float) -> None:
         """Begin the next start, which has the seed of the earlier ones. Raises OSError if the disk is full."""
@@ -153,17 +159,10 @@ class WireHistory:
             )
 
     def _write(self, entry: Mapping[str, Any]) -> None:
-        line = json.dumps(entry).encode() + b"\n"
-        path = self.folder / _FILE
-        with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600), "r+b", buffering=0) as file:
-            whole = file.readall().rfind(b"\n") + 1
-            file.truncate(whole)  # a line that was torn must not begin this one
-            try:
-                write_all(file.fileno(), line, str(path))
-            except OSError:
-                file.truncate(whole)
-                raise
-        self._take(json.loads(line))
+        with self._lock:
+            with LineFile(self.folder / _FILE) as file:
+                line = file.append(entry)
+            self._take(json.loads(line))
 
     def _take(self, entry: Mapping[str, Any]) -> None:
         if "start" in entry:

@@ -1,9 +1,11 @@
 """The journal of a wire: a record for each message and link, on disk as soon as it is made, and Parquet files made from it.
 
-`record` writes into memory that is mapped from a file, so the record survives the end of the process. A thread hands the records
-to listeners ten times a second, and makes a Parquet file from every file of records that is full. The folder is locked for this
-process, and a file in it says when the wire was last alive. What an earlier start left behind, because it was killed or the disk
-was full, is recovered. `journal_tables` reads the journal, of a wire that runs or was killed, too.
+A `WireJournal` has four parts. `JournalRecords` writes each record into memory that is mapped from a file, so the record
+survives the end of the process. `JournalWords` gives codes to keys and senders. `JournalPlace` locks the folder for this
+process, and notes when the wire was last alive, and what could not be written. `WireHistory` (history.py) has the starts, the
+events and the changes of settings. The journal's thread hands the records to listeners ten times a second, and lets a Parquet
+file be made from every file of records that is full. What an earlier start left behind, because it was killed or the disk was
+full, is recovered. `journal_tables` reads the journal, of a wire that runs or was killed, too.
 
 Records have codes for keys and senders. A line of the file `NNN.words` has a code and its text, so the records of a wire that
 was killed can be read. The end of the file is mapped into memory, as records are: a call of the system for each word costs many
@@ -28,9 +30,9 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Generic, ParamSpec, final
 
 import numpy as np
 import pyarrow as pa
@@ -38,13 +40,13 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
-from evedrop.model.slot.link import NEVER, Change
+from evedrop.model.slot.link import NEVER
 from evedrop.results.folder import make_private
-from evedrop.results.wire_summary import JournalState
-from evedrop.system.files import try_lock
+from evedrop.results.wire_summary import JournalState, JournalSummary
+from evedrop.system.files import lines_in, try_lock
 from evedrop.system.output import warn
 from evedrop.system.waiting import wait_for_thread
-from evedrop.wire.history import NotedEvent, Numbered, WireHistory, highest
+from evedrop.wire.history import Numbered, WireHistory, highest
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import (
     HELD,
@@ -57,11 +59,9 @@ from evedrop.wire.records import (
     Records,
     WireFate,
     Words,
-    amend_parquet,
     mapped_end,
     next_numbers,
     records_in,
-    records_of,
     table_of,
     write_parquet,
 )
@@ -69,23 +69,38 @@ from evedrop.wire.records import (
 PART_ROWS = 2**17
 """Records in a file: at 70 000 messages a second it is full after two seconds."""
 _TICK = 0.1  # seconds between two blocks for the listeners
-_PATIENCE = 10.0  # seconds after the last delay of a part, until its Parquet file is made, and after a full disk
+_PATIENCE = 10.0  # seconds after a full disk
+_NOT_HELD = ~HELD & 0xFF
 
 Listener = Callable[[Records], None]
 """Gets each block of new records."""
 AmendmentListener = Callable[[Records, WireFate], None]
 """Gets records that it got before, and the fate that they have now."""
-EventListener = Callable[[float, str], None]
-"""Gets the time of an event, in seconds since 1970, and a line about it."""
+_P = ParamSpec("_P")
+
+
+@final
+class Listeners(list[Callable[_P, None]], Generic[_P]):
+    """Functions that are called for each new part of a journal. One that fails is called no more, and the user is told."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        """tell: for what the user must know."""
+        super().__init__()
+        self._tell = tell
+
+    def hear(self, *arguments: _P.args, **named: _P.kwargs) -> None:
+        """Call all of them."""
+        for listener in list(self):
+            try:
+                listener(*arguments, **named)
+            except Exception as error:  # a broken view must not end the journal
+                self.remove(listener)
+                self._tell(f"{listener!r} failed and gets no more records of the journal: {error!r}")
 
 
 @final
 class WireJournal:
-    """The journal of one start of a wire. Threads may call its methods at the same time.
-
-    record: (time, n, sequence, delay, key code, source code, size, link code, kind, fate) → the row's number, for `amend`; the
-    arguments are as in `RECORD`.
-    """
+    """The journal of one start of a wire, and the thread that tends it. Threads may call its methods at the same time."""
 
     def __init__(
         self, folder: Path, plan: WirePlan, *, tell: Callable[[str], None] = warn, part_rows: int = PART_ROWS
@@ -94,63 +109,46 @@ class WireJournal:
 
         Raises UsageError if another wire uses the folder, if it was made with another seed, or if it cannot be written.
         """
-        self.listeners: list[Listener] = []
-        self.amendment_listeners: list[AmendmentListener] = []
-        self.event_listeners: list[EventListener] = []
-        self.recorded = 0
-        """The number of all records, when it is closed."""
-        self.missing = 0
-        """The number of records that are not on the disk, because it had no room for them; listeners still got them."""
-        self.links = [link.name for link in plan.links]
-        """The names of the links, in the order of their codes."""
-        self._tell, self._rows = tell, part_rows
         self.folder = folder
         """The wire's folder."""
-        self._folder = folder / JOURNAL_FOLDER
-        self._state = threading.RLock()  # guards the parts
+        self.listeners: Listeners[Records] = Listeners(tell)
+        self.amendment_listeners: Listeners[Records, WireFate] = Listeners(tell)
+        self.event_listeners: Listeners[float, str] = Listeners(tell)
+        """They get the time of an event, in seconds since 1970, and a line about it."""
+        self._tell = tell
+        self._links = [link.name for link in plan.links]
         self._handing = threading.RLock()  # so that listeners get blocks in order
-        self._parts: dict[int, JournalPart] = {}
-        self._buffers: dict[int, Any] = {}
-        self._next = 0  # the part whose rows are handed over now
-        self._amended: deque[tuple[Records, WireFate]] = deque()
-        self._number = itertools.count()
-        self._stopped, self._convert_after = math.inf, 0.0
-        self._amended_late: deque[tuple[int, WireFate]] = deque()
+        self._ended = threading.Event()
+        self._stopped = math.inf
         try:
-            self._place = JournalPlace(self._folder, tell)
+            self.place = JournalPlace(folder / JOURNAL_FOLDER, tell)
             try:
-                self._begin(plan)
+                self._begin(plan, part_rows)
             except BaseException:
-                self._place.close()
+                self.place.close()
                 raise
         except OSError as error:
             raise UsageError(
                 f"{folder} cannot be written ({error.strerror}); make room, or give another folder"
             ) from error
-        self.record = self._recorder()
-        self._ended = threading.Event()
         self._thread = threading.Thread(target=self._tend, name="journal", daemon=True)
         self._thread.start()
 
-    def _begin(self, plan: WirePlan) -> None:
-        self._history = WireHistory.read(self._folder)
-        self._history.expect_settings()
-        self._history.expect_seed(plan)  # before the recovery: a start that is refused changes nothing
-        self.recovered = recover(self._folder, self._history)
+    def _begin(self, plan: WirePlan, part_rows: int) -> None:
+        self.history = WireHistory.read(self.place.folder)
+        self.history.expect_settings()
+        self.history.expect_seed(plan)  # before the recovery: a start that is refused changes nothing
+        self.recovered = recover(self.place.folder, self.history)
         """The number of records that an earlier start left behind, because it was killed or the disk was full."""
-        self.counts: dict[Numbered, int] = dict(self._history.counts)
+        self.counts: dict[Numbered, int] = dict(self.history.counts)
         """(link, key, kind of stream) → the number of its next message, as of the records handed to the listeners."""
-        self._history.begin(plan, time.time())
+        self.history.begin(plan, time.time())
         self._began = time.monotonic()  # the recovery of an earlier start does not count
         admits = KeyLimit(plan.links, self.counts, self._tell).admits
-        self._words = JournalWords(self._place.unfinished, self.start, self._place.miss, admits)
-        self._place.begin()
-        self._add_part(0)
-
-    @property
-    def start(self) -> int:
-        """The number of this start of the wire in its folder, from 1."""
-        return self._history.start
+        self.words = JournalWords(self.place.unfinished, self.history.start, self.place.miss, admits)
+        self.place.begin()
+        files = PartFiles(self.place, self.history.start, self._links, self.words)
+        self.records = JournalRecords(files, part_rows, self.place.miss)
 
     @property
     def seconds(self) -> float:
@@ -158,97 +156,49 @@ class WireJournal:
         return min(time.monotonic(), self._stopped) - self._began
 
     @property
-    def incomplete_since(self) -> float | None:
-        """When something could not be written for the first time, in seconds since 1970; None: the disk always had room."""
-        return self._place.incomplete_since
-
-    @property
-    def removed(self) -> Path | None:
-        """The journal's folder, or the one inside it, if it was removed or moved while the wire ran."""
-        return self._place.removed
-
-    @property
     def state(self) -> JournalState:
         """Whether this start still runs."""
         return "ended" if self._ended.is_set() else "running"
 
-    def key_code(self, key: str, side: str = "") -> int:
-        """The code of a key of a side's programs in records; 0 if it is new, and there are too many (`KeyLimit`)."""
-        return self._words.key_code(key, side)
+    @property
+    def recorded(self) -> int:
+        """The number of all records, when it is closed."""
+        return self.records.recorded
 
-    def source_code(self, source: str) -> int:
-        """The code of a sender in records; 0 for "", a sender that is not known."""
-        return self._words.source_code(source)
+    @property
+    def completeness(self) -> JournalSummary:
+        """What an earlier start left behind, and what is not on the disk."""
+        return JournalSummary(self.recovered, self.records.missing, self.place.incomplete_since)
 
     def key_of(self, code: int) -> str:
         """The key that has a code."""
-        return self._words.key_of(code)
-
-    def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
-        """The settings that the messages of a stream had, from message 0 on: what `KeyFates` needs to continue."""
-        return self._history.changes_of(link, key, kind)
+        return self.words.key_of(code)
 
     def change(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int]) -> None:
         """Note other settings of a link. since: (key, kind of stream) → the number of its first message that has them."""
-        with self._state:
-            try:
-                self._history.change(link, settings, since, time.time())
-            except OSError as error:
-                self._place.miss(error)
-
-    @property
-    def events(self) -> list[NotedEvent]:
-        """The events of this start so far, with seconds since it began."""
-        with self._state:
-            return self._history.events
+        with self.place.noting_errors():
+            self.history.change(link, settings, since, time.time())
 
     def note(self, line: str, *, bypass: bool = False) -> None:
         """Note an event that happens now, and tell the listeners. bypass: whether it tells a way past the wire."""
         now = time.time()
-        with self._state:
-            try:
-                self._history.note(line, now, bypass)
-            except OSError as error:
-                self._place.miss(error)
-        self._hear(self.event_listeners, now, line)
-
-    def amend(self, row: int, fate: WireFate) -> None:
-        """Change the fate of a row that was recorded."""
-        at, place = divmod(row, self._rows)
-        with self._state:
-            part = self._parts.get(at)
-            if part is None:
-                self._amended_late.append((row, fate))
-                return
-            before = part.amend(place, fate)
-            if place < part.handed:
-                self._amended.append((before, fate))
-
-    def sent(self, row: int) -> None:
-        """Note that a message whose row was recorded as `HELD` has been delivered."""
-        at, place = divmod(row, self._rows)
-        if (buffer := self._buffers.get(at)) is not None:  # its Parquet file never has the mark
-            buffer[(place + 1) * RECORD.itemsize - 1] &= ~HELD & 0xFF
+        with self.place.noting_errors():
+            self.history.note(line, now, bypass)
+        self.event_listeners.hear(now, line)
 
     def flush(self) -> None:
         """Hand all records to the listeners now, and all amendments."""
         with self._handing:
             while True:
-                with self._state:
-                    amended = [self._amended.popleft() for _ in range(len(self._amended))]
-                    part = self._parts.get(self._next)
-                    block = np.empty(0, RECORD) if part is None else part.take()
-                    if part is not None and part.path is None:
-                        self.missing += len(block)
-                    if part is not None and part.full:
-                        self._next += 1
+                amended, block = self.records.take()
                 for fate in {fate for _, fate in amended}:
                     records = np.concatenate([record for record, its in amended if its == fate])
-                    self._hear(self.amendment_listeners, records, fate)
-                if part is None or not len(block):
+                    self.amendment_listeners.hear(records, fate)
+                if not len(block):
                     return
-                self._count(block)
-                self._hear(self.listeners, block)
+                for link, key, kind, n in next_numbers(block):
+                    highest(self.counts, (self._links[link], self.key_of(key), kind.stream), n)
+                self.listeners.hear(block)
 
     def close(self) -> None:
         """Hand over and write everything, and let another wire use the folder. Nothing may be recorded any more."""
@@ -257,27 +207,25 @@ class WireJournal:
         self._ended.set()
         wait_for_thread(self._thread)
         self._stopped = time.monotonic()
-        self.recorded = next(self._number)
+        self.records.end()
         self.flush()
-        self._place.poll()
-        if self.removed is not None:
-            self.missing = self.recorded
+        self.place.poll()
+        if self.place.removed is not None:
+            self.records.missing = self.recorded
         else:
             self._finish()
-        self._words.close()
-        self._place.close()
+        self.words.close()
+        self.place.close()
 
     def _finish(self) -> None:
         try:
-            self._amend_converted()
-            for at in sorted(self._parts):
-                self._convert(at)
-            self._history.end(self.counts, time.time(), self.missing)
-            shutil.rmtree(self._place.unfinished)
+            self.records.write_all()
+            self.history.end(self.counts, time.time(), self.records.missing)
+            shutil.rmtree(self.place.unfinished)
         except OSError as error:
             self._tell(
                 f"the journal's last Parquet files cannot be written ({error.strerror}); its records stay in "
-                f"{self._place.unfinished}, where all commands read them; make room, and the next start of the wire makes the "
+                f"{self.place.unfinished}, where all commands read them; make room, and the next start of the wire makes the "
                 "files"
             )
 
@@ -286,6 +234,96 @@ class WireJournal:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+    def _tend(self) -> None:
+        """The thread: blocks for the listeners, room for the next records, Parquet files."""
+        while not self._ended.wait(_TICK):
+            self.flush()
+            with contextlib.suppress(OSError):  # only a killed wire needs to have noted it
+                self.place.beat()
+            self.place.poll()
+            self.records.tend(time.time())
+
+
+@final
+class JournalRecords:
+    """The records of one start, in parts. Threads may call its methods at the same time.
+
+    record: (time, n, sequence, delay, key code, source code, size, link code, kind, fate) → the row's number, for `amend`; the
+    arguments are as in `RECORD`.
+
+    sent: (row) → None: a message whose row was recorded as `HELD` has been delivered.
+    """
+
+    def __init__(self, files: PartFiles, part_rows: int, miss: Callable[[OSError], None]) -> None:
+        """part_rows: records in a part; miss: called when the disk has no room for a part. Raises OSError."""
+        self.recorded = 0
+        """The number of all records, after `end`."""
+        self.missing = 0
+        """The number of records that are not on the disk, because it had no room for them; listeners still got them."""
+        self._files, self._rows, self._miss = files, part_rows, miss
+        self._lock = threading.RLock()  # guards the parts
+        self._parts: dict[int, JournalPart] = {}
+        self._buffers: dict[int, Any] = {}
+        self._number = itertools.count()
+        self._next = 0  # the part whose rows are handed over now
+        self._amended: deque[tuple[Records, WireFate]] = deque()
+        self._full_until = 0.0  # when to try again to write to a disk that was full
+        self._add_part(0)
+        self.record, self.sent = self._recorder(), self._sender()
+
+    def amend(self, row: int, fate: WireFate) -> None:
+        """Change the fate of a row that was recorded as `HELD`, for which its part has waited; after the wire, nothing."""
+        at, place = divmod(row, self._rows)
+        with self._lock:
+            part = self._parts.get(at)
+            if part is None:
+                return
+            before = part.amend(place, fate)
+            if place < part.handed:
+                self._amended.append((before, fate))
+
+    def take(self) -> tuple[list[tuple[Records, WireFate]], Records]:
+        """The rows (1,) that were taken before and amended since, with the fates that they have now; and the next new rows."""
+        with self._lock:
+            amended = [self._amended.popleft() for _ in range(len(self._amended))]
+            part = self._parts.get(self._next)
+            if part is None:
+                return amended, np.empty(0, RECORD)
+            block = part.take()
+            if part.path is None:
+                self.missing += len(block)
+            if part.full:
+                self._next += 1
+            return amended, block
+
+    def tend(self, now: float) -> None:
+        """Make room for the next records, and the Parquet file of a full part of which no message is `HELD`."""
+        with self._lock, contextlib.suppress(OSError):  # `_room` tries again, and reports it
+            part = self._parts.get(self._next)
+            if part is not None and 2 * part.handed > self._rows and self._next + 1 not in self._buffers:
+                self._add_part(self._next + 1)
+        with self._lock:  # a thread that records may make a part
+            over = sorted(at for at, part in self._parts.items() if part.full and not part.holds)
+        for at in [at for at in over if self._parts[at].path is None]:  # many parts would need too much memory
+            self._convert(at)
+        if now < self._full_until:
+            return
+        try:
+            for at in over[:1]:
+                if at in self._parts:
+                    self._convert(at)
+        except OSError:  # the records are safe where they are
+            self._full_until = now + _PATIENCE
+
+    def end(self) -> None:
+        """Count all records: there will be no more."""
+        self.recorded = next(self._number)
+
+    def write_all(self) -> None:
+        """Make the Parquet files of all parts. Raises OSError if the disk is full: the parts stay as they are."""
+        for at in sorted(self._parts):
+            self._convert(at)
 
     def _recorder(self) -> Callable[..., int]:
         """The function `record`, which looks nothing up in the object: it is called for every message."""
@@ -318,107 +356,72 @@ class WireJournal:
 
         return record
 
+    def _sender(self) -> Callable[[int], None]:
+        """The function `sent`, which looks nothing up in the object either."""
+        rows, width, last, part_of = self._rows, RECORD.itemsize, RECORD.itemsize - 1, self._buffers.get
+
+        def sent(row: int) -> None:
+            buffer = part_of(row // rows)
+            if buffer is not None:  # it is None after the wire
+                buffer[row % rows * width + last] &= _NOT_HELD
+
+        return sent
+
     def _room(self, at: int) -> None:
         """Make a part in the thread that records, because the journal's own thread could not do so in time."""
-        with self._state:
+        with self._lock:
             if at not in self._buffers:
                 try:
                     self._add_part(at)
                 except OSError as error:
-                    self._place.miss(error)
+                    self._miss(error)
                     self._add_part(at, in_memory=True)
 
     def _add_part(self, at: int, in_memory: bool = False) -> None:
-        path = None if in_memory else self._place.unfinished / f"{self._name(at)}.rows"
-        self._parts[at] = part = JournalPart(path, self._rows)
+        self._parts[at] = part = JournalPart(None if in_memory else self._files.rows(at), self._rows)
         self._buffers[at] = part.buffer
-
-    def _name(self, at: int) -> str:
-        return f"{self.start:03d}-{at + 1:04d}"
-
-    def _tend(self) -> None:
-        """The thread: blocks for the listeners, room for the next records, Parquet files."""
-        while not self._ended.wait(_TICK):
-            self.flush()
-            with contextlib.suppress(OSError):  # only a killed wire needs to have noted it
-                self._place.beat()
-            self._place.poll()
-            with self._state, contextlib.suppress(OSError):  # `_room` tries again, and reports it
-                part = self._parts.get(self._next)
-                if part is not None and 2 * part.handed > self._rows and self._next + 1 not in self._buffers:
-                    self._add_part(self._next + 1)
-            now = time.time()
-            with self._state:  # a thread that records may make a part
-                settled = [at for at, part in self._parts.items() if part.full and part.settled + _PATIENCE < now]
-            over = sorted(at for at in settled if not self._parts[at].holds)
-            for at in [at for at in over if self._parts[at].path is None]:  # many parts would need too much memory
-                self._convert(at)
-            if now < self._convert_after:
-                continue
-            try:
-                self._amend_converted()
-                for at in over[:1]:
-                    if at in self._parts:
-                        self._convert(at)
-            except OSError:  # the records are safe where they are
-                self._convert_after = now + _PATIENCE
-
-    def _hear(self, listeners: list[Any], *arguments: Any) -> None:
-        for listener in list(listeners):
-            try:
-                listener(*arguments)
-            except Exception as error:  # a broken view must not end the journal
-                listeners.remove(listener)
-                self._tell(f"{listener!r} failed and gets no more records of the journal: {error!r}")
-
-    def _count(self, block: Records) -> None:
-        """Raise `counts` to the numbers in a block."""
-        for link, key, kind, n in next_numbers(block):
-            highest(self.counts, (self.links[link], self.key_of(key), kind.stream), n)
 
     def _convert(self, at: int) -> None:
         """Make the Parquet file of a part, and forget the part.
 
         Raises OSError if the disk is full: the part stays as it is. A part in memory is forgotten all the same.
         """
-        part, path = self._parts[at], parquet_path(self._folder, self._name(at))
-        while True:
-            with self._state:
-                amendments, records = part.amendments, part.whole()
-            try:
-                if len(records):
-                    write_parquet(path, table_of(records, self._words.words(self.links)))
-                written = len(records)
-            except OSError:
-                if part.path is not None:
-                    raise
-                written = 0
-            with self._state:
-                if amendments == part.amendments:
-                    if part.path is None:
-                        self.missing -= written
-                    part.remove()
-                    del self._parts[at], self._buffers[at]
-                    return
-
-    def _amend_converted(self) -> None:
-        """Change fates in Parquet files. Raises OSError if the disk is full."""
-        parts: dict[int, dict[int, WireFate]] = {}
-        for row, fate in [self._amended_late.popleft() for _ in range(len(self._amended_late))]:
-            at, place = divmod(row, self._rows)
-            parts.setdefault(at, {})[place] = fate
-        links = {name: code for code, name in enumerate(self.links)}
-        for at, fates in parts.items():
-            path = parquet_path(self._folder, self._name(at))
-            if not path.exists():  # the disk had no room for this part
-                continue
-            try:
-                before = records_of(amend_parquet(path, fates), links, self._words.key_codes)
-            except OSError:
-                self._amended_late.extend((at * self._rows + place, fate) for place, fate in fates.items())
+        part = self._parts[at]
+        records = part.whole()
+        try:
+            self._files.write(at, records)
+            if part.path is None:
+                self.missing -= len(records)
+        except OSError:
+            if part.path is not None:
                 raise
-            for i, fate in enumerate(fates.values()):
-                self._hear(self.amendment_listeners, before[i : i + 1], fate)
+        with self._lock:
+            part.remove()
+            del self._parts[at], self._buffers[at]
+
+
+@final
+class PartFiles:
+    """The files of one start: for each part the rows while they change, and then a Parquet file."""
+
+    def __init__(self, place: JournalPlace, start: int, links: Sequence[str], words: JournalWords) -> None:
+        """start: its number, from 1; links: their names, in the order of their codes."""
+        self._place, self._start, self._links, self._words = place, start, links, words
+
+    def rows(self, at: int) -> Path:
+        """The file of the rows of a part, from 0."""
+        return self._place.unfinished / f"{self._name(at)}.rows"
+
+    def write(self, at: int, records: Records) -> None:
+        """Make the Parquet file of a part; none for no records. Raises OSError if the disk is full."""
+        if len(records):
+            write_parquet(self._parquet(at), table_of(records, self._words.words(self._links)))
+
+    def _name(self, at: int) -> str:
+        return f"{self._start:03d}-{at + 1:04d}"
+
+    def _parquet(self, at: int) -> Path:
+        return parquet_path(self._place.folder, self._name(at))
 
 
 _ROOM = 2**18  # bytes of the file that are mapped at once, unless a word is longer
@@ -466,12 +469,7 @@ class JournalWords:
         """The key that has a code."""
         return self._texts["key"][code]
 
-    @property
-    def key_codes(self) -> Mapping[str, int]:
-        """Key → code."""
-        return self._codes["key"]
-
-    def words(self, links: list[str]) -> Words:
+    def words(self, links: Sequence[str]) -> Words:
         """All codes so far and what they stand for. links: the names of the links, in the order of their codes."""
         return Words(links, dict(enumerate(self._texts["key"])), dict(enumerate(self._texts["source"])))
 
@@ -524,8 +522,8 @@ def words_in(unfinished: Path, start: int, links: list[str]) -> Words:
     """The words of a start that has not ended, from its file."""
     words = Words(links, {}, {})
     with contextlib.suppress(FileNotFoundError):
-        for line in _path(unfinished, start).read_bytes().splitlines():
-            with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):  # the last line may be torn
+        for line in lines_in(_path(unfinished, start)):
+            with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):  # a line may be damaged
                 kind, code, text = json.loads(line)
                 (words.keys if kind == "key" else words.sources)[int(code)] = (
                     str(text).encode("utf-8", "replace").decode()
@@ -598,7 +596,9 @@ class JournalPlace:
 
         Raises UsageError if another wire uses the folder, and OSError if it cannot be written.
         """
-        self._journal, self._tell = journal, tell
+        self._tell = tell
+        self.folder = journal
+        """The journal's folder."""
         self.incomplete_since: float | None = None
         """When something could not be written for the first time, in seconds since 1970; None: the disk always had room."""
         self.removed: Path | None = None
@@ -608,6 +608,7 @@ class JournalPlace:
         make_private(self.unfinished)
         self._lock = locked(journal)
         self._alive: int | None = None
+        self._telling = threading.RLock()  # so that threads that miss something at once tell so once
 
     def begin(self) -> None:
         """Begin to note that the wire is alive, once an earlier start has been recovered. Raises OSError."""
@@ -621,35 +622,45 @@ class JournalPlace:
 
     def poll(self) -> None:
         """Check whether the folder is still there, and report at once if it is not."""
-        if self.removed is not None:
-            return
-        self.removed = self._missing()
-        if self.removed is not None:
-            self.incomplete_since = self.incomplete_since or time.time()
-            self._tell(
-                f"{self.removed} was removed or moved while the wire runs, so the wire no longer has a journal; it goes on; end "
-                "it, and start it again"
-            )
+        with self._telling:
+            if self.removed is not None:
+                return
+            self.removed = self._lost()
+            if self.removed is not None:
+                self.incomplete_since = self.incomplete_since or time.time()
+                self._tell(
+                    f"{self.removed} was removed or moved while the wire runs, so the wire no longer has a journal; it goes on; "
+                    "end it, and start it again"
+                )
 
     def miss(self, error: OSError) -> None:
         """Note that something could not be written, and tell so the first time."""
-        self.poll()
-        if self.incomplete_since is None:
-            self.incomplete_since = time.time()
-            at = time.strftime("%H:%M:%S", time.localtime(self.incomplete_since))
-            self._tell(
-                f"the journal is incomplete from {at} on, because {self._journal} cannot be written ({error.strerror}); the wire "
-                "goes on; make room"
-            )
+        with self._telling:
+            self.poll()
+            if self.incomplete_since is None:
+                self.incomplete_since = time.time()
+                at = time.strftime("%H:%M:%S", time.localtime(self.incomplete_since))
+                self._tell(
+                    f"the journal is incomplete from {at} on, because {self.folder} cannot be written ({error.strerror}); the "
+                    "wire goes on; make room"
+                )
 
-    def _missing(self) -> Path | None:
+    @contextlib.contextmanager
+    def noting_errors(self) -> Iterator[None]:
+        """`miss` an OSError of the block instead of raising it."""
+        try:
+            yield
+        except OSError as error:
+            self.miss(error)
+
+    def _lost(self) -> Path | None:
         """The folder, or the one inside it, that was removed, moved or replaced."""
         try:
-            if not os.path.samestat(os.fstat(self._lock), os.stat(self._journal)):
-                return self._journal
+            if not os.path.samestat(os.fstat(self._lock), os.stat(self.folder)):
+                return self.folder
             return self.unfinished if self._alive is not None and os.fstat(self._alive).st_nlink == 0 else None
         except (FileNotFoundError, NotADirectoryError):
-            return self._journal
+            return self.folder
         except OSError:  # a disk that does not answer may answer later
             return None
 

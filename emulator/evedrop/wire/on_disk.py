@@ -18,14 +18,13 @@ from rich.console import Console
 
 from evedrop.errors import UsageError
 from evedrop.model.checks import as_toml
-from evedrop.model.slot.link import Change
 from evedrop.results.reading import results_of_this_version
-from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, JournalState, WireSummary
+from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, JournalState, JournalSummary, WireSummary
 from evedrop.show.report.wire import wire_sentences, wire_table
 from evedrop.show.terminal_tables import rich_table
 from evedrop.system.files import is_locked
 from evedrop.wire.file import load_wire
-from evedrop.wire.history import NotedEvent, WireHistory
+from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import JOURNAL_FOLDER, UNFINISHED, AmendmentListener, Listener, journal_tables, last_beat
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.records import records_of
@@ -58,41 +57,27 @@ class JournalOnDisk:
     def __init__(self, folder: Path, plan: WirePlan) -> None:
         self.listeners: list[Listener] = []
         self.amendment_listeners: list[AmendmentListener] = []
-        self.recorded = self.recovered = self.missing = 0
-        self.incomplete_since: float | None = None
+        self.recorded = 0
+        self.completeness = JournalSummary(0, 0, None)
         self._folder = folder
         self._links = {link.name: link.number for link in plan.links}
-        self._history = WireHistory.read(folder / JOURNAL_FOLDER)
+        self.history = WireHistory.read(folder / JOURNAL_FOLDER)
         self.seconds = 0.0
         """Until the wire was last alive, or heard its last message, as far as these were read."""
         self.state: JournalState = "ended"
-        if not self._history.ended:
+        if not self.history.ended:
             self.state = "running" if is_locked(folder / JOURNAL_FOLDER) else "killed"
         self._keys = [""]  # code 0 stands for all keys beyond the limit
         self._codes = {"": 0}
-
-    @property
-    def start(self) -> int:
-        """The number of the start, from 1."""
-        return self._history.start
-
-    @property
-    def events(self) -> list[NotedEvent]:
-        """The events of the start, with seconds since it began."""
-        return self._history.events
 
     def key_of(self, code: int) -> str:
         """The key of a code."""
         return self._keys[code]
 
-    def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
-        """The settings that the messages of a stream had, from message 0 on."""
-        return self._history.changes_of(link, key, kind)
-
     def read(self) -> None:
         """Hand all records to the listeners. Raises UsageError if there is no journal, or it is damaged."""
         self._is_alive_at(last_beat(self._folder / JOURNAL_FOLDER / UNFINISHED))
-        for table in journal_tables(self._folder, self.start, killed=self.state == "killed"):
+        for table in journal_tables(self._folder, self.history.start, killed=self.state == "killed"):
             for key in {*_words(table["key"])} - {*self._codes}:
                 try:
                     zenoh.KeyExpr(key)
@@ -110,11 +95,11 @@ class JournalOnDisk:
                 for listener in self.listeners:
                     listener(records)
         # Again, because a change may have come in between; it is written before the first record that it concerns.
-        self._history = WireHistory.read(self._folder / JOURNAL_FOLDER)
-        self._history.expect_settings()
+        self.history = WireHistory.read(self._folder / JOURNAL_FOLDER)
+        self.history.expect_settings()
 
     def _is_alive_at(self, time: float) -> None:
-        self.seconds = max(self.seconds, time - self._history.began)
+        self.seconds = max(self.seconds, time - self.history.began)
 
 
 def _words(column: pa.ChunkedArray) -> list[str]:

@@ -205,8 +205,9 @@ class PublicationRelay:
         """The function that is called for every message: it looks up as little as possible."""
         ways_of: dict[str, _Ways] = {}
         now, clock, way_to = time.time, time.monotonic, self._way_to
-        record, amend = self._journal.record, self._journal.amend
-        read = SenderReader(self._journal.source_code)
+        records = self._journal.records
+        record, amend, sent = records.record, records.amend, records.sent
+        read = SenderReader(self._journal.words.source_code)
         put, put_kind, delete_kind = zenoh.SampleKind.PUT, int(Kind.PUT), int(Kind.DELETE)
         unlinked, underway, zenoh_error = int(WireFate.UNLINKED), int(WireFate.UNDERWAY), zenoh.ZError
         refused = WireFate.REFUSED
@@ -245,7 +246,7 @@ class PublicationRelay:
                     size,
                     way.link,
                     kind | AGAIN if again else kind,
-                    fate or (0 if at_once else HELD),
+                    fate or HELD,
                 )
                 if fate:
                     continue
@@ -259,6 +260,7 @@ class PublicationRelay:
                         continue
                     begun = clock()
                     message()
+                    sent(row)
                     if clock() - begun > LONG_SECONDS:
                         send_queue.took(clock() - begun, way.alone)
                 except zenoh_error:
@@ -278,7 +280,7 @@ class PublicationRelay:
             else:
                 for way in ready[0]:
                     way.forget()
-        code = self._journal.key_code(key, self._name)
+        code = self._journal.words.key_code(key, self._name)
         taken = [self._plan.link_of(self._name, target, expression) for target in self._targets]
         states = [self._links[link.name] for link in taken if link is not None]
         ended = time.time() > self._until

@@ -88,7 +88,7 @@ class QueryRelay:
         self._services: tuple[frozenset[tuple[str, str]], tuple[bool, ...]] | None = None
         self._mirrored: dict[str, dict[str, tuple[zenoh.KeyExpr, Any]]] = {name: {} for name in sides}
         self._lock = threading.RLock()
-        self._read = SenderReader(journal.source_code)
+        self._read = SenderReader(journal.words.source_code)
         self._patience = Scheduler(_MOST_WAITING, 0, lambda _: None)
         self._heard: SimpleQueue[tuple[str, str | None, zenoh.Query] | None] = SimpleQueue()
         self.duty = Duty("among the queries")
@@ -254,16 +254,18 @@ class QueryRelay:
         now, size = time.time(), message.size
         with self._lock:
             sender, sequence = self._read(message.attachment, message.source)
-        code = self._journal.key_code(key, way[0])
+        code = self._journal.words.key_code(key, way[0])
         state = self._link(*way, expression)
         if state is None:
-            self._journal.record(now, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, WireFate.UNLINKED)
+            self._journal.records.record(now, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, WireFate.UNLINKED)
             return
         n, fate, delay, again = -1, int(WireFate.TOO_MANY_KEYS), 0.0, False
         if code:
             n, fate, delay, again = self._decided(state, kind.stream, key, expression, now, size)
         mark = int(kind) | AGAIN if again else int(kind)
-        row = self._journal.record(now, n, sequence, delay, code, sender, size, state.link.number, mark, fate or HELD)
+        row = self._journal.records.record(
+            now, n, sequence, delay, code, sender, size, state.link.number, mark, fate or HELD
+        )
         if fate:
             self._wait_in_vain(asked)
             return

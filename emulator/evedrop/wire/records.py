@@ -20,11 +20,11 @@ from typing import Any, final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from evedrop.model.links.loss_model import Fate
 from evedrop.results.folder import private_replacement
+from evedrop.results.growing_tables import parquet_writer
 from evedrop.system.files import write_all
 
 
@@ -92,7 +92,7 @@ AGAIN = 0x80
 """Added to the kind in the record of a message that was delivered twice."""
 
 HELD = 0x80
-"""Added to the fate in the record of a message that will be delivered, until it is: it is delayed, or waits for its turn."""
+"""Added to the fate in the record of a message that will be delivered, until Zenoh has taken it."""
 
 UNLINKED = 2**16 - 1
 """The code of a link in the record of a message that no link takes."""
@@ -194,10 +194,6 @@ class JournalPart:
         self._stored: Records = np.frombuffer(self.buffer, RECORD)
         self.handed = 0
         """The number of rows that were handed to the listeners."""
-        self.amendments = 0
-        """How many times a fate was changed."""
-        self.settled = 0.0
-        """When the last delay of these rows is over, in seconds since 1970."""
 
     def take(self) -> Records:
         """A copy of the rows that are whole and were not taken yet, up to the first that is not whole."""
@@ -205,8 +201,6 @@ class JournalPart:
         missing = rest["fate"] == 0
         rows = _whole(rest[: int(missing.argmax()) if missing.any() else len(rest)])
         self.handed += len(rows)
-        if len(rows):
-            self.settled = max(self.settled, float((rows["time"] + rows["delay"]).max()))
         return rows
 
     def whole(self) -> Records:
@@ -222,7 +216,6 @@ class JournalPart:
         """Change the fate of a row; returns the row as it was, (1,)."""
         before = _whole(self._stored[place : place + 1])
         self._stored["fate"][place] = fate + STORED
-        self.amendments += 1
         return before
 
     @property
@@ -329,19 +322,5 @@ def _codes(column: pa.ChunkedArray, codes: Mapping[str, int], none: int) -> NDAr
 
 def write_parquet(path: Path, table: pa.Table) -> None:
     """Write a Parquet file, which is complete under its name. Raises OSError if the disk is full."""
-    with private_replacement(path) as unfinished, unfinished.open("wb") as file:
-        pq.write_table(table, file, compression="zstd", compression_level=1)
-
-
-def amend_parquet(path: Path, fates: Mapping[int, WireFate]) -> pa.Table:
-    """Change the fates of some rows of a Parquet file; returns the rows as they were. Raises OSError if it cannot be written."""
-    table = pq.read_table(path)
-    before = table.take(list(fates))
-    for name, text_of in (("fate", word_of), ("reason", REASONS.get)):
-        texts = table[name].cast(pa.string()).to_pylist()
-        for row, fate in fates.items():
-            texts[row] = text_of(fate)
-        at, column = table.schema.get_field_index(name), PARQUET.field(name)
-        table = table.set_column(at, column, pa.array(texts, pa.string()).cast(column.type))
-    write_parquet(path, table)
-    return before
+    with private_replacement(path) as unfinished, parquet_writer(unfinished, table.schema) as writer:
+        writer.write_table(table)

@@ -104,7 +104,7 @@ class WireRelay:
     def _open(self, stack: contextlib.ExitStack) -> None:
         plan, journal, links = self.plan, self._journal, self.links
         self.sides = {name: stack.enter_context(SideSession(side, plan.largest)) for name, side in plan.sides.items()}
-        send_queues = {name: SendQueue(name, plan, journal, self._tell) for name in plan.sides}
+        send_queues = {name: SendQueue(name, plan, journal.records, self._tell) for name in plan.sides}
         stack.callback(self._end_send_queues, [*send_queues.values()])
         publishers = {name: Publishers(side.session) for name, side in self.sides.items()}
         self._queries = QueryRelay(self.sides, links, send_queues, plan, journal, self._tell)

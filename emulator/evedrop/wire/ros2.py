@@ -9,7 +9,6 @@ Source: docs/ros2.md, what the wire reads, and the journal.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -20,6 +19,7 @@ from typing import Final, final
 import zenoh
 from xxhash import xxh3_128_intdigest
 
+from evedrop.system.files import LineFile
 from evedrop.system.output import warn
 
 _ATTACHMENT = Struct("<q8xB16s")
@@ -214,8 +214,8 @@ class EntityLog:
             return
         self._known.add((side, token))
         try:
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"side": side, **asdict(entity)}) + "\n")
+            with LineFile(self._path) as file:
+                file.append({"side": side, **asdict(entity)})
         except OSError as error:
             warn(f"{self._path} lacks entities of ROS 2 from now on ({error.strerror}); the wire and its journal go on")
             self._path = None

@@ -84,8 +84,8 @@ def run_wire(
                 say(
                     f"{journal.recovered:,} messages were recovered from an earlier start, which was killed; their numbers go on"
                 )
-            if journal.start > 1:
-                say(continuation(journal.start, journal.counts))
+            if journal.history.start > 1:
+                say(continuation(journal.history.start, journal.counts))
             with ExitStack() as stack:
                 with watchdog.doing(Duty("while the sides were opened", ANSWER_SECONDS)):
                     relay = stack.enter_context(WireRelay(plan, journal, warn, happened))
@@ -106,8 +106,8 @@ def run_wire(
         say(line)
     for line in wire_failures(summary):
         (say if complain is None else complain)(line)
-    if journal.removed is not None:
-        raise RunError(_removed(journal.removed, out))
+    if journal.place.removed is not None:
+        raise RunError(_removed(journal.place.removed, out))
     say(f"results: {out}")
     return status
 

@@ -406,7 +406,7 @@ class RunningLink:
         if fates is None:
             kind, key = stream
             start = self._numbers.pop(stream) if stream in self._numbers else self._counted(stream)
-            changes = self._journal.changes_of(self.link.name, key, kind)
+            changes = self._journal.history.changes_of(self.link.name, key, kind)
             if self._links_of_keys is None or self._links_of_keys[0] != changes:
                 self._links_of_keys = (changes, PerKeyLinks(self.link, self._seed, changes))
             fates = self._fates[stream] = KeyFates(

@@ -40,7 +40,7 @@ from evedrop.results.wire_summary import (
 )
 from evedrop.score.summary import Judged
 from evedrop.system.output import warn
-from evedrop.wire.history import NotedEvent
+from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.records import REASONS, UNLINKED, Kind, Records, WireFate
@@ -56,18 +56,23 @@ BYPASSED = "programs could speak past the wire"
 class SummarisedJournal(Protocol):
     """What a summary needs from a journal; `WireJournal` and `JournalOnDisk` provide it."""
 
-    listeners: list[Listener]
-    amendment_listeners: list[AmendmentListener]
-    recorded: int
-    missing: int
+    history: WireHistory
 
     @property
-    def incomplete_since(self) -> float | None:
-        """When something could not be written for the first time, in seconds since 1970."""
+    def listeners(self) -> list[Listener]:
+        """They get each block of new records."""
 
     @property
-    def start(self) -> int:
-        """The number of the start of the wire in its folder, from 1."""
+    def amendment_listeners(self) -> list[AmendmentListener]:
+        """They get records whose fate has changed."""
+
+    @property
+    def recorded(self) -> int:
+        """The number of all records."""
+
+    @property
+    def completeness(self) -> JournalSummary:
+        """What an earlier start left behind, and what is not on the disk."""
 
     @property
     def seconds(self) -> float:
@@ -77,19 +82,8 @@ class SummarisedJournal(Protocol):
     def state(self) -> JournalState:
         """What became of this start."""
 
-    @property
-    def recovered(self) -> int:
-        """The number of records that an earlier start had left behind."""
-
-    @property
-    def events(self) -> Sequence[NotedEvent]:
-        """The events of this start, with seconds since it began."""
-
     def key_of(self, code: int) -> str:
         """The key of a code."""
-
-    def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
-        """The settings that the messages of a stream had."""
 
 
 @final
@@ -169,16 +163,16 @@ class WireScorekeeper:
         journal, links = self._journal, self.links()
         return WireSummary(
             seed=self._plan.seed,
-            start=journal.start,
+            start=journal.history.start,
             state=journal.state,
             seconds=journal.seconds,
             heard=journal.recorded,
             unlinked=self._unlinked.heard,
             unaccounted=self.unaccounted,
-            journal=JournalSummary(journal.recovered, journal.missing, journal.incomplete_since),
+            journal=journal.completeness,
             links=links,
             expectations=self.judged(links),
-            events=[WireEventSummary(*event) for event in journal.events],
+            events=[WireEventSummary(*event) for event in journal.history.events],
             made_with={
                 "python": platform.python_version(),
                 **{name: importlib.metadata.version(name) for name in ("evedrop", "eclipse-zenoh")},
@@ -187,7 +181,7 @@ class WireScorekeeper:
 
     def judged(self, links: Mapping[str, WireLinkSummary]) -> list[Judged]:
         """The expectations of the wire, and whether they held. None held if programs could have spoken past the wire."""
-        bypassed = any(event.bypass for event in self._journal.events)
+        bypassed = any(event.bypass for event in self._journal.history.events)
         judged = [self._judged(table, links[table.subject]) for table in self._plan.expectations]
         return [replace(result, held=None, why=BYPASSED) if bypassed and result.held else result for result in judged]
 
@@ -269,7 +263,7 @@ class WireScorekeeper:
         shared: those of the link so far, which streams with the same numbers and settings share: a key that never came again
         is like all others. Raises UsageError if a message has two fates, which only a journal on disk that was changed can say.
         """
-        changes = self._journal.changes_of(link.name, self._journal.key_of(key), Kind(kind).stream)
+        changes = self._journal.history.changes_of(link.name, self._journal.key_of(key), Kind(kind).stream)
         numbers = tuple(sorted(tally.ranges))
         name = (tuple((change.at, id(change.settings)) for change in changes), numbers, tally.tried)
         if name not in shared:

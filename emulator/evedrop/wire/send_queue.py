@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final, final
 
-from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal import JournalRecords
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.records import WireFate
 from evedrop.wire.running_link import KeyOrder, Scheduler
@@ -57,7 +57,7 @@ class SendQueue:
         self,
         side: str,
         plan: WirePlan,
-        journal: WireJournal,
+        records: JournalRecords,
         tell: Callable[[str], None],
         *,
         most: int = MOST_WAITING,
@@ -65,7 +65,7 @@ class SendQueue:
         patience: float = PATIENCE,
     ) -> None:
         """tell: for what the user must know; most, most_bytes: how much may wait; patience: in seconds."""
-        self._side, self._journal, self._tell = side, journal, tell
+        self._side, self._records, self._tell = side, records, tell
         self._most, self._most_bytes, self._patience = most, most_bytes, patience
         self._queue: deque[tuple[int, int, Task]] = deque()
         """What waits, as bytes, row, and task; the first one is being sent."""
@@ -108,7 +108,7 @@ class SendQueue:
         if not delay and order is None:
             self._hand(size, row, task, patient, lost)
         elif not self._delays.hold(delay, size, row, lambda: self._hand(size, row, task, patient, lost), order):
-            self._journal.amend(row, WireFate.UNDERWAY if self._ending else WireFate.HELD_UP)
+            self._records.amend(row, WireFate.UNDERWAY if self._ending else WireFate.HELD_UP)
             if lost is not None:
                 lost()
 
@@ -144,7 +144,7 @@ class SendQueue:
             self._ending = True
             self._room.set()
         for row in self._delays.close():
-            self._journal.amend(row, WireFate.UNDERWAY)
+            self._records.amend(row, WireFate.UNDERWAY)
         with self._lock:
             self._over = True
             self._wake()
@@ -156,7 +156,7 @@ class SendQueue:
             self._ended = True
             for _, row, _ in self._queue:
                 if row != _NO_ROW:
-                    self._journal.amend(row, WireFate.UNDERWAY)
+                    self._records.amend(row, WireFate.UNDERWAY)
 
     def _put(self, size: int, row: int, task: Task) -> None:
         """Add to the queue. The lock is held."""
@@ -187,7 +187,7 @@ class SendQueue:
                 trust = self._trust
             if not self._gets_room(trust * (self._patience + waiting / _SLOW)):
                 self._stop()
-        self._journal.amend(row, WireFate.UNDERWAY if self._ending else WireFate.CONGESTED)
+        self._records.amend(row, WireFate.UNDERWAY if self._ending else WireFate.CONGESTED)
         if lost is not None:
             lost()
 
@@ -216,10 +216,10 @@ class SendQueue:
         )
 
     def _refused(self, row: int) -> None:
-        self._journal.amend(row, WireFate.REFUSED)
+        self._records.amend(row, WireFate.REFUSED)
 
     def _run(self) -> None:
-        queue, lock, sent = self._queue, self._lock, self._journal.sent
+        queue, lock, sent = self._queue, self._lock, self._records.sent
         while queue or self._wait():
             item = queue[0]
             size, row, task = item

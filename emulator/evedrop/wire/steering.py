@@ -212,7 +212,7 @@ class WireControl:
             for name, (heard, delivered) in self._scorekeeper.counts().items()
         }
         sides = {name: list(endpoints) for name, endpoints in self._relay.endpoints.items()}
-        whole = self._journal.incomplete_since is None
+        whole = self._journal.place.incomplete_since is None
         complete = "complete" if whole else "incomplete, because its folder could not be written"
-        bypasses = [event.line for event in self._journal.events if event.bypass]
+        bypasses = [event.line for event in self._journal.history.events if event.bypass]
         return WireStatus(self._conductor.seconds, sides, links, list(self._events), complete, bypasses)

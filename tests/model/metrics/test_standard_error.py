@@ -20,7 +20,7 @@ from scipy.stats import t as student
 from evedrop.cli.api import montecarlo, run
 from evedrop.cli.report import closing_table, print_summary
 from evedrop.model.metrics.built_in import UsedFraction
-from evedrop.model.metrics.metric import MeanMetric, ScoredSlots, TallyMetric
+from evedrop.model.metrics.metric import MeanMetric, ScoredSlots
 from evedrop.model.metrics.standard_error import ratio_error, standard_error, z_of
 from evedrop.model.metrics.text import estimate
 from evedrop.model.process import Floats
@@ -201,7 +201,7 @@ def test_a_metric_that_is_not_known_trial_by_trial_has_none(monkeypatch: pytest.
     assert tally.of_trials("kept") is None
     monkeypatch.setattr("evedrop.score.sums.metric", lambda _: UsedFraction)
     assert tally.of_trials("used") is not None
-    monkeypatch.setattr(UsedFraction, "sums_of_trials", TallyMetric.sums_of_trials)
+    monkeypatch.setattr(UsedFraction, "trial_sums", None)
     assert tally.of_trials("used") is None
 
 

@@ -38,7 +38,7 @@ from evedrop.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
 from evedrop.names import LEGITIMATE
 from evedrop.results.ending import noted
 from evedrop.results.folder import make_private, private_replacement
-from evedrop.results.growing_tables import parquet_or_stream
+from evedrop.results.growing_tables import parquet_or_stream, parquet_writer
 from evedrop.results.reading import Results, as_of
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.shard_score import load_score
@@ -245,7 +245,7 @@ class Gathered(ABC):
         rows = [_Rows(source, schema, self) for source in sources]
         with (
             private_replacement(table) as unfinished,
-            pq.ParquetWriter(unfinished, schema, compression="zstd", compression_level=1) as writer,
+            parquet_writer(unfinished, schema) as writer,
         ):
             for first in count(0, self.slots_at_once):
                 parts = [reader.below(first + self.slots_at_once) for reader in rows]

@@ -20,7 +20,6 @@ from evedrop.model.metrics.metric import (
     ReceiverTally,
     ScoredSlots,
     TallyMetric,
-    TrialTally,
 )
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action
@@ -33,16 +32,8 @@ class ReceivedFraction(MeanMetric, TallyMetric):
     meaning = "packets received"
     rests_on = "recorder"
     column = MetricColumn("received", 0, ".4f")
-
-    @classmethod
-    def of_tally(cls, tally: ReceiverTally) -> float:
-        """The fraction over the run."""
-        return (tally.received + tally.late) / max(1, tally.offered)
-
-    @classmethod
-    def sums_of_trials(cls, tally: TrialTally) -> Floats | None:
-        """Counts of packets received in every trial, (R,)."""
-        return tally.received.astype(np.float64)
+    sums = ("received", "late")
+    trial_sums = "received"
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
@@ -57,16 +48,8 @@ class UsedFraction(MeanMetric, TallyMetric):
 
     meaning = "packets received and used"
     column = MetricColumn("used", 1, ".4f")
-
-    @classmethod
-    def of_tally(cls, tally: ReceiverTally) -> float:
-        """The fraction over the run."""
-        return (tally.used + tally.late_used) / max(1, tally.offered)
-
-    @classmethod
-    def sums_of_trials(cls, tally: TrialTally) -> Floats | None:
-        """Counts of packets received and used in every trial, (R,)."""
-        return tally.used.astype(np.float64)
+    sums = ("used", "late_used")
+    trial_sums = "used"
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
@@ -82,16 +65,8 @@ class MeanError(MeanMetric, TallyMetric):
     expected = "theoretical_trace_covariance"
     sweep_column = MetricColumn("mean error", 0)
     sweep_picture = "marks"
-
-    @classmethod
-    def of_tally(cls, tally: ReceiverTally) -> float:
-        """Its mean over the run."""
-        return tally.error / max(1, tally.offered)
-
-    @classmethod
-    def sums_of_trials(cls, tally: TrialTally) -> Floats | None:
-        """Its sum over the slots of every trial, (R,)."""
-        return tally.error
+    sums = ("error",)
+    trial_sums = "error"
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
@@ -128,16 +103,8 @@ class MeanTraceCovariance(MeanMetric, TallyMetric):
     rests_on = "recorded trials"
     column = MetricColumn("reported tr P", 3)
     sweep_column = MetricColumn("reported tr P", 2)
-
-    @classmethod
-    def of_tally(cls, tally: ReceiverTally) -> float:
-        """Its mean over the run."""
-        return tally.trace / max(1, tally.offered)
-
-    @classmethod
-    def sums_of_trials(cls, tally: TrialTally) -> Floats | None:
-        """The sum of tr P over the slots of every trial, (R,); None if not every trial's is known."""
-        return tally.trace
+    sums = ("trace",)
+    trial_sums = "trace"
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
@@ -158,11 +125,7 @@ class TheoreticalTraceCovariance(TallyMetric):
     column = MetricColumn("theoretical tr P", 4)
     sweep_column = MetricColumn("theoretical tr P", 1)
     sweep_picture = "lines"
-
-    @classmethod
-    def of_tally(cls, tally: ReceiverTally) -> float:
-        """Its mean over the run; NaN without theory."""
-        return tally.theoretical_trace / max(1, tally.offered)
+    sums = ("theoretical_trace",)
 
     @classmethod
     def tally(cls, trials: int) -> MetricTally:

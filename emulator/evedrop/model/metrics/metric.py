@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, NamedTuple, Self, final
+from typing import Any, ClassVar, Literal, NamedTuple, Self, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,18 +174,24 @@ class Metric(ABC):
 
 
 class TallyMetric(Metric):
-    """A metric that is computed for a whole run from `ReceiverTally`, without a tally of its own."""
+    """A mean whose sums over a whole run are in `ReceiverTally`, so that it needs no tally of its own for that."""
+
+    sums: ClassVar[tuple[str, ...]]
+    """The entries of `ReceiverTally` that are added up; the metric is their sum for each slot and trial."""
+    trial_sums: ClassVar[str | None] = None
+    """The entry of `TrialTally` that is the same sum for each trial, if there is one."""
 
     @classmethod
-    @abstractmethod
     def of_tally(cls, tally: ReceiverTally) -> float:
         """The metric of a whole run; NaN if it has none."""
+        total: float = sum(getattr(tally, name) for name in cls.sums)
+        return total / max(1, tally.offered)
 
     @classmethod
     def sums_of_trials(cls, tally: TrialTally) -> Floats | None:
         """What it is the mean of, summed over the slots of every trial, (R,); None if that is not known."""
-        del tally
-        return None
+        sums: NDArray[Any] | None = None if cls.trial_sums is None else getattr(tally, cls.trial_sums)
+        return None if sums is None else sums.astype(np.float64)
 
 
 @final
