@@ -170,7 +170,7 @@ def _send(session: zenoh.Session, peer: Peer, load: Load) -> list[float]:
         if load.rate:
             time.sleep(max(0.0, start + k / load.rate - time.monotonic()))
         times.append(time.monotonic())
-        publisher.put(envelope(peer.key, {"k": k, "z": payload}))
+        publisher.put(envelope(peer.key, {"k": k, "c": 1, "z": payload}))
     sys.stdin.read()  # the session stays open until all messages have arrived
     token.undeclare()
     return times

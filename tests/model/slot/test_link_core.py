@@ -56,12 +56,14 @@ class OneByOne:
         """The belief after a slot."""
         heard = arrival.heard
         header = None if heard.header is None else heard.header[None]
-        beliefs = self.core.take_slots(
+        taken = self.core.take_slots(
             range(k, k + 1),
             Arrivals(heard.gamma[None], heard.z[None], header, {0: arrival.late} if arrival.late else {}),
         )
-        self.late, self.used = np.zeros((2, len(self.late)), np.uint16) if beliefs.late is None else beliefs.late[:, 0]
-        assert same(beliefs.beliefs.last, self.core.belief)
+        none = np.zeros(len(self.late), np.uint16)
+        self.late = none if taken.late is None else taken.late[0]
+        self.used = none if taken.late_used is None else taken.late_used[0]
+        assert same(taken.beliefs.last, self.core.belief)
         return self.core.belief
 
 
