@@ -25,9 +25,10 @@ def packets(slots: range, told: bool = False) -> PacketSlots:
     return PacketSlots(slots.start, np.where(sent[:, None], z, 0.0), None, sent, z + 1.0 if told else None)
 
 
-def downlink(waited: bool, put: list[bytes], betrayed: int | None = None) -> Downlink:
-    """A receiver's link for the slots of a batch; betrayed: the slot whose state is told to it."""
+def downlink(waited: bool, put: list[bytes], betrayed: int | None = None, message: int = BATCH) -> Downlink:
+    """A receiver's link for the slots of a batch; betrayed: the slot whose state is told to it; message: slots of one at most."""
     brief = MemoryBench().brief
+    brief = replace(brief, flow=replace(brief.flow, message=message))
     if betrayed is not None:
         brief = replace(brief, part=replace(brief.part, leaks={"eve": betrayed}))
     link = Downlink("eve", brief.part.links["eve"], brief, lambda payload, _: put.append(payload), waited)
@@ -58,6 +59,17 @@ def test_deliveries_that_nobody_waits_for_are_sent_as_one_message() -> None:
         part = read_delivery(Reader("d", payload), k, SHAPE, most=BATCH)
         assert np.array_equal(part.gamma, whole.gamma[k : k + c])
         assert part.z.tobytes() == whole.z[k : k + c].tobytes()
+
+
+@pytest.mark.parametrize(("message", "expected"), [(1, [1] * 5), (2, [2, 2, 1]), (3, [3, 2])])
+def test_a_message_carries_no_more_slots_than_the_run_allows(message: int, expected: list[int]) -> None:
+    """Its size is bounded by that number."""
+    put: list[bytes] = []
+    link = downlink(False, put, message=message)
+    for k in range(5):
+        link.take(packets(range(k, k + 1)))
+    link.flush()
+    assert [c for _, c in contents(put)] == expected
 
 
 def test_they_are_sent_before_a_barrier() -> None:

@@ -80,7 +80,7 @@ class Downlink:
         self._rests: dict[int, float] = {}
         """Slot → the fraction of a slot that the first trial's packet takes in addition, for packets that may still arrive."""
         self._leak = brief.part.leaks.get(name)
-        self._waited = waited
+        self._waited, self._most = waited, brief.flow.message
         self._held: list[PacketSlots] = []
 
     def plan(self, slots: range) -> None:
@@ -115,10 +115,11 @@ class Downlink:
         elif self._waited:
             self._deliver(packets)
         else:
-            if packets.truth is not None:
+            betrayed = packets.truth is not None
+            if betrayed or sum(held.count for held in self._held) + packets.count > self._most:
                 self.flush()
             self._held.append(replace(packets, sent=None))  # unsent packets are silenced already
-            if packets.truth is not None:
+            if betrayed:
                 self.flush()
 
     def flush(self) -> None:
