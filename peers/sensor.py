@@ -14,7 +14,7 @@ from evedrop.live.network.process_session import GapDetector, Mailbox, ProcessSe
 from evedrop.live.network.program import ProgramStates
 from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import AnyBrief, Brief, ProgramEntry, SensorPart, decoded
+from evedrop.live.protocol.brief import AnyBrief, Brief, ProgramPart, SensorPart, decoded
 from evedrop.live.protocol.codec import Reader, read_progress
 from evedrop.live.protocol.commands import EndRun, Go, Hold, Start
 from evedrop.live.protocol.packets import barrier, packets_of, read_acknowledgement, resend, uplink
@@ -293,7 +293,7 @@ def _core_of(brief: Brief[SensorPart], scheme: Scheme, program: ProgramStates | 
 def sense(
     brief: Brief[SensorPart],
     connect: Callable[[AnyBrief], ProcessSession] = Session,
-    listen: Callable[[ProgramEntry, bool, float], ProgramStates] = ProgramStates,
+    listen: Callable[[ProgramPart, bool, float], ProgramStates] = ProgramStates,
     clock: Clock = SYSTEM_CLOCK,
 ) -> None:
     """Run the sensor of a brief.

@@ -13,7 +13,7 @@ import pyarrow as pa
 import tomli_w
 
 from evedrop.errors import RunError
-from evedrop.live.protocol.brief import ProgramEntry
+from evedrop.live.protocol.brief import ProgramPart
 from evedrop.live.protocol.state_message import read_state
 from evedrop.scenario.estimates import warnings_of
 from evedrop.scenario.loading import load, parse, value_of
@@ -117,7 +117,7 @@ def _states(data: bytes, folder: Path) -> None:
     fit_process(folder / "pose.csv")
 
 
-def _state_message(entry: ProgramEntry, data: bytes, _folder: Path) -> None:
+def _state_message(entry: ProgramPart, data: bytes, _folder: Path) -> None:
     try:
         read_state(data, entry)
     except ValueError as error:
@@ -144,7 +144,7 @@ def _recordings() -> list[bytes]:
 
 _DAY = b"time [s],P_solar [kW],P_load [kW]\n0,0.5,0.2\n1,0.6,0.2\n2,0.7,1.25\n"
 _POSE = ("time,x [m],v\n" + "".join(f"{5 + 0.1 * k:.1f},{k % 7},{0.1 * (k % 5)}\n" for k in range(30))).encode()
-_NAMED = ProgramEntry("robot/pose", ["x", "y"], [0.0, 1.5], "tcp/127.0.0.1:7447")
+_NAMED = ProgramPart("robot/pose", ["x", "y"], [0.0, 1.5], "tcp/127.0.0.1:7447")
 _WALK = b"k,received,delay\n0,1,2.5\n1,0,\n2,1,3\n"
 
 OF_SCENARIOS: dict[str, Reader] = {

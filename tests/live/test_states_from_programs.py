@@ -18,7 +18,7 @@ from evedrop.cli.api import montecarlo, run
 from evedrop.errors import RunError
 from evedrop.live.launch.starter import preloaded
 from evedrop.live.network.program import ProgramStates
-from evedrop.live.protocol.brief import ProgramEntry
+from evedrop.live.protocol.brief import ProgramPart
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
 from evedrop.scenario.recordings.disturbance_file import table_text
@@ -127,7 +127,7 @@ def test_states_are_taken_from_messages_as_they_come() -> None:
         session.put("robot/other", "[7, 0]")
         session.delete("robot/pose")
         wait_until(lambda: len(samples) == 5, "all messages arrive")
-    entry = ProgramEntry("robot/pose", ["x", "v"], [0.0, 0.0], listen="tcp/127.0.0.1:0")
+    entry = ProgramPart("robot/pose", ["x", "v"], [0.0, 0.0], listen="tcp/127.0.0.1:0")
     for newest, expected in ((True, [2.0]), (False, [0.0, 1.0, 2.0])):
         with ProgramStates(entry, newest, 5.0) as states:
             for sample in samples:
@@ -143,7 +143,7 @@ def test_states_are_taken_from_messages_as_they_come() -> None:
 def test_a_silent_program_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """With key, endpoint, slot and how long it was silent."""
     monkeypatch.setattr("evedrop.live.network.program.LEAST_SECONDS", 0.0)
-    entry = ProgramEntry("robot/pose", ["x", "v"], [0.0, 0.0], listen="tcp/127.0.0.1:0")
+    entry = ProgramPart("robot/pose", ["x", "v"], [0.0, 0.0], listen="tcp/127.0.0.1:0")
     with ProgramStates(entry, False, 0.01) as states:
         with pytest.raises(RunError, match=r"robot/pose at tcp/127.0.0.1:0: no state came for 0 s; check that"):
             states.take(range(1))

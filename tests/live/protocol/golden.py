@@ -250,7 +250,7 @@ def decode_barrier(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) ->
     """As router and receivers read it."""
     message = wire.Reader(KEY, raw)
     assert packets.is_barrier(message)
-    return {"k": message.slot(value["k"]), "hold": message.flag("hold")}
+    return {"k": message.slot(value["k"]), "hold": message.fields["hold"]}
 
 
 def decode_resend(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -265,7 +265,7 @@ def decode_held(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> di
     """As the recorder reads it."""
     message = wire.Reader(KEY, raw)
     assert telemetry.is_held(message)
-    return {"k": message.slot(value["k"]), "held": message.flag("held")}
+    return {"k": message.slot(value["k"]), "held": message.fields["held"]}
 
 
 def control_of(value: dict[str, Any]) -> commands.ControlCommand:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from evedrop.errors import BriefError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import EavesdropperPart, RecorderPart, RouterPart, SensorPart, has_part, read_brief
+from evedrop.live.protocol.json_tables import plain
 from evedrop.scenario.stream_keys import StreamKeys
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
@@ -43,6 +45,31 @@ def test_a_brief_has_the_part_of_its_role() -> None:
     """And of no other."""
     assert has_part(BRIEF, EavesdropperPart)
     assert not has_part(BRIEF, SensorPart)
+
+
+@pytest.mark.parametrize("role", ["router", "relay"])
+def test_a_router_has_a_limit_for_every_kind_of_message(role: str, tmp_path: Path) -> None:
+    """And so has a relay."""
+    brief = json.loads(json.dumps(BRIEFS["replay-attack/router"]))
+    if role == "relay":
+        users, limits = brief["part"]["users"], brief["part"]["limits"]
+        brief["part"] = {
+            "users": users,
+            "receivers": [],
+            "listen": "x",
+            "zid": "1",
+            "controller": None,
+            "limits": limits,
+        }
+        brief["role"] = "relay"
+    assert refusal(brief, tmp_path) is None
+    del brief["part"]["limits"]["ack"]
+    assert "`ack` of part.limits is missing, or no kind of key - at `$.part`" in str(refusal(brief, tmp_path))
+
+
+def test_a_table_that_nobody_can_change_is_written_as_any_other() -> None:
+    """As parameters may be."""
+    assert json.dumps(MappingProxyType({"use": 0.5}), default=plain) == '{"use": 0.5}'
 
 
 def test_a_brief_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:

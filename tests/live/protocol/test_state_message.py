@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from evedrop.errors import BriefError
-from evedrop.live.protocol.brief import AnyBrief, ProgramEntry, SensorPart, decoded, encoded, read_brief
+from evedrop.live.protocol.brief import AnyBrief, ProgramPart, SensorPart, decoded, encoded, read_brief
 from evedrop.live.protocol.state_message import MOST_BYTES, read_state
 from evedrop.scenario.loading import checked
 from tests.builders import part_of
 from tests.live.protocol.made_briefs import made
 
-NAMED = ProgramEntry("robot/pose", ["x", "y"], [1.0, 0.0], "tcp/127.0.0.1:7447")
-PLACED = ProgramEntry("robot/pose", ["x", "y"], [0.0, 0.0], "tcp/127.0.0.1:7447", offsets=[4, 20])
+NAMED = ProgramPart("robot/pose", ["x", "y"], [1.0, 0.0], "tcp/127.0.0.1:7447")
+PLACED = ProgramPart("robot/pose", ["x", "y"], [0.0, 0.0], "tcp/127.0.0.1:7447", offsets=[4, 20])
 
 
 @pytest.mark.parametrize("text", ['{"x": 1.5, "y": -2, "z": "?"}', "[1.5, -2]"])
@@ -55,7 +55,7 @@ def test_states_at_known_bytes() -> None:
         (struct.pack("<4sddd", b"", 0.0, 0.0, float("nan")), PLACED, "has y = nan"),
     ],
 )
-def test_what_is_not_a_state_is_refused(payload: bytes, entry: ProgramEntry, message: str) -> None:
+def test_what_is_not_a_state_is_refused(payload: bytes, entry: ProgramPart, message: str) -> None:
     """With what it is, and what was expected."""
     with pytest.raises(ValueError, match=message):
         read_state(payload, entry)

@@ -25,7 +25,7 @@ from evedrop.live.protocol.brief import (
     LegitimatePart,
     Model,
     Part,
-    ProgramEntry,
+    ProgramPart,
     RecorderPart,
     RelayPart,
     RouterPart,
@@ -251,12 +251,12 @@ def briefs_of(
     return {made_brief.process: made_brief for made_brief in made}
 
 
-def _program_of(process: ProcessTable) -> ProgramEntry | None:
+def _program_of(process: ProcessTable) -> ProgramPart | None:
     """The program that publishes the states; None if none does."""
     program = process.zenoh
     if process.source != "zenoh" or program is None:
         return None
-    return ProgramEntry(
+    return ProgramPart(
         program.key, process.states or (), process.around, program.connect, program.listen, program.offsets
     )
 

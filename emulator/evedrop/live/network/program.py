@@ -15,7 +15,7 @@ import zenoh
 
 from evedrop.errors import BriefError, RunError
 from evedrop.live.network.connecting import open_session
-from evedrop.live.protocol.brief import ProgramEntry
+from evedrop.live.protocol.brief import ProgramPart
 from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.live.protocol.state_message import MOST_BYTES, read_state
 from evedrop.model.process import Floats
@@ -27,7 +27,7 @@ _MOST_WAITING = 100_000
 _CONNECT_SECONDS = 30.0
 
 
-def program_config(entry: ProgramEntry) -> ZenohConfig:
+def program_config(entry: ProgramPart) -> ZenohConfig:
     """Zenoh configuration of the session: one endpoint, and no scouting for others."""
     scouting = {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}}
     if entry.listen is not None:
@@ -50,7 +50,7 @@ class ProgramStates:
     patience: seconds for which the program may be silent.
     """
 
-    def __init__(self, entry: ProgramEntry, newest: bool, patience: float, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(self, entry: ProgramPart, newest: bool, patience: float, clock: Clock = SYSTEM_CLOCK) -> None:
         """Raises BriefError if there is no router at the endpoint, or if the endpoint cannot be listened on."""
         self._entry, self._newest = entry, newest
         self._patience = max(patience, LEAST_SECONDS)

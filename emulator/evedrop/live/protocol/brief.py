@@ -175,7 +175,7 @@ class RelayPart:
 
 
 @dataclass(frozen=True)
-class ProgramEntry:
+class ProgramPart:
     """The program that publishes the states, and the form of its messages."""
 
     key: str
@@ -226,7 +226,7 @@ class SensorPart:
     """None without a detector for its filter."""
     states: str | None = None
     """Given states of all slots, as deviations, as `encoded`; None if they are not known before the run."""
-    program: ProgramEntry | None = None
+    program: ProgramPart | None = None
     """The program that gives the states; None if none does."""
 
     @property

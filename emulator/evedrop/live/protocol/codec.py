@@ -114,20 +114,6 @@ class Reader:
             raise self.malformed(f"{name} = {shown(value)}", f"one of {', '.join(choices)}")
         return value
 
-    def flag(self, name: str) -> bool:
-        """A boolean field."""
-        value = self._fields.get(name)
-        if type(value) is not bool:
-            raise self.malformed(f"{name} = {shown(value)}", f"a boolean {name}")
-        return value
-
-    def names(self, name: str) -> tuple[str, ...]:
-        """A list of strings."""
-        value = self._fields.get(name)
-        if not isinstance(value, list) or not all(isinstance(element, str) for element in value):
-            raise self.malformed(f"{name} = {shown(value)}", f"a list {name} of strings")
-        return tuple(value)
-
     def array(self, name: str, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
         """A binary field as a read-only array of this type and shape."""
         value = self._fields.get(name)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.live.protocol.brief import ProgramEntry
+from evedrop.live.protocol.brief import ProgramPart
 from evedrop.model.checks import is_number
 from evedrop.model.process import Floats
 from evedrop.model.slot.cores import LARGEST, deviations
@@ -23,7 +23,7 @@ _SHOWN = 80
 _DOUBLE = struct.Struct("<d")
 
 
-def read_state(payload: bytes, entry: ProgramEntry) -> Floats:
+def read_state(payload: bytes, entry: ProgramPart) -> Floats:
     """The state in a message of the program, as deviations from the reference, (n,).
 
     Raises ValueError, with what the message is and what was expected.
@@ -40,7 +40,7 @@ def read_state(payload: bytes, entry: ProgramEntry) -> Floats:
     return deviations(np.array(values, np.float64), np.array(entry.reference))
 
 
-def _named(payload: bytes, entry: ProgramEntry) -> Iterator[Any]:
+def _named(payload: bytes, entry: ProgramPart) -> Iterator[Any]:
     """The values in a JSON list, or under the names of the states in a JSON object."""
     try:
         values = json.loads(payload)
