@@ -39,7 +39,8 @@ class Plant:
     measurement_noise: Floats | None = None
     """Covariance of v, (p, p)."""
 
-    def __post_init__(self) -> None:
+    def expect_possible(self) -> None:
+        """Raise ValueError unless all matrices and vectors have the shapes that go together."""
         n, m, q = self.start.size, self.input_matrix.shape[-1], self.disturbance_matrix.shape[-1]
         shapes = {"input_matrix": (n, m), "disturbance_matrix": (n, q), "noise": (n, n), "start": (n,)}
         shapes |= {"input_lower": (m,), "input_upper": (m,), "state_lower": (n,), "state_upper": (n,)}

@@ -234,7 +234,7 @@ def test_an_estimator_that_knows_the_inputs_has_the_plant_of_its_model(tmp_path:
     refused = refusal(brief, tmp_path)
     assert refused is not None
     assert "noise has the shape " in refused
-    assert "`$.part.controller.plant`" in refused
+    assert "part.controller.plant" in refused
     plant |= {"start": [0.0], "noise": [[1.0]], "state_lower": [-1.0], "state_upper": [1.0]}
     plant |= {"input_matrix": plant["input_matrix"][:1], "disturbance_matrix": plant["disturbance_matrix"][:1]}
-    assert "part.plant cannot be used (ValueError: it does not have " in str(refusal(brief, tmp_path))
+    assert "part.controller.plant cannot be used (ValueError: it does not have " in str(refusal(brief, tmp_path))

@@ -143,6 +143,7 @@ class RouterPart:
         for name, schedule in self.links.items():
             brief.expect_keys(streams_of(name, schedule))
             with _using(f"part.links.{name}"):
+                schedule.expect_possible()
                 keys = brief.stream_keys
                 Link(schedule, name, {stream: keys[stream] for stream in streams_of(name, schedule)}, brief.batch)
         if self.acknowledgements is not None:
@@ -242,7 +243,7 @@ class SensorPart:
         if self.plant is not None:
             if self.disturbances is None:
                 raise BriefError(f"part.disturbances is missing, which moves the plant; {WRITE_AGAIN}")
-            _expect_plant(brief, self.plant, self.disturbances)
+            _expect_plant(brief, "part.plant", self.plant, self.disturbances)
         with _using("part.monitor"):
             if self.monitor is not None:
                 if self.plant is None or self.plant.output_matrix is None:
@@ -279,7 +280,7 @@ class LegitimatePart:
         """Make the scheme, and look for the keys of its streams."""
         brief.expect_keys(_scheme(brief, self.scheme).estimator_streams)
         if self.controller is not None and self.controller.plant is not None:
-            _expect_plant(brief, self.controller.plant)
+            _expect_plant(brief, "part.controller.plant", self.controller.plant)
 
 
 @dataclass(frozen=True)
@@ -336,7 +337,7 @@ class ControllerPart:
         if self.strategy not in CONTROLLERS:
             names = ", ".join(sorted(CONTROLLERS))
             raise BriefError(f"part.strategy is {self.strategy:.40}, expected one of {names}; {WRITE_AGAIN}")
-        _expect_plant(brief, self.assignment.plant, self.disturbances)
+        _expect_plant(brief, "part.assignment.plant", self.assignment.plant, self.disturbances)
         with _using("part.assignment"):
             given, own = brief.model.process, self.assignment.process
             if not all(np.array_equal(*two) for two in zip(given.matrices, own.matrices, strict=True)):
@@ -395,9 +396,10 @@ def _scheme(brief: AnyBrief, spec: Mapping[str, Any]) -> Scheme:
         return scheme_of(brief.model.process, spec)
 
 
-def _expect_plant(brief: AnyBrief, plant: Plant, disturbances: str | None = None) -> None:
+def _expect_plant(brief: AnyBrief, path: str, plant: Plant, disturbances: str | None = None) -> None:
     n = brief.model.process.n
-    with _using("part.plant"):
+    with _using(path):
+        plant.expect_possible()
         if plant.start.shape != (n,):
             raise ValueError(f"it does not have {n} states, as the model does")
     with _using("part.disturbances"):

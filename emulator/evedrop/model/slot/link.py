@@ -101,7 +101,8 @@ class LinkSchedule:
     correlation: tuple[str, float] | None = None
     """The receiver whose losses these are tied to, and how strongly."""
 
-    def __post_init__(self) -> None:
+    def expect_possible(self) -> None:
+        """Raise ValueError unless window, changes and outages are within a run's slots, and there is a loss model."""
         outages = (slot for outage in self.outages for slot in (outage.start, outage.stop))
         expect_slots(self.window, *(change.at for change in self.changes), *outages)
         if self.window > MOST_SLOTS or not isinstance(self.settings.get("loss"), Mapping):
