@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Collection
-from dataclasses import replace
 from functools import partial
 from queue import Empty
 from typing import final
@@ -235,12 +234,12 @@ class SensorLoop:
         if self._back is not None:
             sent = None if slots.sent is None else slots.sent[0]
             alarms = self._core.acknowledged(k, self._back.wait(k), sent)
-            slots = replace(slots, alarms=None if alarms is None else alarms[None])
+            slots = slots.changed(alarms=None if alarms is None else alarms[None])
         if self._steered is not None:
             u, failed = self._steered.wait(k, slots.states[0])
             if self._steered.decides(k):
                 self._core.set_inputs(u)
-            slots = replace(slots, u=u[None], failed=failed[None])
+            slots = slots.changed(u=u[None], failed=failed[None])
         return slots
 
     def _wait(self, k: int) -> None:

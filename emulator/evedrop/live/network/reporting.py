@@ -7,7 +7,6 @@ barrier. So a full window always holds a reported slot, and no process waits for
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from typing import final
 
 import numpy as np
@@ -20,6 +19,8 @@ from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.model.slot.records import ReceiverSlots, SensorSlots
+
+_PART_BYTES = 1 << 16  # of covariances that wait: single slots are joined before their digests are computed
 
 
 def is_due(brief: AnyBrief, k: int) -> bool:
@@ -38,7 +39,7 @@ class TruthReporter:
     def add_slots(self, slots: SensorSlots) -> None:
         """Add consecutive slots, which do not cross the end of a report; report if one is due with the last of them."""
         self._held.append(slots)
-        if is_due(self._brief, slots.slots[-1]):
+        if is_due(self._brief, slots.first + slots.count - 1):
             self.flush()
 
     def flush(self) -> None:
@@ -95,29 +96,42 @@ class BeliefReporter:
         self._digests: dict[int, Digests] = {}
         self._sums = BlockSums(brief.trials, brief.slots, cuts) if brief.recorded < brief.trials else None
         self._trace_sums: dict[int, Floats] = {}
+        self._parts: list[ReceiverSlots] = []
+        self._part_bytes = 0
         self._held: list[ReceiverSlots] = []
 
     def add_slots(self, slots: ReceiverSlots) -> None:
         """Add consecutive slots, with the covariances of all trials, and report where a report is due."""
-        k, stop, batch = slots.first, slots.slots.stop, self._brief.flow.batch
+        first, k, batch = slots.first, slots.first, self._brief.flow.batch
+        stop = first + slots.count
         while k < stop:
             end = min(stop, self._blocks.end(k), k - k % batch + batch)
-            self._hold(slots.rows(slice(k - slots.first, end - slots.first)))
-            if is_due(self._brief, end - 1):
+            part = slots if end - k == slots.count else slots.rows(slice(k - first, end - first))
+            self._parts.append(part)
+            self._part_bytes += part.P.nbytes
+            due = is_due(self._brief, end - 1)
+            if due or end == self._blocks.end(k) or self._part_bytes >= _PART_BYTES:
+                self._take_parts()
+            if due:
                 self.flush(end)
             k = end
 
-    def _hold(self, slots: ReceiverSlots) -> None:
-        """Hold slots that are all in one report and one block of the digest."""
+    def _take_parts(self) -> None:
+        """Compute digests and sums of the parts that wait; all are in one report and one block of the digest."""
+        if not self._parts:
+            return
+        slots = ReceiverSlots.joined(self._parts)
+        self._parts, self._part_bytes = [], 0
         trace = kernels.traces(slots.P)
         self._digests.update(self._log.add(slots.slots, slots.beliefs))
         if self._sums is not None:
             self._trace_sums.update(self._sums.add(slots.slots, trace))
         sums = np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1)
-        self._held.append(replace(slots, P=slots.P[..., : self._brief.recorded], trace=sums))
+        self._held.append(slots.changed(P=slots.P[..., : self._brief.recorded], trace=sums))
 
     def flush(self, end: int) -> None:
         """Report all slots that are not reported yet, and the progress to slot `end`."""
+        self._take_parts()
         if self._held:
             report = Report(ReceiverSlots.joined(self._held), self._digests, self._trace_sums)
             self._put(end - 1, report.pack())

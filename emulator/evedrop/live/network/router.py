@@ -116,9 +116,10 @@ class Downlink:
             self._deliver(packets)
         else:
             betrayed = packets.truth is not None
-            if betrayed or sum(held.count for held in self._held) + packets.count > self._most:
+            if self._held and (betrayed or packets.slots.stop - self._held[0].first > self._most):
                 self.flush()
-            self._held.append(replace(packets, sent=None))  # unsent packets are silenced already
+            # Unsent packets are silenced already.
+            self._held.append(packets if packets.sent is None else packets.changed(sent=None))
             if betrayed:
                 self.flush()
 
