@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
-from evedrop.results.growing_tables import last_round
+from evedrop.results.crash_proof_tables import last_round
 from evedrop.results.reading import Results
 from evedrop.results.resolved_scenario import resolved
 from evedrop.scenario.tables import Scenario

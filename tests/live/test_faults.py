@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.results.growing_tables import last_round
+from evedrop.results.crash_proof_tables import last_round
 from tests.conftest import Evedrop, Live, cause_of, wait_until, with_mark
 from tests.examples import mostly_long
 from tests.rogue import with_rogue

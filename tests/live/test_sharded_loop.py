@@ -14,7 +14,7 @@ import pyarrow as pa
 import pytest
 
 from evedrop import montecarlo, run
-from evedrop.results.growing_tables import last_round
+from evedrop.results.crash_proof_tables import last_round
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from tests.builders import digests_of

@@ -18,7 +18,7 @@ from evedrop import load_results, montecarlo, run
 from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.gathering import shards_of
 from evedrop.live.launch.shards import OneProgress
-from evedrop.results.growing_tables import last_round
+from evedrop.results.crash_proof_tables import last_round
 from evedrop.results.reading import Results, age_of_metrics
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import ProgressEvent, RunEnded, RunProgress, Started, silent

@@ -12,8 +12,8 @@ from pydantic import BaseModel
 
 from evedrop.cli.api import montecarlo
 from evedrop.model.receiver import ACTIONS
-from evedrop.results import growing_tables as growing
-from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish
+from evedrop.results import crash_proof_tables as growing
+from evedrop.results.crash_proof_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish
 from evedrop.results.reading import Results
 from evedrop.results.tables import DIGESTS, JOURNAL
 from evedrop.scenario.expect import ExpectTable

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
-from evedrop.results.growing_tables import batches_of
+from evedrop.results.crash_proof_tables import batches_of
 from evedrop.results.reading import Results
 from evedrop.scenario.progress_events import RunEvent
 from evedrop.scenario.recorded import recorded

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from evedrop.errors import UnknownName, UsageError
 from evedrop.model.digest import DIGEST_BYTES
 from evedrop.model.streams import MOST_SLOTS
-from evedrop.results.growing_tables import batches_of, goes_on, is_unfinished, last_round, metrics_path, schema_of
+from evedrop.results.crash_proof_tables import batches_of, goes_on, is_unfinished, last_round, metrics_path, schema_of
 from evedrop.results.summary_file import plain
 from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, inputs_schema_in, trials_schema
 from evedrop.scenario.arguments import path_argument

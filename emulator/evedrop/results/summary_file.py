@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from evedrop.results.crash_proof_tables import forget
 from evedrop.results.folder import replace_private
-from evedrop.results.growing_tables import forget
 from evedrop.score.summary import Summary
 
 

@@ -23,8 +23,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from evedrop.model.links.loss_model import Fate
+from evedrop.results.crash_proof_tables import parquet_writer
 from evedrop.results.folder import private_replacement
-from evedrop.results.growing_tables import parquet_writer
 from evedrop.system.files import write_all
 
 

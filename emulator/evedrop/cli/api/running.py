@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, final
 from evedrop.cli.api.notebook import progress
 from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults
 from evedrop.errors import EvedropError, UsageError
-from evedrop.results.growing_tables import goes_on
+from evedrop.results.crash_proof_tables import goes_on
 from evedrop.scenario.arguments import CHANGES, path_argument, refuse_unless, table_argument
 from evedrop.scenario.loading import plain_tables, prepared
 from evedrop.scenario.progress_events import OnEvent

@@ -36,9 +36,9 @@ from numpy.typing import NDArray
 from evedrop.errors import UsageError
 from evedrop.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
 from evedrop.names import LEGITIMATE
+from evedrop.results.crash_proof_tables import parquet_or_stream, parquet_writer
 from evedrop.results.ending import noted
 from evedrop.results.folder import make_private, private_replacement
-from evedrop.results.growing_tables import parquet_or_stream, parquet_writer
 from evedrop.results.reading import Results, as_of
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.shard_score import load_score

@@ -78,8 +78,8 @@ class Chain:
 class LossModel(ABC):
     """Decides fates from uniform numbers, for all trials at once, slot by slot.
 
-    Each file of this folder defines one model, whose name in a scenario is the file's name. `parameters` are the entries
-    that the scenario gives it, each with an example.
+    A file of this folder has one model, or a few that are related; `__init__.py` gives each its name in a scenario.
+    `parameters` are the entries that the scenario gives it, each with an example.
     """
 
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})

@@ -109,7 +109,7 @@ class Transit:
 
 @final
 class LinkCore:
-    """Decides the fates of a batch of slots ahead, and passes on the packets of many of these slots at once, or of one.
+    """Has a `Link` decide the fates of a batch of slots ahead, and passes on the packets of many of these slots, or of one.
 
     keys: those of `streams_of`.
     """

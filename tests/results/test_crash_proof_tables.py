@@ -23,8 +23,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
+from evedrop.results.crash_proof_tables import UNFINISHED, goes_on, last_round
 from evedrop.results.ending import note_end
-from evedrop.results.growing_tables import UNFINISHED, goes_on, last_round
 from evedrop.results.reading import Results
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import unwritten
