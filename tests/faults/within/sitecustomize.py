@@ -32,7 +32,7 @@ if LAUNCHES or (CONFUSED and "evedrop.fork_server" in sys.orig_argv):
 
         def on_event(line: Any, event: Any) -> None:
             with open(f"{FOLDER}/news", "a") as file:
-                file.write(json.dumps({**event.plain, "at": time.monotonic()}) + "\n")
+                file.write(json.dumps({**json.loads(event.line), "at": time.monotonic()}) + "\n")
             show(line, event)
 
         module.ProgressLine.on_event = on_event
