@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -115,6 +116,33 @@ def test_every_mutant_fits_the_code(mutant: Mutant) -> None:
     assert mutant.seeds
     with pytest.raises(ValueError, match="2 times, not once"):
         mutated(mutant, 2 * text)
+
+
+LOOKED_AT = {
+    "module.ProgressLine": "cli/console.py",
+    "event": "scenario/progress_events.py",
+    "module.Brief": "live/protocol/brief.py",
+    "module.SshHost": "live/launch/other_hosts.py",
+    "host": "live/launch/other_hosts.py",
+    "module.Publisher": "live/network/connection.py",
+    "publisher": "live/network/connection.py",
+    "other": "live/network/connection.py",
+}
+"""What the campaign looks at from within the launcher and the processes → the file that has it."""
+
+
+def test_what_the_campaign_looks_at_is_there() -> None:
+    """The attributes that it replaces or reads in the program have these names: a renamed one would only be missed in a run."""
+    text = (Path(__file__).parent / "within" / "sitecustomize.py").read_text(encoding="utf-8")
+    for owner, file in LOOKED_AT.items():
+        attributes = set(re.findall(rf"\b{re.escape(owner)}\.(\w+)", text)) - {"heard", "key", "name"}
+        assert attributes, owner
+        program = (ROOT / "emulator" / "evedrop" / file).read_text(encoding="utf-8")
+        for attribute in attributes:
+            assert re.search(rf"def {attribute}\b|self\.{attribute}\b", program), (
+                owner,
+                attribute,
+            )
 
 
 def test_the_outcome_of_a_mutant_is_read_from_what_the_campaign_says(tmp_path: Path) -> None:
