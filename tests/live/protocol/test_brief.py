@@ -72,6 +72,13 @@ def test_a_table_that_nobody_can_change_is_written_as_any_other() -> None:
     assert json.dumps(MappingProxyType({"use": 0.5}), default=plain) == '{"use": 0.5}'
 
 
+def test_the_entries_of_a_brief_are_those_of_its_file() -> None:
+    """A launcher sends them to another host, where they are written to a file."""
+    brief = BRIEF
+    assert brief.entries == json.loads(brief.text)
+    assert brief.entries["process"] == brief.process
+
+
 def test_a_brief_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
     """A sparse file of more than a gigabyte."""
     path = BRIEF.write(tmp_path)
