@@ -11,7 +11,7 @@ import pytest
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.model.record import Record, column, columns, largest_bytes
-from evedrop.model.slot.records import LinkSlots, ReceiverSlots
+from evedrop.model.slot.records import ReceiverSlots
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +89,3 @@ def test_a_receiver_has_the_traces_of_all_trials_only_if_all_are_recorded() -> N
     assert slots.traces_of_trials.tolist() == [[12.0, 14.0, 16.0, 18.0]]
     assert slots.changed(P=P[..., :2]).traces_of_trials is None
     assert slots.beliefs.P is P
-
-
-def test_a_link_names_the_reasons_of_its_losses() -> None:
-    """In the order of the columns."""
-    lost = np.arange(16, dtype=np.uint32).reshape(2, 8)
-    by_reason = LinkSlots(0, np.ones((2, 3), bool), lost, np.zeros(2, np.uint32)).lost_by_reason
-    assert list(by_reason)[:3] == ["lost", "corrupted", "overflow"]
-    assert by_reason["corrupted"].tolist() == [1, 9]

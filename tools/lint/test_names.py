@@ -93,7 +93,7 @@ def modules_of(folder: str) -> set[str]:
 
 
 def test_a_test_file_is_named_after_a_module() -> None:
-    """Whoever changes P/M.py finds its tests in tests/P/test_M.py or test_M_ASPECT.py; P's own in test_P_ASPECT.py.
+    """The tests of a module P/M.py are in tests/P/test_M.py or test_M_ASPECT.py, and those of a package P in test_P_ASPECT.py.
 
     In tests/live and tests/cli themselves, a file is named after what somebody does.
     """

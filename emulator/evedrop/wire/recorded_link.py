@@ -38,11 +38,6 @@ _HIDDEN = {WireFate.OVERFLOW, WireFate.CUT, WireFate.TOO_LARGE, WireFate.LOOPED}
 """The fates of messages that the loss model may have lost as well: nobody can tell."""
 
 
-def is_wire_folder(path: Path) -> bool:
-    """Whether a path is the results folder of a wire."""
-    return (path / JOURNAL_FOLDER).is_dir()
-
-
 def journal_recording(
     folder: Path, link: str | None = None, key: str | None = None, *, gaps: bool = False, longest: float | None = None
 ) -> MessageRecording:

@@ -16,6 +16,7 @@ from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Again, Go, LinkChange
 from evedrop.live.protocol.record_messages import packed
+from evedrop.model.links.loss_model import REASONS
 from evedrop.model.slot.link import Change
 from evedrop.model.slot.records import PacketSlots
 from tests.conftest import LIMIT, wait_until
@@ -128,7 +129,7 @@ def send_blocks(bench: MemoryBench, slots: range, count: int) -> None:
 
 
 def received(payloads: list[bytes], first: int) -> list[tuple[bytes, bytes, list[tuple[int, bytes]]]]:
-    """What deliveries of consecutive slots say of each slot, however many slots each has: γ, z, and late packets."""
+    """The γ, z and late packets of each slot, from deliveries that may have several slots."""
     slots: list[tuple[bytes, bytes, list[tuple[int, bytes]]]] = []
     for payload in payloads:
         arrivals = packets.read_delivery(Reader("d", payload), first + len(slots), SHAPE, window=3, most=BATCH)
@@ -250,7 +251,9 @@ def test_a_barrier_is_passed_on_and_a_changed_link_is_changed_from_there_on(kept
         for k, payload in enumerate(after["eve"], at):
             assert not packets.read_delivery(Reader("d", payload), k, SHAPE).gamma.any()
         wanted = journals(bench, at, 40, WINDOWS)
-        assert {int(journal.links["eve"].slots.lost_by_reason["cut"].min()) for journal in wanted.values()} == {5}
+        assert {int(journal.links["eve"].slots.lost[:, REASONS.index("cut")].min()) for journal in wanted.values()} == {
+            5
+        }
         if kept:
             check_later(bench, done, {}, after)
     if not kept:
@@ -288,7 +291,7 @@ def test_who_is_away_gets_neither_deliveries_nor_barriers() -> None:
     assert marks == {"legitimate": [10, 15, 20, 24], "eve": [10, 24]}
     slots = {name: [k for barrier, k in all_of if not barrier] for name, all_of in heard.items()}
     assert slots == {"legitimate": [*range(24)], "eve": [*range(10), *range(20, 24)]}
-    down = np.concatenate([journal.links["eve"].slots.lost_by_reason["down"] for journal in journaled.values()])
+    down = np.concatenate([journal.links["eve"].slots.lost[:, REASONS.index("down")] for journal in journaled.values()])
     assert down.tolist() == [5 if k in away else 0 for k in range(24)]
 
 

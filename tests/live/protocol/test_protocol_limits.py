@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import MalformedMessage
+from evedrop.live.launch.briefs import flow_of
 from evedrop.live.network.process_session import Mailbox, allowance
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
@@ -24,6 +25,7 @@ from evedrop.model.slot.link import COUNTED_BURSTS, Account, Change
 from evedrop.model.slot.link_core import Arrivals, Late
 from evedrop.model.slot.records import LinkSlots, PacketSlots, ReceiverSlots, SensorSlots
 from tests.examples import examples
+from tests.live.protocol.made_briefs import briefed
 
 SIZES = st.builds(
     Sizes,
@@ -126,6 +128,21 @@ def expect_that_all_fit(sizes: Sizes) -> None:
         assert len(head_of("evedrop/r0123abcd/telemetry/" + "n" * 32)) + len(message) <= limit, kind
         if kind != "control":
             assert limit <= 3 * len(message) + 5000 * (sizes.receivers + 1), kind
+
+
+@pytest.mark.parametrize("window", [0, 6, 100, 1000])
+def test_a_message_of_many_slots_with_every_late_packet_is_read(window: int) -> None:
+    """In each slot, the packets of every slot of the window and their copies: a reader takes only so many maps."""
+    scenario = briefed(legitimate={"window": window, "link": {"quality": 0.9}}, trials=200, slots=5000)
+    c, n = flow_of(scenario).message, len(scenario.process.A)
+    assert c == {0: 64, 6: 64, 100: 20, 1000: 2}[window]
+    heard = Reception(np.ones(200, bool), np.ones((n, 200)))
+    k = 2 * window
+    late = {row: tuple(Late(k + row - back, heard) for back in range(window + 1) for _ in range(2)) for row in range(c)}
+    gamma = np.ones((c, 200), bool)
+    raw = packets.delivery(range(k, k + c), Arrivals(gamma, np.ones((c, n, 200)), None, late))
+    read = packets.read_delivery(wire.Reader("evedrop/r/downlink/legitimate", raw), k, (n, 200), 0, window, c)
+    assert [len(read.late[row]) for row in range(c)] == [2 * (window + 1)] * c
 
 
 def test_what_waits_is_bounded_by_sender() -> None:

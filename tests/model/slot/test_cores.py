@@ -110,10 +110,10 @@ def test_what_is_sent_does_not_depend_on_blocks(scheme: str, driven: bool) -> No
             for column in columns(SensorSlots)
         )
         assert all(same(*pair) for pair in zip(sent.packets, made[0].packets, strict=True))
-    rows = made[0].rows(slice(3, 5))
-    assert rows.slots.slots == range(3, 5)
-    assert same(rows.slots.x, made[0].slots.x[3:5])
-    assert same(rows.packets.at(1).z, made[0].packets.at(4).z)
+    rows = made[0].slots.rows(slice(3, 5))
+    assert rows.slots == range(3, 5)
+    assert same(rows.x, made[0].slots.x[3:5])
+    assert same(made[0].packets.rows(slice(3, 5)).at(1).z, made[0].packets.at(4).z)
 
 
 def link(schedule: LinkSchedule) -> LinkCore:

@@ -34,6 +34,7 @@ from evedrop.live.protocol.brief import (
     Wiring,
     encoded,
 )
+from evedrop.live.protocol.codec import MOST_PARTS
 from evedrop.live.protocol.keys import Sizes
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.schemes import scheme_of
@@ -69,9 +70,22 @@ def flow_of(scenario: Scenario) -> Flow:
         batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
     elif scenario.process.source == "zenoh":
         batch = 1  # the program's pace is not known, and its messages should be on disk when it falls silent
-    message = max(1, min(_MOST_SLOTS, batch, _MESSAGE_BYTES // (8 * len(scenario.process.A) * scenario.trials)))
+    message = _slots_of_message(scenario, batch)
     largest = max(sizes_of(scenario, batch, message).of_kinds.values())
     return Flow(window, batch, scenario.longest_outage, largest, message)
+
+
+def _slots_of_message(scenario: Scenario, batch: int) -> int:
+    """How many slots' packets a message may carry: bounded by its numbers, and by its late packets, each of which is a map."""
+    numbers = len(scenario.process.A) * scenario.trials
+    late = 2 * (
+        _longest_window(scenario) + 1
+    )  # for each slot, the packets of every slot of the window, and their copies
+    return max(1, min(_MOST_SLOTS, batch, _MESSAGE_BYTES // (8 * numbers), (MOST_PARTS - 2) // late))
+
+
+def _longest_window(scenario: Scenario) -> int:
+    return max(scenario.window(name) for name in scenario.receivers)
 
 
 def sizes_of(scenario: Scenario, batch: int, message: int) -> Sizes:
@@ -83,7 +97,7 @@ def sizes_of(scenario: Scenario, batch: int, message: int) -> Sizes:
         scenario.trials,
         scenario.record_trials,
         batch,
-        max(scenario.window(name) for name in scenario.receivers),
+        _longest_window(scenario),
         len(scenario.receivers),
         len(scheme.header),
         0 if plant is None or table is None else plant.inputs,
@@ -100,7 +114,7 @@ def history_of(scenario: Scenario) -> int:
     some acknowledgements, the packets decide that the jammer has missed in a row: if the scheme may be silent, any number of
     slots may be between them.
     """
-    window = max(scenario.window(name) for name in scenario.receivers)
+    window = _longest_window(scenario)
     scheme, channel = scheme_of(scenario.process.process, scenario.encoding.spec), ack_channel_of(scenario)
     memory = 0 if channel is None else min(channel.memory, scenario.slots)
     if not scheme.may_be_silent:

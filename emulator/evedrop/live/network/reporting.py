@@ -127,7 +127,10 @@ class BeliefReporter:
         if self._sums is not None:
             self._trace_sums.update(self._sums.add(slots.slots, trace))
         sums = np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1)
-        self._held.append(slots.changed(P=slots.P[..., : self._brief.recorded], trace=sums))
+        P, recorded = slots.P, self._brief.recorded
+        if recorded < self._brief.trials:
+            P = P[..., :recorded].copy()  # a view would keep the covariances of all trials until the report
+        self._held.append(slots.changed(P=P, trace=sums))
 
     def flush(self, end: int) -> None:
         """Report all slots that are not reported yet, and the progress to slot `end`."""

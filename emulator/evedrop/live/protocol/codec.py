@@ -28,7 +28,8 @@ from evedrop.model.receiver import Flags, flags_of
 _LARGEST = 2**62  # the default bound of integers: slots can be added to it without leaving 64 bits
 _SMALL_BYTES = 1 << 16  # objects that msgpack unpacks from this few bytes take some megabytes at most
 _WHY_CHARACTERS = 1000
-_PARTS = 4096  # lists and maps in a message; enough for many processes
+MOST_PARTS = 4096
+"""How many lists and maps a message of more than 64 KiB may have; enough for many processes."""
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -53,7 +54,9 @@ _PACKERS = _Packers()
 class Reader:
     """Reads the fields of one message. Raises MalformedMessage for a field of another type, size or range."""
 
-    def __init__(self, key: str, payload: bytes, fields: Mapping[Any, Any] | None = None, parts: int = _PARTS) -> None:
+    def __init__(
+        self, key: str, payload: bytes, fields: Mapping[Any, Any] | None = None, parts: int = MOST_PARTS
+    ) -> None:
         """key: on which it came; fields: if it is unpacked already; parts: how many lists and maps a large message may have."""
         self.key = key
         self._parts = parts

@@ -7,10 +7,12 @@ Source: docs/protocol.md, messages.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evedrop.live.protocol.codec import Reader, pack
 from evedrop.live.protocol.record_messages import RecordFormat, packed
@@ -90,17 +92,12 @@ def read_resend(message: Reader, slots: int) -> tuple[int, int, int]:
     return message.integer("n", 1), done, message.integer("k", 0, done)
 
 
-def delivery(slots: range, arrivals: Arrivals, z: bytes | None = None) -> bytes:
-    """Encode a delivery of some slots: γ, and z and header of the trials that received.
-
-    z: the payloads, if their bytes are known.
-    """
+def delivery(slots: range, arrivals: Arrivals) -> bytes:
+    """Encode a delivery of some slots: γ, and z and header of the trials that received."""
     gamma = arrivals.gamma
     fields: dict[str, Any] = {"k": slots.start, "c": len(slots), "gamma": packed_flags(gamma).tobytes()}
-    if payload := _received(gamma, arrivals.z) if z is None else z:
-        fields["z"] = payload
-    if arrivals.header is not None and (header := _received(gamma, arrivals.header.astype("<i8", copy=False))):
-        fields["header"] = header
+    if gamma.any():
+        fields |= _received(gamma, arrivals.z, arrivals.header)
     if arrivals.truth:
         fields["truth"] = b"".join(arrivals.truth[row].tobytes() for row in range(len(slots)))
     if arrivals.late:
@@ -110,20 +107,28 @@ def delivery(slots: range, arrivals: Arrivals, z: bytes | None = None) -> bytes:
     return pack(fields)
 
 
-def _received(gamma: Flags, values: Floats | I64) -> bytes:
-    """Values (c, m, R) of the trials that received, slot by slot."""
-    if gamma.shape[1] == 1:
+def _received(gamma: Flags, z: Floats, header: I64 | None) -> dict[str, bytes]:
+    """Z (c, n, R) and header (c, h, R) of the trials that received, slot by slot."""
+    fields = {"z": _gathered(gamma, z, kernels.gather)}
+    if header is not None:
+        fields["header"] = _gathered(gamma, header.astype("<i8", copy=False), partial(np.compress, axis=1))
+    return fields
+
+
+def _gathered(gamma: Flags, values: NDArray[Any], gather: Callable[[Flags, Any], NDArray[Any]]) -> bytes:
+    """Values (c, m, R) of the trials that received; gather: takes those of one slot, from its flags and values."""
+    if gamma.all():
+        return values.tobytes()
+    if gamma.shape[1] == 1:  # without a call for each slot
         return values[gamma[:, 0]].tobytes()
-    return b"".join(np.compress(some, of_slot, axis=1).tobytes() for some, of_slot in zip(gamma, values, strict=True))
+    return b"".join(gather(some, of_slot).tobytes() for some, of_slot in zip(gamma, values, strict=True))
 
 
 def _late(at: int, packets: Late) -> dict[str, Any]:
     heard = packets.heard
-    fields = {"at": at, "k": packets.k, "gamma": packed_flags(heard.gamma).tobytes()}
-    fields["z"] = _received(heard.gamma[None], heard.z[None])
-    if heard.header is not None:
-        fields["header"] = _received(heard.gamma[None], heard.header.astype("<i8", copy=False)[None])
-    return fields
+    header = None if heard.header is None else heard.header[None]
+    received = _received(heard.gamma[None], heard.z[None], header)
+    return {"at": at, "k": packets.k, "gamma": packed_flags(heard.gamma).tobytes(), **received}
 
 
 def read_delivery(

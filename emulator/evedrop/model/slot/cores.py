@@ -141,10 +141,6 @@ class Sent(NamedTuple):
             SensorSlots.joined([part.slots for part in parts]), PacketBlock.joined([part.packets for part in parts])
         )
 
-    def rows(self, some: slice) -> Sent:
-        """Some of the slots."""
-        return Sent(self.slots.rows(some), self.packets.rows(some))
-
 
 @final
 class SensorCore:

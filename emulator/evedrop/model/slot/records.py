@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.kernels.current import kernels
-from evedrop.model.links.loss_model import REASONS
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Beliefs, Codes, Flags
 from evedrop.model.record import Record, column
@@ -87,8 +85,3 @@ class LinkSlots(Record):
     late: U16 | None = column(
         "c R", "packets of earlier slots delivered in this one, without second copies", "<u2", default=None
     )
-
-    @property
-    def lost_by_reason(self) -> Mapping[str, U32]:
-        """Reason → trials whose packet was lost for it, (c,)."""
-        return dict(zip(REASONS, self.lost.T, strict=True))
