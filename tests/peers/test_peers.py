@@ -289,6 +289,26 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
     assert stage.put.empty()
 
 
+@pytest.mark.parametrize("message", [2, 3, 64])
+def test_a_message_of_many_slots_stays_in_the_window(message: int, stage: Stage) -> None:
+    """Until its followers report progress, the sensor sends a window, in messages that end with a report."""
+    brief = replace(briefs()["sensor"], flow=Flow(WINDOW, BATCH, message=message))
+    sensor = SensorThread(stage, brief)
+    stage.commands.put(Start().pack())
+    sent = 0
+    while sent < WINDOW:
+        key, payload = sensor.next()
+        if key == sensor.keys.uplink:
+            made = packets.read_uplink(wire.Reader(key, payload), sent, packets.packet_format(2, 3), BATCH)
+            assert made.count == min(message, BATCH - sent % BATCH, WINDOW - sent)
+            sent += made.count
+    assert sensor.next()[0] == sensor.keys.telemetry("sensor")
+    for name in (*part_of(brief, SensorPart).receivers, "recorder"):
+        sensor.progress(name, 1)
+    made = packets.read_uplink(wire.Reader(*sensor.next()), WINDOW, packets.packet_format(2, 3), BATCH)
+    assert made.count == 1
+
+
 def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
     """All packets from the slot that is asked for on, and as many before it as the router needs, after a word of them."""
     brief = briefs()["sensor"]

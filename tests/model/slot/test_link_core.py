@@ -151,6 +151,15 @@ def test_an_absence_is_a_receiver_that_hears_nothing() -> None:
                 assert np.array_equal(result.action[row], np.full(BATCH.trials, Action.LOST))
 
 
+@pytest.mark.parametrize("window", [0, 3])
+def test_an_absent_receiver_counts_late_packets_as_it_does_when_it_is_there(window: int) -> None:
+    """None arrive; a receiver without a window counts none, so that its slots can be joined with those before and after."""
+    result = Absence(PROCESS, prior(PROCESS, BATCH.trials, 1), window).take_slots(range(1, 4))
+    for counts in (result.late, result.late_used):
+        assert (counts is None) is (window == 0)
+        assert counts is None or (counts.tolist() == np.zeros((3, BATCH.trials)).tolist() and counts.dtype == np.uint16)
+
+
 def test_the_prior_of_a_slot_is_the_state_covariance() -> None:
     """A receiver that starts before slot k reports 0 and Σ_{k−1}."""
     sigma = PROCESS.initial_covariance
