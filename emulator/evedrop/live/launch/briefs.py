@@ -78,9 +78,8 @@ def flow_of(scenario: Scenario) -> Flow:
 def _slots_of_message(scenario: Scenario, batch: int) -> int:
     """How many slots' packets a message may carry: bounded by its numbers, and by its late packets, each of which is a map."""
     numbers = len(scenario.process.A) * scenario.trials
-    late = 2 * (
-        _longest_window(scenario) + 1
-    )  # for each slot, the packets of every slot of the window, and their copies
+    # In each slot, the packets of every slot of the window may arrive, and their copies.
+    late = 2 * (_longest_window(scenario) + 1)
     return max(1, min(_MOST_SLOTS, batch, _MESSAGE_BYTES // (8 * numbers), (MOST_PARTS - 2) // late))
 
 
