@@ -34,8 +34,7 @@ from evedrop.live.protocol.brief import (
     Wiring,
     encoded,
 )
-from evedrop.live.protocol.codec import MOST_PARTS
-from evedrop.live.protocol.keys import Sizes
+from evedrop.live.protocol.keys import MOST_PARTS, Sizes
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link import COUNTED_BURSTS

@@ -21,15 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.errors import Gap, MalformedMessage, Refusal
-from evedrop.live.protocol.keys import reader_of, writer_of
+from evedrop.live.protocol.keys import MOST_PARTS, reader_of, writer_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags, flags_of
 
 _LARGEST = 2**62  # the default bound of integers: slots can be added to it without leaving 64 bits
 _SMALL_BYTES = 1 << 16  # objects that msgpack unpacks from this few bytes take some megabytes at most
 _WHY_CHARACTERS = 1000
-MOST_PARTS = 4096
-"""How many lists and maps a message of more than 64 KiB may have; enough for many processes."""
 
 S = TypeVar("S", bound=msgspec.Struct)
 
