@@ -1,10 +1,11 @@
-"""Private memory of a run's processes, and whether it stays the same over many slots.
+"""Memory of a run's processes, of its launcher and of `evedrop report`, and whether it stays the same over many slots.
 
     python benchmarks/memory.py [--quick]
 
 Private memory is what a process has for itself: its pages that no other process shares (Private_* of /proc/PID/smaps_rollup).
 The growth is that from the second quarter of the slots to the last, each by its median, because queues fill and empty. It does
-not include the final tables.
+not include the final tables. Peaks are the largest resident memory (VmHWM of /proc/PID/status), libraries included: the
+launcher has its peak when it makes the page of the run, as `evedrop report` does again.
 """
 
 from __future__ import annotations
@@ -19,12 +20,15 @@ from pathlib import Path
 from statistics import median
 from subprocess import PIPE
 
-from live_run import measured, slots_on_disk
+from live_run import measured, slots_on_disk, started
 from processes import processes_of
 from table import Row, judged, run_alone
 
 _POLL_SECONDS = 0.1
+_PEAK_SECONDS = 0.01
 _FLAT = 10.0  # MB in a million slots, which is ten bytes a slot: less than one number of each slot kept forever
+_PEAK = 150.0  # MB
+_MORE = 15.0  # MB that a peak may be above that of a short run
 _PEERS = frozenset({"sensor", "legitimate", "eavesdropper"})
 _BARE = """
 import msgpack, numpy, sys, zenoh
@@ -110,8 +114,27 @@ def bare_interpreter() -> float:
         return processes_of(pair[0].pid)[0].private
 
 
+def peak_of(process: subprocess.Popen[bytes]) -> float:
+    """The largest resident memory of a process until it ends, in MB."""
+    peak = 0.0
+    while process.poll() is None:
+        lines = Path(f"/proc/{process.pid}/status").read_text(encoding="ascii", errors="replace").splitlines()
+        peak = max([peak, *(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM"))])
+        time.sleep(_PEAK_SECONDS)
+    return peak
+
+
+def peaks(slots: int) -> dict[str, float]:
+    """The peaks of `evedrop run` with these slots (of the launcher), and of `evedrop report` of its results, in MB."""
+    with started("eavesdroppers", "--pace", "0", "--slots", str(slots)) as (process, out):
+        launcher = peak_of(process)
+        command = [sys.executable, "-m", "evedrop", "report", str(out)]
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL) as report:
+            return {"the launcher of `evedrop run`": launcher, "`evedrop report`": peak_of(report)}
+
+
 def rows(quick: bool) -> Iterator[Row]:
-    """The largest peer, and the growth of every process."""
+    """The largest peer, the growth of every process, and the peaks of the launcher and of a report."""
     slots = 3_000 if quick else 2_000_000
     # A small run is slowed down, more and more, until a busy machine finds time to look at it.
     for pace in ("0.0005", "0.002", "0.008") if quick else ("0",):
@@ -138,6 +161,18 @@ def rows(quick: bool) -> Iterator[Row]:
         "the same",
         judged(growth[name] < _FLAT, growth[name] < _FLAT),
     )
+    few, many = (300, 3_000) if quick else (1_000, 1_000_000)
+    of_few = peaks(few)
+    for name, peak in peaks(many).items():
+        flat = peak - of_few[name] <= _MORE
+        yield Row(
+            f"peak of {name}, {many:,} slots",
+            f"{peak:.0f} MB",
+            f"with {few:,} slots: {of_few[name]:.0f} MB",
+            f"{_PEAK:.0f} MB, and flat: at most {_MORE:.0f} MB above {few:,} slots",
+            "the same",
+            judged(flat and peak <= _PEAK, flat and peak <= _PEAK),
+        )
 
 
 if __name__ == "__main__":

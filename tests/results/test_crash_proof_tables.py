@@ -17,13 +17,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
-from evedrop.results.crash_proof_tables import UNFINISHED, goes_on, last_round
+from evedrop.results.crash_proof_tables import UNFINISHED, goes_on, last_round, parquet_batches
 from evedrop.results.ending import note_end
 from evedrop.results.reading import Results
 from evedrop.results.resolved_scenario import write_resolved
@@ -422,3 +423,17 @@ def test_a_broken_disk_is_not_called_full() -> None:
     assert "free some room" not in message
     assert "look at the disk" in message
     assert "free some room" in unwritten(OSError(errno.ENOSPC, "No space left on device"))
+
+
+def test_reading_a_parquet_file_in_batches_keeps_one_row_group(tmp_path: Path) -> None:
+    """By default pyarrow (26) reads all row groups ahead and keeps them until the file is closed."""
+    path, group = tmp_path / "numbers.parquet", 65_536
+    numbers = np.random.default_rng(5).random(group)
+    with pq.ParquetWriter(path, pa.schema([("number", pa.float64())]), use_dictionary=False) as writer:
+        for _ in range(40):
+            writer.write_table(pa.table({"number": numbers}))
+    before, most, rows = pa.total_allocated_bytes(), 0, 0
+    for batch in parquet_batches(path, 8192, ["number"]):
+        most, rows = max(most, pa.total_allocated_bytes() - before), rows + batch.num_rows
+    assert rows == 40 * group
+    assert most < 4 * numbers.nbytes

@@ -245,9 +245,23 @@ def parquet_or_stream(folder: Path, name: str, rows: int = _GROUP_ROWS) -> Itera
     path = folder / f"{name}.parquet"
     if path.exists():
         with contextlib.suppress(OSError, pa.ArrowException):
-            yield from pq.ParquetFile(path).iter_batches(rows)
+            yield from parquet_batches(path, rows)
     else:
         yield from batches_of(folder, name)
+
+
+def parquet_batches(path: Path, rows: int, columns: Sequence[str] | None = None) -> Iterator[pa.RecordBatch]:
+    """The rows of a Parquet file, `rows` at a time, with all columns or these. Memory: one row group.
+
+    Raises OSError or an error of Arrow if the file is damaged, KeyError if it lacks a column.
+    """
+    # By default Arrow reads all row groups ahead and keeps them; each of its threads would keep memory, too.
+    with pq.ParquetFile(path, pre_buffer=False) as file:
+        if columns is not None:  # `iter_batches` passes over columns that are not there, and this raises an error
+            file.schema_arrow.empty_table().select(columns)
+        for batch in file.iter_batches(rows, columns=columns, use_threads=False):
+            yield batch
+            pa.default_memory_pool().release_unused()
 
 
 def finish(folder: Path) -> None:

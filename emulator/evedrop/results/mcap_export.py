@@ -15,10 +15,9 @@ from typing import Any, final
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
-from evedrop.results.crash_proof_tables import batches_of
+from evedrop.results.crash_proof_tables import batches_of, parquet_batches
 from evedrop.results.reading import Results
 from evedrop.scenario.progress_events import RunEvent
 from evedrop.scenario.recorded import recorded
@@ -190,7 +189,7 @@ class _Tables:
         try:
             with opened(path):  # reading a pipe would block
                 pass
-            for batch in pq.ParquetFile(path).iter_batches(self._batch_rows, columns=columns):
+            for batch in parquet_batches(path, self._batch_rows, columns):
                 batch.validate(full=True)
                 yield batch
         except (Unreadable, OSError, pa.ArrowException) as error:

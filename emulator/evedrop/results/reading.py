@@ -19,7 +19,15 @@ import pyarrow.parquet as pq
 from evedrop.errors import UnknownName, UsageError
 from evedrop.model.digest import DIGEST_BYTES
 from evedrop.model.streams import MOST_SLOTS
-from evedrop.results.crash_proof_tables import batches_of, goes_on, is_unfinished, last_round, metrics_path, schema_of
+from evedrop.results.crash_proof_tables import (
+    batches_of,
+    goes_on,
+    is_unfinished,
+    last_round,
+    metrics_path,
+    parquet_batches,
+    schema_of,
+)
 from evedrop.results.summary_file import plain
 from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, inputs_schema_in, trials_schema
 from evedrop.scenario.arguments import path_argument
@@ -147,13 +155,8 @@ class Results:
         try:
             if path.exists():
                 _refuse_pipe(path)
-                with pq.ParquetFile(path) as file:
-                    # `iter_batches` passes over columns that are not there, and this raises an error.
-                    file.schema_arrow.empty_table().select(columns)
-                    # Without threads, each of which would keep memory.
-                    for batch in file.iter_batches(_PIECE_ROWS, columns=list(columns), use_threads=False):
-                        yield _validated(batch, columns)
-                        pa.default_memory_pool().release_unused()
+                for batch in parquet_batches(path, _PIECE_ROWS, list(columns)):
+                    yield _validated(batch, columns)
             elif schema_of(self.folder, name) is None:
                 raise FileNotFoundError("there is no such file")
             else:

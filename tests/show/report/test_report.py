@@ -192,7 +192,7 @@ def peak_of_report(folder: Path) -> int:
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the largest memory of a program alone")
 def test_the_memory_of_a_report_does_not_grow_with_the_slots(study: Path, tmp_path: Path) -> None:
-    """It used to read whole tables: 0.7 kB a slot, that is 70 MB for the further slots here."""
+    """It used to read whole tables, 0.7 kB a slot, and later to keep what it had read of them, some 45 bytes a slot."""
     peaks = []
     for times in (200, 1850):
         lengthened(study, tmp_path / str(times), times)
