@@ -11,8 +11,8 @@ import pytest
 
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
-from evedrop.wire.plan import Side, SideTls, WireEvent
-from evedrop.wire.tables import in_seconds, place_of
+from evedrop.wire.plan import Side, WireEvent
+from evedrop.wire.tables import TlsTable, in_seconds, place_of
 from tests.builders import mistakes_of, places_of
 from tests.golden.pages import Golden
 
@@ -118,9 +118,8 @@ def test_everything_that_a_file_can_have(tmp_path: Path) -> None:
     )
     files = [str(tmp_path / name) for name in ("robot.pem", "robot.key", "ca.pem")]
     endpoints = ("tls/0.0.0.0:7448", "unixsock-stream//run/robot")
-    assert plan.sides["robot"] == Side(
-        "robot", endpoints, (), SideTls(*files), {"ada": "secret"}, ("robot/**", "@ros2_lv/**")
-    )
+    tls = TlsTable(certificate=files[0], key=files[1], authority=files[2])
+    assert plan.sides["robot"] == Side("robot", endpoints, (), tls, {"ada": "secret"}, ("robot/**", "@ros2_lv/**"))
     assert plan.sides["base"] == Side("base", (), ("tcp/127.0.0.1:7447",))
     assert plan.sides["third"] == Side("third", ("tcp/127.0.0.1:0",))
     assert [link.name for link in plan.links] == ["robot-base", "robot-base-2", "robot-third", "robot-third-2"]

@@ -15,9 +15,10 @@ from evedrop.errors import UsageError
 from evedrop.live.network.certificates import Authority
 from evedrop.system.lacks import lack_of
 from evedrop.system.ports import free_port
-from evedrop.wire.plan import Side, SideTls
+from evedrop.wire.plan import Side
 from evedrop.wire.records import WireFate
 from evedrop.wire.side import PROBES, SideSession, side_config
+from evedrop.wire.tables import TlsTable
 from tests.conftest import wait_until
 from tests.wire.test_publications import reader, ready
 from tests.wire.wire_at_work import ANYWHERE, at_work, both_ways, link, plan_of, program
@@ -202,7 +203,8 @@ def test_a_side_with_tls_wants_certificates_of_its_authority(tmp_path: Path) -> 
             paths.append(str(path))
         return paths[0], paths[1], paths[2]
 
-    tls = SideTls(*files_of("side"))
+    files = files_of("side")
+    tls = TlsTable(certificate=files[0], key=files[1], authority=files[2])
     sides = {"robot": Side("robot", ("tls/127.0.0.1:0",), tls=tls)}
     with at_work(plan_of(link("robot", "base"), sides=sides), tmp_path / "out") as wire, wire.program("base") as base:
         endpoint = {"endpoints": list(wire.relay.endpoints["robot"]), "timeout_ms": 0}

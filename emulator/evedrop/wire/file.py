@@ -28,7 +28,7 @@ from evedrop.scenario.table import sentences, unusable
 from evedrop.scenario.words import listed, toml_text
 from evedrop.system.files import Unreadable, shown, text_of
 from evedrop.system.hints import near
-from evedrop.wire.plan import Side, SideTls, WireEvent, WireLink, WirePlan
+from evedrop.wire.plan import Side, WireEvent, WireLink, WirePlan
 from evedrop.wire.tables import (
     ENCRYPTED,
     NOTHING_LOST,
@@ -155,8 +155,7 @@ def _plan(file: WireFile) -> WirePlan:
 
 
 def _side(name: str, table: SideTable) -> Side:
-    tls = None if table.tls is None else SideTls(table.tls.certificate, table.tls.key, table.tls.authority)
-    return Side(name, table.endpoints, tuple(table.connect), tls, table.users, tuple(table.keys), table.peers)
+    return Side(name, table.endpoints, tuple(table.connect), table.tls, table.users, tuple(table.keys), table.peers)
 
 
 def _link(number: int, name: str, table: WireLinkTable) -> WireLink:
@@ -183,8 +182,7 @@ def wire_event(
 def _side_table(side: Side) -> dict[str, Any]:
     table: dict[str, Any] = {"listen": list(side.listen), "connect": list(side.connect), "keys": list(side.keys)}
     if side.tls is not None:
-        authority = {} if side.tls.authority is None else {"authority": side.tls.authority}
-        table["tls"] = {"certificate": side.tls.certificate, "key": side.tls.key, **authority}
+        table["tls"] = side.tls.model_dump(exclude_none=True)
     if side.users is not None:
         table["users"] = dict(side.users)
     if side.peers:

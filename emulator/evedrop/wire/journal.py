@@ -5,7 +5,7 @@ survives the end of the process. `JournalWords` gives codes to keys and senders.
 process, and notes when the wire was last alive, and what could not be written. `WireHistory` (history.py) has the starts, the
 events and the changes of settings. The journal's thread hands the records to listeners ten times a second, and lets a Parquet
 file be made from every file of records that is full. What an earlier start left behind, because it was killed or the disk was
-full, is recovered. `journal_tables` reads the journal, of a wire that runs or was killed, too.
+full, is recovered. `journal_tables` and `JournalOnDisk` read the journal, of a wire that runs or was killed, too.
 
 Records have codes for keys and senders. A line of the file `NNN.words` has a code and its text, so the records of a wire that
 was killed can be read. The end of the file is mapped into memory, as records are: a call of the system for each word costs many
@@ -38,12 +38,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+import zenoh
 
 from evedrop.errors import UsageError
+from evedrop.model.checks import as_toml
 from evedrop.model.slot.link import NEVER
 from evedrop.results.folder import make_private
 from evedrop.results.wire_summary import JournalState, JournalSummary
-from evedrop.system.files import lines_in, try_lock
+from evedrop.system.files import is_locked, lines_in, try_lock
 from evedrop.system.output import warn
 from evedrop.system.waiting import wait_for_thread
 from evedrop.wire.history import Numbered, WireHistory, highest
@@ -62,6 +64,7 @@ from evedrop.wire.records import (
     mapped_end,
     next_numbers,
     records_in,
+    records_of,
     table_of,
     write_parquet,
 )
@@ -802,3 +805,60 @@ def last_beat(unfinished: Path) -> float:
         beat: float = struct.unpack("<d", (unfinished / "alive").read_bytes())[0]
         return beat
     return 0.0
+
+
+@final
+class JournalOnDisk:
+    """The journal of the latest start of a wire."""
+
+    def __init__(self, folder: Path, plan: WirePlan) -> None:
+        self.listeners: list[Listener] = []
+        self.amendment_listeners: list[AmendmentListener] = []
+        self.recorded = 0
+        self.completeness = JournalSummary(0, 0, None)
+        self._folder = folder
+        self._links = {link.name: link.number for link in plan.links}
+        self.history = WireHistory.read(folder / JOURNAL_FOLDER)
+        self.seconds = 0.0
+        """Until the wire was last alive, or heard its last message, as far as these were read."""
+        self.state: JournalState = "ended"
+        if not self.history.ended:
+            self.state = "running" if is_locked(folder / JOURNAL_FOLDER) else "killed"
+        self._keys = [""]  # code 0 stands for all keys beyond the limit
+        self._codes = {"": 0}
+
+    def key_of(self, code: int) -> str:
+        """The key of a code."""
+        return self._keys[code]
+
+    def read(self) -> None:
+        """Hand all records to the listeners. Raises UsageError if there is no journal, or it is damaged."""
+        self._is_alive_at(last_beat(self._folder / JOURNAL_FOLDER / UNFINISHED))
+        for table in journal_tables(self._folder, self.history.start, killed=self.state == "killed"):
+            for key in {*_words_of(table["key"])} - {*self._codes}:
+                try:
+                    zenoh.KeyExpr(key)
+                except zenoh.ZError as error:
+                    raise UsageError(
+                        f"the journal in {self._folder} is damaged: {as_toml(key)} is not a key; remove the journal, or give "
+                        "another folder"
+                    ) from error
+                self._codes[key] = len(self._keys)
+                self._keys.append(key)
+            records = records_of(table, self._links, self._codes)
+            self.recorded += len(records)
+            if len(records):
+                self._is_alive_at(float(records["time"].max()))
+                for listener in self.listeners:
+                    listener(records)
+        # Again, because a change may have come in between; it is written before the first record that it concerns.
+        self.history = WireHistory.read(self._folder / JOURNAL_FOLDER)
+        self.history.expect_settings()
+
+    def _is_alive_at(self, time: float) -> None:
+        self.seconds = max(self.seconds, time - self.history.began)
+
+
+def _words_of(column: pa.ChunkedArray) -> list[str]:
+    """The words that a dictionary column may contain."""
+    return [word for chunk in column.chunks for word in chunk.dictionary.to_pylist()]

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import zenoh
 
-from evedrop.wire.tables import WireExpectTable
+from evedrop.wire.tables import TlsTable, WireExpectTable
 
 _MARK = "/@adv"
 _HISTORY = f"{_MARK}/"
@@ -36,16 +36,6 @@ def numbered_as(key: str) -> str:
 
 
 @dataclass(frozen=True)
-class SideTls:
-    """The certificates of a side, as paths of PEM files."""
-
-    certificate: str
-    key: str
-    authority: str | None = None
-    """The authority whose clients may connect; None: a client needs no certificate."""
-
-
-@dataclass(frozen=True)
 class Side:
     """A place at which programs connect: a Zenoh router session of the wire."""
 
@@ -54,7 +44,7 @@ class Side:
     """Zenoh endpoints; port 0 stands for any free port."""
     connect: tuple[str, ...] = ()
     """Endpoints of routers that are there already."""
-    tls: SideTls | None = None
+    tls: TlsTable | None = None
     users: Mapping[str, str] | None = None
     """User → password of those who may connect; None: everybody may."""
     keys: tuple[str, ...] = ("**",)

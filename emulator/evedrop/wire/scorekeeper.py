@@ -15,9 +15,9 @@ import platform
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby, pairwise
+from itertools import accumulate, groupby, pairwise
 from pathlib import Path
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import numpy as np
 import zenoh
@@ -28,20 +28,18 @@ from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.links import loss_of
 from evedrop.model.links.loss_model import Chain, LossModel, count_variance
 from evedrop.model.process import Floats
-from evedrop.model.slot.link import NEVER, Change
+from evedrop.model.slot.link import NEVER, Change, LinkSchedule
+from evedrop.model.slot.link_distribution import stretches
 from evedrop.results.folder import replace_private
 from evedrop.results.wire_summary import (
     WIRE_SUMMARY_FILE,
-    JournalState,
-    JournalSummary,
     WireEventSummary,
     WireLinkSummary,
     WireSummary,
 )
 from evedrop.score.summary import Judged
 from evedrop.system.output import warn
-from evedrop.wire.history import WireHistory
-from evedrop.wire.journal import AmendmentListener, Listener
+from evedrop.wire.journal import JournalOnDisk, WireJournal
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.records import REASONS, UNLINKED, Kind, Records, WireFate
 from evedrop.wire.tables import WireExpectTable
@@ -53,44 +51,11 @@ BYPASSED = "programs could speak past the wire"
 """Why an expectation of a wire with bypasses did not hold."""
 
 
-class SummarisedJournal(Protocol):
-    """What a summary needs from a journal; `WireJournal` and `JournalOnDisk` provide it."""
-
-    history: WireHistory
-
-    @property
-    def listeners(self) -> list[Listener]:
-        """They get each block of new records."""
-
-    @property
-    def amendment_listeners(self) -> list[AmendmentListener]:
-        """They get records whose fate has changed."""
-
-    @property
-    def recorded(self) -> int:
-        """The number of all records."""
-
-    @property
-    def completeness(self) -> JournalSummary:
-        """What an earlier start left behind, and what is not on the disk."""
-
-    @property
-    def seconds(self) -> float:
-        """How long this start has lasted."""
-
-    @property
-    def state(self) -> JournalState:
-        """What became of this start."""
-
-    def key_of(self, code: int) -> str:
-        """The key of a code."""
-
-
 @final
 class WireScorekeeper:
     """Listens to a wire's journal, and adds up. Threads may call its methods at the same time."""
 
-    def __init__(self, plan: WirePlan, journal: SummarisedJournal) -> None:
+    def __init__(self, plan: WirePlan, journal: WireJournal | JournalOnDisk) -> None:
         self._plan, self._journal = plan, journal
         self._links = {link.number: LinkTally() for link in plan.links}
         self._unlinked = LinkTally()
@@ -341,21 +306,15 @@ def bounds(mean: float, variance: float, count: int) -> tuple[float, float]:
 
 
 def _parts(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Iterable[range]) -> Iterator[_Part]:
-    last = {
-        change.at: change.settings
-        for change in sorted(changes, key=lambda change: change.at)
-        if change.settings is not None
-    }
-    stretches: list[tuple[int, int, Mapping[str, Any]]] = [(0, 0, settings)]
-    for at, new in last.items():
-        number, _, before = stretches[-1]
-        stretches.append((number + (new["loss"] != before["loss"]), at, new))
-    ends = [at for _, at, _ in stretches[1:]] + [NEVER]
+    marks = stretches(LinkSchedule(settings, changes=tuple(changes)))
+    models = accumulate((new["loss"] != old["loss"] for (_, old, _), (_, new, _) in pairwise(marks)), initial=0)
+    ends = [*(start for start, _, _ in marks[1:]), NEVER]
+    parts = [*zip(models, marks, ends, strict=True)]
     for some in ranges:
-        for (number, start, new), stop in zip(stretches, ends, strict=True):
+        for model, (start, new, _), stop in parts:
             slots = range(max(some.start, start), min(some.stop, stop))
             if slots:
-                yield _Part(number, new["loss"], slots, 1.0 - new.get("corrupt", 0.0))
+                yield _Part(model, new["loss"], slots, 1.0 - new.get("corrupt", 0.0))
 
 
 def _delivered(loss: LossModel, slots: range) -> float:

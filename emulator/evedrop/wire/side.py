@@ -7,21 +7,20 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
-import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, final
 
 import zenoh
 
 from evedrop.errors import UsageError
+from evedrop.live.network.access import users_file
 from evedrop.live.network.connecting import open_session
 from evedrop.system.ports import free_port
-from evedrop.wire.plan import Side, SideTls, WireLink
+from evedrop.wire.plan import Side, WireLink
+from evedrop.wire.tables import TlsTable
 from evedrop.wire.watchdog import ANSWER_SECONDS, Duty
 
 _REMOTE = zenoh.Locality.REMOTE
@@ -56,8 +55,8 @@ class SideSession:
         """largest: bytes of the largest message. Raises UsageError if the side cannot listen or connect where it must."""
         self.side = side
         self.name = side.name
-        with _users_file(side.users) as users:
-            self.session, self.endpoints = _opened(side, largest, users)
+        with contextlib.nullcontext() if side.users is None else users_file(side.users) as users:
+            self.session, self.endpoints = _opened(side, largest, None if users is None else str(users))
         """Its session, and where programs connect: with a free port where the plan has port 0."""
         self.zid = str(self.session.zid())
         self.duty = Duty(f"at the side {side.name}", ANSWER_SECONDS)
@@ -80,11 +79,11 @@ class SideSession:
         ).undeclare()
 
 
-def _opened(side: Side, largest: int, users_file: str | None) -> tuple[zenoh.Session, tuple[str, ...]]:
+def _opened(side: Side, largest: int, users: str | None) -> tuple[zenoh.Session, tuple[str, ...]]:
     """The session of a side, and its endpoints. Raises UsageError."""
     for attempt in range(_ATTEMPTS):
         endpoints = tuple(_with_port(endpoint) for endpoint in side.listen)
-        config = side_config(replace(side, listen=endpoints), largest, users_file)
+        config = side_config(replace(side, listen=endpoints), largest, users)
         try:
             return open_session(zenoh.Config.from_json5(json.dumps(config))), endpoints
         except zenoh.ZError as error:
@@ -115,8 +114,11 @@ def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...
     return tuple(dict.fromkeys(expressions))
 
 
-def side_config(side: Side, largest: int, users_file: str | None) -> ZenohConfig:
-    """The configuration of a side's session. Messages keep the timestamp that they have, or have none."""
+def side_config(side: Side, largest: int, users: str | None) -> ZenohConfig:
+    """The configuration of a side's session; users: the path of the file of its users.
+
+    Messages keep the timestamp that they have, or have none.
+    """
     link: ZenohConfig = {"rx": {"max_message_size": max(2 * largest, 2**30)}}  # what is larger is in no journal
     if side.tls is not None:
         link["tls"] = _tls(side.tls)
@@ -135,8 +137,8 @@ def side_config(side: Side, largest: int, users_file: str | None) -> ZenohConfig
         "timestamping": {"enabled": False},
         "transport": {"link": link},
     }
-    if users_file is not None:
-        config["transport"]["auth"] = {"usrpwd": {"dictionary_file": users_file}}
+    if users is not None:
+        config["transport"]["auth"] = {"usrpwd": {"dictionary_file": users}}
     if side.keys != ("**",):
         # Only a side that connects to a router needs probes, and with them its programs could say that sides are joined.
         probes = (PROBES,) if side.connect else ()
@@ -162,7 +164,7 @@ def _access(keys: tuple[str, ...]) -> ZenohConfig:
     }
 
 
-def _tls(tls: SideTls) -> ZenohConfig:
+def _tls(tls: TlsTable) -> ZenohConfig:
     section: ZenohConfig = {
         "listen_certificate": tls.certificate,
         "listen_private_key": tls.key,
@@ -173,19 +175,6 @@ def _tls(tls: SideTls) -> ZenohConfig:
     if tls.authority is not None:
         section["root_ca_certificate"] = tls.authority
     return section
-
-
-@contextlib.contextmanager
-def _users_file(users: Mapping[str, str] | None) -> Iterator[str | None]:
-    """A private file of users and passwords, which Zenoh reads when it opens a session."""
-    if users is None:
-        yield None
-        return
-    with tempfile.TemporaryDirectory(prefix="evedrop-") as folder:
-        path = Path(folder, "users")
-        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
-            file.writelines(f"{user}:{password}\n" for user, password in users.items())
-        yield str(path)
 
 
 def _refusal(side: Side, why: str) -> str:

@@ -184,7 +184,7 @@ class WireExpectTable(Table):
         if self.below is None and self.above is None:
             yield "below", "is missing, and so is above; add one of them, or both"
         if WIRE_METRICS[self.metric.rpartition(".")[2]].has_quantile == (self.quantile is None):
-            names = [kind.name for kind in WIRE_METRICS.values() if kind.has_quantile]
+            names = [name for name, kind in WIRE_METRICS.items() if kind.has_quantile]
             sentence = (
                 f"is missing; a {listed(names)} needs one"
                 if self.quantile is None
@@ -363,7 +363,7 @@ class WireLinkTable(WireSettingsTable):
 
 
 class TlsTable(Table):
-    """`tls = {…}` of a side: PEM files."""
+    """`tls = {…}` of a side: PEM files. Only clients of the authority may connect; without one, they need no certificate."""
 
     certificate: Annotated[File, Field(examples=["robot.pem"])]
     key: Annotated[File, Field(examples=["robot.key"])]

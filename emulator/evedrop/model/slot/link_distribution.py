@@ -122,7 +122,9 @@ def stretches(schedule: LinkSchedule) -> list[tuple[int, Mapping[str, Any], bool
     for change in sorted(schedule.changes, key=lambda later: later.at):
         settings = settings if change.settings is None else change.settings
         cut = cut if change.cut is None else change.cut
-        marks = [mark for mark in marks if mark[0] != change.at] + [(change.at, settings, cut)]
+        if marks[-1][0] == change.at:
+            marks.pop()
+        marks.append((change.at, settings, cut))
     return marks
 
 
