@@ -102,6 +102,12 @@ class Conductor:
         return dict(self._present)
 
     @property
+    def dropped(self) -> dict[str, int]:
+        """Process → how many messages it dropped because they name another key, as far as it has confirmed its end."""
+        counts = {**self.misdelivered, RECORDER: self._session.dropped}
+        return {name: count for name, count in counts.items() if count}
+
+    @property
     def unreached(self) -> list[str]:
         """The processes that are on the network, but whose subscription to their commands is not known yet.
 

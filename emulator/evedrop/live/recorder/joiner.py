@@ -81,13 +81,15 @@ class Joiner:
         """The first slot that the router has not journaled."""
         return min(links.end for links in self._links.values())
 
-    def reported(self, name: str) -> int:
-        """The first slot that a receiver, or the controller, has not reported."""
-        return self._decided if name == CONTROLLER else self._reports[name].end
+    def reported(self, process: str) -> int:
+        """The first slot that a process has not reported."""
+        if process in self._reports:
+            return self._reports[process].end
+        return {SENSOR: self.sent, ROUTER: self.journaled, CONTROLLER: self._decided}[process]
 
     def places(self, reporters: Iterable[str]) -> dict[str, int]:
         """Process → the first slot that it has not reported, for sensor, router, and these reporters."""
-        return {SENSOR: self.sent, ROUTER: self.journaled, **{name: self.reported(name) for name in reporters}}
+        return {name: self.reported(name) for name in (SENSOR, ROUTER, *reporters)}
 
     def complete(self, slots: int) -> bool:
         """Whether this many slots have been returned and, if there is a controller, it has reported them, too."""

@@ -1,0 +1,112 @@
+"""Directs the processes of a run: what the recorder does again and again until all slots are joined.
+
+Between two messages it carries out events, answers the operator, looks for lost connections, and for processes that hold up the
+run.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from queue import SimpleQueue
+from typing import final
+
+from evedrop.live.network.connection import Question
+from evedrop.live.network.control_file import Control, remove_control
+from evedrop.live.network.launcher_pipe import emit
+from evedrop.live.network.operator import Answer, Order
+from evedrop.live.protocol.brief import Brief, RecorderPart
+from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
+from evedrop.live.protocol.commands import ReportStatus, is_process_status, read_process_status
+from evedrop.live.protocol.requests import StatusRequest
+from evedrop.live.recorder.conductor import Conductor
+from evedrop.live.recorder.recorded_run import RecordedRun
+from evedrop.live.recorder.recovery import Recovery, Stall, patience_of
+from evedrop.live.recorder.steering import Steering, status_of
+from evedrop.names import CONTROLLER, OPERATOR
+from evedrop.scenario.progress_events import Started
+
+
+@final
+class Direction:
+    """Directs the processes of a run, whose slots `run` takes."""
+
+    def __init__(
+        self, conductor: Conductor, brief: Brief[RecorderPart], run: RecordedRun, confirmations: SimpleQueue[bytes]
+    ) -> None:
+        """confirmations: the launcher's, each with the number of an event."""
+        scenario, flow = run.score.scenario, brief.flow
+        self._conductor, self._brief, self._run, self._confirmations = conductor, brief, run, confirmations
+        self._steering = Steering(scenario, conductor, emit, run.folder.amend, paused=brief.part.paused)
+        self._recovery = Recovery(conductor, self._steering, flow, scenario.pace, emit)
+        program = scenario.process.source == "zenoh"
+        patience = patience_of(flow.longest_outage, scenario.pace, flow.batch, program)
+        self._stall = Stall(patience, flow.batch, lambda: conductor.send_to_all(ReportStatus()))
+        course = run.score.course
+        course.events, course.outages = self._steering.events, self._recovery.outages  # which grow
+
+    def start(self) -> None:
+        """Wait for all processes, and let the sensor begin. Raises RunError if some do not appear, Interrupted."""
+        self._conductor.assemble()
+        self._run.start()
+        part = self._brief.part
+        control = Control(self._brief.run, self._brief.router, OPERATOR, part.operator, part.operator_identity)
+        control.write(self._run.folder.now)
+        self._conductor.start()
+        emit(Started())
+
+    def take_message(self) -> None:
+        """Take the next message, if there is one within a moment. Raises Interrupted if the run was told to end."""
+        item = self._conductor.next_message()
+        if item is None:
+            return
+        source, payload = item
+        message = Reader(self._conductor.keys[source], payload)
+        if is_refusal(message):
+            raise read_refusal(message, source)
+        if is_process_status(message):
+            self._stall.add_answer(source, read_process_status(message, self._run.score.scenario.slots))
+        elif self._run.take(source, message, self._steering):
+            self._conductor.report_progress(self._run.done)
+
+    def steer(self) -> None:
+        """Take the launcher's confirmations and the operator's questions, and carry out due events."""
+        while not self._confirmations.empty():
+            self._steering.done(int(self._confirmations.get_nowait()))
+        while not self._conductor.questions.empty():
+            self._answer(self._conductor.questions.get_nowait())
+        self._steering.carry_on(self._run.done)
+        self._run.view.note(self._steering.events)
+
+    def look_after(self) -> None:
+        """Recover from lost connections. Raises RunError if a process is lost for too long, or holds up the run."""
+        done, at = self._run.done, self._steering.at
+        self._recovery.poll(done)
+        held = at is not None and done >= at
+        present = set(self._run.score.scenario.digested) - self._conductor.absent
+        unneeded = () if self._run.score.all_joined else (CONTROLLER,)
+        missing = bool(self._conductor.missing)
+        self._stall.poll(done, lambda: self._run.places(present), unneeded, held=held, missing=missing)
+
+    def dismiss(self) -> None:
+        """Remove the control file of the run, which is over, answer all open questions, and close open outages."""
+        complete = self._run.score.all_joined
+        with suppress(FileNotFoundError):
+            remove_control(self._run.folder.now)
+        self._steering.answer_open_orders(self._run.done, complete=complete)
+        while not self._conductor.questions.empty():
+            self._conductor.questions.get_nowait().answer(Answer(refused=("the run is over",)).pack())
+        self._recovery.give_up(self._run.done, complete=complete)
+
+    def _answer(self, question: Question) -> None:
+        """Take a question from the operator; a malformed one is refused and does not harm the run."""
+        order, run = Order.of(question), self._run
+        if order is None:
+            return
+        if isinstance(order.request, StatusRequest):
+            scenario, rate = run.score.scenario, run.progress.rate(run.done)
+            tally = run.score.run_tally
+            order.answer(Answer(status=status_of(scenario, run.done, rate, self._steering, self._conductor, tally)))
+        elif self._brief.part.shard:
+            order.refuse("this run is in shards, which cannot be steered; run it with --set shards=1 to steer it")
+        else:
+            self._steering.take_order(order, run.done)

@@ -1,0 +1,40 @@
+"""How far a run has come and how fast, as the recorder tells the launcher and the operator."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import final
+
+from evedrop.live.network.launcher_pipe import emit
+from evedrop.scenario.progress_events import RunProgress
+from evedrop.score.scorekeeper import Scored
+
+_SECONDS = 0.25
+
+
+@final
+class ProgressReporter:
+    """Reports progress to the launcher four times a second."""
+
+    def __init__(self) -> None:
+        self._told = time.monotonic()
+        self._before = (self._told, 0)
+
+    def start(self) -> None:
+        """Note that the first slot begins."""
+        self._before = (time.monotonic(), 0)
+
+    def rate(self, done: int) -> float:
+        """Slots per second since the last report."""
+        at, before = self._before
+        return (done - before) / max(time.monotonic() - at, 1e-3)
+
+    def report(self, done: int, scored: Mapping[str, Scored]) -> None:
+        """Report that all slots below `done` are scored, if it is time to; scored: the last of them."""
+        now = time.monotonic()
+        if now - self._told < _SECONDS:
+            return
+        errors = {name: float(score.squared_error.mean()) for name, score in scored.items()}
+        emit(RunProgress(done, self.rate(done), "slots/s", errors))
+        self._told, self._before = now, (now, done)

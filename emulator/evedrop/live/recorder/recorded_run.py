@@ -1,0 +1,64 @@
+"""What is recorded of a run: messages become slots, and these are scored, written and shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import final
+
+from evedrop.live.protocol.brief import Brief, RecorderPart
+from evedrop.live.protocol.codec import Reader
+from evedrop.live.recorder.intake import Intake
+from evedrop.live.recorder.progress import ProgressReporter
+from evedrop.live.recorder.run_folder import RunFolder
+from evedrop.live.recorder.run_score import RunScore
+from evedrop.live.recorder.run_view import RunView
+from evedrop.live.recorder.steering import Steering
+from evedrop.scenario.tables import Scenario
+from evedrop.score.scorekeeper import Scorekeeper
+
+
+@final
+class RecordedRun:
+    """The parts of a run's record, from the messages to the results folder."""
+
+    def __init__(self, brief: Brief[RecorderPart], scenario: Scenario) -> None:
+        self._keeper = Scorekeeper(scenario, scenario.trials)
+        self._intake = Intake(brief, scenario, self._keeper.run_tally)
+        self.score = RunScore(scenario, self._keeper.run_tally, self._intake.joiner)
+        self.folder = RunFolder(Path(brief.part.results), self.score, brief.part.shard)
+        self.view = RunView()
+        self.progress = ProgressReporter()
+
+    @property
+    def done(self) -> int:
+        """The first slot that is not scored."""
+        return self._intake.joiner.done
+
+    @property
+    def complete(self) -> bool:
+        """Whether all slots are scored and, if there is a controller, it has reported them, too."""
+        return self._intake.joiner.complete(self.score.scenario.slots)
+
+    def places(self, reporters: Iterable[str]) -> Mapping[str, int]:
+        """Process → the first slot that it has not reported, for sensor, router, and these reporters."""
+        return self._intake.joiner.places(reporters)
+
+    def start(self) -> None:
+        """Note that the first slot begins."""
+        self.score.course.start()
+        self.progress.start()
+
+    def take(self, source: str, message: Reader, steering: Steering) -> bool:
+        """Take a message of telemetry or of the journal; returns whether slots are complete with it.
+
+        Raises MalformedMessage, Gap or Contradiction.
+        """
+        slots = self._intake.take(source, message, steering)
+        if slots is None:
+            return False
+        scored = self._keeper.add_slots(slots)
+        self.folder.add_slots(slots, scored)
+        self.view.add_slots(slots, scored)
+        self.progress.report(self.done, scored)
+        return True

@@ -1,0 +1,90 @@
+"""What a live run has come to: its tallies, how it goes, and the summary that is made from both.
+
+Source: docs/results.md, summary.json.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import final
+
+from evedrop.live.recorder.joiner import Joiner
+from evedrop.results.shard_score import dump_score
+from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
+from evedrop.scenario.tables import Scenario
+from evedrop.score.expectations_held import replay_of
+from evedrop.score.run_tally import RunTally
+from evedrop.score.scorekeeper import RunOutcome, digest_of, summary_of
+from evedrop.score.summary import Summary
+
+
+@final
+@dataclass
+class Course:
+    """How a run goes, apart from its numbers."""
+
+    started: float = field(init=False)
+    """When all processes were there, in seconds; before that, when the recorder began."""
+    ended: float = field(init=False)
+    """When it had come as far as the summary says."""
+    events: Sequence[RunEvent] = ()
+    outages: Sequence[ConnectionOutage] = ()
+    misdelivered: Mapping[str, int] = field(default_factory=dict)
+    """Process → messages with other processes' keys, which it dropped."""
+
+    def __post_init__(self) -> None:
+        self.start()
+
+    def start(self) -> None:
+        """Note that all processes are there."""
+        self.started = self.ended = time.monotonic()
+
+    def end(self) -> None:
+        """Note that this is the end of the run so far."""
+        self.ended = time.monotonic()
+
+
+@final
+class RunScore:
+    """The score of a run so far, and its summary."""
+
+    def __init__(self, scenario: Scenario, run_tally: RunTally, joiner: Joiner) -> None:
+        self.scenario = scenario
+        """With the operator's changes; it is the same for the slots so far."""
+        self.course = Course()
+        self.run_tally = run_tally
+        """The tallies of the slots so far."""
+        self.joiner = joiner
+
+    @property
+    def all_joined(self) -> bool:
+        """Whether all slots are joined."""
+        return self.joiner.done == self.scenario.slots
+
+    def summary(self, folder: Path, how: str, accused: tuple[str, ...] = ()) -> Summary:
+        """The summary of the slots so far.
+
+        folder: the results folder; how: how the run ended; accused: the processes whose misbehaviour ended it. Raises NoAnswer.
+        """
+        if self.all_joined:
+            for name, sums in self.joiner.trace_sums.items():
+                self.run_tally.tallies[name].know_traces(sums)
+        digests = {name: digest_of(self.scenario, name, blocks) for name, blocks in self.joiner.digests.items()}
+        course = self.course
+        outcome = RunOutcome(
+            course.ended - course.started,
+            how,
+            replay_of(folder, self.scenario),
+            events=course.events,
+            outages=course.outages,
+            accused=accused,
+            misdelivered=course.misdelivered,
+        )
+        return summary_of(self.scenario, self.run_tally, digests, outcome)
+
+    def dump(self, folder: Path) -> None:
+        """Dump the tallies of a shard, for the summary of the whole run. Raises OSError."""
+        dump_score(self.run_tally, folder, self.scenario)

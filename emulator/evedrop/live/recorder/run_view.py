@@ -1,0 +1,55 @@
+"""What the recorder shows of a run: a recording for the views, if anybody wants it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, final
+
+from evedrop.live.network.launcher_pipe import emit
+from evedrop.scenario.progress_events import RunEvent, ViewOpened
+from evedrop.scenario.tables import Scenario
+from evedrop.score.scorekeeper import Scored
+from evedrop.score.slots import Slots
+from evedrop.show.view.scene_slots import loop_values_of, open_recording, shown
+
+if TYPE_CHECKING:
+    from evedrop.show.view.recording import ViewRecording
+    from evedrop.show.view.scene_slots import LoopValues
+
+
+@final
+class RunView:
+    """The recording of a run; without one, until it is opened, every method does nothing."""
+
+    def __init__(self) -> None:
+        self._recording: ViewRecording | None = None
+        self._loop_values: LoopValues | None = None
+        self._around: Sequence[float] = ()
+        self._noted = 0
+
+    def open(self, scenario: Scenario, run: str, path: Path) -> None:
+        """Begin the recording of the run with this name."""
+        self._around, self._loop_values = scenario.process.around, loop_values_of(scenario)
+        self._recording = open_recording(scenario, run, path, lambda text: emit(ViewOpened(None, text)))
+
+    def add_slots(self, slots: Slots, scored: Mapping[str, Scored]) -> None:
+        """Show the next slots."""
+        if self._recording is not None:
+            self._recording.add(shown(slots, scored, self._around, self._loop_values))
+
+    def note(self, events: Sequence[RunEvent]) -> None:
+        """Note the events of the run that are new; events: all so far."""
+        if self._recording is not None:
+            for event in events[self._noted :]:
+                self._recording.note(event.slot, "INFO", event.line)
+        self._noted = len(events)
+
+    def close(self) -> bool:
+        """Complete the recording; returns whether this process can end as usual: False if a thread hangs."""
+        return self._recording is None or self._recording.close()
+
+    @property
+    def failure(self) -> str | None:
+        """Why there is no recording, or an incomplete one; None if it did not fail."""
+        return None if self._recording is None else self._recording.failure
