@@ -102,7 +102,7 @@ for host in sys.argv[2:]:
 
 def test_hosts_of_their_own_change_nothing_and_show_nothing(tmp_path: Path) -> None:
     """Digests are those in memory; a scan finds the router's port alone, and a capture neither payload nor password."""
-    scenario = on_hosts()
+    scenario = on_hosts(slots=1500)  # more seconds than a busy machine needs to start a command
     with apart(tmp_path, scenario) as (network, run), captured(network, "router", tmp_path / "capture"):
         run.start()
         run.running()
