@@ -215,3 +215,17 @@ def test_headers_and_sent_slots_must_be_there_as_the_scheme_says() -> None:
     payload = packet(FIRST, np.ones((2, 3)))
     with pytest.raises(MalformedMessage, match="header of None; expected 24 bytes"):
         read_uplink(Reader(UP, payload), FIRST, packet_format(2, 3, 1))
+
+
+@pytest.mark.parametrize("gamma", [[[1, 1, 1], [1, 1, 1]], [[1], [0]]], ids=["every trial", "one trial"])
+def test_a_delivery_is_read_as_sent_where_it_arrives(gamma: list[list[int]]) -> None:
+    """Payloads and headers of two slots: 0 where nothing arrives."""
+    flags = np.array(gamma, np.bool_)
+    trials = flags.shape[1]
+    z, header = np.arange(1.0, 4 * trials + 1).reshape(2, 2, trials), np.arange(1, 2 * trials + 1).reshape(2, 1, trials)
+    payload = delivery(range(FIRST, FIRST + 2), Arrivals(flags, z, header))
+    read = read_delivery(Reader(DOWN, payload), FIRST, (2, trials), 1, WINDOW, MOST)
+    assert read.header is not None
+    assert np.array_equal(read.gamma, flags)
+    assert np.array_equal(read.z, np.where(flags[:, None], z, 0.0))
+    assert np.array_equal(read.header, np.where(flags[:, None], header, 0))

@@ -15,7 +15,7 @@ from evedrop.model.links.loss_model import Fate
 from evedrop.model.modulated import ModulatedCovariance, limit_of
 from evedrop.model.process import Process
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
-from evedrop.model.slot.link_distribution import distribution_of
+from evedrop.model.slot.link_distribution import distribution_of, stretches
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.scenario.theory import Expectation
 
@@ -149,3 +149,10 @@ def test_what_theory_does_not_know(schedule: LinkSchedule) -> None:
     assert distribution_of(schedule) is None
     assert np.isnan(traces(schedule)).all()
     assert math.isnan(Expectation(WALK, None, Outcomes.plain).limit)
+
+
+def test_of_two_changes_in_a_slot_both_count_from_there_on() -> None:
+    """The settings of the first and the cut of the second are one stretch."""
+    other = {"loss": {"model": "bernoulli", "quality": 0.2}}
+    schedule = LinkSchedule(PLAIN, 0, (Change(15, other), Change(15, cut=True)))
+    assert stretches(schedule) == [(0, PLAIN, False), (15, other, True)]
