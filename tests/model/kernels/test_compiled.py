@@ -142,11 +142,8 @@ def test_packed_trials_are_the_same(random: np.random.Generator, sizes: tuple[in
     """The numbers of some trials are taken out of all, and put back."""
     slots, n, trials = sizes
     flags, x = random.random((slots, trials)) < share, numbers(random, *sizes)
-    for some, values in zip(flags, x, strict=True):
-        twins("gather", some, values)
-    packed = np.concatenate(
-        [np.zeros(0), *(reference.gather(some, values).ravel() for some, values in zip(flags, x, strict=True))]
-    )
+    twins("gather", flags, x)
+    packed = reference.gather(flags, x)
     twins("scatter", flags, packed, n)
     assert np.array_equal(reference.scatter(flags, packed, n), np.where(flags[:, None, :], x, 0.0), equal_nan=True)
 

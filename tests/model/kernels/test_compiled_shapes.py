@@ -53,7 +53,7 @@ FIT: dict[str, tuple[Any, ...]] = {
     "count_bursts": (codes(SLOTS, TRIALS), 1, np.zeros(TRIALS, np.int64), 4),
     "add_to_histograms": (np.zeros((SLOTS, 9), np.uint32), ones(SLOTS, TRIALS), 50, 1000),
     "scatter": (flags(SLOTS, TRIALS), ones(STATES * SLOTS * TRIALS), STATES),
-    "gather": (flags(TRIALS), ones(STATES, TRIALS)),
+    "gather": (flags(SLOTS, TRIALS), ones(*PACKETS)),
     "triangular_factors": (ones(SLOTS, STATES, 3),),
     "carried_factors": (ones(*SQUARE), ones(*SQUARE), ones(*SQUARE), 3),
     "follow_mixture": (

@@ -52,7 +52,7 @@ _WINDOW_BYTES = 64 * 2**20
 _MOST_SLOTS_AHEAD = 4096
 _REPORT_SECONDS = 0.04
 _MOST_SLOTS = 64  # whose packets one message carries
-_MESSAGE_BYTES = 1 << 18  # of their numbers, so that they stay in the processor's cache
+_MESSAGE_BYTES = 1 << 20  # of the numbers of one message
 LAUNCHED_PATIENCE = 30  # seconds
 
 

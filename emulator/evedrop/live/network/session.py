@@ -54,6 +54,7 @@ from evedrop.live.protocol.commands import (
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig, low_pass, reader_of
 from evedrop.live.protocol.launcher_events import RouterListens
 from evedrop.names import RECORDER, ROUTER
+from evedrop.system.allocator import keep_for_messages
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 
 READY_SECONDS = 30.0
@@ -170,6 +171,7 @@ class Session:
         zenoh.init_log_from_env_or(_LOGGED)
         if brief.ends_with_stdin:
             when_launcher_is_gone(lambda: os._exit(3))
+        keep_for_messages(brief.flow.largest_message)
         self.keys = RunKeys(brief.run)
         self._process = brief.process
         self.patience = float(brief.patience)

@@ -38,6 +38,11 @@ def pack(fields: Mapping[str, Any]) -> bytes:
     return message
 
 
+def binary(array: NDArray[Any], dtype: str) -> memoryview:
+    """An array's bytes, of this little-endian type, as a field to be packed: a view, where the array is as messages need it."""
+    return np.ascontiguousarray(array, dtype).data
+
+
 class _Packers(threading.local):
     """A packer for each thread: making one takes longer than packing a small message."""
 

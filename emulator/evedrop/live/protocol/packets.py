@@ -7,14 +7,12 @@ Source: docs/protocol.md, messages.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from evedrop.live.protocol.codec import Reader, pack
+from evedrop.live.protocol.codec import Reader, binary, pack
 from evedrop.live.protocol.record_messages import RecordFormat, packed
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats
@@ -54,7 +52,7 @@ def read_uplink(message: Reader, k: int, packets: RecordFormat[PacketSlots], mos
 
 def acknowledgement(k: int, acknowledged: Flags) -> bytes:
     """Encode the acknowledgements of slot k, (R,), either from the legitimate estimator or as they reach the sensor."""
-    return pack({"k": k, "gamma": packed_flags(acknowledged).tobytes()})
+    return pack({"k": k, "gamma": binary(packed_flags(acknowledged), "u1")})
 
 
 def read_acknowledgement(message: Reader, k: int, trials: int) -> Flags:
@@ -95,11 +93,11 @@ def read_resend(message: Reader, slots: int) -> tuple[int, int, int]:
 def delivery(slots: range, arrivals: Arrivals) -> bytes:
     """Encode a delivery of some slots: γ, and z and header of the trials that received."""
     gamma = arrivals.gamma
-    fields: dict[str, Any] = {"k": slots.start, "c": len(slots), "gamma": packed_flags(gamma).tobytes()}
+    fields: dict[str, Any] = {"k": slots.start, "c": len(slots), "gamma": binary(packed_flags(gamma), "u1")}
     if gamma.any():
         fields |= _received(gamma, arrivals.z, arrivals.header)
     if arrivals.truth:
-        fields["truth"] = b"".join(arrivals.truth[row].tobytes() for row in range(len(slots)))
+        fields["truth"] = binary(np.stack([arrivals.truth[row] for row in range(len(slots))]), "<f8")
     if arrivals.late:
         fields["late"] = [
             _late(slots.start + row, packets) for row, parts in sorted(arrivals.late.items()) for packets in parts
@@ -107,28 +105,28 @@ def delivery(slots: range, arrivals: Arrivals) -> bytes:
     return pack(fields)
 
 
-def _received(gamma: Flags, z: Floats, header: I64 | None) -> dict[str, bytes]:
+def _received(gamma: Flags, z: Floats, header: I64 | None) -> dict[str, memoryview]:
     """Z (c, n, R) and header (c, h, R) of the trials that received, slot by slot."""
-    fields = {"z": _gathered(gamma, z, kernels.gather)}
+    fields = {"z": _gathered(gamma, z)}
     if header is not None:
-        fields["header"] = _gathered(gamma, header.astype("<i8", copy=False), partial(np.compress, axis=1))
+        fields["header"] = _gathered(gamma, header.view(np.float64))
     return fields
 
 
-def _gathered(gamma: Flags, values: NDArray[Any], gather: Callable[[Flags, Any], NDArray[Any]]) -> bytes:
-    """Values (c, m, R) of the trials that received; gather: takes those of one slot, from its flags and values."""
+def _gathered(gamma: Flags, values: Floats) -> memoryview:
+    """Values (c, m, R) of the trials that received; whole numbers come as the numbers with the same bits."""
     if gamma.all():
-        return values.tobytes()
-    if gamma.shape[1] == 1:  # without a call for each slot
-        return values[gamma[:, 0]].tobytes()
-    return b"".join(gather(some, of_slot).tobytes() for some, of_slot in zip(gamma, values, strict=True))
+        return binary(values, "<f8")
+    if gamma.shape[1] == 1:  # a call of the kernel takes longer
+        return binary(values[gamma[:, 0]], "<f8")
+    return binary(kernels.gather(gamma, values), "<f8")
 
 
 def _late(at: int, packets: Late) -> dict[str, Any]:
     heard = packets.heard
     header = None if heard.header is None else heard.header[None]
     received = _received(heard.gamma[None], heard.z[None], header)
-    return {"at": at, "k": packets.k, "gamma": packed_flags(heard.gamma).tobytes(), **received}
+    return {"at": at, "k": packets.k, "gamma": binary(packed_flags(heard.gamma), "u1"), **received}
 
 
 def read_delivery(
@@ -158,11 +156,8 @@ def _heard(message: Reader, shape: tuple[int, int, int], header: int) -> tuple[F
             raise message.malformed("z although nothing was received", "no z")
         return gamma, np.zeros(shape), headers
     if headers is not None:
-        numbers, at = message.array("header", "<i8", (header * received,)), 0
-        for some, of_slot in zip(gamma, headers, strict=True):
-            count = header * int(np.count_nonzero(some))
-            of_slot[:, some] = numbers[at : at + count].reshape(header, -1)
-            at += count
+        numbers = message.array("header", "<i8", (header * received,))
+        headers = kernels.scatter(gamma, numbers.view(np.float64), header).view(np.int64)
     if received == gamma.size:
         return gamma, message.finite("z", shape), headers
     return gamma, kernels.scatter(gamma, message.finite("z", (n * received,)), n), headers

@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar, final
 
 import numpy as np
 
-from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.codec import Reader, binary
 from evedrop.model.receiver import packed_flags
 from evedrop.model.record import Record, RecordColumn, columns
 
@@ -25,9 +25,9 @@ def packed(record: Record) -> dict[str, Any]:
     for entry in columns(type(record)):
         array = getattr(record, entry.name)
         if array is not None:
-            fields[entry.name] = (
-                packed_flags(array) if entry.is_flag else array.astype(entry.dtype, copy=False)
-            ).tobytes()
+            fields[entry.name] = binary(
+                packed_flags(array) if entry.is_flag else array, "u1" if entry.is_flag else entry.dtype.str
+            )
     return fields
 
 

@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 
-from evedrop.live.protocol.codec import Reader, pack, shown
+from evedrop.live.protocol.codec import Reader, binary, pack, shown
 from evedrop.live.protocol.record_messages import RecordFormat, packed
 from evedrop.model.digest import DIGEST_BYTES, Blocks, Digests
 from evedrop.model.links.loss_model import REASONS
@@ -142,14 +142,14 @@ class Report:
                 "k": self.slots.first,
                 "c": self.slots.count,
                 **packed(self.slots),
-                "digests": {block: digests.tobytes() for block, digests in self.digests.items()},
+                "digests": {block: binary(digests, "u1") for block, digests in self.digests.items()},
                 **({"trace_sums": sums} if (sums := _packed_sums(self.trace_sums)) else {}),
             }
         )
 
 
-def _packed_sums(sums: Mapping[int, Floats]) -> dict[int, bytes]:
-    return {block: block_sums.astype("<f8").tobytes() for block, block_sums in sums.items()}
+def _packed_sums(sums: Mapping[int, Floats]) -> dict[int, memoryview]:
+    return {block: binary(block_sums, "<f8") for block, block_sums in sums.items()}
 
 
 def _read_sums(message: Reader, trials: int, blocks: list[int]) -> dict[int, Floats]:
@@ -201,7 +201,7 @@ def _check_symmetric(message: Reader, P: Floats) -> None:
 
 def leaving(k: int, belief: Belief) -> bytes:
     """Encode a receiver's final belief before an outage that begins with slot k."""
-    return pack({"k": k, "leaves": True, "x_hat": belief.x_hat.tobytes(), "P": belief.P.tobytes()})
+    return pack({"k": k, "leaves": True, "x_hat": binary(belief.x_hat, "<f8"), "P": binary(belief.P, "<f8")})
 
 
 def is_leaving(message: Reader) -> bool:
@@ -230,8 +230,8 @@ class Journal:
         links = {
             name: {
                 **packed(link.slots),
-                "bursts": link.bursts.astype("<u4").tobytes(),
-                "delays": link.delays.astype("<u4").tobytes(),
+                "bursts": binary(link.bursts, "<u4"),
+                "delays": binary(link.delays, "<u4"),
             }
             for name, link in self.links.items()
         }
@@ -270,7 +270,7 @@ def _check_account(message: Reader, name: str, link: Account, window: int) -> No
 
 def known(name: str, k: int, x: Floats) -> bytes:
     """Encode the state that the controller acts on in slot k, (n, R); name: `x_hat` for an estimate, `x` for the true state."""
-    return pack({"k": k, name: x.tobytes()})
+    return pack({"k": k, name: binary(x, "<f8")})
 
 
 def read_known(message: Reader, name: str, k: int, shape: tuple[int, int]) -> Floats:
@@ -281,9 +281,9 @@ def read_known(message: Reader, name: str, k: int, shape: tuple[int, int]) -> Fl
 
 def decided(k: int, u: Floats, failed: Flags) -> bytes:
     """Encode the inputs (m, R) from slot k on, and where the decision failed, (R,), so that the previous inputs stay."""
-    fields = {"k": k, "u": u.tobytes()}
+    fields = {"k": k, "u": binary(u, "<f8")}
     if failed.any():
-        fields["failed"] = packed_flags(failed).tobytes()
+        fields["failed"] = binary(packed_flags(failed), "u1")
     return pack(fields)
 
 
@@ -306,8 +306,8 @@ class Decisions:
 
     def pack(self) -> bytes:
         """Encode it as a message."""
-        digests = {block: digests.tobytes() for block, digests in self.digests.items()}
-        return pack({"k": self.first, "c": self.count, "seconds": self.seconds.tobytes(), "digests": digests})
+        digests = {block: binary(digests, "u1") for block, digests in self.digests.items()}
+        return pack({"k": self.first, "c": self.count, "seconds": binary(self.seconds, "<f8"), "digests": digests})
 
 
 def read_decisions(message: Reader, first: int, extent: Extent, blocks: Blocks, period: int) -> Decisions:

@@ -244,10 +244,10 @@ def scatter(flags: Flags, packed: Floats, n: int) -> Floats:
 
 def gather(flags: Flags, x: Floats) -> Floats:
     """As `reference.gather`."""
-    n, trials = x.shape
-    out = np.empty((n, int(np.count_nonzero(flags))))
-    some = _bytes(flags, (trials,))
-    _lib.kernels_gather(n, trials, out.shape[1], some, _doubles(x, x.shape), _buffer("double[]", out))
+    slots, n, trials = x.shape
+    out = np.empty(n * int(np.count_nonzero(flags)))
+    some = _bytes(flags, (slots, trials))
+    _lib.kernels_gather(slots, n, trials, some, _doubles(x, x.shape), _buffer("double[]", out))
     return out
 
 

@@ -315,11 +315,11 @@ def scatter(flags: Flags, packed: Floats, n: int) -> Floats:
 
 
 def gather(flags: Flags, x: Floats) -> Floats:
-    """The columns of x (n, R) where the flags (R,) are set, (n, count)."""
-    _, trials = x.shape
-    expect_bytes(flags, (trials,))
-    some: Floats = np.compress(flags, x, axis=1)
-    return some
+    """The numbers of x (c, n, R) in the flagged trials, flags (c, R), as `scatter` takes them, (m,)."""
+    slots, _, trials = x.shape
+    expect_bytes(flags, (slots, trials))
+    rows = [of_slot[:, some].ravel() for of_slot, some in zip(x, flags, strict=True)]
+    return np.concatenate(rows) if rows else np.empty(0)
 
 
 def triangular_factors(M: Floats) -> Floats:

@@ -150,8 +150,8 @@ void kernels_scatter(int64_t slots, int64_t n, int64_t trials, const uint8_t *fl
   CHOOSE(scatter, (slots, n, trials, flags, packed, z));
 }
 
-void kernels_gather(int64_t n, int64_t trials, int64_t count, const uint8_t *flags, const double *x, double *out) {
-  CHOOSE(gather, (n, trials, count, flags, x, out));
+void kernels_gather(int64_t slots, int64_t n, int64_t trials, const uint8_t *flags, const double *x, double *out) {
+  CHOOSE(gather, (slots, n, trials, flags, x, out));
 }
 
 int kernels_triangularise(int64_t count, int64_t n, int64_t m, double *M) {

@@ -56,8 +56,8 @@ void kernels_histogram(int64_t rows, int64_t trials, const double *values, int s
    trials); 0 elsewhere. */
 void kernels_scatter(int64_t slots, int64_t n, int64_t trials, const uint8_t *flags, const double *packed, double *z);
 
-/* The `count` flagged numbers of every row of x (n, trials), out (n, count); flags (trials,). */
-void kernels_gather(int64_t n, int64_t trials, int64_t count, const uint8_t *flags, const double *x, double *out);
+/* The numbers of x (slots, n, trials) in the flagged trials, flags (slots, trials), as kernels_scatter takes them. */
+void kernels_gather(int64_t slots, int64_t n, int64_t trials, const uint8_t *flags, const double *x, double *out);
 
 /* Each of M (count, n, m), m >= n, turned by Givens rotations until it is lower triangular with a non-negative diagonal, in place.
    Returns 0, -1 where memory is short, and 1 where a rotation would divide by 0 because a square is too small for a double. */

@@ -240,12 +240,16 @@ static void NAME(scatter, SET)(int64_t slots, int64_t n, int64_t trials, const u
   }
 }
 
-static void NAME(gather, SET)(int64_t n, int64_t trials, int64_t count, const uint8_t *flags, const double *x, double *out) {
-  for (int64_t i = 0; i < n; i++, x += trials, out += count)
-    for (int64_t r = 0, j = 0; j < count && r < trials; r++) {
-      out[j] = x[r];
-      j += flags[r];
-    }
+static void NAME(gather, SET)(int64_t slots, int64_t n, int64_t trials, const uint8_t *flags, const double *x, double *out) {
+  for (int64_t s = 0; s < slots; s++, flags += trials) {
+    int64_t count = 0;
+    for (int64_t r = 0; r < trials; r++) count += flags[r];
+    for (int64_t i = 0; i < n; i++, x += trials, out += count)
+      for (int64_t r = 0, j = 0; j < count && r < trials; r++) {
+        out[j] = x[r];
+        j += flags[r];
+      }
+  }
 }
 
 #undef LANES
