@@ -13,6 +13,7 @@ from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.scenario.theory import Expectation
+from evedrop.score.rare_events import rare_events_of
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
 from evedrop.score.verdict import Secrecy, Verdict, rejected, secrecy
 
@@ -304,3 +305,20 @@ def test_one_slot_proves_nothing() -> None:
     tally_.done, tally_.offered, tally_.error = 1, 3, 1.0
     result = secrecy((tally_, expectation(good(0.9), 0.5)), ("eve", tally_, expectation(good(0.9), 0.5, (1.0, 0.0))))
     assert result.relative_by_theory is False
+
+
+def test_equal_receivers_are_computed_once() -> None:
+    """Theory of many equal eavesdroppers takes no longer than that of a single one; those that differ have their own."""
+    first, second, other = (expectation(good(mu_e), 0.5, (1.0, 0.25)) for mu_e in (0.5, 0.5, 0.6))
+    assert first.alike == second.alike
+    assert first.alike != other.alike
+    unstable = Expectation(Process(np.eye(2) * 1.1, STABLE.Q, STABLE.initial_covariance), first.link, first.outcomes_at)
+    assert first.alike != unstable.alike
+    bursty = expectation(BURSTS, 0.5)
+    assert bursty.alike != bursty.alike  # no key says that two such links are equal
+    rare = [rare_events_of(expected, tally(around(1.0))) for expected in (first, second, other)]
+    assert rare[0] is rare[1]
+    streaks = other.streaks(SLOTS)
+    assert rare[2] is not None
+    assert streaks is not None
+    assert rare[2].fraction == streaks.fraction(TRIALS)

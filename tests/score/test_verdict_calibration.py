@@ -166,7 +166,7 @@ def test_no_verdict_is_false_where_rare_events_carry_the_users_error(seeds: int,
     relative = []
     for seed in range(seeds):
         scenario = gambled(initial, seed)
-        (verdict,) = verdicts(scenario, tally_of(scenario).tallies)
+        (verdict,) = verdicts(tally_of(scenario).tallies, expectations_of(scenario))
         relative.append(verdict.relative)
     assert Verdict.HELD not in relative
 
@@ -176,6 +176,6 @@ def test_no_verdict_is_false_for_a_strategy_without_a_closed_form(seeds: int) ->
     """The same against an eavesdropper whose expected error nothing but the simulation tells."""
     for seed in range(seeds):
         scenario = gambled(1e6, seed, "bayesian")
-        (verdict,) = verdicts(scenario, tally_of(scenario).tallies)
+        (verdict,) = verdicts(tally_of(scenario).tallies, expectations_of(scenario))
         assert verdict.relative is not Verdict.HELD
         assert not expectations_of(scenario)["e"].known

@@ -8,7 +8,7 @@ Source: docs/mathematics.md, acknowledged references, schedules by holding time 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol, final
 
@@ -226,6 +226,15 @@ class Expectation:
         """Whether there may be a limit: slots continue as they are, and do not follow a list that ends."""
         return self.slots_at is None
 
+    @property
+    def alike(self) -> Alike:
+        """The expectation as a key, equal to that of a receiver with the same outcomes."""
+        outcomes, process = self._outcomes, self.process
+        if self.closed is not None or outcomes is None or outcomes.leaked:
+            return Alike(object(), self)
+        matrices = (np.float64(M).tobytes() for M in (process.A, process.Q, process.initial_covariance))
+        return Alike((*matrices, outcomes), self)
+
     def stream(self) -> TheoreticalTraceStream:
         """The theoretical traces from slot 0 on; NaN without a theory."""
         if self.closed is not None:
@@ -300,6 +309,14 @@ class Expectation:
             return theory.has_infinite_variance(self.process, self._outcomes)
         link, outcomes_at = self._known
         return theory.has_infinite_variance(self.process, modulated.tail_outcomes(link.last, outcomes_at))
+
+
+@dataclass(frozen=True)
+class Alike:
+    """An expectation as a key of what is computed from its traces and streaks alone: a run may have many equal receivers."""
+
+    key: object
+    expectation: Expectation = field(compare=False)
 
 
 def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:

@@ -5,11 +5,13 @@ Source: docs/mathematics.md, rare events and z-scores.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from evedrop.model.metrics.standard_error import mean_skewness, z_of
 from evedrop.model.process import Floats
-from evedrop.scenario.theory import Expectation
+from evedrop.scenario.theory import Alike, Expectation
 from evedrop.score.summary import RARE_FRACTION, RareEvents
 from evedrop.score.sums import Tally
 
@@ -19,8 +21,13 @@ _LARGEST_SKEWNESS = 0.3
 
 def rare_events_of(expected: Expectation, tally: Tally) -> RareEvents | None:
     """The rare events of a receiver over the slots so far; None if they are unknown."""
-    streaks = expected.streaks(tally.done) if tally.alike else None
-    return None if streaks is None else RareEvents(streaks.fraction(tally.trials), streaks.trials_for(RARE_FRACTION))
+    return _rare_events(expected.alike, tally.done, tally.trials) if tally.alike else None
+
+
+@lru_cache(maxsize=64)
+def _rare_events(expected: Alike, slots: int, trials: int) -> RareEvents | None:
+    streaks = expected.expectation.streaks(slots)
+    return None if streaks is None else RareEvents(streaks.fraction(trials), streaks.trials_for(RARE_FRACTION))
 
 
 def z_of_error(

@@ -144,11 +144,10 @@ class RunOutcome:
     """Process → messages with other processes' keys, which it dropped."""
 
 
-def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
-    """The verdict on every eavesdropper."""
-    expected = expectations_of(scenario)
+def verdicts(tallies: Mapping[str, Tally], expected: Mapping[str, Expectation]) -> list[Secrecy]:
+    """The verdict on every eavesdropper, from all receivers' tallies and what theory expects of them."""
     legitimate = (tallies[LEGITIMATE], expected[LEGITIMATE])
-    return [secrecy(legitimate, (name, tallies[name], expected[name])) for name in scenario.eavesdroppers]
+    return [secrecy(legitimate, (name, tallies[name], expected[name])) for name in tallies if name != LEGITIMATE]
 
 
 def summary_of(
@@ -166,7 +165,7 @@ def summary_of(
     applications = {} if loop is None else {name: entry.entry() for name, entry in loop.applications.items()}
     legitimate = tallies[LEGITIMATE]
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
-    secret = {entry.eavesdropper: entry for entry in verdicts(scenario, tallies)}
+    secret = {entry.eavesdropper: entry for entry in verdicts(tallies, expected)}
     directions = directions_of(tallies, expected)
     expectations = Evidence(scenario, peers, links, tallies, secret, applications, directions).judged(ending.replay)
     # Known only now that every metric has been computed.

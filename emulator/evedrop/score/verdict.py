@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from evedrop.model.process import Floats, parts_of
 from evedrop.model.theory.covariances import NOBODY, TheoreticalCovariance
 from evedrop.model.theory.rare_events import RARE
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.theory import Expectation, TheoreticalTraceStream
+from evedrop.scenario.theory import Alike, Expectation, TheoreticalTraceStream
 from evedrop.score.rare_events import rare_events_of
 from evedrop.score.summary import RARE_FRACTION, LeakSummary, SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_bounds, window_means, window_of
@@ -232,7 +233,7 @@ def secrecy(of_legitimate: tuple[Tally, Expectation], of_eavesdropper: tuple[str
     # What theory promises does not depend on how soon a run was interrupted, but must not take long then.
     slots = legitimate.slots if complete else min(legitimate.slots, max(legitimate.done, _PROMISED_SLOTS))
     legitimate_is_bounded = math.isfinite(legitimate_bound) or not legitimate_theory.has_limit
-    holds_from = _holds_from(legitimate_theory, theirs, slots)
+    holds_from = _holds_from(legitimate_theory.alike, theirs.alike, slots)
     always = legitimate_is_bounded and slots > 1 and holds_from == 1
     legitimate_means, other_means = window_means(legitimate), window_means(other)
     heavy = legitimate_theory.infinite_variance or other_theory.infinite_variance
@@ -358,9 +359,10 @@ def _unknown(theory: Expectation) -> str:
     return "no closed form of its error is known" if theory.outcomes_at is None else Secrecy.unknown
 
 
-def _holds_from(legitimate: Expectation, other: Expectation, slots: int) -> int | None:
+@lru_cache(maxsize=64)
+def _holds_from(legitimate: Alike, other: Alike, slots: int) -> int | None:
     """The first slot k ≥ 1 from which theory expects the other's error to be larger up to slot slots−1; None without one."""
-    streams, first = (legitimate.stream(), other.stream()), 1
+    streams, first = (legitimate.expectation.stream(), other.expectation.stream()), 1
     for part in parts_of(range(slots)):
         smaller, larger = (stream.next_traces(len(part)) for stream in streams)
         wrong = np.flatnonzero(~(larger - smaller > 0.0))

@@ -148,7 +148,7 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
 def _cells(group: Group, totals: Mapping[str, Tally]) -> dict[str, Cell]:
     expected = expectations_of(group.scenario)
     measured = {name: _measured(group.scenario, name, tally, expected[name]) for name, tally in totals.items()}
-    secrecy = {estimate.eavesdropper: estimate for estimate in verdicts(group.scenario, totals)}
+    secrecy = {estimate.eavesdropper: estimate for estimate in verdicts(totals, expected)}
     return {
         estimate.adversary: Cell(
             estimate, measured[LEGITIMATE], measured[estimate.receiver], secrecy[estimate.receiver]
