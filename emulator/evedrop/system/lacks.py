@@ -6,7 +6,9 @@ import errno
 import os
 import resource
 import sys
+import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -76,6 +78,16 @@ def preload_within_limit() -> None:
     if not _has_room():
         raise MemoryError
     import_module("scipy.special")
+
+
+def preload_meanwhile() -> None:
+    """Import on a thread what a summary needs: a run that computes one while it is going on would stop for the import."""
+
+    def load() -> None:
+        with suppress(Exception):  # the summary's own import says what is wrong
+            import_module("scipy.special")
+
+    threading.Thread(target=load, name="preload", daemon=True).start()
 
 
 def _limit() -> int | None:

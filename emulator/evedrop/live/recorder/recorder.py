@@ -35,7 +35,7 @@ from evedrop.results.folder import new_folder
 from evedrop.scenario.progress_events import ViewOpened
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer, WebAddress
-from evedrop.system.lacks import preload_within_limit
+from evedrop.system.lacks import preload_meanwhile, preload_within_limit
 from evedrop.system.signals import heeded
 
 _ORPHAN_SECONDS = 30.0  # to write the results once the launcher is gone
@@ -107,6 +107,7 @@ def _conduct(
         direction = Direction(conductor, brief, run, confirmations)
         try:
             direction.start()
+            preload_meanwhile()
             while not run.complete:
                 direction.take_message()
                 direction.steer()
