@@ -14,8 +14,9 @@ from evedrop.live.network.program import ProgramStates
 from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief, ProgramPart, SensorPart, decoded
-from evedrop.live.protocol.codec import Reader, read_progress
+from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import EndRun, Go, Hold, Start
+from evedrop.live.protocol.notices import Progress
 from evedrop.live.protocol.packets import barrier, packets_of, read_acknowledgement, resend, uplink
 from evedrop.live.protocol.telemetry import held
 from evedrop.model.detection import CusumBatch
@@ -87,7 +88,7 @@ class Window:
     def _take(self, name: str, payload: bytes | bool, k: int) -> None:
         """Take a progress message; all slots of it are below k or k itself."""
         if isinstance(payload, bytes):
-            self._done[name] = max(self._done[name], read_progress(self._keys[name], payload, k))
+            self._done[name] = max(self._done[name], Progress.read(self._keys[name], payload, k).k)
         self._measure()
 
     def go_on(self, k: int, absent: Collection[str]) -> None:

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from evedrop.errors import MalformedMessage
-from evedrop.live.protocol.codec import Reader, read_refusal, refusal
+from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.notices import RefusalNotice
 from evedrop.scenario.loading import load
 from evedrop.system.ports import free_port
 from tests.by_hand import by_hand
@@ -240,7 +241,7 @@ PROGRESS = {
 def test_malformed_progress_is_its_senders(evedrop: Evedrop, case: str) -> None:
     """The sensor refuses it, and the run ends with the name of the receiver that sent it, not with the sensor's."""
     does, message = PROGRESS[case]
-    rogue = with_rogue(evedrop, "naive", f"reporting.progress = lambda k: {does}")
+    rogue = with_rogue(evedrop, "naive", f"reporting.Progress.pack = lambda notice: {does}")
     done = evedrop.live("eavesdroppers", "--slots", "100000", env=rogue).end()
     assert done.status == 3
     first = done.err.splitlines()[0]
@@ -255,7 +256,7 @@ def test_the_sender_is_named_where_everybody_is_started_by_hand(
     evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The sensor, on another host perhaps, tells the recorder what it refuses before it ends, so the sender is named."""
-    rogue = with_rogue(evedrop, "naive", "reporting.progress = lambda k: pack({'k': 10**9})")
+    rogue = with_rogue(evedrop, "naive", "reporting.Progress.pack = lambda notice: pack({'k': 10**9})")
     monkeypatch.setenv("PYTHONPATH", rogue["PYTHONPATH"])
     scenario = load("eavesdroppers", {"slots": 100_000})
     with by_hand(scenario, evedrop.folder, f"tcp/127.0.0.1:{free_port()}") as run:
@@ -271,14 +272,15 @@ def test_the_sender_is_named_where_everybody_is_started_by_hand(
 
 def test_nobody_is_accused_of_keys_that_are_not_its_own() -> None:
     """A refusal must be of a key that the process reads, in its own run; and what it says is shown without control characters."""
-    reader = Reader("evedrop/r1/telemetry/naive", refusal("evedrop/r1/uplink", "x"))
+    reader = Reader("evedrop/r1/telemetry/naive", RefusalNotice.of("evedrop/r1/uplink", "x").pack())
     with pytest.raises(MalformedMessage, match="a key that naive reads"):
-        read_refusal(reader, "naive")
-    reader = Reader("evedrop/r1/telemetry/sensor", refusal("evedrop/r2/progress/naive", "x"))
+        RefusalNotice.read(reader, "naive")
+    reader = Reader("evedrop/r1/telemetry/sensor", RefusalNotice.of("evedrop/r2/progress/naive", "x").pack())
     with pytest.raises(MalformedMessage, match="a key that sensor reads"):
-        read_refusal(reader, "sensor")
-    reader = Reader("evedrop/r1/telemetry/sensor", refusal("evedrop/r1/progress/naive", "\x1b[2Jx\n"))
-    result = read_refusal(reader, "sensor")
+        RefusalNotice.read(reader, "sensor")
+    reader = Reader("evedrop/r1/telemetry/sensor", RefusalNotice.of("evedrop/r1/progress/naive", "\x1b[2Jx\n").pack())
+    result = RefusalNotice.read(reader, "sensor")
+    assert result is not None
     assert result.at_fault == ("naive",)
     assert str(result) == "malformed message on evedrop/r1/progress/naive: ?[2Jx? (refused by sensor)"
 
@@ -286,7 +288,7 @@ def test_nobody_is_accused_of_keys_that_are_not_its_own() -> None:
 BOMB = """
 from evedrop.live.network.reporting import BeliefReporter
 def add_slots(self, slots, *rest, honest=BeliefReporter.add_slots):
-    for k in slots:
+    for k in slots.slots:
         for _ in range(5 if k % 500 == 0 else 0):
             self._put(k, bytes([0xdd, 0, 0x98, 0x96, 0x80]) + bytes([0x90]) * 10**7)
             self._put_progress(k, bytes([0x90]) * 10**7)

@@ -19,11 +19,11 @@ import pytest
 import zenoh
 
 from evedrop import montecarlo
-from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol.brief import AnyBrief, read_brief
 from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.notices import Progress
 from evedrop.model.streams import stream_key
 from evedrop.names import RECORDER
 from evedrop.results.reading import Results
@@ -140,7 +140,7 @@ def disturb(eve: AnyBrief, keys: RunKeys) -> None:
             if key in own:
                 continue
             attacker.declare_queryable(key, lambda query: query.reply(query.key_expr, b"\xc1"))
-            for payload in (EndRun().pack(), wire.progress(10**9), packet(0, np.zeros((2, 3))), b"\xc1"):
+            for payload in (EndRun().pack(), Progress(10**9).pack(), packet(0, np.zeros((2, 3))), b"\xc1"):
                 attacker.put(key, enclosed(key, payload), congestion_control=zenoh.CongestionControl.BLOCK)
             attacker.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
             if key.rpartition("/")[2] in PROCESSES and "/alive/" in key:

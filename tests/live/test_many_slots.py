@@ -16,9 +16,10 @@ import pytest
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, RouterPart, SensorPart
-from evedrop.live.protocol.codec import Reader, progress
+from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import EndRun, Go, Start
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.notices import Progress
 from evedrop.live.protocol.packets import is_barrier
 from evedrop.live.protocol.telemetry import is_held, is_leaving
 from evedrop.peers.eavesdropper import eavesdrop
@@ -154,7 +155,7 @@ class Run:
         done = min(self.reported.values())
         if done > self.done:
             self.done = done
-            self.stage.callbacks[self.keys.progress("recorder")](progress(done))
+            self.stage.callbacks[self.keys.progress("recorder")](Progress(done).pack())
         if self.held == done:
             self.go_on(done)
 

@@ -22,6 +22,7 @@ from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import AnyBrief, Flow, LegitimatePart, SensorPart
 from evedrop.live.protocol.commands import EndRun, Start
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.notices import Progress
 from evedrop.model.digest import Blocks, Digests
 from evedrop.model.process import Process
 from evedrop.peers.eavesdropper import eavesdrop
@@ -104,7 +105,7 @@ def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
             assert np.array_equal(report.slots.action == 0, lost)
         else:
             assert key == keys.progress(name)
-            assert wire.read_progress(key, payload, SLOTS) == end
+            assert Progress.read(key, payload, SLOTS).k == end
     assert end == SLOTS
     assert set(blocks) == {0}
 
@@ -228,7 +229,7 @@ def test_a_report_is_kept_for_a_window(name: str, stage: Stage) -> None:
         ends.append(message.integer("k") + message.integer("c"))
     assert ends == [40, 44, 48, 50]
     stage.buffers[RunKeys("r").progress(name)].again(1, SLOTS)
-    assert stage.all(RunKeys("r").progress(name)) == [wire.progress(SLOTS)]
+    assert stage.all(RunKeys("r").progress(name)) == [Progress(SLOTS).pack()]
 
 
 class SensorThread:
@@ -259,7 +260,7 @@ class SensorThread:
 
     def progress(self, name: str, k: int) -> None:
         """Somebody reports progress."""
-        self.stage.callbacks[self.keys.progress(name)](wire.progress(k))
+        self.stage.callbacks[self.keys.progress(name)](Progress(k).pack())
 
 
 def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
@@ -358,7 +359,7 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(slowest: str, stage: Stag
             window.wait(limit)
 
     def report(name: str, k: int) -> None:
-        stage.callbacks[session.keys.progress(name)](wire.progress(k))
+        stage.callbacks[session.keys.progress(name)](Progress(k).pack())
 
     reaches(10)
     for name in set(followers) - {slowest}:

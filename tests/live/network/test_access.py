@@ -23,6 +23,7 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import telemetry
 from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.commands import EndRun, Unknown
+from evedrop.live.protocol.notices import Progress
 from evedrop.live.protocol.packets import read_delivery
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
@@ -83,12 +84,12 @@ def talk(stage: Bench) -> None:
     for name in PROCESSES:
         stage.settle(name)
         if name != "sensor":
-            stage.put(name, stage.keys.progress(name), wire.progress(1))
-            assert stage.progress[name].hear()[1] == wire.progress(1)
+            stage.put(name, stage.keys.progress(name), Progress(1).pack())
+            assert stage.progress[name].hear()[1] == Progress(1).pack()
         stage.put("recorder", stage.keys.control(name), Unknown().pack())
         assert stage.controls[name].hear()[1] == Unknown().pack()
-    stage.put("recorder", stage.keys.progress("recorder"), wire.progress(1))
-    assert stage.progress["recorder"].hear()[1] == wire.progress(1)
+    stage.put("recorder", stage.keys.progress("recorder"), Progress(1).pack())
+    assert stage.progress["recorder"].hear()[1] == Progress(1).pack()
 
 
 MODES: dict[str, dict[str, Any]] = {
@@ -221,7 +222,7 @@ def test_eavesdropper_can_write_only_its_telemetry_and_progress(mode: str, stage
     """Its messages on any other key, and all its deletions, reach no process; the run goes on undisturbed."""
     keys = all_keys(stage)
     own = {keys[f"telemetry/{EVE}"], keys[f"progress/{EVE}"]}
-    payloads = (packet(stage.due, np.zeros(SHAPE)), EndRun().pack(), wire.progress(10**9), b"\xc1")
+    payloads = (packet(stage.due, np.zeros(SHAPE)), EndRun().pack(), Progress(10**9).pack(), b"\xc1")
     block = zenoh.CongestionControl.BLOCK
     with attacking(stage, mode) as attacker:
         for key in [*keys.values(), f"evedrop/{stage.keys.run}/**", "**"]:

@@ -22,6 +22,7 @@ from evedrop.live.protocol.brief import AnyBrief, RelayPart, RouterPart
 from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.commands import EndRun, Unknown
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.notices import Progress
 from evedrop.names import RELAY
 from tests.builders import part_of
 from tests.conftest import wait_until
@@ -55,8 +56,8 @@ def test_everything_that_is_granted_crosses(stage: Bench) -> None:
         flow(stage)
     assert wire.Reader(*stage.journal.hear()).integer("c") == 8
     for name in RECEIVERS:
-        stage.put(name, stage.keys.progress(name), wire.progress(3))
-        assert stage.progress[name].hear() == (stage.keys.progress(name), wire.progress(3))
+        stage.put(name, stage.keys.progress(name), Progress(3).pack())
+        assert stage.progress[name].hear() == (stage.keys.progress(name), Progress(3).pack())
         stage.settle(name)
     stage.settle("sensor")
     for name in ("sensor", *RECEIVERS):
@@ -141,8 +142,8 @@ def test_nobody_can_pose_as_the_router_at_the_relay(stage: Bench) -> None:
             attacker.declare_subscriber(stage.keys.progress("legitimate"), stolen)
             attacker.put(stage.keys.downlink("legitimate"), b"forged")
             attacker.put(stage.keys.journal, b"forged")
-            stage.put("legitimate", stage.keys.progress("legitimate"), wire.progress(4))
-            assert stage.progress["legitimate"].hear()[1] == wire.progress(4)
+            stage.put("legitimate", stage.keys.progress("legitimate"), Progress(4).pack())
+            assert stage.progress["legitimate"].hear()[1] == Progress(4).pack()
     except zenoh.ZError:
         pass  # it is not even let in
     flow(stage)

@@ -21,16 +21,17 @@ from evedrop.live.network.control_file import Control
 from evedrop.live.network.operator import Answer, ask
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief
-from evedrop.live.protocol.codec import Reader, enclosed, head_of, named_in, progress
+from evedrop.live.protocol.codec import Reader, enclosed, head_of, named_in
 from evedrop.live.protocol.commands import EndRun, Start
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.notices import Progress
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.system.ports import free_port
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import is_matched, small_network
 from tests.proxy import Cable, cable
 
-GOOD = progress(7)
+GOOD = Progress(7).pack()
 
 
 def foreign(keys: RunKeys, key: str) -> list[bytes]:
@@ -185,9 +186,9 @@ def test_a_lost_connection_is_replaced(stage: Stage) -> None:
         session.ready()
         assert watched.get(timeout=LIMIT)
         assert tokens.get(timeout=LIMIT)
-        stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(1))])
-        stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(0))])
-        assert handed_on.get(timeout=LIMIT) == progress(0)  # so the one before it has arrived too
+        stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), Progress(1).pack())])
+        stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), Progress(0).pack())])
+        assert handed_on.get(timeout=LIMIT) == Progress(0).pack()  # so the one before it has arrived too
         ids = {str(session.connection.session.zid())}
         for _ in range(3):
             stage.cable.flap()
@@ -196,10 +197,10 @@ def test_a_lost_connection_is_replaced(stage: Stage) -> None:
             # One flap may cost two sessions; the events of the second then come early at the next flap.
             wait_until(lambda: str(session.connection.session.zid()) not in ids, "another session")
             ids.add(str(session.connection.session.zid()))
-        stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(2))])
-        stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(3))])
-        assert [subscription.recv(), subscription.recv()] == [progress(1), progress(2)]
-        assert handed_on.get(timeout=LIMIT) == progress(3)
+        stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), Progress(2).pack())])
+        stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), Progress(3).pack())])
+        assert [subscription.recv(), subscription.recv()] == [Progress(1).pack(), Progress(2).pack()]
+        assert handed_on.get(timeout=LIMIT) == Progress(3).pack()
         wait_until(lambda: session.reaches(keys.progress("eve")), "the reader of its progress")
         put(GOOD)
         assert heard.get(timeout=LIMIT) == enclosed(keys.progress("eve"), GOOD)

@@ -16,6 +16,7 @@ from evedrop.live.protocol import codec, commands, packets, telemetry
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import telemetry as loop_wire
 from evedrop.live.protocol.commands import ProcessStatus, read_process_status
+from evedrop.live.protocol.notices import EndReport, Progress, RefusalNotice
 from evedrop.live.protocol.requests import REQUESTS, RunStatus, read_request
 from evedrop.model.digest import Blocks
 from evedrop.model.receiver import Belief, Reception
@@ -145,10 +146,9 @@ def decode_known(name: str) -> Decode:
 
 def decode_over(raw: bytes) -> dict[str, Any]:
     """As the recorder reads it."""
-    message = wire.Reader(KEY, raw)
-    assert wire.is_over(message)
-    dropped = wire.read_over(message)
-    return {"over": True, **({"misdelivered": dropped} if dropped else {})}
+    report = EndReport.read(wire.Reader(KEY, raw))
+    assert report is not None
+    return {"over": True, **({"misdelivered": report.misdelivered} if report.misdelivered else {})}
 
 
 def decode_envelope(key: str, raw: bytes) -> dict[str, Any]:
@@ -225,8 +225,8 @@ def decode_process_status(_shape: dict[str, Any], _value: dict[str, Any], raw: b
 def decode_refusal(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the recorder reads it from the sensor; the recorder refuses messages that an eavesdropper wrote."""
     message = wire.Reader(KEY, raw)
-    assert wire.is_refusal(message)
-    refusal = wire.read_refusal(message, "sensor")
+    refusal = RefusalNotice.read(message, "sensor")
+    assert refusal is not None
     assert refusal.at_fault == ("eve",)
     assert str(refusal) == f"malformed message on {value['refuses']}: {value['why']} (refused by sensor)"
     return {name: message.text(name) for name in value}
@@ -350,8 +350,8 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
         decode_acknowledgement,
     ),
     "progress": (
-        lambda _shape, value: wire.progress(value["k"]),
-        lambda _shape, _value, raw: {"k": wire.read_progress(KEY, raw, SLOTS)},
+        lambda _shape, value: Progress(value["k"]).pack(),
+        lambda _shape, _value, raw: {"k": Progress.read(KEY, raw, SLOTS).k},
     ),
     "control": (lambda _shape, value: control_of(value).pack(), decode_control),
     "resend": (lambda _shape, value: packets.resend(value["n"], value["again"], value["k"]), decode_resend),
@@ -374,7 +374,7 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
     ),
     "decisions": (encode_decisions, decode_decisions),
     "over": (
-        lambda _shape, value: wire.end_report(value.get("misdelivered", 0)),
+        lambda _shape, value: EndReport(value.get("misdelivered", 0)).pack(),
         lambda _shape, _value, raw: decode_over(raw),
     ),
     "envelope": (
@@ -385,5 +385,5 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
         lambda _shape, value: ProcessStatus(value["k"], tuple(value["waits"])).pack(),
         decode_process_status,
     ),
-    "refusal": (lambda _shape, value: wire.refusal(value["refuses"], value["why"]), decode_refusal),
+    "refusal": (lambda _shape, value: RefusalNotice.of(value["refuses"], value["why"]).pack(), decode_refusal),
 }

@@ -9,10 +9,10 @@ import msgpack
 import numpy as np
 
 from evedrop.live.network import operator
-from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import commands, packets, telemetry
 from evedrop.live.protocol import telemetry as loop_wire
 from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.notices import Progress, RefusalNotice
 from evedrop.live.protocol.requests import LinkStatus, RunStatus, StepRequest, read_request
 from evedrop.model.digest import Blocks
 from evedrop.model.links.loss_model import REASONS
@@ -48,7 +48,7 @@ READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
     "estimate": _on("estimate", lambda m: loop_wire.read_known(m, "x_hat", K, SHAPE)),
     "state": _on("state", lambda m: loop_wire.read_known(m, "x", K, SHAPE)),
     "input": _on("input", lambda m: loop_wire.read_decided(m, K, (INPUTS, TRIALS))),
-    "progress": ("evedrop/r1/progress/eve", lambda raw: wire.read_progress("evedrop/r1/progress/eve", raw, K)),
+    "progress": ("evedrop/r1/progress/eve", lambda raw: Progress.read("evedrop/r1/progress/eve", raw, K).k),
     "control": _commanded("eve"),
     "go": _commanded("sensor", ("eve", "recorder")),
     "change": _commanded("router", ("eve", "legitimate")),
@@ -63,7 +63,7 @@ READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
     "decisions": _on("telemetry/controller", lambda m: loop_wire.read_decisions(m, K, EXTENT, BLOCKS, PERIOD)),
     "journal": _on("journal", lambda m: telemetry.read_journal(m, K, {"legitimate": 0, "eve": WINDOW}, EXTENT)),
     "process-status": _on("telemetry/eve", lambda m: commands.read_process_status(m, SLOTS)),
-    "refusal": _on("telemetry/eve", lambda m: wire.read_refusal(m, "eve")),
+    "refusal": _on("telemetry/eve", lambda m: RefusalNotice.read(m, "eve")),
 }
 """What is read → the key it comes on, and its reader, of the bytes within the envelope. A reader gives values or raises
 MalformedMessage or Gap; either names the key."""
@@ -94,7 +94,7 @@ EXAMPLES: Mapping[str, bytes] = {
     "estimate": loop_wire.known("x_hat", K, _z),
     "state": loop_wire.known("x", K, _z),
     "input": loop_wire.decided(K, _z[:1], _flags),
-    "progress": wire.progress(K),
+    "progress": Progress(K).pack(),
     "control": commands.EndRun().pack(),
     "go": commands.Go(K, ("eve",), 9).pack(),
     "change": commands.LinkChange("eve", (Change(4, cut=True), Change(9, {"loss": {}}))).pack(),
@@ -114,7 +114,7 @@ EXAMPLES: Mapping[str, bytes] = {
     "decisions": loop_wire.Decisions(K, 4, np.ones(1), _digests).pack(),
     "journal": telemetry.Journal(K, 2, _accounts()).pack(),
     "process-status": commands.ProcessStatus(K, ("evedrop/r1/uplink",)).pack(),
-    "refusal": wire.refusal("evedrop/r1/downlink/eve", "no k"),
+    "refusal": RefusalNotice.of("evedrop/r1/downlink/eve", "no k").pack(),
 }  # fmt: skip
 """A message that each reader takes, to begin with."""
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from evedrop.errors import MalformedMessage
-from evedrop.live.protocol.codec import Reader, pack, read_refusal, refusal
+from evedrop.live.protocol.codec import Reader, pack
+from evedrop.live.protocol.notices import RefusalNotice
 from evedrop.live.protocol.packets import packet_format, packets_of, read_delivery, read_uplink, uplink
 from evedrop.live.protocol.telemetry import Extent, read_truth, truth
 from evedrop.model.receiver import Reception
@@ -80,10 +81,11 @@ def test_digests_of_slots_in_which_no_block_ends_are_refused() -> None:
 )
 def test_only_a_key_that_the_process_reads_can_be_refused(key: str) -> None:
     """Of its own run, and with a writer to blame."""
-    right = read_refusal(Reader(KEY, refusal("evedrop/r1/downlink/eve", "no\nk")), "eve")
+    right = RefusalNotice.read(Reader(KEY, RefusalNotice.of("evedrop/r1/downlink/eve", "no\nk").pack()), "eve")
+    assert right is not None
     assert (right.at_fault, "no?k" in str(right)) == (("router",), True)
     with pytest.raises(MalformedMessage, match="expected a key that eve reads"):
-        read_refusal(Reader(KEY, refusal(key, "no k")), "eve")
+        RefusalNotice.read(Reader(KEY, RefusalNotice.of(key, "no k").pack()), "eve")
 
 
 def test_the_reasons_and_the_alarms_of_the_sensor_are_read_as_sent() -> None:

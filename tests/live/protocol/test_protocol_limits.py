@@ -18,6 +18,7 @@ from evedrop.live.protocol import telemetry as loop_wire
 from evedrop.live.protocol.codec import head_of
 from evedrop.live.protocol.commands import Again, ProcessStatus
 from evedrop.live.protocol.keys import Sizes
+from evedrop.live.protocol.notices import Progress, RefusalNotice
 from evedrop.model.digest import BLOCK_SLOTS
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.receiver import Belief, Reception
@@ -88,7 +89,7 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
         telemetry.leaving(k, Belief(z, np.ones((n, n, R)), np.ones(R, np.uint8))),
         loop_wire.Decisions(k, c, seconds, digests_of((c + sizes.period) // BLOCK_SLOTS + 1, R)).pack(),
         ProcessStatus(k, tuple("evedrop/r0123abcd/progress/" + "n" * 32 for _ in range(sizes.receivers + 1))).pack(),
-        wire.refusal("evedrop/r0123abcd/progress/" + "n" * 32, "x" * 1000),
+        RefusalNotice.of("evedrop/r0123abcd/progress/" + "n" * 32, "x" * 1000).pack(),
     ]
     names = [f"{i:032}" for i in range(sizes.receivers)]
     return {
@@ -100,7 +101,7 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
         "input": loop_wire.decided(k, np.ones((sizes.inputs, R)), all_of),
         "telemetry": max(reports, key=len),
         "journal": telemetry.Journal(k, c, dict.fromkeys(names, account)).pack(),
-        "progress": wire.progress(k),
+        "progress": Progress(k).pack(),
         "control": Again(k, k, {name: (Change(k, cut=True),) * 100 for name in names}).pack(),
     }
 

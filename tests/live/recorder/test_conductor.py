@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from evedrop.errors import Interrupted, RunError
-from evedrop.live.protocol.codec import end_report
 from evedrop.live.protocol.commands import Abandon, Start
+from evedrop.live.protocol.notices import EndReport
 from evedrop.live.recorder.conductor import Conductor, Stop
 from evedrop.names import RECORDER
 from tests.clock import TestClock
@@ -126,7 +126,7 @@ def test_processes_that_come_and_go_are_noted() -> None:
     conductor.absent.add("smart")
     assert conductor.missing == []
     network.watches["smart"](True)
-    report = end_report(0)
+    report = EndReport(0).pack()
     network.reads[network.keys.telemetry("sensor")](report)
     assert conductor.next_message() is None
     assert conductor.lost == {}

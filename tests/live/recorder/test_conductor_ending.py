@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from evedrop.live.protocol.codec import end_report
 from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.notices import EndReport
 from evedrop.live.recorder.conductor import Conductor, Stop
 from tests.clock import TestClock
 
@@ -73,7 +73,7 @@ class Network:
         if name == "relay":
             self.watches[name](False)
             return
-        self.reads[self.keys.journal if name == "router" else self.keys.telemetry(name)](end_report(misdelivered))
+        self.reads[self.keys.journal if name == "router" else self.keys.telemetry(name)](EndReport(misdelivered).pack())
         if name != "router":
             self.watches[name](False)
 
@@ -110,7 +110,7 @@ def test_a_process_that_loses_its_connection_just_then_is_told_again(network: Ne
         if times == 1:
             network.watches["smart"](True)
         else:
-            network.reads[network.keys.telemetry("smart")](end_report(0))
+            network.reads[network.keys.telemetry("smart")](EndReport(0).pack())
 
     network.does["smart"] = lost
     ended(network)

@@ -12,7 +12,7 @@ from typing import final
 import numpy as np
 
 from evedrop.live.protocol.brief import AnyBrief
-from evedrop.live.protocol.codec import progress
+from evedrop.live.protocol.notices import Progress
 from evedrop.live.protocol.telemetry import Decisions, Report, truth
 from evedrop.model.digest import BlockDigests, Blocks, BlockSums, Digests, InputLog
 from evedrop.model.kernels.current import kernels
@@ -139,4 +139,4 @@ class BeliefReporter:
             report = Report(ReceiverSlots.joined(self._held), self._digests, self._trace_sums)
             self._put(end - 1, report.pack())
             self._held, self._digests, self._trace_sums = [], {}, {}
-        self._put_progress(end - 1, progress(end))
+        self._put_progress(end - 1, Progress(end).pack())

@@ -40,7 +40,7 @@ from evedrop.live.network.launcher_pipe import emit, when_launcher_is_gone
 from evedrop.live.network.process_session import ReplayBuffer, allowance
 from evedrop.live.network.zenoh_log import LOGGED
 from evedrop.live.protocol.brief import AnyBrief, Brief, Identity, RouterPart, RoutingPart
-from evedrop.live.protocol.codec import Dropped, Reader, end_report, refusal
+from evedrop.live.protocol.codec import Dropped, Reader
 from evedrop.live.protocol.commands import (
     Abandon,
     Again,
@@ -53,6 +53,7 @@ from evedrop.live.protocol.commands import (
 )
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig, low_pass, reader_of
 from evedrop.live.protocol.launcher_events import RouterListens
+from evedrop.live.protocol.notices import EndReport, RefusalNotice
 from evedrop.names import RECORDER, ROUTER
 from evedrop.system.allocator import keep_for_messages
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
@@ -221,7 +222,7 @@ class Session:
         """Tell the recorder which message cannot be read, and why; wait a moment for it to end the run."""
         publisher = self._reporting
         if publisher is not None and publisher.matched:
-            publisher(refusal(error.key, str(error)))
+            publisher(RefusalNotice.of(error.key, str(error)).pack())
             with suppress(Empty):
                 self._commands.get(timeout=_HEARD_SECONDS)
 
@@ -344,7 +345,7 @@ class Session:
         """
         publisher = self._reporting
         if publisher is not None:
-            publisher(end_report(self.dropped))
+            publisher(EndReport(self.dropped).pack())
         else:
             self.connection.disappear()
 

@@ -20,14 +20,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.errors import Gap, MalformedMessage, Refusal
-from evedrop.live.protocol.keys import MOST_PARTS, reader_of, writer_of
+from evedrop.errors import Gap, MalformedMessage
+from evedrop.live.protocol.keys import MOST_PARTS, writer_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags, flags_of
 
 _LARGEST = 2**62  # the default bound of integers: slots can be added to it without leaving 64 bits
 _SMALL_BYTES = 1 << 16  # objects that msgpack unpacks from this few bytes take some megabytes at most
-_WHY_CHARACTERS = 1000
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -207,50 +206,6 @@ def _counter(most: int) -> Callable[[Any], Any]:
         return part
 
     return count
-
-
-def progress(k: int) -> bytes:
-    """Encode the report that all slots below k are done."""
-    return pack({"k": k})
-
-
-def read_progress(key: str, payload: bytes, sent: int) -> int:
-    """Decode a progress report: the first slot that is not done; all slots below `sent` were sent."""
-    return Reader(key, payload).integer("k", 0, sent)
-
-
-def end_report(dropped: int) -> bytes:
-    """Encode the last message of a process that ends on command; dropped: how many messages it dropped that named another key."""
-    return pack({"over": True, **({"misdelivered": dropped} if dropped else {})})
-
-
-def refusal(key: str, why: str) -> bytes:
-    """Encode the last message of a process that ends because it cannot read a message on a key; why: the reason."""
-    return pack({"refuses": key, "why": why[:_WHY_CHARACTERS]})
-
-
-def is_refusal(message: Reader) -> bool:
-    """Whether a message reports a refused message."""
-    return message.has("refuses")
-
-
-def read_refusal(message: Reader, process: str) -> Refusal:
-    """Decode a refusal into an error; the key of the refused message must be one that the process reads."""
-    key, why = message.text("refuses"), message.text("why")
-    if key.split("/")[:2] != message.key.split("/")[:2] or not writer_of(key) or reader_of(key) != process:
-        raise message.malformed(f"refuses = {shown(key)}", f"a key that {process} reads")
-    plain = "".join(character if character.isprintable() else "?" for character in why[:_WHY_CHARACTERS])
-    return Refusal(process, key, writer_of(key), plain)
-
-
-def is_over(message: Reader) -> bool:
-    """Whether a message is a process's last."""
-    return message.has("over")
-
-
-def read_over(message: Reader) -> int:
-    """Decode how many messages the process dropped."""
-    return message.integer("misdelivered", 1) if message.has("misdelivered") else 0
 
 
 _SHOWN_BYTES = 600  # more than any key of a run has

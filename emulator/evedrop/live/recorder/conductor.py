@@ -12,8 +12,9 @@ from evedrop.errors import Interrupted, RunError
 from evedrop.live.network.connection import Question
 from evedrop.live.network.process_session import Mailbox
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.codec import Reader, is_over, progress, read_over
+from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Abandon, ControlCommand, EndRun, Start
+from evedrop.live.protocol.notices import EndReport, Progress
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
@@ -163,7 +164,7 @@ class Conductor:
 
     def report_progress(self, done: int) -> None:
         """Tell the sensor that all slots below `done` are scored."""
-        self._progress(progress(done))
+        self._progress(Progress(done).pack())
 
     def end(self, patience: float) -> None:
         """Tell all processes that the run is over, repeatedly until they have left; the routers after all others.
@@ -212,9 +213,9 @@ class Conductor:
     def _hear_out(self, item: tuple[str, bytes | bool] | None) -> None:
         """Note which processes are present, and which confirm that the run is over; ignore all other messages."""
         if item is not None and isinstance(item[1], bytes):
-            message = Reader(self.keys[item[0]], item[1])
-            if is_over(message):
-                self.misdelivered[item[0]] = read_over(message)
+            report = EndReport.read(Reader(self.keys[item[0]], item[1]))
+            if report is not None:
+                self.misdelivered[item[0]] = report.misdelivered
         self._note(item)
 
     def abandon(self, why: str) -> None:

@@ -15,8 +15,9 @@ from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.launcher_pipe import emit
 from evedrop.live.network.operator import Answer, Order
 from evedrop.live.protocol.brief import Brief, RecorderPart
-from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
+from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import ReportStatus, is_process_status, read_process_status
+from evedrop.live.protocol.notices import RefusalNotice
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.recorder.conductor import Conductor
 from evedrop.live.recorder.recorded_run import RecordedRun
@@ -61,8 +62,9 @@ class Direction:
             return
         source, payload = item
         message = Reader(self._conductor.keys[source], payload)
-        if is_refusal(message):
-            raise read_refusal(message, source)
+        refusal = RefusalNotice.read(message, source)
+        if refusal is not None:
+            raise refusal
         if is_process_status(message):
             self._stall.add_answer(source, read_process_status(message, self._run.score.scenario.slots))
         elif self._run.take(source, message, self._steering):
