@@ -15,7 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.results.crash_proof_tables import UNFINISHED, last_round
+from evedrop.results.crash_proof_tables import last_round
+from evedrop.results.folder import UNFINISHED
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.system.ports import free_port

@@ -10,7 +10,8 @@ import sys
 import pytest
 
 from evedrop.live.launch.starter import GRACE_SECONDS
-from evedrop.results.crash_proof_tables import UNFINISHED, last_round
+from evedrop.results.crash_proof_tables import last_round
+from evedrop.results.folder import UNFINISHED
 from evedrop.results.reading import Results
 from tests.conftest import Evedrop, Live, wait_until
 

@@ -24,8 +24,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
-from evedrop.results.crash_proof_tables import UNFINISHED, goes_on, last_round, parquet_batches
+from evedrop.results.crash_proof_tables import goes_on, last_round, parquet_batches
 from evedrop.results.ending import note_end
+from evedrop.results.folder import UNFINISHED
 from evedrop.results.reading import Results
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import unwritten

@@ -13,7 +13,8 @@ from pydantic import BaseModel
 from evedrop.cli.api import montecarlo
 from evedrop.model.receiver import ACTIONS
 from evedrop.results import crash_proof_tables as growing
-from evedrop.results.crash_proof_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish
+from evedrop.results.crash_proof_tables import BATCH_BYTES, TableStream, Unfinished, finish
+from evedrop.results.folder import UNFINISHED
 from evedrop.results.reading import Results
 from evedrop.results.tables import DIGESTS, JOURNAL
 from evedrop.scenario.expect import ExpectTable

@@ -24,12 +24,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from evedrop.results.folder import make_private, private_opener, replace_private
+from evedrop.results.folder import UNFINISHED, make_private, private_opener, replace_private
 from evedrop.results.tables import NULLABLE
 from evedrop.system.files import LineFile, is_locked, lines_in, try_lock, write_all
 
-UNFINISHED = "unfinished"
-"""The folder inside a results folder that contains unfinished tables."""
 BATCH_BYTES = 16 * 2**20
 """The largest record batch and row group of a Parquet file, unless a single row is larger."""
 _GROUP_ROWS = 65_536

@@ -11,7 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from evedrop.errors import UsageError
-from evedrop.results.crash_proof_tables import UNFINISHED, finish, is_unfinished, last_round
+from evedrop.results.crash_proof_tables import finish, is_unfinished, last_round
+from evedrop.results.folder import UNFINISHED
 from evedrop.results.reading import Results, age_of_metrics
 from evedrop.results.summary_file import write_summary
 from evedrop.results.writer import ResultsWriter

@@ -22,6 +22,9 @@ from evedrop.errors import RunError, UsageError
 from evedrop.system.files import shown
 from evedrop.system.signals import leave_after
 
+UNFINISHED = "unfinished"
+"""The folder inside a results folder that contains what only a run in progress needs, such as unfinished tables."""
+
 
 def default_folder(scenario: str | Path) -> Path:
     """The default name of a results folder: `runs/<scenario>-<time>` in the current folder."""

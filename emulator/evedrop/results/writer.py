@@ -22,8 +22,8 @@ from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
 from evedrop.model.receiver import ACTIONS, MISLED, NOTHING, TYPES, Action, Codes, Flags, packed_flags
 from evedrop.names import CONTROLLER
-from evedrop.results.crash_proof_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish, write_metrics
-from evedrop.results.folder import HeldFolder
+from evedrop.results.crash_proof_tables import BATCH_BYTES, TableStream, Unfinished, finish, write_metrics
+from evedrop.results.folder import UNFINISHED, HeldFolder
 from evedrop.results.resolved_scenario import TakenStates
 from evedrop.results.summary_file import summary_text
 from evedrop.results.tables import DIGESTS, JOURNAL, SLOTS, input_columns, inputs_schema, rows_of, trials_schema

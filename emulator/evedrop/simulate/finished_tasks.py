@@ -24,8 +24,16 @@ from typing import Any, final
 import pyarrow as pa
 
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
-from evedrop.results.crash_proof_tables import UNFINISHED, goes_on
-from evedrop.results.folder import HeldFolder, disk_errors, make_private, new_folder, private_replacement, write_private
+from evedrop.results.crash_proof_tables import goes_on
+from evedrop.results.folder import (
+    UNFINISHED,
+    HeldFolder,
+    disk_errors,
+    make_private,
+    new_folder,
+    private_replacement,
+    write_private,
+)
 from evedrop.results.resolved_scenario import made_with
 from evedrop.results.shard_score import NotData, packed, unpacked
 from evedrop.scenario.tables import Scenario

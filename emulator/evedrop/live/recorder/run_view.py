@@ -31,7 +31,7 @@ class RunView:
     def open(self, scenario: Scenario, run: str, path: Path) -> None:
         """Begin the recording of the run with this name."""
         self._around, self._loop_values = scenario.process.around, loop_values_of(scenario)
-        self._recording = open_recording(scenario, run, path, lambda text: emit(ViewOpened(None, text)))
+        self._recording = open_recording(scenario, run, path, lambda text: emit(ViewOpened(None, text)), live=True)
 
     def add_slots(self, slots: Slots, scored: Mapping[str, Scored]) -> None:
         """Show the next slots."""

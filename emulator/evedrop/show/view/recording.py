@@ -27,6 +27,7 @@ from evedrop.show.view.events import Event, introduction
 from evedrop.show.view.panels import PANELS
 from evedrop.show.view.panels.panel import COLUMNS, ROWS_ABOVE, ROWS_BELOW, PlacedView, ViewPanel
 from evedrop.show.view.scene import Scene, SceneSlots
+from evedrop.show.view.staged import StagedChunks, chunk_sizes
 from evedrop.system.output import warn
 
 T = TypeVar("T")
@@ -64,13 +65,13 @@ class PanelSet:
         """Record every panel's styles."""
         self._each(lambda panel: _style(panel.styles(), to))
 
-    def send(self, slots: SceneSlots, to: rr.RecordingStream) -> None:
-        """Record the next slots."""
-        self._each(lambda panel: _send(panel.columns(slots), to))
+    def send(self, slots: SceneSlots, put: Callable[[Column], None]) -> None:
+        """Record the next slots; put: is called with each column."""
+        self._each(lambda panel: _send(panel.columns(slots), put))
 
-    def send_notes(self, notes: Sequence[Event], to: rr.RecordingStream) -> None:
+    def send_notes(self, notes: Sequence[Event], put: Callable[[Column], None]) -> None:
         """Record lines about the run."""
-        self._each(lambda panel: _send(panel.notes(notes), to))
+        self._each(lambda panel: _send(panel.notes(notes), put))
 
     def _each(self, ask: Callable[[ViewPanel], Sequence[T]]) -> list[T]:
         return [answer for name, panel in [*self._panels.items()] for answer in self._tried(name, partial(ask, panel))]
@@ -145,16 +146,17 @@ def _style(styles: Mapping[str, rr.AsComponents], to: rr.RecordingStream) -> tup
     return ()
 
 
-def _send(columns: Iterable[Column], to: rr.RecordingStream) -> tuple[()]:
+def _send(columns: Iterable[Column], put: Callable[[Column], None]) -> tuple[()]:
     for column in columns:
-        column.send(to)
+        put(column)
     return ()
 
 
 _APPLICATION = "evedrop"
 _PERIOD = 0.1  # seconds between batches at most
-_MOST_SLOTS = 1024  # in a batch
-_MOST_WAITING = 20_000  # slots that the file may be behind before the run waits for it
+_MOST_SLOTS = 16_384  # in a batch
+_MOST_WAITING = 50_000  # slots that the file may be behind before the run waits for it
+_PACED_PERIOD, _FAST_PERIOD = 0.2, 0.4  # of a run in real time, and as fast as possible: each chunk costs time
 FILE_TIMEOUT = 5.0
 """Seconds that a run waits for the file before it continues without one.
 
@@ -171,11 +173,15 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
     A subclass says what is recorded. The constructor calls `_layout`, the thread `_style` and then `_send`.
     """
 
-    def __init__(self, path: Path, name: str, notes: Sequence[Note], patience: float | None = None) -> None:
+    def __init__(
+        self, path: Path, name: str, notes: Sequence[Note], patience: float | None = None, period: float = _PERIOD
+    ) -> None:
         """name: identifies the recording: recordings of the same name are shown as one. notes: the first lines.
 
         patience: how long the file may take to begin, for a batch, and to end, in seconds; by default `FILE_TIMEOUT`.
+        period: seconds between two calls of `_send`, at most.
         """
+        self._name, self._period = name, period
         self._patience = FILE_TIMEOUT if patience is None else patience
         self.failure: str | None = None
         """Why there is no recording on disk, or an incomplete one."""
@@ -186,7 +192,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
         self._last = False
         """Whether the present call of `_send` is the last one."""
         self._changed = threading.Condition()
-        self._file = rr.RecordingStream(_APPLICATION, recording_id=name)
+        self._file = self._stream()
         begun = threading.Event()
         self._writer = threading.Thread(target=self._record, args=(path, begun), name="recording", daemon=True)
         try:
@@ -208,7 +214,20 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
 
     @abstractmethod
     def _send(self, chunks: list[Chunk], notes: list[Note], to: rr.RecordingStream) -> bool:
-        """Record what came since the last call, about ten times a second; returns whether anything was recorded."""
+        """Record what came since the last call; returns whether anything was recorded."""
+
+    def _stream(self, *, send_properties: bool = True) -> rr.RecordingStream:
+        """A stream of the recording; send_properties: whether it tells when the recording began."""
+        return rr.RecordingStream(_APPLICATION, recording_id=self._name, send_properties=send_properties)
+
+    def _begin(self, path: Path) -> None:
+        """Begin the file, with layout and styles."""
+        self._file.save(private_file(path), default_blueprint=self._blueprint)
+        self._style(self._file)
+
+    def _finish(self) -> None:
+        """Finish the file."""
+        self._file.disconnect()
 
     def _append(self, chunk: Chunk, size: int, most: int, patience: float) -> None:
         """Append to the list. With more than `most` in it, wait, and after `patience` seconds do without a recording."""
@@ -220,7 +239,8 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
             if self.failure is None:
                 self._waiting.append(chunk)
                 self._waiting_size += size
-                self._changed.notify_all()
+                if self._waiting_size >= _MOST_SLOTS:  # otherwise the thread need not look
+                    self._changed.notify_all()
 
     def close(self) -> bool:
         """Finish the file, within a time limit.
@@ -243,8 +263,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
         """Begin the file and write it to its end. Rerun never returns from a file that cannot even be begun."""
         if self.failure is None:
             try:
-                self._file.save(private_file(path), default_blueprint=self._blueprint)
-                self._style(self._file)
+                self._begin(path)
             except Exception as error:
                 self._give_up(str(error))
         begun.set()
@@ -253,7 +272,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
     def _write(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closing or self._waiting_size >= _MOST_SLOTS, _PERIOD)
+                self._changed.wait_for(lambda: self._closing or self._waiting_size >= _MOST_SLOTS, self._period)
                 chunks, self._waiting, self._waiting_size = self._waiting, [], 0
                 notes, self._notes = self._notes, []
                 self._last = self._closing
@@ -265,7 +284,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
             if self._last:
                 break
         if self.failure is None:
-            self._file.disconnect()
+            self._finish()
 
     def _put(self, chunks: list[Chunk], notes: list[Note]) -> None:
         if self.failure is not None or not self._send(chunks, notes, self._file):
@@ -281,10 +300,16 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
 class ViewRecording(RecordingThread[SceneSlots, Event]):
     """Writes the recording of one run."""
 
-    def __init__(self, path: Path, scene: Scene, warn: Callable[[str], None] = warn) -> None:
-        """warn: tells the user about a panel that is left out; called from any thread."""
-        self._scene, self._warn = scene, warn
-        super().__init__(path, scene.run, introduction(scene))
+    def __init__(self, path: Path, scene: Scene, warn: Callable[[str], None] = warn, *, live: bool = False) -> None:
+        """warn: tells the user about a panel that is left out; called from any thread.
+
+        live: whether viewers are to follow a run in real time, by files beside the recording; see `live_files`.
+        """
+        self._scene, self._warn, self._recorded = scene, warn, 0
+        self._staged: StagedChunks | None = None
+        period = _PACED_PERIOD if scene.pace > 0 else _FAST_PERIOD
+        self._sizes = chunk_sizes(scene.pace, period) if live else []
+        super().__init__(path, scene.run, introduction(scene), period=period)
 
     def add(self, slots: SceneSlots) -> None:
         """Record the next slots. Waits only for a disk that is thousands of slots behind, and for a few seconds at most."""
@@ -303,9 +328,28 @@ class ViewRecording(RecordingThread[SceneSlots, Event]):
     def _style(self, to: rr.RecordingStream) -> None:
         self._panels.send_styles(to)
 
+    def _begin(self, path: Path) -> None:
+        if not self._sizes:
+            super()._begin(path)
+            return
+        staged = StagedChunks(path, self._file, self._sizes, lambda: self._stream(send_properties=False))
+        super()._begin(path)
+        staged.begin(self._patience)
+        self._staged = staged
+
     def _send(self, chunks: list[SceneSlots], notes: list[Event], to: rr.RecordingStream) -> bool:
+        put = self._staged.put if self._staged is not None else partial(Column.send, to=to)
         if chunks:
-            self._panels.send(SceneSlots.joined(chunks), to)
+            slots = SceneSlots.joined(chunks)
+            self._recorded = slots.first + slots.count
+            self._panels.send(slots, put)
         if notes:
-            self._panels.send_notes(notes, to)
+            self._panels.send_notes(notes, put)
+        if self._staged is not None and (chunks or notes or self._last):
+            self._staged.pass_on(self._recorded, self._patience, self._last)
         return bool(chunks or notes)
+
+    def _finish(self) -> None:
+        super()._finish()
+        if self._staged is not None:
+            self._staged.close()

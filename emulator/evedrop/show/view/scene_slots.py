@@ -111,11 +111,13 @@ def open_recording(
     warn: Callable[[str], None] = warn,
     words: Mapping[str, str] | None = None,
     unknown_links: Collection[str] = (),
+    *,
+    live: bool = False,
 ) -> ViewRecording:
     """Begin the run's recording on disk.
 
     run: its name; warn: as in ViewRecording; words: receiver → the name of its scheme or strategy, if not that of the scenario;
-    unknown_links: receivers whose link has a quality that is not that of the scenario, and unknown.
+    unknown_links: receivers whose link has a quality that is not that of the scenario, and unknown; live: as in ViewRecording.
     """
     from evedrop.show.view.recording import ViewRecording  # noqa: PLC0415 - saves 0.3 s and 100 MB in a run without a view
 
@@ -147,7 +149,7 @@ def open_recording(
         ways={name: ways for name, ways in ways.items() if ways is not None},
         **driven_scene(scenario),
     )
-    return ViewRecording(path, scene, warn)
+    return ViewRecording(path, scene, warn, live=live)
 
 
 def shown(

@@ -32,6 +32,7 @@ from typing import IO, final
 
 from evedrop.errors import UsageError
 from evedrop.show.view.bounded_http import BoundedServer, QuietHandler
+from evedrop.show.view.live_files import LiveFiles
 
 _POLL_SECONDS = 0.05  # between two checks of whether the file has grown
 _PIECE = 2**18
@@ -39,48 +40,59 @@ _PIECE = 2**18
 
 @final
 class Followed:
-    """A file that grows, read from its beginning; it may not exist yet, and it may be moved."""
+    """A recording that grows, read from its beginning; it may not exist yet, and its folder may be moved."""
 
     def __init__(self, path: Path, complete: bool = False) -> None:
-        """complete: whether the file will not grow."""
+        """complete: whether the recording will not grow."""
         self._path = path
-        self._file: int | None = None
+        self._files: LiveFiles | None = None
         self._lock = threading.Lock()
         self._over = threading.Event()
         if complete:
             self._over.set()
 
     def complete(self) -> None:
-        """Declare the file complete: `pieces` then stops at its end."""
+        """Declare the recording complete: `pieces` then stops at its end."""
         with contextlib.suppress(OSError):
             self._opened()
         self._over.set()
 
     def pieces(self) -> Iterator[bytes]:
-        """The contents of the file, piece by piece as it grows; waits for more until the file is complete."""
-        at = 0
+        """The recording so far, in large chunks, then what is added to it, as it comes; waits for more until it is complete."""
+        while (files := self._begun()) is None:
+            if self._over.wait(_POLL_SECONDS) and self._begun() is None:
+                return
+        *parts, (start, _) = files.spans or [(0, 0)]
+        for descriptor, (first, end) in zip(files.descriptors, parts, strict=False):
+            at = first
+            while piece := os.pread(descriptor, min(_PIECE, end - at), at):
+                at += len(piece)
+                yield piece
         while True:
             over = self._over.is_set()  # asked before reading, so that no piece written in between is lost
-            piece = self._read(at)
+            spans = files.spans
+            most = _PIECE if spans is None else min(_PIECE, spans[-1][1] - start)
+            piece = os.pread(files.descriptors[-1], most, start)
             if piece:
-                at += len(piece)
+                start += len(piece)
                 yield piece
             elif over:
                 return
             else:
                 self._over.wait(_POLL_SECONDS)
 
-    def _read(self, at: int) -> bytes:
-        try:
-            return os.pread(self._opened(), _PIECE, at)
-        except OSError:
-            return b""
+    def _begun(self) -> LiveFiles | None:
+        """The files, as soon as something can be read; None before."""
+        with contextlib.suppress(OSError):
+            files = self._opened()
+            return None if files.spans == [] else files
+        return None
 
-    def _opened(self) -> int:
+    def _opened(self) -> LiveFiles:
         with self._lock:
-            if self._file is None:
-                self._file = os.open(self._path, os.O_RDONLY)
-            return self._file
+            if self._files is None:
+                self._files = LiveFiles(self._path)
+            return self._files
 
 
 def feed(followed: Followed, pipe: IO[bytes]) -> None:
