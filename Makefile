@@ -8,7 +8,7 @@ READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs-ready
 NOTEBOOKS_READY := $(VENV)/.notebooks-ready
 
-.PHONY: demo test test-wheel test-pictures notebooks bench coverage test-long test-hosts test-compose test-fresh test-faults test-mutants docs lint lint-types lint-rest setup clean
+.PHONY: demo test test-wheel test-pictures notebooks bench bench-against coverage test-long test-hosts test-compose test-fresh test-faults test-mutants docs lint lint-types lint-rest setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
@@ -36,6 +36,11 @@ coverage: $(READY)
 QUICK ?=
 bench: $(READY)
 	$(BIN)/python benchmarks/bench.py $(QUICK)
+
+# What became slower than a commit, by default the last tag: both run the same commands in turns, most of an hour.
+BASE ?=
+bench-against: $(READY)
+	$(BIN)/python benchmarks/against.py $(BASE) $(QUICK)
 
 # Also the tests with random examples, with more examples than in `make test`.
 test-long: $(READY)

@@ -42,6 +42,7 @@ FAMILIES = tuple(
         ("montecarlo", 900.0),
         ("start_up", 600.0),
         ("memory", 1200.0),
+        ("recording", 300.0),
         ("wire", 1200.0),
     )
 )

@@ -112,9 +112,9 @@ def rows(quick: bool) -> Iterator[Row]:
         "latency that the router adds at 1 kHz, 4 receivers",
         f"median {middle:,.0f} µs, 99 % {tail:,.0f} µs",
         f"raw Zenoh: median {bare:,.0f} µs, 99 % {bare_tail:,.0f} µs",
-        "median below 100 µs, 99 % below 1 ms",
+        "median below 80 µs, 99 % below 400 µs",
         "median below 50 µs",
-        judged(middle < 100 and tail < 1000, middle < 50),
+        judged(middle < 80 and tail < 400, middle < 50),
     )
 
 

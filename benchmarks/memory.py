@@ -147,9 +147,9 @@ def rows(quick: bool) -> Iterator[Row]:
         "private memory of a peer, one trial, the largest",
         f"{size:.0f} MB ({name})",
         f"an interpreter with numpy and a Zenoh session: {bare_interpreter():.0f} MB",
-        "40 MB",
+        "30 MB",
         "25 MB",
-        judged(size <= 40, size <= 25),
+        judged(size <= 30, size <= 25),
     )
     growth = looks.growth
     name = max(growth, key=lambda process: growth[process])
