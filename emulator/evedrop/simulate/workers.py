@@ -2,6 +2,10 @@
 
 A worker process has a pipe of its own and shares no lock with other processes, so that killing one cannot hang the others. A
 thread of its own writes to that pipe and reads from it: a worker that is suspended, or hangs, may leave half a message there.
+
+`concurrent.futures.ProcessPoolExecutor` was tried in their place: when one worker is killed it fails all tasks, those of other
+workers too, and names no cause; it waits for a suspended worker without end; and a task cannot return what it has when it is
+told to stop.
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
 """Starts the processes of a run: each by an interpreter of its own, or all by fork servers.
 
-A fork server is a bare process that has already imported the modules (`evedrop.fork_server`). Tests pass a starter that starts
-none.
+A fork server is a bare process that has already imported the modules (`evedrop.fork_server`). `multiprocessing` has one, too,
+which was tried: its forks have the environment of the first, the caller's session and standard files, and live on when the
+caller is killed; while it is suspended no death is noticed, and when it is killed all its living forks count as ended. Tests
+pass a starter that starts none.
 
 Source: docs/architecture.md, why it is built this way.
 """
