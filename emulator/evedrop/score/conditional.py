@@ -7,8 +7,8 @@ Source: docs/montecarlo.md, the most surprising trial.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, final
+from collections.abc import Sequence
+from typing import final
 
 import numpy as np
 
@@ -36,11 +36,8 @@ class ConditionalError:
         """prior: covariance before slot 0, (n, n)."""
         self._process = process
         self._P = np.repeat(prior[:, :, None], trials, axis=2)
-        self._sum = np.zeros(trials)
-        self._mark = np.zeros(trials)
-        """The sum up to the last used state."""
-        self._squares = np.zeros(trials)
-        """The squares of the sums from one used state to the next."""
+        self._sums = np.zeros((3, trials))
+        """Of tr P over all slots, and up to the last used state; and the squares of its sums from one used state to the next."""
         self.slots = 0
         """The number of slots so far; 0 in a mode without errors."""
 
@@ -50,29 +47,19 @@ class ConditionalError:
         covariances = kernels.follow_covariance(process.A, process.Q, self._P, action, self.slots == 0)
         self._P = covariances[-1]
         self.slots += len(action)
-        used, traces = action == _STATE, kernels.traces(covariances)
-        rows: Iterable[tuple[Any, Any]] = zip(used, traces, strict=True)
-        sums: Sequence[Any] = self._sum, self._mark, self._squares
-        if used.shape[1] == 1:  # Python's floats are many times as fast as arrays of one number, and have the same bits
-            rows, sums = zip(used[:, 0].tolist(), traces[:, 0].tolist(), strict=True), [value.item() for value in sums]
-        total, mark, squares = sums
-        # Slot by slot, so that the bits do not depend on how many slots are added at a time.
-        for now, trace in rows:
-            between = (total - mark) * now  # tr P is 0 where a state is used
-            mark = mark + between
-            squares = squares + between * between
-            total = total + trace
-        self._sum, self._mark, self._squares = (np.atleast_1d(value) for value in (total, mark, squares))
+        kernels.add_between(self._sums, action == _STATE, kernels.traces(covariances))
 
     @property
     def expected(self) -> Floats:
         """The expected sum of the squared errors of each trial, (R,)."""
-        return self._sum
+        total: Floats = self._sums[0]
+        return total
 
     @property
     def variance(self) -> Floats:
         """The upper bound of its variance, (R,)."""
-        return 2.0 * (self._squares + (self._sum - self._mark) ** 2)
+        total, mark, squares = self._sums
+        return 2.0 * (squares + (total - mark) ** 2)
 
     def probability(self, error: Floats) -> Floats:
         """The probability, for each trial, that the sum of squared errors is as far from its expectation as `error` (R,).
@@ -91,7 +78,7 @@ class ConditionalError:
     def merged(cls, parts: Sequence[ConditionalError]) -> ConditionalError:
         """The sums of disjoint sets of trials, in their order."""
         whole = cls(parts[0]._process, np.zeros_like(parts[0]._process.Q), 0)
-        for name in ("_P", "_sum", "_mark", "_squares"):
+        for name in ("_P", "_sums"):
             setattr(whole, name, np.concatenate([getattr(part, name) for part in parts], axis=-1))
         whole.slots = min(part.slots for part in parts)
         return whole

@@ -12,6 +12,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from evedrop.model.digest import added_in_order
+from evedrop.model.kernels.current import kernels
 from evedrop.model.metrics.standard_error import standard_error, z_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
@@ -49,7 +50,7 @@ class LeakTally:
     """The bits, and the unencrypted states, that R trials received, summed over slots from slot 0 on."""
 
     def __init__(self, trials: int) -> None:
-        self._bits, self._clear = np.zeros(trials), np.zeros(trials)
+        self._sums = np.zeros((2, trials))  # bits, and unencrypted states
         self._expected = np.zeros(1)  # NaN without theory
         self.slots = 0
         """The number of slots so far; 0 in a mode without packets."""
@@ -57,11 +58,7 @@ class LeakTally:
     def add_slots(self, action: Codes, nu: Flags, revealed: HeardBits) -> None:
         """Add the next slots: the receiver's actions, and the packets' types, (c, R) each."""
         self.slots += len(action)
-        of_state, of_other = revealed.by_type.T[:, :, None]
-        bits = np.where(action == Action.LOST, 0.0, np.where(nu, of_other, of_state))
-        clear = np.isinf(bits)
-        self._bits = added_in_order(self._bits, np.where(clear, 0.0, bits))
-        self._clear += clear.sum(axis=0)
+        kernels.add_leaked(self._sums, action != Action.LOST, nu, revealed.by_type)
         expected = np.full(len(action), math.nan) if revealed.expected is None else revealed.expected
         self._expected = added_in_order(self._expected, expected[:, None])
 
@@ -69,8 +66,7 @@ class LeakTally:
     def merged(cls, parts: Sequence[LeakTally]) -> LeakTally:
         """The sums of disjoint sets of trials, in their order; of no slots if the trials were cut short at different slots."""
         whole = cls(0)
-        whole._bits = np.concatenate([part._bits for part in parts])
-        whole._clear = np.concatenate([part._clear for part in parts])
+        whole._sums = np.concatenate([part._sums for part in parts], axis=1)
         whole._expected = parts[0]._expected
         whole.slots = parts[0].slots if len({part.slots for part in parts}) == 1 else 0
         return whole
@@ -80,11 +76,11 @@ class LeakTally:
         """The entry of the summary; None without slots."""
         if not self.slots:
             return None
-        means = self._bits / self.slots
+        means = self._sums[0] / self.slots
         bits, error = float(np.mean(means)), standard_error(means)
         total = float(self._expected[0])
         expected = None if math.isnan(total) else total / self.slots
-        clear = float(np.mean(self._clear)) / self.slots
+        clear = float(np.mean(self._sums[1])) / self.slots
         return LeakSummary(clear, bits, error, expected, z_of(means, expected))
 
 

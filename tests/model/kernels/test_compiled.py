@@ -214,6 +214,14 @@ def test_counts_are_the_same(random: np.random.Generator, slots: int, trials: in
     compiled.add_to_histograms(counts[0], values, 50, base)
     reference.add_to_histograms(counts[1], values, 50, base)
     same(*counts)
+    flags, types = random.random((2, slots, trials)) < 0.5
+    by_type = random.choice([0.0, 1.5, np.inf], (slots, 2))
+    between, leaked = ([sums, sums.copy()] for sums in (numbers(random, 3, trials), np.abs(numbers(random, 2, trials))))
+    for kernels, *sums in zip((compiled, reference), between, leaked, strict=True):
+        kernels.add_between(sums[0], flags, values)
+        kernels.add_leaked(sums[1], flags, types, by_type)
+    same(*between)
+    same(*leaked)
 
 
 @QUICK

@@ -51,6 +51,8 @@ FIT: dict[str, tuple[Any, ...]] = {
     "traces": (ones(*COVARIANCES),),
     "count_codes": (codes(SLOTS, TRIALS), 3),
     "count_bursts": (codes(SLOTS, TRIALS), 1, np.zeros(TRIALS, np.int64), 4),
+    "add_between": (ones(3, TRIALS), flags(SLOTS, TRIALS), ones(SLOTS, TRIALS)),
+    "add_leaked": (ones(2, TRIALS), flags(SLOTS, TRIALS), flags(SLOTS, TRIALS), ones(SLOTS, 2)),
     "add_to_histograms": (np.zeros((SLOTS, 9), np.uint32), ones(SLOTS, TRIALS), 50, 1000),
     "scatter": (flags(SLOTS, TRIALS), ones(STATES * SLOTS * TRIALS), STATES),
     "gather": (flags(SLOTS, TRIALS), ones(*PACKETS)),

@@ -199,6 +199,23 @@ def traces(P: Floats) -> Floats:
     return out
 
 
+def add_between(sums: Floats, used: Flags, traces: Floats) -> None:
+    """As `reference.add_between`."""
+    slots, trials = used.shape
+    expect(sums, (3, trials))
+    rows = [_buffer("double[]", row, require_writable=True) for row in sums]
+    _lib.kernels_add_between(slots, trials, _bytes(used, used.shape), _doubles(traces, used.shape), *rows)
+
+
+def add_leaked(sums: Floats, heard: Flags, nu: Flags, by_type: Floats) -> None:
+    """As `reference.add_leaked`."""
+    slots, trials = heard.shape
+    expect(sums, (2, trials))
+    rows = [_buffer("double[]", row, require_writable=True) for row in sums]
+    flags = _bytes(heard, heard.shape), _bytes(nu, heard.shape)
+    _lib.kernels_add_leaked(slots, trials, *flags, _doubles(by_type, (slots, 2)), *rows)
+
+
 def count_codes(codes: Codes, kinds: int) -> NDArray[np.uint32]:
     """As `reference.count_codes`."""
     slots, trials = codes.shape

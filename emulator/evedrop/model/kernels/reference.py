@@ -261,6 +261,44 @@ def traces(P: Floats) -> Floats:
     return trace
 
 
+@np.errstate(over="ignore", invalid="ignore")
+def add_between(sums: Floats, used: Flags, traces: Floats) -> None:
+    """Add slots to three sums of each trial, (3, R): of tr P, of tr P up to the last used state, and the squares between states.
+
+    used (c, R): where a state is used; traces (c, R) is then 0. Slot by slot, so that the bits do not depend on how many slots
+    are added at a time.
+    """
+    slots, trials = used.shape
+    expect(sums, (3, trials))
+    expect_bytes(used, (slots, trials))
+    expect(traces, (slots, trials))
+    total, mark, squares = sums
+    for now, trace in zip(used, traces, strict=True):
+        between = (total - mark) * now
+        mark += between
+        squares += between * between
+        total += trace
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def add_leaked(sums: Floats, heard: Flags, nu: Flags, by_type: Floats) -> None:
+    """Add slots to two sums of each trial, (2, R): of the bits that packets reveal, and of the packets that reveal everything.
+
+    heard (c, R): whether the packet was received; nu (c, R): its type; by_type (c, 2): the bits of each type, inf for everything.
+    """
+    slots, trials = heard.shape
+    expect(sums, (2, trials))
+    expect_bytes(heard, (slots, trials))
+    expect_bytes(nu, (slots, trials))
+    expect(by_type, (slots, 2))
+    bits, clear = sums
+    for some, types, (of_state, of_other) in zip(heard, nu, by_type.tolist(), strict=True):
+        revealed = np.where(some, np.where(types, of_other, of_state), 0.0)
+        everything = np.isinf(revealed)
+        bits += np.where(everything, 0.0, revealed)
+        clear += everything
+
+
 def count_codes(codes: Codes, kinds: int) -> NDArray[np.uint32]:
     """How often each code below `kinds` occurs in each slot, (c, kinds), from codes (c, R)."""
     slots, trials = codes.shape

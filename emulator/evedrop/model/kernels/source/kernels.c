@@ -132,6 +132,16 @@ void kernels_traces(int64_t slots, int64_t n, int64_t trials, const double *P, d
   CHOOSE(traces, (slots, n, trials, P, out));
 }
 
+void kernels_add_between(int64_t slots, int64_t trials, const uint8_t *state, const double *traces, double *total,
+                         double *mark, double *squares) {
+  CHOOSE(add_between, (slots, trials, state, traces, total, mark, squares));
+}
+
+void kernels_add_leaked(int64_t slots, int64_t trials, const uint8_t *heard, const uint8_t *nu, const double *by_type,
+                        double *bits, double *clear) {
+  CHOOSE(add_leaked, (slots, trials, heard, nu, by_type, bits, clear));
+}
+
 void kernels_count_codes(int64_t slots, int64_t trials, const uint8_t *codes, int64_t kinds, uint32_t *counts) {
   CHOOSE(count_codes, (slots, trials, codes, kinds, counts));
 }

@@ -40,6 +40,16 @@ void kernels_squared_errors(int64_t slots, int64_t n, int64_t trials, const doub
 /* tr P, (slots, trials), from (slots, n, n, trials). */
 void kernels_traces(int64_t slots, int64_t n, int64_t trials, const double *P, double *out);
 
+/* Slot by slot: what total (trials,) grew by since mark (trials,) is added to mark, and its square to squares (trials,), where
+   state (slots, trials) is 1; then traces (slots, trials) is added to total. */
+void kernels_add_between(int64_t slots, int64_t trials, const uint8_t *state, const double *traces, double *total,
+                         double *mark, double *squares);
+
+/* Slot by slot, where heard (slots, trials) is 1: adds by_type (slots, 2), at the column nu (slots, trials), to bits (trials,), or 1
+   to clear (trials,) where that is infinite. */
+void kernels_add_leaked(int64_t slots, int64_t trials, const uint8_t *heard, const uint8_t *nu, const double *by_type,
+                        double *bits, double *clear);
+
 /* How often each code below `kinds` occurs in each slot, (slots, kinds), from codes (slots, trials). */
 void kernels_count_codes(int64_t slots, int64_t trials, const uint8_t *codes, int64_t kinds, uint32_t *counts);
 

@@ -194,6 +194,32 @@ static void NAME(count_codes, SET)(int64_t slots, int64_t trials, const uint8_t 
   }
 }
 
+static void NAME(add_between, SET)(int64_t slots, int64_t trials, const uint8_t *state, const double *traces, double *total,
+                                   double *mark, double *squares) {
+  for (int64_t s = 0; s < slots; s++, state += trials, traces += trials)
+    for (int64_t r = 0; r < trials; r++) {
+      double between = (total[r] - mark[r]) * (double)state[r];
+      mark[r] += between;
+      squares[r] += between * between;
+      total[r] += traces[r];
+    }
+}
+
+static void NAME(add_leaked, SET)(int64_t slots, int64_t trials, const uint8_t *heard, const uint8_t *nu, const double *by_type,
+                                  double *bits, double *clear) {
+  for (int64_t s = 0; s < slots; s++, heard += trials, nu += trials, by_type += 2) {
+    double of[2], all[2];
+    for (int i = 0; i < 2; i++) {
+      all[i] = isinf(by_type[i]) ? 1.0 : 0.0;
+      of[i] = isinf(by_type[i]) ? 0.0 : by_type[i];
+    }
+    for (int64_t r = 0; r < trials; r++) {
+      bits[r] += heard[r] ? (nu[r] ? of[1] : of[0]) : 0.0;
+      clear[r] += heard[r] ? (nu[r] ? all[1] : all[0]) : 0.0;
+    }
+  }
+}
+
 static void NAME(bursts, SET)(int64_t slots, int64_t trials, const uint8_t *codes, uint8_t lost, int64_t *run, int64_t most,
                               uint32_t *counts) {
   for (int64_t s = 0; s < slots; s++)
