@@ -68,27 +68,33 @@ class Watcher:
             self._ever_misled = True
             k = first + int(misled.argmax())
             events.append(Event(k, "WARN", f"{self._name} took an innovation for the state, for the first time"))
-        start = 0
-        for end in (*np.flatnonzero(good).tolist(), len(codes)):
+        places = np.flatnonzero(good)
+        starts, ends = np.concatenate([[0], places + 1]), np.append(places, len(codes))
+        looked_at = ends > starts  # a good slot after a good slot changes nothing
+        looked_at[0] = True
+        before = _numbers_before(misled), _numbers_before(silent)
+        for start, end in zip(starts[looked_at].tolist(), ends[looked_at].tolist(), strict=True):
             if end > start:
-                self._extend(first, slice(start, end), misled, silent, events)
+                self._extend(first, start, end, before, events)
             if end < len(codes):
                 self._recover(first + end, events)
-            start = end + 1
         return sorted(events, key=lambda event: event.k)
 
-    def _extend(self, first: int, some: slice, misled: Flags, silent: Flags, events: list[Event]) -> None:
-        """Extend the current stretch by some slots of the chunk."""
-        length = self._bad + some.stop - some.start
+    def _extend(
+        self, first: int, start: int, end: int, before: tuple[list[int], list[int]], events: list[Event]
+    ) -> None:
+        """Extend the current stretch by some slots of the chunk; before: how many slots before each are misled, and silent."""
+        misled, silent = before
+        length = self._bad + end - start
         if not self._told and length >= self._long:
-            turn = some.start + self._long - self._bad  # the slot after the one that made it long
-            deceived = self._misled + int(np.count_nonzero(misled[some.start : turn]))
-            unsent = self._silent + int(np.count_nonzero(silent[some.start : turn]))
+            turn = start + self._long - self._bad  # the slot after the one that made it long
+            deceived = self._misled + misled[turn] - misled[start]
+            unsent = self._silent + silent[turn] - silent[start]
             events.append(Event(first + turn - 1, "WARN", self._lost(deceived, unsent)))
             self._told = True
         self._bad = length
-        self._misled += int(np.count_nonzero(misled[some]))
-        self._silent += int(np.count_nonzero(silent[some]))
+        self._misled += misled[end] - misled[start]
+        self._silent += silent[end] - silent[start]
 
     def _recover(self, k: int, events: list[Event]) -> None:
         if self._told:
@@ -107,3 +113,9 @@ class Watcher:
             line = f"{self._name} had no packet for {self._long} slots"
         line = f"{line}, {unsent} of them silent" if unsent else line
         return f"{line}, {deceived} misled" if deceived else line
+
+
+def _numbers_before(flags: Flags) -> list[int]:
+    """How many flags before each are set, and how many in all, (c + 1,)."""
+    numbers: list[int] = np.concatenate([[0], np.cumsum(flags)]).tolist()
+    return numbers
