@@ -11,7 +11,7 @@ import pytest
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.protocol.codec import Reader, pack
-from evedrop.live.protocol.notices import RefusalNotice
+from evedrop.live.protocol.notices import Progress, RefusalNotice
 from evedrop.live.protocol.packets import packet_format, packets_of, read_delivery, read_uplink, uplink
 from evedrop.live.protocol.telemetry import Extent, read_truth, truth
 from evedrop.model.receiver import Reception
@@ -83,6 +83,7 @@ def test_only_a_key_that_the_process_reads_can_be_refused(key: str) -> None:
     """Of its own run, and with a writer to blame."""
     right = RefusalNotice.read(Reader(KEY, RefusalNotice.of("evedrop/r1/downlink/eve", "no\nk").pack()), "eve")
     assert right is not None
+    assert RefusalNotice.read(Reader(KEY, Progress(3).pack()), "eve") is None
     assert (right.at_fault, "no?k" in str(right)) == (("router",), True)
     with pytest.raises(MalformedMessage, match="expected a key that eve reads"):
         RefusalNotice.read(Reader(KEY, RefusalNotice.of(key, "no k").pack()), "eve")
