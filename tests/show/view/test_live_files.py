@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +15,7 @@ from evedrop.results.folder import UNFINISHED
 from evedrop.show.view.column import TIMELINE
 from evedrop.show.view.recording import ViewRecording
 from evedrop.show.view.serving import Followed
-from evedrop.show.view.staged import chunk_sizes
+from evedrop.show.view.staged import StagedChunks, chunk_sizes
 from tests.conftest import LIMIT, wait_until
 from tests.show.view.simulated_run import Simulated
 
@@ -151,3 +152,18 @@ def test_chunks_grow_tenfold_from_file_to_file() -> None:
     assert chunk_sizes(1.0, 0.2) == [1000, 100, 10]
     assert chunk_sizes(0.001, 0.2) == [4000]
     assert chunk_sizes(0.0, 0.4) == []
+
+
+def test_a_disk_that_is_full_at_the_end_is_reported(
+    run: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run ends as usual, and says that its recording is incomplete."""
+
+    def full(_staged: StagedChunks) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(StagedChunks, "close", full)
+    recording = ViewRecording(tmp_path / "recording.rrd", run.scene, live=True)
+    recording.add(next(iter(run.chunks(10))))
+    assert not recording.close()
+    assert "No space left on device" in str(recording.failure)

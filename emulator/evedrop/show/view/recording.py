@@ -284,7 +284,10 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
             if self._last:
                 break
         if self.failure is None:
-            self._finish()
+            try:
+                self._finish()
+            except Exception as error:  # such as a full disk
+                self._give_up(str(error))
 
     def _put(self, chunks: list[Chunk], notes: list[Note]) -> None:
         if self.failure is not None or not self._send(chunks, notes, self._file):
