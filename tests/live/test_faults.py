@@ -65,7 +65,7 @@ ROGUES = {
     "NaN estimate": ("smart", "change(lambda self: dict(x_hat=self.slots.x_hat * float('nan')))", "NaN"),
     "skipped slot": ("sensor", "packets(lambda slots: dataclasses.replace(slots, first=slots.first + 2))", "gap on"),
     "journal without a link": ("router", "Journal.pack = lambda self: pack({'k': 0, 'c': 1, 'links': {}})", "a map"),
-    "wrong progress": ("suspicious", "reporting.progress = lambda k: b''", "not msgpack"),
+    "wrong progress": ("suspicious", "reporting.Progress.pack = lambda notice: b''", "not msgpack"),
 }
 """What is wrong → the process at fault, how, and the expected message: for each pair of a sender and a process that notices."""
 

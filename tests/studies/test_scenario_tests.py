@@ -222,7 +222,7 @@ def test_an_interrupt_ends_tests_whose_processes_are_suspended(evedrop: Evedrop)
     """They are continued, so that they end their runs."""
     written(evedrop.folder / "cases", a=HOLDS, b=ENDLESS)
     live = in_the_second("--jobs", "2", evedrop=evedrop)
-    jobs = [pid for pid, command in live.left().items() if "scenario_test_jobs import work" in command]
+    jobs = [pid for pid, command in live.left().items() if "scenario_tests import work" in command]
     assert jobs
     for pid in jobs:
         os.kill(pid, signal.SIGSTOP)
@@ -242,7 +242,7 @@ def test_a_test_whose_process_stays_suspended_is_broken(evedrop: Evedrop, monkey
     def suspend() -> None:
         while not suspended and not over.wait(0.1):
             left = with_mark(str(evedrop.temporary)).items()
-            jobs = [pid for pid, command in left if "scenario_test_jobs import work" in command and "a.toml" in command]
+            jobs = [pid for pid, command in left if "scenario_tests import work" in command and "a.toml" in command]
             if jobs and any("sensor" in command for _, command in left):
                 os.kill(jobs[0], signal.SIGSTOP)
                 suspended.append(jobs[0])

@@ -96,7 +96,8 @@ def test_the_folder_of_modules_can_be_another(tutorial: Evedrop) -> None:
     }
     done = tutorial("check", "home/three.toml", "--set", "modules=nowhere")
     assert done.status == 2
-    assert f'modules: is "{tutorial.folder}/nowhere", which is not a folder' in done.err
+    assert f'modules: is "{str(tutorial.folder)[:60]}' in done.err  # a long path is shortened
+    assert ", which is not a folder" in done.err
 
 
 @pytest.mark.long
