@@ -56,7 +56,7 @@ class Measurement:
                 done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=_LIMIT)
             except (OSError, subprocess.TimeoutExpired) as error:
                 raise NotMeasured(str(error)) from error
-            if done.returncode not in _MEASURED:
+            if done.returncode not in _MEASURED or not (out / "summary.json").exists():
                 raise NotMeasured(done.stderr.strip().splitlines()[-1] if done.stderr.strip() else "no reason given")
             return self.speed(out, time.monotonic() - began, _processor_seconds() - spent)
 
@@ -112,26 +112,39 @@ def is_slower(ratios: Sequence[float]) -> bool:
 
 
 def compare(rows: Iterator[Measurement], before: str, rounds: int) -> list[str]:
-    """Print a row for each measurement; returns those that became slower. before: the earlier installation's interpreter."""
-    slower = []
+    """Print a row for each measurement; returns those that became slower, or fail now.
+
+    before: the earlier installation's interpreter. A row that it cannot measure is left out: it may not know the command.
+    """
+    worse = []
     for row in rows:
-        try:
-            pairs = [(row.of(sys.executable), row.of(before)) for _ in range(rounds)]
-        except NotMeasured as reason:
-            print(f"| {row.what} | not measured: {reason} | |", flush=True)
+        pairs = []
+        for _ in range(rounds):
+            try:
+                now = row.of(sys.executable)
+            except NotMeasured as reason:
+                print(f"| {row.what} | {reason} | fails now |", flush=True)
+                worse.append(row.what)
+                break
+            try:
+                pairs.append((now, row.of(before)))
+            except NotMeasured as reason:
+                print(f"| {row.what} | not measured before: {reason} | |", flush=True)
+                break
+        if len(pairs) < rounds:
             continue
         ratios = [now / then for now, then in pairs]
         word = "slower" if is_slower(ratios) else ""
         shown = ", ".join(f"{ratio:.2f}" for ratio in sorted(ratios))
         print(f"| {row.what} | {statistics.median(ratios):.2f} ({shown}) | {word} |", flush=True)
-        slower += [row.what] if word else []
-    return slower
+        worse += [row.what] if word else []
+    return worse
 
 
 def last_tag(root: Path) -> str | None:
-    """The last tag before this commit; None without one."""
+    """The last tag of a version before this commit; None without one."""
     done = subprocess.run(
-        ["git", "describe", "--tags", "--abbrev=0"],  # noqa: S607
+        ["git", "describe", "--tags", "--abbrev=0", "--match", "v[0-9]*"],  # noqa: S607
         cwd=root,
         capture_output=True,
         text=True,
@@ -171,15 +184,19 @@ def main(words: Sequence[str] | None = None, root: Path = ROOT) -> int:
     with tempfile.TemporaryDirectory() as folder:
         rows = measurements(Path(folder), options.quick)
         if options.python is not None:
-            slower = compare(rows, options.python, rounds)
+            worse = compare(rows, options.python, rounds)
         else:
             with installed(base) as before:
-                slower = compare(rows, before, rounds)
+                worse = compare(rows, before, rounds)
     if options.quick:
         print("\nThese sizes are too small to judge by.")
         return 0
-    print(f"\nSlower than before: {'; '.join(slower)}." if slower else "\nNothing became slower.")
-    return 1 if slower else 0
+    print(
+        f"\nSlower than before, or failed: {'; '.join(worse)}."
+        if worse
+        else "\nNothing that was measured became slower."
+    )
+    return 1 if worse else 0
 
 
 if __name__ == "__main__":
