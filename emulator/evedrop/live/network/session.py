@@ -8,6 +8,7 @@ dropped.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import sys
@@ -173,6 +174,7 @@ class Session:
         if brief.ends_with_stdin:
             when_launcher_is_gone(lambda: os._exit(3))
         keep_for_messages(brief.flow.largest_message)
+        gc.freeze()  # imported modules stay: a collection that looks at them holds up packets
         self.keys = RunKeys(brief.run)
         self._process = brief.process
         self.patience = float(brief.patience)
