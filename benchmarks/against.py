@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import statistics
 import subprocess
 import sys
@@ -25,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from live_run import scenario_file
+from processes import children_seconds
 from throughput import eavesdroppers
 
 ROOT = Path(__file__).parents[1]
@@ -50,7 +50,7 @@ class Measurement:
         """How fast an installation's command is. Raises NotMeasured."""
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "run"
-            spent, began = _processor_seconds(), time.monotonic()
+            spent, began = children_seconds(), time.monotonic()
             command = [python, "-m", "evedrop", *self.words, "--out", str(out)]
             try:
                 done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=_LIMIT)
@@ -58,12 +58,7 @@ class Measurement:
                 raise NotMeasured(str(error)) from error
             if done.returncode not in _MEASURED or not (out / "summary.json").exists():
                 raise NotMeasured(done.stderr.strip().splitlines()[-1] if done.stderr.strip() else "no reason given")
-            return self.speed(out, time.monotonic() - began, _processor_seconds() - spent)
-
-
-def _processor_seconds() -> float:
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
+            return self.speed(out, time.monotonic() - began, children_seconds() - spent)
 
 
 def slots_a_second(out: Path, _clock: float, _processor: float) -> float:

@@ -14,7 +14,6 @@ times, medians of several rounds.
 from __future__ import annotations
 
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from processes import children_seconds
 from table import Row, judged, load, run_alone
 
 from evedrop.scenario.loading import checked
@@ -159,13 +159,12 @@ def command_over_pcg64(slots: int, trials: int, rounds: int) -> Row:
 def command_time(*words: str) -> float:
     """The processor seconds of a command of Evedrop and of all processes that it started."""
     with tempfile.TemporaryDirectory() as folder:
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        before = children_seconds()
         command = [sys.executable, "-m", "evedrop", *words, "--out", str(Path(folder) / "run")]
         status = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False).returncode
     if status not in {0, 1}:  # 1: an expectation of the scenario was not met
         raise RuntimeError(f"{' '.join(command)} ended with status {status}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return children_seconds() - before
 
 
 def full(scenario: Scenario) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import time
 from collections.abc import Iterator
@@ -68,6 +69,12 @@ def _names(pid: int) -> tuple[str, str]:
         return words[words.index("evedrop") + 1], Path(words[-1]).stem
     other = next((word for word in words if word.startswith("evedrop.")), Path(words[0]).name if words else "ended")
     return other, other
+
+
+def children_seconds() -> float:
+    """The processor seconds of all processes that this one has started and waited for."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def watch_cpu(process: subprocess.Popen[bytes], interval: float = 0.05) -> dict[str, float]:

@@ -29,6 +29,10 @@ SHAPES = st.tuples(st.integers(1, 3), st.integers(1, 17))
 RANDOM = st.builds(np.random.default_rng, st.integers(0, 2**32))
 
 
+HEADERS = np.array([0, 3, -1, -(2**63), 2**63 - 1, 0x7FF0000000000001])
+"""Also those whose bits are, as a float's, no number: one of them would change where it is taken for one."""
+
+
 def made_packets(random: np.random.Generator, shape: tuple[int, int], header: int, odd: bool) -> PacketSlots:
     """Packets of some slots; odd: some of them were not sent, and the state is betrayed."""
     n, trials = shape
@@ -36,7 +40,7 @@ def made_packets(random: np.random.Generator, shape: tuple[int, int], header: in
     return PacketSlots(
         FIRST,
         random.normal(size=(c, n, trials)),
-        random.integers(-5, 5, (c, header, trials)) if header else None,
+        random.choice(HEADERS, (c, header, trials)) if header else None,
         random.random((c, trials)) < 0.5 if odd else None,
         random.normal(size=(c, n, trials)) if odd else None,
     )
@@ -48,7 +52,7 @@ def made_arrivals(random: np.random.Generator, shape: tuple[int, int], header: i
     c = int(random.integers(1, MOST + 1))
     gamma = np.array([random.random(trials) < random.choice([0.0, 0.5, 1.0]) for _ in range(c)])
     z = random.normal(size=(c, n, trials))
-    headers = random.integers(-5, 5, (c, header, trials)) if header else None
+    headers = random.choice(HEADERS, (c, header, trials)) if header else None
     late = {}
     if odd:
         for row in np.flatnonzero(~gamma.all(axis=1)).tolist():
