@@ -46,6 +46,19 @@ def test_silence_is_no_loss() -> None:
     assert lost[0] == Event(3, "WARN", "eve lost 3 packets in a row")
 
 
+def test_a_stretch_ends_with_the_first_slot_of_a_piece() -> None:
+    """Its end is told, and the next stretch begins from nothing."""
+    codes = [STATE, LOST, LOST, LOST, STATE, LOST, LOST, STATE]
+    assert (
+        watch(codes, [4])
+        == watch(codes, [])
+        == [
+            Event(3, "WARN", "eve lost synchronisation: 3 slots without a state"),
+            Event(4, "INFO", "eve regained synchronisation after 3 slots"),
+        ]
+    )
+
+
 def test_short_stretches_are_not_told() -> None:
     """One or two missed packets are everyday life."""
     assert watch([LOST, LOST, STATE] * 20, []) == []
