@@ -93,10 +93,8 @@ class Scorekeeper:
             tally.account(link, receiver.action)
             if sensor.sent is not None:
                 tally.account_sent(sensor.sent, link)
-            late = None
             if receiver.late is not None and receiver.late_used is not None and link.late is not None:
-                late = (receiver.late, receiver.late_used)
-                tally.account_late(link.late, *late)
+                tally.account_late(link.late, receiver.late, receiver.late_used)
             tally.watched.add_slots(
                 ScoredSlots(
                     slots.first,
@@ -104,7 +102,8 @@ class Scorekeeper:
                     receiver.action,
                     values.sums.trace,
                     values.expected,
-                    late,
+                    receiver.late,
+                    receiver.late_used,
                     sensor.x,
                     receiver.x_hat,
                 )

@@ -186,10 +186,10 @@ class WatchedTally:
     def add_slots(self, slots: ScoredSlots) -> None:
         """Add the next slots."""
         for watch, tally in self._tallies.items():
-            start, stop = max(watch.first - slots.first, 0), min(watch.end - slots.first, len(slots.error))
+            start, stop = max(watch.first - slots.first, 0), min(watch.end - slots.first, slots.count)
             stateless = slots.x is None and watch.metric != SYNCHRONISED and metric(watch.metric).needs_states
             if start < stop and not stateless:
-                tally.add(slots if (start, stop) == (0, len(slots.error)) else slots.part(start, stop))
+                tally.add(slots.rows(slice(start, stop)))
 
     def begin(self) -> None:
         """Make the tallies of packages' metrics now, not with the first slot."""

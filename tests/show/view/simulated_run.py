@@ -43,19 +43,7 @@ class Simulated:
         """The slots, as the recorder hands them over: some at a time."""
         for first in range(0, self.scene.slots, length):
             part = slice(first, first + length)
-            peers = {
-                name: PeerSlots(
-                    p.x_hat[part],
-                    p.P[part],
-                    p.action[part],
-                    p.squared_error[part],
-                    p.standard_error[part],
-                    p.trace[part],
-                    p.theoretical_trace[part],
-                )
-                for name, p in self.slots.peers.items()
-            }
-            yield SceneSlots(first, self.slots.x[part], self.slots.nu[part], peers)
+            yield self.slots.rows(part).changed(peers={name: p.rows(part) for name, p in self.slots.peers.items()})
 
 
 def simulate(
@@ -98,7 +86,7 @@ def simulate(
     for s in shown:
         x_hat, P, action, error, spread, trace = (np.array(column) for column in zip(*seen[s.name], strict=True))
         theory = expected(process, s, qualities[s.name], slots)
-        peers[s.name] = PeerSlots(x_hat, P, action.astype(np.uint8), error, spread, trace, theory)
+        peers[s.name] = PeerSlots(0, x_hat, P, action.astype(np.uint8), error, spread, trace, theory)
     scene = Scene(
         "Simulated", f"simulated-{seed}-{slots}", slots, trials, process.n, pace, shown, float(np.trace(process.Q))
     )

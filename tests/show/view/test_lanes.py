@@ -30,7 +30,7 @@ def known(error: float, trace: float, scene: Scene = SCENE) -> Synchronisation:
     none = np.zeros(1)
     P = np.diag([trace / 4, 3 * trace / 4])[None]
     off = np.sqrt(error / 4), -np.sqrt(3 * error / 4)
-    peer = PeerSlots(np.array([off]), P, none.astype(np.uint8), none, none, none, none)
+    peer = PeerSlots(0, np.array([off]), P, none.astype(np.uint8), none, none, none, none)
     return Synchronisation(knowledge(scene, np.zeros((1, 2)), peer)[0])
 
 

@@ -39,7 +39,7 @@ class ReceivedFraction(MeanMetric, TallyMetric):
     def values(slots: ScoredSlots) -> Floats:
         """Counts of packets received, (c, R)."""
         received: Floats = (slots.action != Action.LOST).astype(np.float64)
-        return received if slots.late is None else np.add(received, slots.late[0], out=received)
+        return received if slots.late is None else np.add(received, slots.late, out=received)
 
 
 @final
@@ -55,7 +55,7 @@ class UsedFraction(MeanMetric, TallyMetric):
     def values(slots: ScoredSlots) -> Floats:
         """Counts of packets received and used, (c, R)."""
         used: Floats = ((slots.action != Action.LOST) & (slots.action != Action.DISCARDED)).astype(np.float64)
-        return used if slots.late is None else np.add(used, slots.late[1], out=used)
+        return used if slots.late_used is None else np.add(used, slots.late_used, out=used)
 
 
 class MeanError(MeanMetric, TallyMetric):

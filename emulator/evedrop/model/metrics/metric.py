@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, NamedTuple, Self, final
 
 import numpy as np
@@ -17,52 +17,32 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
+from evedrop.model.record import Record, column
 
-Late = Sequence[NDArray[np.uint16]] | NDArray[np.uint16]
+U16 = NDArray[np.uint16]
 COVARIANCE_ONLY = "covariance-only"
 """The mode that simulates covariances, and no errors."""
 
 
-@dataclass(frozen=True)
-class ScoredSlots:
-    """One receiver over c consecutive slots of R trials."""
+@dataclass(frozen=True, eq=False)
+class ScoredSlots(Record):
+    """One receiver over c consecutive slots of R trials, compared with the true states."""
 
-    first: int
-    """The first of the slots."""
-    error: Floats
-    """Squared error, or tr of the actual covariance in a covariance-only study, (c, R)."""
-    action: Codes
-    """`Action`, (c, R)."""
-    trace: Floats
-    """Reported tr P, summed over trials, (c,): a live run does not know it trial by trial."""
-    expected: Floats
-    """Trace of the theoretical error covariance, (c,)."""
-    late: Late | None = None
-    """Counts of packets of earlier slots that arrived, and that were used, (c, R) each; None if the receiver accepts none."""
-    x: Floats | None = None
-    """True states, (c, n, R); None in modes without states."""
-    x_hat: Floats | None = None
-    """Estimates, (c, n, R); None in modes without states."""
+    error: Floats = column("c R", "squared error, or tr of the actual covariance in a covariance-only study")
+    action: Codes = column("c R", "`Action`", "u1")
+    trace: Floats = column("c", "reported tr P, summed over trials: a live run does not know it trial by trial")
+    expected: Floats = column("c", "trace of the theoretical error covariance")
+    late: U16 | None = column(
+        "c R", "packets of earlier slots that arrived; None: the receiver accepts none", "<u2", default=None
+    )
+    late_used: U16 | None = column("c R", "those among them that it used", "<u2", default=None)
+    x: Floats | None = column("c n R", "true states; None in modes without states", default=None)
+    x_hat: Floats | None = column("c n R", "estimates; None in modes without states", default=None)
 
     @property
     def trials(self) -> int:
         """The number of trials."""
         return int(self.error.shape[1])
-
-    def part(self, start: int, stop: int) -> ScoredSlots:
-        """The slots from `start` to before `stop`, counted from the first of these slots."""
-        rows = slice(start, stop)
-        return replace(
-            self,
-            first=self.first + start,
-            error=self.error[rows],
-            action=self.action[rows],
-            trace=self.trace[rows],
-            expected=self.expected[rows],
-            late=None if self.late is None else [column[rows] for column in self.late],
-            x=None if self.x is None else self.x[rows],
-            x_hat=None if self.x_hat is None else self.x_hat[rows],
-        )
 
 
 class MetricTally(ABC):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from evedrop.model.links.way import Way
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
+from evedrop.model.record import Record, RecordColumn, column
 from evedrop.scenario.application import Panel
 
 TRUTH_NAME = "truth"
@@ -61,28 +62,17 @@ class Scene:
     """The panels of applications."""
 
 
-@dataclass(frozen=True)
-class PeerSlots:
-    """One receiver over c consecutive slots."""
+@dataclass(frozen=True, eq=False)
+class PeerSlots(Record):
+    """One receiver over c consecutive slots: the first recorded trial, and means over all trials."""
 
-    x_hat: Floats
-    """Estimate in the first recorded trial, (c, n)."""
-    P: Floats
-    """Covariance that it reports in the first recorded trial, (c, n, n)."""
-    action: Codes
-    """`Action` in the first recorded trial, (c,)."""
-    squared_error: Floats
-    """|x − x̂|², mean over trials, (c,)."""
-    standard_error: Floats
-    """The standard error of this mean, (c,); NaN for one trial."""
-    trace: Floats
-    """tr P that it reports, mean over trials, (c,)."""
-    theoretical_trace: Floats
-    """Trace of the actual error covariance by theory, (c,); NaN where there is none."""
-
-    def mapped(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> PeerSlots:
-        """The same with every array changed, for example cut to some slots."""
-        return PeerSlots(*(change(getattr(self, field.name)) for field in fields(self)))
+    x_hat: Floats = column("c n", "estimates in the first recorded trial")
+    P: Floats = column("c n n", "covariances that it reports in the first recorded trial")
+    action: Codes = column("c", "`Action` in the first recorded trial", "u1")
+    squared_error: Floats = column("c", "|x − x̂|², mean over trials")
+    standard_error: Floats = column("c", "the standard error of this mean; NaN for one trial")
+    trace: Floats = column("c", "tr P that it reports, mean over trials")
+    theoretical_trace: Floats = column("c", "trace of the actual error covariance by theory; NaN where there is none")
 
 
 @dataclass(frozen=True)
@@ -97,31 +87,23 @@ class Moved:
     @classmethod
     def joined(cls, moves: Sequence[Moved]) -> Moved:
         """Consecutive slots as one."""
-        curves = {path: _joined([move.curves[path] for move in moves], axis=1) for path in moves[0].curves}
-        return cls(_joined([move.values for move in moves]), curves)
+        curves = {path: np.concatenate([move.curves[path] for move in moves], axis=1) for path in moves[0].curves}
+        return cls(np.concatenate([move.values for move in moves]), curves)
 
 
-@dataclass(frozen=True)
-class SceneSlots:
+@dataclass(frozen=True, eq=False)
+class SceneSlots(Record):
     """c consecutive slots, complete. The view keeps its arrays for a while, so they must not be changed afterwards."""
 
-    first: int
-    """Number of the first of them."""
-    x: Floats
-    """True state of the first recorded trial, (c, n)."""
-    nu: Flags
-    """ν of the first recorded trial, (c,): true for an innovation."""
-    peers: Mapping[str, PeerSlots]
-    """By name, one for each receiver of the scene."""
+    x: Floats = column("c n", "true states of the first recorded trial")
+    nu: Flags = column("c", "ν of the first recorded trial: true for an innovation", "?")
+    peers: Mapping[str, PeerSlots] = field(default_factory=dict)
+    """By name, for each receiver of the scene."""
     moved: Moved | None = None
     """None without a closed loop."""
-    sent: Flags | None = None
-    """Whether the sensor sent a packet in the first recorded trial, (c,); None: in every slot."""
-
-    @property
-    def count(self) -> int:
-        """The number of slots, c."""
-        return len(self.nu)
+    sent: Flags | None = column(
+        "c", "whether the sensor sent a packet in the first recorded trial; None: in every slot", "?", default=None
+    )
 
     @property
     def numbers(self) -> NDArray[np.int64]:
@@ -129,30 +111,17 @@ class SceneSlots:
         return np.arange(self.first, self.first + self.count)
 
     @classmethod
-    def joined(cls, chunks: Sequence[SceneSlots]) -> SceneSlots:
+    def joined(cls, parts: Sequence[SceneSlots]) -> SceneSlots:
         """Consecutive slots as one, whose arrays cannot be written to."""
-        first = chunks[0]
         peers = {
-            name: PeerSlots(
-                *(_joined([getattr(chunk.peers[name], field.name) for chunk in chunks]) for field in fields(peer))
-            )
-            for name, peer in first.peers.items()
+            name: PeerSlots.joined([part.peers[name] for part in parts]).mapped(_read_only) for name in parts[0].peers
         }
-        moves = [chunk.moved for chunk in chunks if chunk.moved is not None]
-        sent = None
-        if any(chunk.sent is not None for chunk in chunks):
-            sent = _joined([np.ones(chunk.count, np.bool_) if chunk.sent is None else chunk.sent for chunk in chunks])
-        return cls(
-            first.first,
-            _joined([chunk.x for chunk in chunks]),
-            _joined([chunk.nu for chunk in chunks]),
-            peers,
-            Moved.joined(moves) if moves else None,
-            sent,
-        )
+        moves = [part.moved for part in parts if part.moved is not None]
+        whole = super().joined(parts).mapped(_read_only)
+        return whole.changed(peers=peers, moved=Moved.joined(moves) if moves else None)
 
 
-def _joined(parts: Sequence[NDArray[Any]], axis: int = 0) -> NDArray[Any]:
-    whole = parts[0].view() if len(parts) == 1 else np.concatenate(parts, axis=axis)
-    whole.flags.writeable = False
-    return whole
+def _read_only(_: RecordColumn, array: NDArray[Any]) -> NDArray[Any]:
+    view = array.view()
+    view.flags.writeable = False
+    return view

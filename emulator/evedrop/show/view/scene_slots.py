@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
-from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -161,6 +160,7 @@ def shown(
     """
     peers = {
         name: PeerSlots(
+            slots.first,
             x_hat=receiver.x_hat[:, :, 0] + around,
             P=receiver.P[:, :, :, 0],
             action=receiver.action[:, 0],
@@ -210,7 +210,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
             deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
             some = sensor.rows(rows)
             moved = None if loop_values is None else loop_values.take(some, deviations)
-            shown = {name: peer.mapped(itemgetter(rows)) for name, peer in peers.items()}
+            shown = {name: peer.rows(rows) for name, peer in peers.items()}
             sent = None if some.sent is None else some.sent[:, 0]
             recording.add(SceneSlots(first, some.x[:, :, 0], some.nu[:, 0], shown, moved, sent))
         for event in results.events:
@@ -278,6 +278,7 @@ def _peer(results: Results, name: str) -> PeerSlots:
             f"{results.folder}: trials.parquet has the unknown action {unknown[0]}; run the scenario again"
         )
     return PeerSlots(
+        0,
         x_hat=x_hat,
         P=P.reshape(-1, n, n),
         action=np.array([ACTION_OF[word] for word in words], np.uint8),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +34,7 @@ def test_the_map_shows_both_ends_and_their_distance(tmp_path: Path) -> None:
     peers = {"legitimate": run.slots.peers["legitimate"], "parked": run.slots.peers["smart"]}
     for slots in run.chunks(400):
         at = slice(slots.first, slots.first + slots.count)
-        some = {name: peer.mapped(itemgetter(at)) for name, peer in peers.items()}
+        some = {name: peer.rows(at) for name, peer in peers.items()}
         recording.add(replace(slots, peers=some))
     assert recording.close()
     places = rows(tmp_path / "r.rrd", "map/parked/at", "Points2D:positions")
