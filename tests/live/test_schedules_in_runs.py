@@ -18,7 +18,7 @@ from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.protocol.brief import read_brief
 from evedrop.scenario.loading import checked
 from evedrop.scenario.theory import expectations_of
-from evedrop.score.verdict import Verdict
+from evedrop.score.secrecy import Claim
 from tests.builders import UNSTABLE, digests_of, process_table
 
 MU_D = [1, 0.0, 0.0, 0.3, 0.3, 0.9, 1, 0.2]
@@ -71,7 +71,7 @@ def test_means_agree_with_theory(tmp_path: Path) -> None:
         assert abs(peer["z"]["mean_squared_error"]) < 4.5, name
     verdict = result.summary["secrecy"]["suspicious"]
     assert (verdict["relative_by_theory"], verdict["perfect_by_theory"]) == (True, None)
-    assert verdict["perfect"] == Verdict.UNDECIDED.value
+    assert verdict["perfect"] == Claim.UNDECIDED.value
 
 
 def test_what_needs_a_constant_probability_says_nothing() -> None:

@@ -21,9 +21,9 @@ from evedrop.model.receiver import Action
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.score.expectations_held import Evidence
+from evedrop.score.secrecy import Claim, Secrecy
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
-from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.score.watched_tally import SYNCHRONISED, WatchedQuantity, WatchedTally
 from evedrop.simulate.montecarlo import Plan
 from tests.conftest import Evedrop
@@ -191,7 +191,7 @@ def test_a_trial_that_never_is_synchronised_is_found_as_nothing(tmp_path: Path) 
     secret = {"secrecy": "relative", "against": "smart"}
     scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged, secret]})
     short = {name: Tally(9, 1) for name in scenario.receivers}
-    open_ = Secrecy("smart", Verdict.UNDECIDED, Verdict.UNDECIDED, True, 1, "", True, 1.0, 1, "mean")
+    open_ = Secrecy("smart", Claim.UNDECIDED, Claim.UNDECIDED, True, 1, "", True, 1.0, 1, "mean")
     peers = dict.fromkeys(scenario.receivers, PeerSummary({"used_fraction": 0.5}, None, False, None))
     judged = Evidence(scenario, peers, {}, short, {"smart": open_}).judged("evedrop run x")
     assert [judgement.held for judgement in judged] == [None] * 3
@@ -202,20 +202,20 @@ def test_a_trial_that_never_is_synchronised_is_found_as_nothing(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("shown", "promised", "value", "held"),
     [
-        (Verdict.HELD, True, "theory promises it, the run shows it", True),
-        (Verdict.UNDECIDED, True, "theory promises it, the run has too few trials to tell", False),
-        (Verdict.FAILED, True, "theory promises it, the run shows that it fails", False),
-        (Verdict.HELD, False, "theory denies it, the run shows it", False),
-        (Verdict.HELD, None, "no theory covers these links, the run shows it", False),
+        (Claim.HELD, True, "theory promises it, the run shows it", True),
+        (Claim.UNDECIDED, True, "theory promises it, the run has too few trials to tell", False),
+        (Claim.FAILED, True, "theory promises it, the run shows that it fails", False),
+        (Claim.HELD, False, "theory denies it, the run shows it", False),
+        (Claim.HELD, None, "no theory covers these links, the run shows it", False),
     ],
 )
 def test_secrecy_is_held_where_theory_and_run_agree(
-    shown: Verdict, promised: bool | None, value: str, held: bool
+    shown: Claim, promised: bool | None, value: str, held: bool
 ) -> None:
     """Of both kinds; whatever the other kind's verdict is."""
     for kind in ("relative", "perfect"):
         scenario = load("eavesdroppers", {"expect": [{"secrecy": kind, "against": "smart"}]})
-        other: dict[str, Any] = {"relative": Verdict.HELD, "perfect": Verdict.HELD}
+        other: dict[str, Any] = {"relative": Claim.HELD, "perfect": Claim.HELD}
         claims: dict[str, Any] = {"relative_by_theory": True, "perfect_by_theory": True, f"{kind}_by_theory": promised}
         verdict = Secrecy("smart", **{**other, kind: shown}, **claims, relative_from=None, windows="", ratio=1.0,
                           trials=9, judged_by="mean")  # fmt: skip

@@ -23,8 +23,9 @@ from evedrop.scenario.theory import Expectation, expectations_of
 from evedrop.score.rare_events import z_of_error
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import verdicts
+from evedrop.score.secrecy import Claim
 from evedrop.score.summary import RARE_FRACTION, RareEvents
-from evedrop.score.verdict import Verdict
+from evedrop.score.verdict import SecrecyOutcome
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import carry_out, tasks_of
 
@@ -166,9 +167,12 @@ def test_no_verdict_is_false_where_rare_events_carry_the_users_error(seeds: int,
     relative = []
     for seed in range(seeds):
         scenario = gambled(initial, seed)
-        (verdict,) = verdicts(tally_of(scenario).tallies, expectations_of(scenario))
+        ((verdict,), overall) = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
         relative.append(verdict.relative)
-    assert Verdict.HELD not in relative
+        assert overall is not None
+        if np.mean(expected["e"][32:]) < np.mean(expected[LEGITIMATE][32:]):
+            assert overall.outcome not in {SecrecyOutcome.RELATIVE, SecrecyOutcome.PERFECT}
+    assert Claim.HELD not in relative
 
 
 @pytest.mark.parametrize("seeds", [10, pytest.param(200, marks=pytest.mark.long)])
@@ -176,6 +180,8 @@ def test_no_verdict_is_false_for_a_strategy_without_a_closed_form(seeds: int) ->
     """The same against an eavesdropper whose expected error nothing but the simulation tells."""
     for seed in range(seeds):
         scenario = gambled(1e6, seed, "bayesian")
-        (verdict,) = verdicts(tally_of(scenario).tallies, expectations_of(scenario))
-        assert verdict.relative is not Verdict.HELD
+        ((verdict,), overall) = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
+        assert verdict.relative is not Claim.HELD
+        assert overall is not None
+        assert overall.outcome not in {SecrecyOutcome.RELATIVE, SecrecyOutcome.PERFECT}
         assert not expectations_of(scenario)["e"].known

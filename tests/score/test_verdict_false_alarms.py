@@ -10,8 +10,9 @@ from scipy.stats import binom, binomtest
 
 from evedrop.model.process import Floats
 from evedrop.scenario.loading import checked
+from evedrop.score.after_start import ERROR_RATE
+from evedrop.score.secrecy import Claim, SignTestOf, relative_verdict, sign_of_mean, sign_of_median
 from evedrop.score.sums import WINDOWS, merged, window_means
-from evedrop.score.verdict import ERROR_RATE, SignTestOf, Verdict, relative_verdict, sign_of_mean, sign_of_median
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import TrialsTask, carry_out
 from tests.builders import MARGINAL, process_table
@@ -51,9 +52,9 @@ def differences(studies: int) -> Floats:
     return whole.reshape(WINDOWS, studies, TRIALS).swapaxes(0, 1)
 
 
-def counted(verdicts: list[Verdict]) -> dict[Verdict, int]:
+def counted(verdicts: list[Claim]) -> dict[Claim, int]:
     """How often each verdict was reached."""
-    return {verdict: verdicts.count(verdict) for verdict in Verdict}
+    return {verdict: verdicts.count(verdict) for verdict in Claim}
 
 
 def most(studies: int) -> int:
@@ -70,13 +71,13 @@ def test_failed_is_said_in_error_no_more_often_than_promised(studies: int, test:
     """Without a difference in any window; with the whole rate for each window, 1000 studies would have too many."""
     samples = differences(studies)
     result = counted([relative_verdict(sample, test, SLOTS)[0] for sample in samples])
-    assert result[Verdict.FAILED] <= most(studies)
-    assert result[Verdict.HELD] <= most(studies)
+    assert result[Claim.FAILED] <= most(studies)
+    assert result[Claim.HELD] <= most(studies)
     alone = sum(any(test(row).below <= ERROR_RATE for row in sample) for sample in samples)
-    assert alone > result[Verdict.FAILED]
+    assert alone > result[Claim.FAILED]
     if studies == 1000:
         assert alone > most(studies)
-        low, high = binomtest(result[Verdict.FAILED], studies).proportion_ci(0.999)
+        low, high = binomtest(result[Claim.FAILED], studies).proportion_ci(0.999)
         assert low <= ERROR_RATE <= high
 
 
@@ -86,5 +87,5 @@ def test_held_is_said_in_error_no_more_often_than_promised(studies: int) -> None
     samples = differences(studies).copy()
     samples[:, 1:] += 1.0
     result = counted([relative_verdict(sample, sign_of_mean, SLOTS)[0] for sample in samples])
-    assert 0 < result[Verdict.HELD] <= most(studies)
-    assert result[Verdict.FAILED] <= binom.ppf(1.0 - SURE, studies, ERROR_RATE / WINDOWS)
+    assert 0 < result[Claim.HELD] <= most(studies)
+    assert result[Claim.FAILED] <= binom.ppf(1.0 - SURE, studies, ERROR_RATE / WINDOWS)

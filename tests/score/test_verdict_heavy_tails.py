@@ -10,7 +10,8 @@ import pytest
 
 from evedrop.cli.api import montecarlo
 from evedrop.model.process import Floats
-from evedrop.score.verdict import ERROR_RATE, SignTest, SignTestOf, sign_of_mean, sign_of_median
+from evedrop.score.after_start import ERROR_RATE
+from evedrop.score.secrecy import SignTest, SignTestOf, sign_of_mean, sign_of_median
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from tests.conftest import Evedrop

@@ -17,7 +17,7 @@ from evedrop.model.theory.closed_forms import encrypted_fraction
 from evedrop.results.comparison import Comparison, read_comparison
 from evedrop.results.summary_file import plain
 from evedrop.scenario.loading import load
-from evedrop.score.verdict import SecrecyVerdict
+from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.comparison import verdict
 from evedrop.show.report.writing import write_report
 from evedrop.simulate.montecarlo import Plan
@@ -29,19 +29,19 @@ MARGINAL: dict[str, Any] = {"slots": 100, "trials": 30, "process__initial_covari
 """Changes of `bayesian`: long enough for verdicts, and trials that lose the first slot do not dominate the mean."""
 
 VERDICTS = {
-    ("plain", "naive"): SecrecyVerdict.BROKEN,
-    ("cipher", "naive"): SecrecyVerdict.PERFECT,
-    ("innovation", "naive"): SecrecyVerdict.PERFECT,
-    ("acknowledged", "reference"): SecrecyVerdict.PERFECT,
-    ("acknowledged", "blocks-critical"): SecrecyVerdict.BROKEN,
-    ("acknowledged", "blocks-all"): SecrecyVerdict.BROKEN,
-    ("acknowledged", "hijacks"): SecrecyVerdict.PERFECT,  # no acknowledgement is lost
-    ("open-loop", "reference"): SecrecyVerdict.PERFECT,
-    ("open-loop", "forges"): SecrecyVerdict.BROKEN,
-    ("twin-track", "naive"): SecrecyVerdict.PERFECT,
-    ("twin-track", "tracker"): SecrecyVerdict.PERFECT,
-    ("twin-track", "replay-informed"): SecrecyVerdict.RELATIVE,
-    ("innovation", "genie"): SecrecyVerdict.RELATIVE,
+    ("plain", "naive"): SecrecyOutcome.BROKEN,
+    ("cipher", "naive"): SecrecyOutcome.PERFECT,
+    ("innovation", "naive"): SecrecyOutcome.PERFECT,
+    ("acknowledged", "reference"): SecrecyOutcome.PERFECT,
+    ("acknowledged", "blocks-critical"): SecrecyOutcome.BROKEN,
+    ("acknowledged", "blocks-all"): SecrecyOutcome.BROKEN,
+    ("acknowledged", "hijacks"): SecrecyOutcome.PERFECT,  # no acknowledgement is lost
+    ("open-loop", "reference"): SecrecyOutcome.PERFECT,
+    ("open-loop", "forges"): SecrecyOutcome.BROKEN,
+    ("twin-track", "naive"): SecrecyOutcome.PERFECT,
+    ("twin-track", "tracker"): SecrecyOutcome.PERFECT,
+    ("twin-track", "replay-informed"): SecrecyOutcome.RELATIVE,
+    ("innovation", "genie"): SecrecyOutcome.RELATIVE,
 }
 
 Everything = tuple[Comparison, Path]
@@ -218,7 +218,7 @@ def test_one_trial_decides_nothing(tmp_path: Path) -> None:
     for adversary in ("naive", "smart"):
         cell = result.cell("innovation", adversary)
         assert cell.eavesdropper is not None
-        assert cell.verdict is SecrecyVerdict.UNDECIDED
+        assert cell.verdict is SecrecyOutcome.OPEN
         assert cell.eavesdropper.standard_error is None
 
 
@@ -322,7 +322,7 @@ def test_innovations_have_no_acknowledgements_to_block(literature: Comparison) -
         cell = literature.cell("innovation", adversary)
         assert cell.ratio is not None
         assert cell.ratio > 1.0
-        assert cell.verdict in {SecrecyVerdict.RELATIVE, SecrecyVerdict.PERFECT}
+        assert cell.verdict in {SecrecyOutcome.RELATIVE, SecrecyOutcome.PERFECT}
 
 
 def test_a_forged_acknowledgement_is_the_users_loss(literature: Comparison) -> None:

@@ -93,8 +93,12 @@ def test_a_folder_of_scenarios_is_tested_in_memory(evedrop: Evedrop) -> None:
     assert [[part.tag for part in case] for case in suite] == [["properties", "failure"], ["properties"], ["error"]]
     properties = {element.get("name"): element.get("value") for element in suite[0][0]}
     seed = str(Results.read(evedrop.folder / "kept/fails").summary["seed"])
-    assert properties == {"seed": seed, "results": "kept/fails", "report": "kept/fails/report.html"}
-    assert "1 of 2 expectations FAILED" in checked(evedrop.folder / "kept/fails").texts
+    verdict = Results.read(evedrop.folder / "kept/fails").typed_summary.verdict
+    assert verdict is not None
+    assert properties == {
+        "seed": seed, "results": "kept/fails", "report": "kept/fails/report.html", "verdict": verdict.sentence,
+    }  # fmt: skip
+    assert f"{verdict.sentence}. 1 of 2 expectations FAILED" in checked(evedrop.folder / "kept/fails").texts
     assert str(suite[0][1].get("message")).startswith(failed)
     assert str(suite[2][0].text).splitlines() == [line.strip() for line in lines[6:-1]]
 

@@ -101,6 +101,12 @@ def output(parser: argparse.ArgumentParser) -> None:
     """Add the options for the results folder and for JSON."""
     parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty")
     as_json(parser, "print only the summary, as JSON, on standard output")
+    verbose(parser)
+
+
+def verbose(parser: argparse.ArgumentParser) -> None:
+    """Add `--verbose`, for all details of a closing report."""
+    parser.add_argument("--verbose", action="store_true", help="print everything that the report page says")
 
 
 def as_json(parser: argparse.ArgumentParser, help_text: str = "print JSON") -> None:
@@ -180,14 +186,14 @@ def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenari
     return scenario
 
 
-def print_so_far(folder: Path, as_json: bool) -> None:
-    """Print the closing report of a run, if it has results, and write its page."""
+def print_so_far(folder: Path, options: argparse.Namespace) -> None:
+    """Print the closing report of a run, if it has results, and write its page; options: those of `output`."""
     from evedrop.cli.report import print_results, report_page
 
     with contextlib.suppress(UsageError):
-        print_results(folder, as_json)
+        print_results(folder, options.json, options.verbose)
         sys.stdout.flush()  # the words first: the page takes a tenth of a second
-        report_page(folder, as_json)
+        report_page(folder, options.json)
 
 
 def hold(viewer: Viewer) -> None:

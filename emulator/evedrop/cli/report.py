@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.table import Table
+from rich.text import Text
 
 from evedrop.cli.console import StyledConsole
 from evedrop.cli.tables import TAKEN
@@ -17,6 +18,7 @@ from evedrop.errors import UsageError
 from evedrop.results.reading import Results
 from evedrop.scenario.recorded import recorded
 from evedrop.score.summary import Summary
+from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report import closing
 from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.comparison import comparison_heading, comparison_lines, pairs_table, schemes_table
@@ -30,32 +32,60 @@ if TYPE_CHECKING:
     from evedrop.results.comparison import Comparison
 
 
+_FAILURE, _WARNING = "red", "yellow"
+_UNCERTAIN = {False: "is uncertain", True: "are uncertain"}
+_STYLES = {
+    SecrecyOutcome.PERFECT: "",
+    SecrecyOutcome.RELATIVE: "",
+    SecrecyOutcome.OPEN: _WARNING,
+    SecrecyOutcome.BROKEN: _FAILURE,
+}
 _DIGEST_WIDTH = 100
 """The least width of a terminal, in columns, to show digests, and the standard error of every metric."""
 
 
-def print_summary(summary: Summary, folder: str, replay: str | None = None) -> None:
-    """Print the closing report on standard output; replay: the beginning of the command that shows one trial live."""
+def print_summary(summary: Summary, folder: str, replay: str | None = None, verbose: bool = False) -> None:
+    """Print the closing report on standard output.
+
+    replay: the beginning of the command that shows one trial live; verbose: with everything that the report page says.
+    """
     console = terminal()
     if summary.ended != "complete":
-        console.print(f"{summary.ended.splitlines()[0]}; the results so far:")
+        console.line_of(f"{summary.ended.splitlines()[0]}; the results so far:", _WARNING)
     console.show(closing.receivers_table(summary), closing_table(summary, console.width))
-    for line in (*closing.remarks(summary), *closing.verdicts(summary)):
-        console.print(line)
+    if summary.verdict is not None:
+        console.line_of(summary.verdict.sentence, f"bold {_STYLES.get(SecrecyOutcome(summary.verdict.outcome), '')}")
+        for outcome, line in closing.verdict_lines(summary):
+            console.line_of(f"  {line}", _STYLES.get(outcome, ""))
+    for line in closing.remarks(summary):
+        console.line_of(line)
+    doubts = list(closing.doubts(summary))
+    if verbose:
+        _print_details(console, summary, replay)
+    elif doubts:
+        console.line_of(f"{len(doubts)} of the means above {_UNCERTAIN[len(doubts) > 1]}; --verbose says why", _WARNING)
+    for line in closing.application_lines(summary):
+        console.line_of(line)
+    for expectation in summary.expectations:
+        console.line_of(expectation.sentence, "" if expectation.held else _FAILURE)
+        if expectation.replay is not None:
+            console.line_of(f"    see it again: {expectation.replay}")
+    console.line_of(f"results: {folder}; to look at them: evedrop view {folder}")
+
+
+def _print_details(console: _Console, summary: Summary, replay: str | None) -> None:
+    """Print what the report page says besides: theory, leaks, directions, doubts, and the most surprising trial."""
+    for line in closing.details(summary):
+        console.line_of(line)
     if summary.directions:
         console.show(closing.directions_table(summary.directions), tight=True)
-    for line in (*closing.doubts(summary), *closing.application_lines(summary)):
-        console.print(line)
-    for expectation in summary.expectations:
-        console.print(expectation.sentence)
-        if expectation.replay is not None:
-            console.print(f"    see it again: {expectation.replay}")
+    for line in closing.doubts(summary):
+        console.line_of(line)
     surprise = closing.surprise(summary)
     if surprise is not None and summary.surprising is not None:
-        console.print(surprise)
+        console.line_of(surprise)
         if replay is not None:
-            console.print(f"    watch it live: {replay} --first-trial {summary.surprising.trial} --trials 1")
-    console.print(f"results: {folder}; to look at them: evedrop view {folder}")
+            console.line_of(f"    watch it live: {replay} --first-trial {summary.surprising.trial} --trials 1")
 
 
 def closing_table(summary: Summary, width: int) -> Table:
@@ -88,6 +118,10 @@ class _Console(StyledConsole):
             taken.append(table)
         self.print(fitted(rich_table(table, **how) if drawn is None else drawn, self))
 
+    def line_of(self, text: str, style: str = "") -> None:
+        """Print a line; on a terminal, one that is too long is divided between words."""
+        self.print(Text(text, style), soft_wrap=not self.is_terminal)
+
 
 def terminal() -> _Console:
     """A console on standard output; 140 columns wide if that is not a terminal."""
@@ -111,8 +145,8 @@ def print_comparison(comparison: Comparison, folder: str) -> None:
     console.print(f"results: {folder}/compare.json, compare.png, scenarios/")
 
 
-def print_results(folder: Path, as_json: bool = False) -> None:
-    """Print the table and the verdict of a results folder, or its summary as JSON, to standard output.
+def print_results(folder: Path, as_json: bool = False, verbose: bool = False) -> None:
+    """Print the table and the verdict of a results folder, or its summary as JSON, to standard output; verbose: all details.
 
     Raises UsageError if it is not a results folder.
     """
@@ -121,7 +155,7 @@ def print_results(folder: Path, as_json: bool = False) -> None:
         print_json(results.summary)
         return
     summary = results.typed_summary
-    print_summary(summary, str(folder), None if summary.mode == "live" else replay_command(folder))
+    print_summary(summary, str(folder), None if summary.mode == "live" else replay_command(folder), verbose)
 
 
 def report_page(folder: Path, silent: bool = False) -> None:

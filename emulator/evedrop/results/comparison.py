@@ -19,8 +19,9 @@ from pydantic import TypeAdapter
 from evedrop.errors import UsageError
 from evedrop.results.reading import ByName
 from evedrop.results.summary_file import plain
+from evedrop.score.secrecy import Claim, Secrecy
 from evedrop.score.summary import RareEvents, SecrecySummary
-from evedrop.score.verdict import Secrecy, SecrecyVerdict, Verdict
+from evedrop.score.verdict import SecrecyOutcome
 from evedrop.system.files import Unreadable, text_of
 
 COMPARISON = "compare.json"
@@ -120,20 +121,13 @@ class Cell:
         return None if self.secrecy is None else self.secrecy.ratio_error
 
     @property
-    def verdict(self) -> SecrecyVerdict | None:
-        """The verdict of the run; theory also decides whether an error is unbounded, and whether two are equal."""
-        secrecy, other, legitimate = self.secrecy, self.eavesdropper, self.legitimate
-        if secrecy is None or other is None or legitimate is None:
-            return None
-        if secrecy.relative is Verdict.FAILED:
-            return SecrecyVerdict.BROKEN
-        unbounded = _limit(other) == math.inf and _limit(legitimate) < math.inf
-        if secrecy.perfect is Verdict.HELD and unbounded:
-            return SecrecyVerdict.PERFECT
-        if secrecy.relative is Verdict.HELD:
-            return SecrecyVerdict.RELATIVE
-        denied = secrecy.relative_by_theory is False and secrecy.relative_from is None and not unbounded
-        return SecrecyVerdict.BROKEN if denied else SecrecyVerdict.UNDECIDED
+    def verdict(self) -> SecrecyOutcome | None:
+        """The verdict of the run; None if the pair is not defined."""
+        return (
+            None
+            if self.secrecy is None or self.secrecy.verdict is None
+            else SecrecyOutcome(self.secrecy.verdict.outcome)
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The cell in the form of compare.json."""
@@ -387,11 +381,13 @@ def _cell(scheme: str, adversary: str, data: Mapping[str, Any], size: tuple[int,
         return Cell(Match(scheme, adversary, not_defined=data["not_defined"]))
     match = Match(scheme, adversary, data["reads_as"], data["attack"], betrayed=bool(data["betrayed"]))
     summary = TypeAdapter(SecrecySummary).validate_python(data["secrecy"])
-    first = data["secrecy"]["ratio_from"]  # results of an older version have none, and are refused
+    first = data["secrecy"]["ratio_from"]
+    if summary.verdict is None:
+        raise KeyError("verdict")  # results of an older version
     secrecy = Secrecy(
         match.receiver,
-        Verdict(summary.relative),
-        Verdict(summary.perfect),
+        Claim(summary.relative),
+        Claim(summary.perfect),
         summary.relative_by_theory,
         summary.relative_from,
         "",
@@ -402,6 +398,7 @@ def _cell(scheme: str, adversary: str, data: Mapping[str, Any], size: tuple[int,
         ratio_error=summary.ratio_standard_error,
         leak=summary.leak,
         ratio_slots=None if first is None else (first, size[0] - 1),
+        verdict=summary.verdict,
     )
     return Cell(match, _simulated_error(data["legitimate"]), _simulated_error(data["eavesdropper"]), secrecy)
 

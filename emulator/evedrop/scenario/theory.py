@@ -365,6 +365,14 @@ def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
     return expectations
 
 
+def error_floor_of(scenario: Scenario, receiver: str) -> tuple[Floats, bool] | None:
+    """The scheme's lower bound on an eavesdropper's error, (slots,), and whether it grows without bound; None if it has none."""
+    assumed = scenario.process.given and not scenario.process.theory
+    if receiver == LEGITIMATE or receiver in scenario.leaks or assumed:
+        return None
+    return scheme_of(scenario.process.process, scenario.encoding.spec).error_floor(scenario.slots)
+
+
 def _in_slots(mu_d: tuple[float, ...], outcomes_in: SlotOutcomes) -> SlotOutcomes:
     """The outcomes of each slot, asked for once for each value of μ_d."""
     outcomes_of: dict[float, OutcomesAt] = {}

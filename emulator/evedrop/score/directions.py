@@ -15,9 +15,9 @@ from evedrop.model.metrics.standard_error import standard_error
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.theory import Expectation
 from evedrop.score.rare_events import rare_events_of, z_of_error
+from evedrop.score.secrecy import Claim, perfect_verdict, relative_verdict, sign_of_mean, sign_of_median
 from evedrop.score.summary import DirectionSummary, RareEvents
 from evedrop.score.sums import DirectionTally, Tally, window_means
-from evedrop.score.verdict import Verdict, perfect_verdict, relative_verdict, sign_of_mean, sign_of_median
 
 
 def directions_of(
@@ -59,7 +59,7 @@ def _judged(
     promised = None
     if legitimate.unbounded is not None and summary.unbounded is not None:
         promised = summary.unbounded and not legitimate.unbounded
-    relative, perfect = Verdict.UNDECIDED, Verdict.FAILED if promised is False else Verdict.UNDECIDED
+    relative, perfect = Claim.UNDECIDED, Claim.FAILED if promised is False else Claim.UNDECIDED
     if all(each.done == each.slots for each in errors):
         heavy = any(each.infinite_variance for each in expected)
         test = sign_of_median if heavy else sign_of_mean

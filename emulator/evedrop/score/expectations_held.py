@@ -17,13 +17,13 @@ from evedrop.model.links.loss_model import REASONS
 from evedrop.scenario.application import APPLICATIONS, Summary
 from evedrop.scenario.expect import ExpectTable, direction_metric, link_metric
 from evedrop.scenario.tables import Scenario
+from evedrop.score.secrecy import Claim, Secrecy
 from evedrop.score.summary import MODES, DirectionSummary, Judged, JudgedValue, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
-from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.score.watched_tally import watch_of
 
 _THEORY = {True: "theory promises it", False: "theory denies it", None: "no theory covers these links"}
-_RUN = {Verdict.HELD.value: "the run shows it", Verdict.FAILED.value: "the run shows that it fails"}
+_RUN = {Claim.HELD.value: "the run shows it", Claim.FAILED.value: "the run shows that it fails"}
 
 
 def replay_of(folder: Path, scenario: Scenario, mode: str = "live") -> str:
@@ -120,7 +120,7 @@ class Evidence:
         promised = verdict.relative_by_theory if relative else verdict.perfect_by_theory
         verdicts = f"{_THEORY[promised]}, {_RUN.get(shown.value, f'the run has {shown.value}')}"
         complete = all(tally.done == tally.slots for tally in self.tallies.values())
-        return verdicts, promised is True and shown is Verdict.HELD if complete else None
+        return verdicts, promised is True and shown is Claim.HELD if complete else None
 
     def _secrecy_in(self, expect: ExpectTable) -> tuple[JudgedValue, bool | None]:
         """The same in one direction, where theory only promises perfect secrecy: relative secrecy is what the run shows."""
@@ -131,7 +131,7 @@ class Evidence:
         shown = str(verdict.relative if relative else verdict.perfect)
         promise = "" if relative else f"{_THEORY[verdict.perfect_by_theory]}, "
         run = _RUN.get(shown, f"the run has {shown}")
-        held = shown == Verdict.HELD.value and (relative or verdict.perfect_by_theory is True)
+        held = shown == Claim.HELD.value and (relative or verdict.perfect_by_theory is True)
         complete = all(tally.done == tally.slots for tally in self.tallies.values())
         return f"{promise}{run}", held if complete else None
 

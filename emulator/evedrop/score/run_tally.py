@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from evedrop.scenario.tables import Scenario
+from evedrop.score.after_start import DistanceTally, leading_states
 from evedrop.score.closed_loop_tally import LoopTally, SolveTimes
 from evedrop.score.conditional import conditional_error_of
 from evedrop.score.filtering import FilterTally
@@ -29,7 +30,9 @@ class RunTally:
     @classmethod
     def nothing(cls, scenario: Scenario, trials: int) -> RunTally:
         """The empty tallies of receivers only: of trials without slots, or in a mode without states."""
-        watches = watches_of(scenario)
+        watches, n = watches_of(scenario), len(scenario.process.A)
+        leading: int | None = leading_states(scenario.process.units or (), n)
+        leading = None if leading == n else leading
         tallies = {
             name: Tally(scenario.slots, trials, WatchedTally(watch, trials), cuts=scenario.outage_bounds(name))
             for name, watch in watches.items()
@@ -38,6 +41,7 @@ class RunTally:
             tally.conditional = conditional_error_of(scenario, name, trials)
             for direction, v in scenario.process.directions_as_arrays.items():
                 tally.directions[direction] = DirectionTally(v, scenario.slots, trials)
+            tally.distance = DistanceTally(leading, scenario.slots, trials)
             tally.leak = LeakTally(trials) if leak_is_known(scenario, name) else None
         return cls(tallies)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple, final
 
@@ -19,7 +20,7 @@ from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.theory import Expectation, TheoreticalTraceStream, expectations_of
+from evedrop.scenario.theory import Expectation, TheoreticalTraceStream, error_floor_of, expectations_of
 from evedrop.score.directions import directions_of
 from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
@@ -27,10 +28,11 @@ from evedrop.score.leak import HeardBitsStream
 from evedrop.score.links import link_summary_of
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.run_tally import RunTally
+from evedrop.score.secrecy import Secrecy, secrecy
 from evedrop.score.slots import Slots
 from evedrop.score.summary import PeerSummary, Summary, SurprisingTrial, Verification
 from evedrop.score.sums import LEVELS, SlotSums, Tally, slot_sums, squared_errors, trial_means
-from evedrop.score.verdict import Secrecy, secrecy
+from evedrop.score.verdict import Verdict, verdict_of
 
 _ENOUGH_TO_SURPRISE = 10  # trials
 
@@ -83,6 +85,8 @@ class Scorekeeper:
             )
             tally = self.run_tally.tallies[name]
             tally.add_slots(slots.first, *values)
+            if tally.distance is not None:
+                tally.distance.add_slots(slots.first, errors, sensor.x, receiver.x_hat)
             if tally.conditional is not None:
                 tally.conditional.add_actions(receiver.action)
             if tally.leak is not None:
@@ -143,10 +147,17 @@ class RunOutcome:
     """Process → messages with other processes' keys, which it dropped."""
 
 
-def verdicts(tallies: Mapping[str, Tally], expected: Mapping[str, Expectation]) -> list[Secrecy]:
-    """The verdict on every eavesdropper, from all receivers' tallies and what theory expects of them."""
-    legitimate = (tallies[LEGITIMATE], expected[LEGITIMATE])
-    return [secrecy(legitimate, (name, tallies[name], expected[name])) for name in tallies if name != LEGITIMATE]
+def verdicts(
+    scenario: Scenario, tallies: Mapping[str, Tally], expected: Mapping[str, Expectation]
+) -> tuple[list[Secrecy], Verdict | None]:
+    """Secrecy against every eavesdropper, from all receivers' tallies and what theory expects of them, and the verdict on all."""
+    legitimate, unit = (tallies[LEGITIMATE], expected[LEGITIMATE]), unit_of(scenario)
+    each = [
+        secrecy(legitimate, (name, tallies[name], expected[name]), unit, partial(_floor_grows, scenario, name))
+        for name in tallies
+        if name != LEGITIMATE
+    ]
+    return each, verdict_of([entry.compared for entry in each if entry.compared is not None], unit)
 
 
 def summary_of(
@@ -164,7 +175,8 @@ def summary_of(
     applications = {} if loop is None else {name: entry.entry() for name, entry in loop.applications.items()}
     legitimate = tallies[LEGITIMATE]
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
-    secret = {entry.eavesdropper: entry for entry in verdicts(tallies, expected)}
+    each, verdict = verdicts(scenario, tallies, expected)
+    secret = {entry.eavesdropper: entry for entry in each}
     directions = directions_of(tallies, expected)
     expectations = Evidence(scenario, peers, links, tallies, secret, applications, directions).judged(ending.replay)
     # Known only now that every metric has been computed.
@@ -195,7 +207,19 @@ def summary_of(
         surprising=_surprising(scenario, tallies),
         expectations=expectations,
         directions=directions,
+        verdict=verdict,
     )
+
+
+def _floor_grows(scenario: Scenario, receiver: str) -> bool:
+    """Whether the scheme's lower bound on an eavesdropper's error grows without bound."""
+    bound = error_floor_of(scenario, receiver)
+    return bound is not None and bound[1]
+
+
+def unit_of(scenario: Scenario) -> str:
+    """The unit of the first states, in which distances are given; empty without units."""
+    return (scenario.process.units or ("",))[0]
 
 
 def _peer(name: str, tally: Tally, expected: Expectation, digest: str | None, mode: str) -> PeerSummary:

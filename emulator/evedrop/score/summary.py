@@ -22,6 +22,7 @@ from evedrop.model.metrics.built_in import LinkAccount
 from evedrop.model.metrics.text import estimate
 from evedrop.scenario import application
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
+from evedrop.score.verdict import Verdict
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -225,6 +226,8 @@ class SecrecySummary:
     """The first slot of the second half of the run, so that the start does not count."""
     leak: LeakSummary | None = None
     """None: unknown, or not measured in this mode."""
+    verdict: Verdict | None = None
+    """None in results of an older version."""
 
 
 @dataclass(frozen=True)
@@ -378,6 +381,8 @@ class Summary:
     expectations: Sequence[Judged]
     directions: Mapping[str, Mapping[str, DirectionSummary]] = field(default_factory=dict)
     """Receiver → direction → its entry; empty without directions, and in modes without estimates."""
+    verdict: Verdict | None = None
+    """On all eavesdroppers; None without any, and in results of an older version."""
 
     @property
     def failed_expectations(self) -> int:
@@ -403,11 +408,10 @@ class Summary:
 
         Raises KeyError for a missing entry, and TypeError or ValueError for a value of another type.
         """
-        # Results of an older version lack directions.
         names = [
             entry.name
             for entry in fields(cls)
-            if entry.name != _OPEN and (entry.name != "directions" or entry.name in entries)
+            if entry.name != _OPEN and (entry.name not in _NEWER or entry.name in entries)
         ]
         own = {name: entries[name] for name in names}
         others = {name: value for name, value in entries.items() if name not in own}
@@ -426,6 +430,8 @@ class _Happened(Struct):
 
 
 _OPEN = "applications"
+_NEWER = {"directions", "verdict"}
+"""Entries that results of an older version lack."""
 
 
 def _expect_possible(summary: Summary) -> None:

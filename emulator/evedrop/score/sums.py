@@ -26,6 +26,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.slot.link import COUNTED_BURSTS, Account
 from evedrop.model.slot.records import LinkSlots
+from evedrop.score.after_start import DistanceTally
 from evedrop.score.conditional import ConditionalError
 from evedrop.score.leak import LeakTally
 from evedrop.score.watched_tally import WatchedQuantity, WatchedTally
@@ -228,6 +229,8 @@ class Tally(ReceiverTally):
     """The expected errors given what happened to the packets; None where that does not determine them."""
     leak: LeakTally | None = None
     """What its packets reveal without the secret; None where that is unknown."""
+    distance: DistanceTally | None = None
+    """How far it is off after the start; None where nobody asks."""
     directions: dict[str, DirectionTally] = field(default_factory=dict)
     """The errors in the scenario's directions, by their names."""
     window_errors: Floats = field(init=False)
@@ -394,6 +397,8 @@ def merged(parts: Sequence[Tally]) -> Tally:
     total.conditional = ConditionalError.merged(conditional) if conditional else None
     for name in parts[0].directions:
         total.directions[name] = DirectionTally.merged([part.directions[name] for part in parts])
+    distances = [part.distance for part in parts if part.distance is not None]
+    total.distance = DistanceTally.merged(distances) if distances else None
     leaks = [part.leak for part in parts if part.leak is not None]
     total.leak = LeakTally.merged(leaks) if leaks else None
     total.packets = np.concatenate([part.packets for part in parts], axis=1)

@@ -1,389 +1,159 @@
-"""Whether secrecy held in a run, and whether theory promises it. "Too few trials to tell" is a verdict of its own.
+"""The verdict: whether the state is kept secret, as a glyph, a word and a sentence, which everything that reports a run shows.
 
-Source: docs/mathematics.md, secrecy and design; docs/results.md, verdict.
+Source: docs/results.md, verdict.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import lru_cache
 
-import numpy as np
-
-from evedrop.model.metrics.standard_error import ratio_error, skewed_test, student_test
-from evedrop.model.metrics.text import count_text, estimate
-from evedrop.model.process import Floats, parts_of
-from evedrop.model.theory.covariances import NOBODY, TheoreticalCovariance
-from evedrop.model.theory.rare_events import RARE
-from evedrop.names import LEGITIMATE
-from evedrop.scenario.theory import Alike, Expectation, TheoreticalTraceStream
-from evedrop.score.rare_events import rare_events_of
-from evedrop.score.summary import RARE_FRACTION, LeakSummary, SecrecySummary
-from evedrop.score.sums import WINDOWS, Tally, window_bounds, window_means, window_of
-
-ERROR_RATE = 0.01
-"""Of a verdict: how often `held`, or `failed`, may be said in error."""
-_ROUNDING = 1e-12  # relative to the eavesdropper's error: over a perfect link the legitimate error is 0
+from evedrop.score.after_start import AfterStart, BatchMeans
 
 
-class Verdict(StrEnum):
-    """What a run shows about a claim."""
+class SecrecyOutcome(StrEnum):
+    """How well the state is kept secret from an eavesdropper, or from all of them."""
 
-    HELD = "held"
-    FAILED = "failed"
-    UNDECIDED = "too few trials to tell"
+    PERFECT = "perfectly secret"
+    """Its error grows without bound, and the legitimate estimator's does not."""
+    RELATIVE = "secret"
+    """Its error stays larger than the legitimate estimator's."""
+    OPEN = "cannot tell yet"
+    BROKEN = "not secret"
+
+    @property
+    def glyph(self) -> str:
+        """A letter that can be told from the others without colours."""
+        return _GLYPHS[self]
+
+
+_GLYPHS = {
+    SecrecyOutcome.PERFECT: "✓",
+    SecrecyOutcome.RELATIVE: "✓",
+    SecrecyOutcome.OPEN: "?",
+    SecrecyOutcome.BROKEN: "✕",
+}
+_ORDER = (SecrecyOutcome.BROKEN, SecrecyOutcome.OPEN, SecrecyOutcome.RELATIVE, SecrecyOutcome.PERFECT)
+_SMALLER = 0.8  # times the legitimate error: less is "more than the estimator", and the rest "as much"
 
 
 @dataclass(frozen=True)
-class Secrecy:
-    """Secrecy against one eavesdropper: the result of the run and the claim of theory."""
+class Verdict:
+    """Whether the state is kept secret."""
 
+    outcome: str
+    """The value of an `SecrecyOutcome`."""
+    reason: str
+    """The rest of the sentence: the distances of both, and how many times larger the eavesdropper's squared error is."""
     eavesdropper: str
-    relative: Verdict
-    perfect: Verdict
-    relative_by_theory: bool | None
-    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded if there is one; None: theory makes no statement."""
-    relative_from: int | None
-    """The first slot k ≥ 1 from which tr E P_k < tr E Pᵉ_k until the end of the run; None if there is none."""
-    windows: str
-    """The slots of the windows in which relative secrecy failed or was undecided, such as "1 to 124"; empty if in all."""
-    perfect_by_theory: bool | None
-    """J bounded and J_e not; None where theory makes no statement."""
-    ratio: float
-    """Mean error over the slots from `ratio_from` on, eavesdropper's over legitimate; NaN before the first slot."""
-    trials: int
-    judged_by: str
-    """`mean` over trials, or `median` where an error has infinite variance, so that a mean is not meaningful."""
-    unknown: str = "no theory covers these links"
-    """The end of the sentence where theory makes no claim."""
-    ratio_error: float | None = None
-    """Standard error of the ratio; None for one trial, and where an error has infinite variance."""
-    leak: LeakSummary | None = None
-    """The leak of its packets; None where that is unknown."""
-    has_bound: bool = True
-    """Whether a bound of the legitimate error is known, against which the run was tested."""
-    ratio_slots: tuple[int, int] | None = None
-    """The first and the last slot over which the ratio is taken; None before the first slot."""
-    missing: str = ""
-    """What the trials lack for a verdict, as the end of a sentence; empty where more of them would simply scatter less."""
+    """The eavesdropper that decides it."""
+    times: str = ""
+    """How many times the legitimate squared error its own is, with the interval; empty if nothing was measured."""
 
     @property
-    def summary(self) -> SecrecySummary:
-        """The entry of the summary."""
-        return SecrecySummary(
-            relative=self.relative.value,
-            perfect=self.perfect.value,
-            relative_by_theory=self.relative_by_theory,
-            relative_from=self.relative_from,
-            perfect_by_theory=self.perfect_by_theory,
-            judged_by=self.judged_by,
-            sentence=self.sentence,
-            ratio=self.ratio if math.isfinite(self.ratio) else None,
-            ratio_standard_error=self.ratio_error,
-            ratio_from=None if self.ratio_slots is None else self.ratio_slots[0],
-            leak=self.leak,
-        )
+    def headline(self) -> str:
+        """Glyph and word, such as "✓ secret"."""
+        outcome = SecrecyOutcome(self.outcome)
+        return f"{outcome.glyph} {outcome.value}"
 
     @property
     def sentence(self) -> str:
-        """One sentence for the closing report."""
-        theory = "perfect" if self.perfect_by_theory else "relative" if self.relative_by_theory else "no"
-        promise = self.unknown
-        if self.relative_by_theory is not None:
-            promise = f"theory promises {theory} secrecy"
-        if theory == "no" and self.relative_from is not None:
-            promise = f"theory promises relative secrecy from slot {self.relative_from} on"
-        if math.isnan(self.ratio):
-            return f"{self.eavesdropper}: nothing was measured; {promise}"
-        times = "∞" if math.isinf(self.ratio) else estimate(self.ratio, self.ratio_error, ".3g")
-        over = "" if self.ratio_slots is None else " in slots {} to {}".format(*self.ratio_slots)
-        where = f" in slots {self.windows}" if self.windows else ""
-        run = {
-            Verdict.HELD: "relative secrecy held in every window of this run",
-            Verdict.FAILED: f"relative secrecy failed in this run{where}",
-            Verdict.UNDECIDED: f"{self.trials:,} trials are too few to decide{where}{self.missing}"
-            if self.trials > 1
-            else "one trial is not enough for a verdict (try --trials 200)",
-        }[self.relative]
-        if self.perfect is Verdict.HELD:
-            legitimate = "stayed bounded" if self.has_bound else "did not"
-            run = f"perfect secrecy held in this run: its error grew while the legitimate one {legitimate}"
-        if self.judged_by == "median" and self.trials > 1:
-            run += " (judged by medians, because the variance is infinite)"
-        return f"{self.eavesdropper}: {times} × the legitimate error{over}; {run}; {promise}"
+        """Glyph, word and reason."""
+        return f"{self.headline}: {self.reason}"
 
 
 @dataclass(frozen=True)
-class SignTest:
-    """The p-values of two one-sided tests on the mean, or the median, of a quantity."""
+class Compared:
+    """An eavesdropper compared with the legitimate estimator, after the start."""
 
-    above: float
-    """The p-value of the hypothesis that it is 0 or less: small where it is above 0."""
-    below: float
-    """The p-value of the hypothesis that it is 0 or more: small where it is below 0."""
+    eavesdropper: str
+    after_start: AfterStart
+    grows: bool = False
+    """Whether perfect secrecy held: its error grows without bound, by theory as well."""
+    denied: bool = False
+    """Whether theory says that its error is not larger in the long run."""
+    why_open: str = ""
+    """Why nothing can be decided; empty if it is only that the samples scatter."""
 
-
-SignTestOf = Callable[[Floats], SignTest]
-"""Tests a quantity, from its samples (R,)."""
-_NOTHING = SignTest(1.0, 1.0)
-_PROMISED_SLOTS = 10_000  # for which theory is computed at least
-
-
-def sign_of_mean(samples: Floats) -> SignTest:
-    """Tests on the mean of samples (R,), by Student's t and by the same corrected for skewness: the larger p-value counts.
-
-    Source: docs/mathematics.md, verdicts.
-    """
-    tests = student_test(samples, 0.0), skewed_test(samples, 0.0)
-    possible = [test for test in tests if test is not None]
-    if possible:
-        return SignTest(max(test.above for test in possible), max(test.below for test in possible))
-    mean = float(np.mean(samples))
-    if len(samples) < 2 or mean == 0.0 or not math.isfinite(mean):
-        return _NOTHING
-    return SignTest(0.0, 1.0) if mean > 0.0 else SignTest(1.0, 0.0)  # all equal
+    @property
+    def outcome(self) -> SecrecyOutcome:
+        """What it shows."""
+        if math.isnan(self.after_start.ratio) or self.after_start.larger is None:
+            return SecrecyOutcome.BROKEN if self.denied else SecrecyOutcome.OPEN
+        if self.after_start.larger:
+            return SecrecyOutcome.PERFECT if self.grows else SecrecyOutcome.RELATIVE
+        return SecrecyOutcome.BROKEN
 
 
-def sign_of_median(samples: Floats) -> SignTest:
-    """Tests on the median of samples (R,), by the number of them on either side of 0, for any tails."""
-    from scipy.special import bdtr  # noqa: PLC0415 - as above
-
-    count = len(samples)
-    low, high = int(np.count_nonzero(samples <= 0.0)), int(np.count_nonzero(samples >= 0.0))
-    return SignTest(float(bdtr(low, count, 0.5)), float(bdtr(high, count, 0.5)))
-
-
-def rejected(p_values: Mapping[int, float]) -> list[int]:
-    """The hypotheses, by number, that Holm's method rejects: at most one time in a hundred is any of them true.
-
-    Source: docs/mathematics.md, verdicts.
-    """
-    hypotheses = []
-    for place, hypothesis in enumerate(sorted(p_values, key=lambda at: p_values[at])):
-        if p_values[hypothesis] > ERROR_RATE / (len(p_values) - place):
-            break
-        hypotheses.append(hypothesis)
-    return sorted(hypotheses)
-
-
-def relative_verdict(
-    difference: Floats, test: SignTestOf, slots: int, least: Floats | None = None, most: Floats | None = None
-) -> tuple[Verdict, str]:
-    """The verdict on relative secrecy, and the slots in which it failed or is undecided, empty if in all.
-
-    difference: the eavesdropper's mean error less the legitimate one, by window and trial, (WINDOWS, R). One window fails the
-    claim, so the windows share the error rate. All windows must support it, so that each may have the whole rate.
-
-    least, most: the same difference from the largest mean that the legitimate error may have, and that the eavesdropper's may
-    have: `held` must hold of the first of them as well, and `failed` of the second. None: these are the means of the trials.
-    """
-    least, most = (difference if each is None else each for each in (least, most))
-    measured = [w for w, row in enumerate(difference) if not np.isnan(row).any()]
-    tests = {w: test(difference[w]) for w in measured}
-    failed = rejected({w: max(tests[w].below, test(most[w]).below) for w in measured})
-    doubtful = [w for w in measured if max(tests[w].above, test(least[w]).above) > ERROR_RATE]
-    if failed:
-        return Verdict.FAILED, _slots_of(failed, slots)
-    if doubtful or not tests:
-        return Verdict.UNDECIDED, _slots_of(doubtful, slots) if len(doubtful) < len(tests) else ""
-    return Verdict.HELD, ""
-
-
-def _slots_of(windows: list[int], slots: int) -> str:
-    """The slots of some windows in words: "1 to 124, 625 to 749"."""
-    bounds = window_bounds(slots)
-    return ", ".join(f"{bounds[window]} to {bounds[window + 1] - 1}" for window in windows)
-
-
-def perfect_verdict(eavesdropper: Floats, legitimate: Floats, bound: float, test: SignTestOf) -> Verdict:
-    """Held if the eavesdropper's error grows from the first to the last quarter and the legitimate error stays within `bound`.
-
-    bound: not finite if none is known. Then the legitimate error must not grow; if it does, it may still be bounded.
-    """
-    quarter = WINDOWS // 4
-    if np.isnan(eavesdropper).any():
-        return Verdict.UNDECIDED
-    growth, legitimate_growth = (
-        test(error[-quarter:].mean(axis=0) - error[:quarter].mean(axis=0)) for error in (eavesdropper, legitimate)
-    )
-    highest = bound + _ROUNDING * float(np.mean(eavesdropper))
-    has_bound = math.isfinite(bound)
-    excess = test(legitimate[-quarter:].mean(axis=0) - highest) if has_bound else _NOTHING
-    if rejected({0: growth.below, 1: excess.above}):
-        return Verdict.FAILED
-    stays = has_bound or legitimate_growth.above > ERROR_RATE
-    return Verdict.HELD if growth.above <= ERROR_RATE and stays else Verdict.UNDECIDED
-
-
-def secrecy(of_legitimate: tuple[Tally, Expectation], of_eavesdropper: tuple[str, Tally, Expectation]) -> Secrecy:
-    """The verdict on one eavesdropper, from both tallies and what theory expects of both receivers."""
-    (legitimate, legitimate_theory), (name, other, other_theory) = of_legitimate, of_eavesdropper
-    # A lower bound can support a promise, but cannot deny one.
-    bounded = other_theory.bound is not None
-    theirs = other_theory.bound or other_theory
-    both_known = legitimate_theory.known and theirs.known
-    legitimate_bound = legitimate_theory.limit if legitimate_theory.known else math.inf
-    perfect_by_theory = (math.isfinite(legitimate_bound) and math.isinf(theirs.limit)) or (None if bounded else False)
-    # A limit too large to be computed neither promises nor denies anything.
-    perfect_by_theory = perfect_by_theory if both_known and not math.isnan(legitimate_bound + theirs.limit) else None
-    complete = legitimate.done == legitimate.slots
-    # What theory promises does not depend on how soon a run was interrupted, but must not take long then.
-    slots = legitimate.slots if complete else min(legitimate.slots, max(legitimate.done, _PROMISED_SLOTS))
-    legitimate_is_bounded = math.isfinite(legitimate_bound) or not legitimate_theory.has_limit
-    holds_from = _holds_from(legitimate_theory.alike, theirs.alike, slots)
-    always = legitimate_is_bounded and slots > 1 and holds_from == 1
-    legitimate_means, other_means = window_means(legitimate), window_means(other)
-    heavy = legitimate_theory.infinite_variance or other_theory.infinite_variance
-    test = sign_of_median if heavy else sign_of_mean
-    relative, windows, missing = Verdict.UNDECIDED, "", ""
-    if complete:
-        difference = other_means - legitimate_means
-        relative, windows = relative_verdict(difference, test, slots)
-        if not heavy and relative is not Verdict.UNDECIDED:
-            least = other_means - largest_means(legitimate_theory, legitimate_means, slots)
-            most = largest_means(other_theory, other_means, slots) - legitimate_means
-            plain, (relative, windows) = relative, relative_verdict(difference, test, slots, least, most)
-            if relative is Verdict.UNDECIDED:
-                in_doubt = (
-                    (LEGITIMATE, legitimate, legitimate_theory)
-                    if plain is Verdict.HELD
-                    else (name, other, other_theory)
-                )
-                missing = _missing(*in_doubt)
-    if not legitimate_theory.has_limit:
-        perfect = Verdict.UNDECIDED
-    elif perfect_by_theory is False:
-        perfect = Verdict.FAILED
+def verdict_on(compared: Compared, unit: str = "", *, best: bool = False) -> Verdict:
+    """The verdict on an eavesdropper; unit: of the distances; best: whether it is the best one of several."""
+    name, values, outcome = compared.eavesdropper, compared.after_start, compared.outcome
+    if math.isnan(values.ratio):
+        return Verdict(outcome.value, compared.why_open or "nothing was measured", name)
+    who = f"the best eavesdropper ({name})" if best else name
+    times = times_text(values.ratio, values.interval)
+    if values.distances is None:
+        numbers = f"{who} has {times} the estimator's squared error"
     else:
-        perfect = (
-            perfect_verdict(other_means, legitimate_means, legitimate_bound, test) if complete else Verdict.UNDECIDED
-        )
-    ratio, scatter, ratio_slots = ratio_of((legitimate, legitimate_theory), other)
-    return Secrecy(
-        name,
-        relative,
-        perfect,
-        (always or (None if bounded else False)) if both_known else None,
-        holds_from if both_known and legitimate_is_bounded else None,
-        windows,
-        perfect_by_theory,
-        ratio,
-        legitimate.trials,
-        "median" if heavy else "mean",
-        unknown=_unknown(other_theory),
-        ratio_error=None if heavy else scatter,
-        leak=None if other.leak is None else other.leak.summary,
-        has_bound=math.isfinite(legitimate_bound),
-        ratio_slots=ratio_slots,
-        missing=missing,
-    )
+        ours, theirs = (distance_text(distance, unit) for distance in values.distances)
+        numbers = f"the estimator is {ours} off, {who} {theirs}: {times} the squared error"
+    if values.in_one_trial:
+        numbers += ", in this trial"
+    match outcome:
+        case SecrecyOutcome.BROKEN:
+            knows = "more than" if values.ratio < _SMALLER else "as much as"
+            if compared.denied and values.larger is None:
+                return Verdict(outcome.value, f"theory gives {name} no larger error; {numbers}", name, times)
+            return Verdict(outcome.value, f"{name} knows {knows} the estimator; {numbers}", name, times)
+        case SecrecyOutcome.OPEN:
+            return Verdict(outcome.value, f"{compared.why_open or values.why_open}; {numbers}", name, times)
+        case SecrecyOutcome.PERFECT:
+            return Verdict(outcome.value, f"{numbers}, and growing", name, times)
+        case SecrecyOutcome.RELATIVE:
+            return Verdict(outcome.value, numbers, name, times)
 
 
-def ratio_of(
-    of_legitimate: tuple[Tally, Expectation], other: Tally
-) -> tuple[float, float | None, tuple[int, int] | None]:
-    """The ratio of two mean errors, the eavesdropper's over the legitimate one, its standard error, and its slots.
-
-    Over the second half of the run, so that the start, in which few packets decide, does not count; over all slots of a run
-    that was cut short or is not longer than its first half. inf if the legitimate error is only rounding; NaN without slots.
-    """
-    legitimate, theory = of_legitimate
-    if not legitimate.done:
-        return math.nan, None, None
-    first = int(window_bounds(legitimate.slots)[WINDOWS // 2])
-    if legitimate.done == other.done == legitimate.slots and first < legitimate.slots:
-        theirs, ours = (tally.window_errors[WINDOWS // 2 : WINDOWS].sum(axis=0) for tally in (other, legitimate))
-    else:
-        first, (theirs, ours) = 0, (tally.window_errors.sum(axis=0) for tally in (other, legitimate))
-    over, under = float(np.mean(theirs)), float(np.mean(ours))
-    alike = legitimate.alike and other.alike
-    slots = (first, legitimate.done - 1)
-    if not under or theory.is_rounding(under / (slots[1] + 1 - first), legitimate.done):
-        return math.inf, None, slots
-    return over / under, ratio_error(theirs, ours) if alike else None, slots
+def verdict_of(compared: Iterable[Compared], unit: str = "") -> Verdict | None:
+    """The verdict on all eavesdroppers: the one that knows most decides, since one can break secrecy. None without any."""
+    several = list(compared)
+    if not several:
+        return None
+    decisive = min(several, key=lambda each: (_ORDER.index(each.outcome), _sortable(each.after_start.ratio)))
+    return verdict_on(decisive, unit, best=len(several) > 1)
 
 
-def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
-    """What a receiver's mean errors by window may be, given those of the trials, (WINDOWS, R): (WINDOWS, 1).
-
-    Theory's expectation where it is known. Where theory only knows a model of what moves the states, the mean of the trials and
-    what rare events carry of the model's expectation. Otherwise what an event that none of R trials met may add to their mean:
-    it has a probability of at most 4.6/R, or one of them would have met it in 99 of 100 studies. The error is then taken to be
-    that of the heaviest trial, or, where too few trials lose the first packet, that of a receiver without packets.
-
-    Source: docs/mathematics.md, verdicts.
-    """
-    trials = means.shape[1]
-    if theory.known:
-        expected = _window_averages(theory.stream(), slots)
-        if not theory.of_model:
-            return expected
-        streaks = theory.streaks(slots)
-        rare = 1.0 if streaks is None else streaks.fraction(trials)
-        return np.asarray(means.mean(axis=1, keepdims=True) + rare * expected)
-    heaviest = means.max(axis=1, keepdims=True)
-    lost = math.nan if theory.link is None else 1.0 - float(theory.link.rates(range(1))[0])
-    if math.isnan(lost) or 0.0 < lost * trials < RARE:
-        heaviest = np.maximum(heaviest, _window_averages(TheoreticalCovariance(theory.process, NOBODY), slots))
-    return np.asarray(means.mean(axis=1, keepdims=True) - math.log(ERROR_RATE) / trials * heaviest)
+def verdict_so_far(
+    ours: BatchMeans, theirs: Sequence[tuple[str, BatchMeans]], unit: str = "", noise: float = 0.0
+) -> Verdict | None:
+    """The verdict on the slots of a run so far, from the mean errors of their batches; noise: tr Q."""
+    compared = []
+    for name, batches in theirs:
+        values = AfterStart.of_batches(ours, batches, noise)
+        compared.append(Compared(name, values, why_open="" if values.larger is not None else "too early"))
+    return verdict_of(compared, unit)
 
 
-def _window_averages(stream: TheoreticalTraceStream, slots: int) -> Floats:
-    """The mean of theoretical traces over the slots of each window, (WINDOWS, 1); NaN for windows without slots."""
-    sums = np.zeros(WINDOWS + 1)
-    for part in parts_of(range(slots)):
-        np.add.at(sums, window_of(np.arange(part.start, part.stop), slots), stream.next_traces(len(part)))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        averages: Floats = (sums[:WINDOWS] / np.diff(window_bounds(slots)))[:, None]
-    return averages
+def _sortable(ratio: float) -> float:
+    return math.inf if math.isnan(ratio) else ratio
 
 
-def _missing(name: str, tally: Tally, theory: Expectation) -> str:
-    """What the trials lack for a verdict that they would otherwise support, as the end of a sentence."""
-    if not theory.known:
-        return f": no closed form bounds the error of {name} in events that none of them met"
-    rare = rare_events_of(theory, tally)
-    ways = "montecarlo --rare estimates its mean"
-    if rare is not None and rare.fraction > RARE_FRACTION and math.isfinite(rare.trials):
-        ways = f"{count_text(rare.trials)} trials would contain them, and {ways}"
-    return f": theory expects a larger error of {name}, which rare events carry; {ways}"
+def times_text(ratio: float, interval: tuple[float, float] | None = None) -> str:
+    """A ratio with two digits and its interval, such as "17 × [13, 22]"."""
+    between = "" if interval is None else " [{}, {}]".format(*map(_two_digits, interval))
+    return f"{_two_digits(ratio)} ×{between}"
 
 
-def _unknown(theory: Expectation) -> str:
-    """Why theory makes no claim about an eavesdropper, as the end of a sentence."""
-    if theory.assumed:
-        return "what theory expects of these states is not known"
-    return "no closed form of its error is known" if theory.outcomes_at is None else Secrecy.unknown
+def distance_text(distance: float, unit: str = "") -> str:
+    """A distance with two digits and its unit, such as "0.32 m"."""
+    return f"{_two_digits(distance)} {unit}".rstrip()
 
 
-@lru_cache(maxsize=64)
-def _holds_from(legitimate: Alike, other: Alike, slots: int) -> int | None:
-    """The first slot k ≥ 1 from which theory expects the other's error to be larger up to slot slots−1; None without one."""
-    streams, first = (legitimate.expectation.stream(), other.expectation.stream()), 1
-    for part in parts_of(range(slots)):
-        smaller, larger = (stream.next_traces(len(part)) for stream in streams)
-        wrong = np.flatnonzero(~(larger - smaller > 0.0))
-        if wrong.size:
-            first = max(1, part.start + int(wrong[-1]) + 1)
-    return first if first < slots else None
-
-
-class SecrecyVerdict(StrEnum):
-    """How much a scheme keeps secret from an adversary, in a word."""
-
-    PERFECT = "perfect"
-    RELATIVE = "relative"
-    UNDECIDED = "too few trials to tell"
-    BROKEN = "broken"
-
-
-MARKS = {
-    SecrecyVerdict.PERFECT: "●",
-    SecrecyVerdict.RELATIVE: "◐",
-    SecrecyVerdict.UNDECIDED: "?",
-    SecrecyVerdict.BROKEN: "✕",
-}
-"""Verdicts as marks that can be distinguished without colours."""
+def _two_digits(number: float) -> str:
+    if not math.isfinite(number):
+        return "∞"
+    digits = f"{number:.2g}".replace("e+0", "e").replace("e+", "e").replace("e-0", "e-")
+    if "e" in digits and 1e-4 <= abs(number) < 999_500:
+        return f"{float(digits):,.0f}" if abs(number) >= 1 else f"{float(digits):f}".rstrip("0")
+    return digits

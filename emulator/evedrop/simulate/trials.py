@@ -219,6 +219,8 @@ def _add(block: TrialBlock, mode: Mode, rows: slice, chunk: Chunk, expected: Map
         tally = block.run_tally.tallies[name]
         tally.watched.add_slots(ScoredSlots(chunk.first, error, action, sums.trace, expected[name]))
         tally.add_slots(chunk.first, error, sums, expected[name])
+        if tally.distance is not None:
+            tally.distance.add_slots(chunk.first, error)
         if (
             tally.conditional is not None and mode is not Mode.COVARIANCE_ONLY
         ):  # there, the error is its own expectation

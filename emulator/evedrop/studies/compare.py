@@ -33,7 +33,7 @@ from evedrop.results.folder import (
 from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.theory import Expectation, expectations_of
+from evedrop.scenario.theory import Expectation, error_floor_of, expectations_of
 from evedrop.score.leak import revealed_by_packets
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.scorekeeper import verdicts
@@ -148,7 +148,8 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
 def _cells(group: Group, totals: Mapping[str, Tally]) -> dict[str, Cell]:
     expected = expectations_of(group.scenario)
     measured = {name: _measured(group.scenario, name, tally, expected[name]) for name, tally in totals.items()}
-    secrecy = {estimate.eavesdropper: estimate for estimate in verdicts(totals, expected)}
+    each, _ = verdicts(group.scenario, totals, expected)
+    secrecy = {estimate.eavesdropper: estimate for estimate in each}
     return {
         estimate.adversary: Cell(
             estimate, measured[LEGITIMATE], measured[estimate.receiver], secrecy[estimate.receiver]
@@ -213,12 +214,10 @@ def _theory(scenario: Scenario, receiver: str, expected: Expectation) -> Theory 
     if usable is not None:
         traces = usable.traces(scenario.slots)
         return Theory(float(np.mean(traces)), float(traces[-1]), usable.limit, usable is not expected)
-    if receiver == LEGITIMATE or receiver in scenario.leaks or expected.assumed:
+    bound = error_floor_of(scenario, receiver)
+    if bound is None:
         return None
-    scenario_theory = scheme_of(scenario.process.process, scenario.encoding.spec).error_floor(scenario.slots)
-    if scenario_theory is None:
-        return None
-    floor, grows = scenario_theory
+    floor, grows = bound
     return Theory(float(np.mean(floor)), float(floor[-1]), math.inf if grows else None, True)
 
 

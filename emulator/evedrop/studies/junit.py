@@ -53,7 +53,7 @@ def _add(suite: ET.Element, tested: Finding) -> None:
         "testcase",
         {"classname": printable(where), "name": printable(path.stem), "time": f"{tested.seconds:.3f}"},
     )
-    attributes = {"seed": tested.seed, "results": tested.folder, "report": tested.report}
+    attributes = {"seed": tested.seed, "results": tested.folder, "report": tested.report, "verdict": tested.verdict}
     if any(value is not None for value in attributes.values()):
         properties = ET.SubElement(case, "properties")
         for name, value in attributes.items():

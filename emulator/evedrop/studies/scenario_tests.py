@@ -99,6 +99,8 @@ class Finding:
     """The results folder."""
     report: Path | None = None
     """Its report.html; None if it has no report."""
+    verdict: str | None = None
+    """The sentence of the run's verdict; None without an eavesdropper, and if the scenario could not be run."""
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -152,10 +154,13 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
     except UsageError as error:
         return ended(Outcome.MISTAKES, [str(error)], seed=made.seed)
     except RunError as error:
-        kept = {"seed": made.seed, "folder": folder, "report": try_report(folder) if has_results(folder) else None}
-        return ended(Outcome.BROKEN, str(error).splitlines(), **kept)
-    kept = {"seed": made.seed, "folder": folder, "report": try_report(folder)}
-    reasons = list(_reasons(Results.read(folder).typed_summary.expectations))
+        page = try_report(folder) if has_results(folder) else None
+        return ended(Outcome.BROKEN, str(error).splitlines(), seed=made.seed, folder=folder, report=page)
+    kept: dict[str, Any] = {"seed": made.seed, "folder": folder, "report": try_report(folder)}
+    summary = Results.read(folder).typed_summary
+    reasons = list(_reasons(summary.expectations))
+    if summary.verdict is not None:
+        kept["verdict"] = summary.verdict.sentence
     return ended(Outcome.FAILED if reasons else Outcome.PASSED, reasons, **kept)
 
 

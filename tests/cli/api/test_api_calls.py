@@ -155,14 +155,14 @@ def test_metrics_are_attributes_with_types(results: RunResults) -> None:
 def test_results_are_short_when_printed_and_a_table_in_a_notebook(results: RunResults) -> None:
     """Texts of the scenario are escaped."""
     assert repr(results).startswith(
-        "<RunResults of '<Small> & quick': 12 slots, 4 trials, in memory (exact); mean error: legitimate 0."
+        "<RunResults of '<Small> & quick': ? cannot tell yet; 12 slots, 4 trials, in memory (exact); mean error: legitimate 0."
     )
     assert len(repr(results)) < 150
     html = results._repr_html_()
     assert "&lt;Small&gt; &amp; quick" in html
     assert "<Small>" not in html
     assert html.count("<tr>") == 3
-    for sentence in closing.verdicts(results.typed_summary):
+    for sentence in closing.details(results.typed_summary):
         assert sentence.split(";")[0] in html
 
 

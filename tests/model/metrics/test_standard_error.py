@@ -304,7 +304,7 @@ def test_the_error_of_a_ratio_is_that_of_leaving_trials_out() -> None:
 
 def report_of(summary: Summary, capsys: pytest.CaptureFixture[str]) -> str:
     """The closing report of a summary."""
-    print_summary(summary, "folder")
+    print_summary(summary, "folder", verbose=True)
     return capsys.readouterr().out
 
 
@@ -322,6 +322,8 @@ def test_the_report_says_where_rare_events_carry_the_error(capsys: pytest.Captur
         "more than 99 % of its expected error is carried by events that are expected fewer than 20 times in 40 trials"
     )
     assert message in report_of(few, capsys)
+    print_summary(few, "folder")
+    assert "1 of the means above is uncertain; --verbose says why" in capsys.readouterr().out
     assert many.peers["legitimate"].rare_events is not None
     assert many.peers["legitimate"].rare_events.fraction < RARE_FRACTION
     for summary in (many, single):

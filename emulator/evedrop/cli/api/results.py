@@ -18,6 +18,7 @@ from evedrop.model.metrics.text import number_text
 from evedrop.results.comparison import Comparison
 from evedrop.results.reading import ByName, Results
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary, Summary
+from evedrop.score.verdict import Verdict
 from evedrop.show.report import closing
 from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.comparison import pairs_table, schemes_table
@@ -99,6 +100,11 @@ class RunResults(Results, ReportedResults):
         return ByName("verdict on", self._typed.secrecy)
 
     @property
+    def verdict(self) -> Verdict | None:
+        """Whether the state is kept secret from all eavesdroppers, as every report says it; None without any."""
+        return self._typed.verdict
+
+    @property
     def expectations(self) -> list[Judged]:
         """The expectations of the scenario, and whether each held."""
         return list(self._typed.expectations)
@@ -114,7 +120,10 @@ class RunResults(Results, ReportedResults):
     def _notes(self) -> Iterator[str]:
         if self.remark is not None:
             yield self.remark
-        for lines in (closing.remarks, closing.verdicts, closing.doubts, closing.application_lines):
+        if self.verdict is not None:
+            yield self.verdict.sentence
+        yield from (line for _, line in closing.verdict_lines(self._typed))
+        for lines in (closing.remarks, closing.details, closing.doubts, closing.application_lines):
             yield from lines(self._typed)
         yield from (expectation.sentence for expectation in self.expectations)
 
@@ -137,7 +146,10 @@ class RunResults(Results, ReportedResults):
             f"{name} {number_text(shown_metric(peer.all_metrics, error), '.3g')}" for name, peer in self.peers.items()
         ]
         remark = "" if self.remark is None else "; incomplete"
-        return f"<RunResults of {self._typed.scenario!r}: {self._facts}; mean error: {', '.join(errors)}{remark}>"
+        verdict = "" if self.verdict is None else f"{self.verdict.headline}; "
+        return (
+            f"<RunResults of {self._typed.scenario!r}: {verdict}{self._facts}; mean error: {', '.join(errors)}{remark}>"
+        )
 
     def _tables(self) -> list[TextTable]:
         directions = self._typed.directions

@@ -63,9 +63,9 @@ def _run(options: argparse.Namespace) -> FinishedRun:
                     hosts=hosts,
                 )
             except (RunError, Interrupted):
-                print_so_far(line.moved or folder, options.json)
+                print_so_far(line.moved or folder, options)
                 raise
-        print_so_far(ended.folder, options.json)
+        print_so_far(ended.folder, options)
     return ended
 
 

@@ -34,9 +34,9 @@ def montecarlo(options: argparse.Namespace) -> int:
             try:
                 status = simulate(scenario, folder, line.on_event, plan, resume=options.resume)
             except Interrupted:
-                print_so_far(line.moved or folder, options.json)
+                print_so_far(line.moved or folder, options)
                 raise
-        print_so_far(line.moved or folder, options.json)
+        print_so_far(line.moved or folder, options)
     return status
 
 

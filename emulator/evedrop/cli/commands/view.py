@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import Command, argument, hold, number_type, served
+from evedrop.cli.options import Command, argument, hold, number_type, served, verbose
 from evedrop.cli.tables import tables
 from evedrop.errors import UsageError
 
@@ -38,7 +38,7 @@ def view(options: argparse.Namespace) -> int:
         from evedrop.results.reading import results_of_this_version
 
         with results_of_this_version(options.run):
-            print_results(options.run)
+            print_results(options.run, verbose=options.verbose)
         print_report_line(options.run)
         return 0
     from evedrop.results.reading import Results
@@ -222,6 +222,7 @@ def _shown(parser: argparse.ArgumentParser) -> None:
     instead.add_argument(
         "--video", type=Path, metavar="FILE.mp4|gif", help="draw some slots as a video instead; needs no screen"
     )
+    verbose(parser)
     instead.add_argument("--table", action="store_true", help="print its table and sentences instead")
     moment = parser.add_mutually_exclusive_group()
     moment.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default the most telling one")

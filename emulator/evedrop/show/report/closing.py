@@ -23,6 +23,7 @@ from evedrop.score.summary import (
     Summary,
     failed,
 )
+from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.text_table import TextColumn, TextTable
 
 
@@ -44,11 +45,24 @@ def heading(summary: Summary) -> str:
 
 
 def outcome(summary: Summary) -> tuple[str, bool | None]:
-    """The outcome of a run in a sentence, and whether it is good; None if there is nothing to judge."""
+    """The verdict on a run and how its expectations ended, in sentences, and whether that is good; None if that is open."""
     sentence, good = expectations_outcome(summary.expectations, "scenario")
     if summary.ended != "complete":
-        return f"{summary.ended.splitlines()[0]}; {sentence}", False
-    return sentence[0].upper() + sentence[1:], good
+        sentence, good = f"{summary.ended.splitlines()[0]}; {sentence}", False
+    sentence = sentence[0].upper() + sentence[1:]
+    if summary.verdict is None:
+        return sentence, good
+    secret = _GOOD[SecrecyOutcome(summary.verdict.outcome)]
+    both = secret if good is not False else False
+    return f"{summary.verdict.sentence}. {sentence}", both
+
+
+_GOOD = {
+    SecrecyOutcome.PERFECT: True,
+    SecrecyOutcome.RELATIVE: True,
+    SecrecyOutcome.OPEN: None,
+    SecrecyOutcome.BROKEN: False,
+}
 
 
 def expectations_outcome(expectations: Sequence[Judged], of: str) -> tuple[str, bool | None]:
@@ -136,8 +150,20 @@ def remarks(summary: Summary) -> Iterator[str]:
         yield _loop_line(summary.controller)
 
 
-def verdicts(summary: Summary) -> Iterator[str]:
-    """The verdicts on secrecy, and what hidden packets revealed."""
+def verdict_lines(summary: Summary) -> Iterator[tuple[SecrecyOutcome, str]]:
+    """For each of several eavesdroppers, the outcome and a line: the verdict, its name, and the ratio of errors."""
+    verdicts = {name: entry.verdict for name, entry in summary.secrecy.items() if entry.verdict is not None}
+    if len(verdicts) < 2:  # the verdict on all says the same
+        return
+    words = max((len(verdict.headline) for verdict in verdicts.values()), default=0)
+    names = max(map(len, verdicts), default=0)
+    for name, verdict in verdicts.items():
+        times = f"{verdict.times} its squared error" if verdict.times else ""
+        yield SecrecyOutcome(verdict.outcome), f"{verdict.headline:{words}}  {name:{names}}  {times}".rstrip()
+
+
+def details(summary: Summary) -> Iterator[str]:
+    """What run and theory say about secrecy against each eavesdropper, and what hidden packets revealed."""
     for name, verdict in summary.secrecy.items():
         yield verdict.sentence
         if verdict.leak is not None and verdict.leak.bits > 0.0:

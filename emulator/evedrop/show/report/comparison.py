@@ -11,20 +11,11 @@ from typing import TYPE_CHECKING
 
 from evedrop.model.metrics.text import ShownNumber, estimate, fraction_text, number_text
 from evedrop.score.summary import RARE_FRACTION
-from evedrop.score.verdict import MARKS, SecrecyVerdict
 from evedrop.show.report.closing import rare_events_words
 from evedrop.show.report.text_table import TextTable
 
 if TYPE_CHECKING:
     from evedrop.results.comparison import Cell, Comparison, SimulatedError
-
-WORDS = {
-    SecrecyVerdict.PERFECT: "perfect",
-    SecrecyVerdict.RELATIVE: "relative",
-    SecrecyVerdict.UNDECIDED: "too few",
-    SecrecyVerdict.BROKEN: "broken",
-}
-"""Each verdict in a word."""
 
 
 def comparison_heading(comparison: Comparison) -> str:
@@ -107,7 +98,7 @@ def theory(of: SimulatedError) -> str:
 
 def verdict(cell: Cell) -> str:
     """The mark and the word of a cell's verdict."""
-    return "–" if cell.verdict is None else f"{MARKS[cell.verdict]} {WORDS[cell.verdict]}"
+    return "–" if cell.verdict is None else f"{cell.verdict.glyph} {cell.verdict.value}"
 
 
 def _rare_fraction(of: SimulatedError | None) -> float:

@@ -11,19 +11,19 @@ from markupsafe import Markup
 
 from evedrop.model.metrics.text import estimate
 from evedrop.results.comparison import Cell, Comparison, read_comparison
-from evedrop.score.verdict import SecrecyVerdict
+from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.comparison import comparison_lines, pairs_table, schemes_table, verdict
 from evedrop.show.report.page import made
 from evedrop.show.view import palette
 from evedrop.show.view.palette import hexadecimal
 
 _GROUND = {
-    SecrecyVerdict.PERFECT: palette.PERFECT,
-    SecrecyVerdict.RELATIVE: palette.RELATIVE,
-    SecrecyVerdict.UNDECIDED: palette.UNDECIDED,
-    SecrecyVerdict.BROKEN: palette.BROKEN,
+    SecrecyOutcome.PERFECT: palette.PERFECT,
+    SecrecyOutcome.RELATIVE: palette.RELATIVE,
+    SecrecyOutcome.OPEN: palette.UNDECIDED,
+    SecrecyOutcome.BROKEN: palette.BROKEN,
 }
-_INK = {SecrecyVerdict.PERFECT: "#fff"}
+_INK = {SecrecyOutcome.PERFECT: "#fff"}
 _DARK = "#16191d"
 
 
@@ -43,7 +43,7 @@ class ComparisonSource:
     def outcome(self) -> str:
         """How many pairs have each verdict, as a sentence."""
         verdicts = [cell.verdict for scheme in self.comparison.schemes.values() for cell in scheme.cells.values()]
-        counts = [(word, verdicts.count(word)) for word in SecrecyVerdict]
+        counts = [(word, verdicts.count(word)) for word in SecrecyOutcome]
         counted = ", ".join(f"{count:,} {word.value}" for word, count in counts if count)
         return f"Secrecy of {sum(count for _, count in counts):,} pairs of scheme and adversary: {counted}"
 

@@ -18,6 +18,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from evedrop.errors import UsageError
+from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.view import palette
 from evedrop.show.view.palette import hexadecimal
@@ -51,6 +52,12 @@ class Page:
     good: bool | None
     """Whether the outcome is good; None if there is nothing to judge."""
     parts: Sequence[Part]
+
+    @property
+    def mark(self) -> str:
+        """The glyph before the outcome; empty if the outcome begins with one, as a verdict does."""
+        begins = self.outcome[:2] in {f"{outcome.glyph} " for outcome in SecrecyOutcome}
+        return "" if begins else {True: "✓ ", False: "✕ ", None: ""}[self.good]
 
     @property
     def html(self) -> str:

@@ -231,7 +231,8 @@ _MOST_TEXT = 40_000
 
 def _verdicts(of: RunSource) -> Iterator[Markup]:
     """What the run shows about secrecy, in sentences."""
-    lines = [*closing.verdicts(of.summary), *closing.doubts(of.summary), *closing.application_lines(of.summary)]
+    each = [line for _, line in closing.verdict_lines(of.summary)]
+    lines = [*each, *closing.details(of.summary), *closing.doubts(of.summary), *closing.application_lines(of.summary)]
     surprise = closing.surprise(of.summary)
     yield made("sentences", [*lines, *([surprise] if surprise is not None else [])])
 

@@ -26,7 +26,7 @@ from evedrop.model.receiver import NOTHING, SILENT
 from evedrop.results.reading import Results
 from evedrop.scenario.arguments import refuse_unless
 from evedrop.scenario.recorded import recorded, recorded_noise
-from evedrop.score.verdict import MARKS, SecrecyVerdict
+from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.view import palette
 from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
 from evedrop.show.view.figure_style import drawing, panels
@@ -278,22 +278,22 @@ def _positions(values: list[Any]) -> list[float]:
 
 # Blue for secrecy kept, darker where perfect; orange for broken: distinct with any colour blindness, and in greyscale.
 _GROUND = {
-    SecrecyVerdict.PERFECT: hexadecimal(palette.PERFECT),
-    SecrecyVerdict.RELATIVE: hexadecimal(palette.RELATIVE),
-    SecrecyVerdict.UNDECIDED: hexadecimal(palette.UNDECIDED),
-    SecrecyVerdict.BROKEN: hexadecimal(palette.BROKEN),
+    SecrecyOutcome.PERFECT: hexadecimal(palette.PERFECT),
+    SecrecyOutcome.RELATIVE: hexadecimal(palette.RELATIVE),
+    SecrecyOutcome.OPEN: hexadecimal(palette.UNDECIDED),
+    SecrecyOutcome.BROKEN: hexadecimal(palette.BROKEN),
 }
 _INK = {
-    SecrecyVerdict.PERFECT: "white",
-    SecrecyVerdict.RELATIVE: "#10202e",
-    SecrecyVerdict.UNDECIDED: "#3c3c3c",
-    SecrecyVerdict.BROKEN: "#2a1200",
+    SecrecyOutcome.PERFECT: "white",
+    SecrecyOutcome.RELATIVE: "#10202e",
+    SecrecyOutcome.OPEN: "#3c3c3c",
+    SecrecyOutcome.BROKEN: "#2a1200",
 }
 _SAID = {
-    SecrecyVerdict.PERFECT: "perfect: its error grows without bound",
-    SecrecyVerdict.RELATIVE: "relative: it stays above the legitimate error",
-    SecrecyVerdict.UNDECIDED: "too few trials to tell",
-    SecrecyVerdict.BROKEN: "broken",
+    SecrecyOutcome.PERFECT: "perfectly secret: its error grows without bound",
+    SecrecyOutcome.RELATIVE: "secret: it stays above the legitimate error",
+    SecrecyOutcome.OPEN: "cannot tell yet",
+    SecrecyOutcome.BROKEN: "not secret",
 }
 _NOTABLE = 1.1  # the factor by which an attack must raise the legitimate error to be noted
 _FACTS = ("legitimate\nerror", "ACKs", "bits\na slot", "energy\na slot", "secret bits\na slot (+ once)")
@@ -373,7 +373,7 @@ def _cell(axes: Axes, column: int, row: int, scheme: SchemeResult, cell: Cell) -
         axes.text(column + 0.5, row, "·", ha="center", va="center", color="#9aa0a6", fontsize=9)
         return
     axes.add_patch(Rectangle(**box, facecolor=_GROUND[word]))
-    axes.text(column + 0.5, row - 0.17, MARKS[word], ha="center", va="center", color=_INK[word], fontsize=11)
+    axes.text(column + 0.5, row - 0.17, word.glyph, ha="center", va="center", color=_INK[word], fontsize=11)
     legitimate = cell.legitimate.typical / scheme.legitimate.typical if scheme.legitimate.typical else math.inf
     raised = f"\nlegitimate {_number(legitimate)}×" if legitimate > _NOTABLE else ""
     axes.text(
@@ -393,7 +393,7 @@ def _legend(axes: Axes, comparison: Comparison, left: float) -> None:
     place = -left - 1.9
     for word, meaning in _SAID.items():
         axes.add_patch(Rectangle((place, rows - 0.12), 0.42, 0.44, facecolor=_GROUND[word], linewidth=0))
-        axes.text(place + 0.21, rows + 0.1, MARKS[word], ha="center", va="center", color=_INK[word], fontsize=9.5)
+        axes.text(place + 0.21, rows + 0.1, word.glyph, ha="center", va="center", color=_INK[word], fontsize=9.5)
         axes.text(place + 0.52, rows + 0.1, meaning, ha="left", va="center", fontsize=8.8)
         place += 1.0 + 0.092 * len(meaning)
     notes = [

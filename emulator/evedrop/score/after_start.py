@@ -1,0 +1,166 @@
+"""The error of an eavesdropper compared with the legitimate one after the start of a run, on which a verdict rests.
+
+The first half of a run does not count: there, few packets decide. Several trials are the samples of a comparison. A single trial,
+and a run that has not ended, is divided into batches of consecutive slots instead.
+
+Source: docs/mathematics.md, verdicts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self, final
+
+import numpy as np
+
+from evedrop.model.digest import added_in_order
+from evedrop.model.kernels.current import kernels
+from evedrop.model.process import Floats
+
+ERROR_RATE = 0.01
+"""Of a verdict: how often it may be given in error."""
+AS_MUCH = 1.25
+"""An eavesdropper knows as much as the legitimate estimator if its squared error is at most this many times as large."""
+_MOST, _FEWEST, _SHORTEST = 32, 8, 8
+"""Batches before neighbours are joined; batches in the second half, and slots of a batch, that a comparison needs."""
+_ROUNDING = 1e-6
+"""The fraction of tr Q below which a squared error is only that of rounding."""
+_CORRELATION = 0.9  # the largest correlation of neighbouring batches that is corrected for
+_LARGEST = 1e300
+
+
+@dataclass(frozen=True)
+class AfterStart:
+    """An eavesdropper's squared error compared with the legitimate one."""
+
+    ratio: float
+    """The eavesdropper's mean squared error over the legitimate one; inf if the latter is only rounding, NaN without slots."""
+    interval: tuple[float, float] | None = None
+    """Of the ratio, at 99 %; None if it is not known."""
+    larger: bool | None = None
+    """Whether the eavesdropper's error is larger; False: at most `AS_MUCH` times as large. None: the samples do not decide it."""
+    distances: tuple[float, float] | None = None
+    """How far the estimates are off, root mean square: the legitimate estimator's and the eavesdropper's; None if not known."""
+    why_open: str = ""
+    """Why `larger` is None, as a clause."""
+    in_one_trial: bool = False
+    """Whether the samples are batches of slots."""
+
+    @classmethod
+    def of_batches(cls, ours: BatchMeans, theirs: BatchMeans, noise: float = 0.0) -> Self:
+        """A comparison by batches, whose mean errors are positive; noise: tr Q.
+
+        Tests the mean of the logarithm of the ratio by Student's t, with the variance for correlated batches.
+        """
+        over, under = theirs.later, ours.later
+        if not len(under):
+            return cls(math.nan, in_one_trial=True)
+        distances = math.sqrt(float(under[:, 1].mean())), math.sqrt(float(over[:, 1].mean()))
+        floor = max(_ROUNDING * noise, np.finfo(float).tiny)
+        mean, other = float(under[:, 0].mean()), float(over[:, 0].mean())
+        ratio = 1.0 if max(mean, other) <= floor else math.inf if mean <= floor else other / mean
+        if len(under) < _FEWEST or ours.length < _SHORTEST:
+            return cls(ratio, None, None, distances, "the run has too few slots", in_one_trial=True)
+        logarithms = np.log(np.clip(over[:, 0], floor, _LARGEST)) - np.log(np.clip(under[:, 0], floor, _LARGEST))
+        low, high = _limits(logarithms)
+        larger = True if low > 0.0 else False if high < math.log(AS_MUCH) else None
+        interval = (math.exp(low), math.exp(high)) if math.isfinite(ratio) and high < 700.0 else None
+        if interval is not None and not interval[0] <= ratio <= interval[1]:
+            interval = None
+        return cls(ratio, interval, larger, distances, "the errors scatter too much in time", in_one_trial=True)
+
+
+def _limits(samples: Floats) -> tuple[float, float]:
+    """One-sided confidence limits of the mean of samples in time, each at 99 %."""
+    from scipy.special import stdtrit  # noqa: PLC0415 - takes a quarter of a second, and not every process judges
+
+    around = samples - samples.mean()
+    variance, count = float(around @ around) / (len(samples) - 1), len(samples)
+    if not variance > 0.0:
+        return float(samples.mean()), float(samples.mean())
+    correlation = float(np.clip((around[1:] @ around[:-1]) / (around @ around), 0.0, _CORRELATION))
+    spread = math.sqrt(variance / count * (1.0 + correlation) / (1.0 - correlation))
+    reach = float(stdtrit(count - 1, 1.0 - ERROR_RATE)) * spread
+    return float(samples.mean()) - reach, float(samples.mean()) + reach
+
+
+@final
+class BatchMeans:
+    """Means of a receiver's squared error over batches of consecutive slots, at most 32 and all of the same length.
+
+    When there are too many, neighbours are joined: the number of slots need not be known. The same slots give the same bits,
+    however they are divided into calls.
+    """
+
+    def __init__(self) -> None:
+        self.length = 1
+        """Slots of a batch."""
+        self._sums = np.zeros((_MOST, 2))
+        self._batches, self._filled = 0, 0
+        self._open = np.zeros(2)
+
+    def add(self, errors: Floats, squared_distances: Floats) -> None:
+        """Add the next c slots: squared errors of all states, and of those that a distance counts, (c,) each."""
+        values, at = np.stack([errors, squared_distances], axis=1), 0
+        while at < len(values):
+            part = values[at : at + self.length - self._filled]
+            self._open = added_in_order(self._open, part)
+            self._filled, at = self._filled + len(part), at + len(part)
+            if self._filled == self.length:
+                self._sums[self._batches] = self._open
+                self._batches, self._filled, self._open = self._batches + 1, 0, np.zeros(2)
+                if self._batches == _MOST:
+                    self._sums[: _MOST // 2] = self._sums[::2] + self._sums[1::2]
+                    self._batches, self.length = _MOST // 2, 2 * self.length
+
+    @property
+    def later(self) -> Floats:
+        """The means of the complete batches in the second half of the slots, (b, 2): of both quantities of `add`."""
+        means: Floats = self._sums[(self._batches + 1) // 2 : self._batches] / self.length
+        return means
+
+
+@final
+class DistanceTally:
+    """How far one receiver's estimates are off in the second half of a run; for a single trial, its errors by batches as well."""
+
+    def __init__(self, states: int | None, slots: int, trials: int) -> None:
+        """states: how many of the first states a distance counts, None for all; slots: of the whole run."""
+        self._states, self._first = states, slots // 2
+        self._total, self._counted = 0.0, 0
+        self.batches = BatchMeans() if trials == 1 else None
+        """None for several trials, which are samples themselves."""
+
+    def add_slots(self, first: int, errors: Floats, x: Floats | None = None, x_hat: Floats | None = None) -> None:
+        """Add the slots from `first` on: squared errors (c, R), states and estimates (c, n, R), None in modes without states."""
+        squares = errors
+        if self._states is not None:
+            if x is None or x_hat is None:
+                squares = np.full_like(errors, np.nan)
+            else:
+                squares = kernels.squared_errors(x[:, : self._states], x_hat[:, : self._states])
+        later = squares[max(0, self._first - first) :]
+        self._total = float(added_in_order(np.array([self._total]), later.sum(axis=1, keepdims=True))[0])
+        self._counted += later.size
+        if self.batches is not None:
+            self.batches.add(errors[:, 0], squares[:, 0])
+
+    @property
+    def distance(self) -> float | None:
+        """Root mean square over slots and trials; None before the second half, and where it is not known."""
+        return math.sqrt(self._total / self._counted) if self._counted and not math.isnan(self._total) else None
+
+    @classmethod
+    def merged(cls, parts: Sequence[Self]) -> Self:
+        """The tally of disjoint sets of trials, in their order."""
+        whole = cls(parts[0]._states, 2 * parts[0]._first, 0)
+        whole._total, whole._counted = sum(part._total for part in parts), sum(part._counted for part in parts)
+        whole.batches = parts[0].batches if len(parts) == 1 else None
+        return whole
+
+
+def leading_states(units: Sequence[str], n: int) -> int:
+    """How many states a distance counts: the first ones, as far as they have the unit of the first; all without units."""
+    return next((i for i, unit in enumerate(units) if unit != units[0]), n)
