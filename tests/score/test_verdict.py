@@ -125,9 +125,10 @@ def test_the_eavesdropper_that_knows_most_decides() -> None:
 @pytest.mark.parametrize(
     ("ratio", "larger", "denied", "sentence"),
     [
-        (0.5, False, False, "✕ not secret: eve knows more than the estimator; the estimator is 1 off, eve 0.71: 0.5 ×"),
-        (1.0, False, False, "✕ not secret: eve knows as much as the estimator; the estimator is 1 off, eve 1: 1 ×"),
-        (1.0, None, True, "✕ not secret: theory gives eve no larger error; the estimator is 1 off, eve 1: 1 ×"),
+        (0.5, False, False, "✗ not secret: eve knows more than the estimator; the estimator is 1 off, eve 0.71: 0.5 ×"),
+        (1.0, False, False, "✗ not secret: eve knows as much as the estimator; the estimator is 1 off, eve 1: 1 ×"),
+        (1.0, None, True, "✗ not secret: by theory, eve knows as much as the estimator in the long run; "
+                          "here the estimator is 1 off, eve 1: 1 ×"),
         (4.0, None, False, "? cannot tell yet: 3 trials are too few; the estimator is 1 off, eve 2: 4 ×"),
         (1e7, True, False, "✓ secret: the estimator is 1 off, eve 3,200: 1e7 ×"),
         (np.nan, None, False, "? cannot tell yet: nothing was measured"),

@@ -158,7 +158,7 @@ def test_the_command_prints_a_table_and_writes_its_folder(evedrop: Evedrop) -> N
     names = ("--schemes", "innovation,acknowledged", "--adversaries", "smart,reference,blocks-critical")
     done = evedrop("compare", "acknowledged", *names, "--trials", "30", "--out", "found")
     assert (done.status, done.err) == (0, "")
-    for text in ("innovation", "acknowledged", "blocks-critical (reference)", "✕ not secret", "not defined: smart"):
+    for text in ("innovation", "acknowledged", "blocks-critical (reference)", "✗ not secret", "not defined: smart"):
         assert text in done.out
     folder = evedrop.folder / "found"
     files = {"compare.json", "compare.pdf", "compare.png", "report.html", "scenarios"}

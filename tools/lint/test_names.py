@@ -112,7 +112,6 @@ def test_a_test_file_is_named_after_a_module() -> None:
 GLOSSARY = ROOT / "docs" / "glossary.md"
 FORMER = {
     "believed": "reported",
-    "believes": "reports",
     "caught a state": "regained synchronisation",
     "Crossing": "WireFate",
     "deviation": "standard_deviation",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from evedrop.score.after_start import AfterStart, BatchMeans
@@ -33,7 +33,7 @@ _GLYPHS = {
     SecrecyOutcome.PERFECT: "✓",
     SecrecyOutcome.RELATIVE: "✓",
     SecrecyOutcome.OPEN: "?",
-    SecrecyOutcome.BROKEN: "✕",
+    SecrecyOutcome.BROKEN: "✗",
 }
 _ORDER = (SecrecyOutcome.BROKEN, SecrecyOutcome.OPEN, SecrecyOutcome.RELATIVE, SecrecyOutcome.PERFECT)
 _SMALLER = 0.8  # times the legitimate error: less is "more than the estimator", and the rest "as much"
@@ -105,7 +105,8 @@ def verdict_on(compared: Compared, unit: str = "", *, best: bool = False) -> Ver
         case SecrecyOutcome.BROKEN:
             knows = "more than" if values.ratio < _SMALLER else "as much as"
             if compared.denied and values.larger is None:
-                return Verdict(outcome.value, f"theory gives {name} no larger error; {numbers}", name, times)
+                reason = f"by theory, {name} knows as much as the estimator in the long run; here {numbers}"
+                return Verdict(outcome.value, reason, name, times)
             return Verdict(outcome.value, f"{name} knows {knows} the estimator; {numbers}", name, times)
         case SecrecyOutcome.OPEN:
             return Verdict(outcome.value, f"{compared.why_open or values.why_open}; {numbers}", name, times)
@@ -125,12 +126,12 @@ def verdict_of(compared: Iterable[Compared], unit: str = "") -> Verdict | None:
 
 
 def verdict_so_far(
-    ours: BatchMeans, theirs: Sequence[tuple[str, BatchMeans]], unit: str = "", noise: float = 0.0
+    ours: BatchMeans, theirs: Sequence[tuple[str, BatchMeans]], unit: str = "", noise: float = 0.0, trials: int = 1
 ) -> Verdict | None:
-    """The verdict on the slots of a run so far, from the mean errors of their batches; noise: tr Q."""
+    """The verdict on the slots of a run so far, from the mean errors of their batches, over all trials; noise: tr Q."""
     compared = []
     for name, batches in theirs:
-        values = AfterStart.of_batches(ours, batches, noise)
+        values = replace(AfterStart.of_batches(ours, batches, noise), in_one_trial=trials == 1)
         compared.append(Compared(name, values, why_open="" if values.larger is not None else "too early"))
     return verdict_of(compared, unit)
 

@@ -13,9 +13,10 @@ from scipy import stats
 
 from evedrop.model.process import Floats
 from evedrop.score.synchronisation import FACTOR, Synchronisation
+from evedrop.score.verdict import Verdict
 from evedrop.show.view.lanes import KNOWLEDGE, ErrorDistance, knowledge
 from evedrop.show.view.panels.fates import WhoKnowsWhat
-from evedrop.show.view.panels.texts import Title
+from evedrop.show.view.panels.texts import VerdictLine
 from evedrop.show.view.recording import ViewRecording
 from evedrop.show.view.scene import PeerSlots, Scene, Shown
 from evedrop.show.view.scene_slots import drawable
@@ -146,11 +147,13 @@ def test_titles_in_any_letters_are_drawn() -> None:
 
 
 def title_of(scene: Scene) -> str:
-    """The text in the first line of a view, in Markdown."""
-    text = Title(scene).styles()["title"].text
-    assert text is not None
-    (title,) = text.as_arrow_array().to_pylist()
-    return str(title)
+    """The title below the verdict, in Markdown."""
+    (column,) = VerdictLine(scene).conclusion(scene.slots - 1, Verdict("secret", "far off", "smart"))
+    assert column.slots.tolist() == [scene.slots - 1]
+    texts = [text for values in column.values for text in values.as_arrow_array().to_pylist() if "secret" in text[0]]
+    headline, _, title = str(texts[0][0]).partition("\n\n")
+    assert headline == "#### ✓ secret: far off"
+    return title
 
 
 def test_the_title_says_which_trials_are_shown() -> None:

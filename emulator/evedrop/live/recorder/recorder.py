@@ -76,6 +76,7 @@ def record(brief: Brief[RecorderPart], report: EndPrinter, serve: str | None = N
         finally:
             emit(SaveStarted())
         run.folder.settle(end)
+    run.view.conclude(run.folder.verdict)
     usual_end = run.view.close()
     run.folder.complete(end)
     emit(end.event(run.view.failure))

@@ -23,6 +23,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
 from evedrop.score.summary import Summary
+from evedrop.score.verdict import Verdict
 
 
 @final
@@ -75,6 +76,11 @@ class RunFolder:
                 self._writer.checkpoint(self._at, self._so_far)
         except OSError as error:
             raise RunError(unwritten(error)) from error
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """The verdict on the run, once it is settled."""
+        return None if self._final is None else self._final.verdict
 
     def settle(self, end: RunEnd) -> None:
         """Compute the summary, and save it and all rows to disk. Raises OSError if they cannot be written."""

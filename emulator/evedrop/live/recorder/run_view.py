@@ -11,6 +11,7 @@ from evedrop.scenario.progress_events import RunEvent, ViewOpened
 from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
+from evedrop.score.verdict import Verdict
 from evedrop.show.view.scene_slots import loop_values_of, open_recording, shown
 
 if TYPE_CHECKING:
@@ -44,6 +45,11 @@ class RunView:
             for event in events[self._noted :]:
                 self._recording.note(event.slot, "INFO", event.line)
         self._noted = len(events)
+
+    def conclude(self, verdict: Verdict | None) -> None:
+        """Show the verdict on the run."""
+        if self._recording is not None:
+            self._recording.conclude(verdict)
 
     def close(self) -> bool:
         """Complete the recording; returns whether this process can end as usual: False if a thread hangs."""

@@ -57,7 +57,7 @@ class Page:
     def mark(self) -> str:
         """The glyph before the outcome; empty if the outcome begins with one, as a verdict does."""
         begins = self.outcome[:2] in {f"{outcome.glyph} " for outcome in SecrecyOutcome}
-        return "" if begins else {True: "✓ ", False: "✕ ", None: ""}[self.good]
+        return "" if begins else {True: "✓ ", False: "✗ ", None: ""}[self.good]
 
     @property
     def html(self) -> str:

@@ -7,10 +7,12 @@ with one warning, and harms neither the run nor the other panels.
 
 from __future__ import annotations
 
+import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Generic, TypeVar, final
 
@@ -22,10 +24,11 @@ from evedrop.errors import NotRegistered
 from evedrop.model.registry import place_of
 from evedrop.results.folder import private_file
 from evedrop.scenario.words import listed
+from evedrop.score.verdict import Verdict
 from evedrop.show.view.column import TIMELINE, Column, laid_out
 from evedrop.show.view.events import Event, introduction
 from evedrop.show.view.panels import PANELS
-from evedrop.show.view.panels.panel import COLUMNS, ROWS_ABOVE, ROWS_BELOW, PlacedView, ViewPanel
+from evedrop.show.view.panels.panel import COLUMNS, ROWS_ABOVE, ROWS_BELOW, SCENE, PlacedView, ViewPanel
 from evedrop.show.view.scene import Scene, SceneSlots
 from evedrop.show.view.staged import StagedChunks, chunk_sizes
 from evedrop.system.output import warn
@@ -59,7 +62,7 @@ class PanelSet:
             for name, panel in [*self._panels.items()]
             for view in self._tried(name, partial(_views, panel, _drawable if PANELS.foreign(name) else _placed))
         ]
-        return laid_out(_arranged(placed), TIMELINE)
+        return laid_out(_tabbed(placed), TIMELINE)
 
     def send_styles(self, to: rr.RecordingStream) -> None:
         """Record every panel's styles."""
@@ -68,6 +71,10 @@ class PanelSet:
     def send(self, slots: SceneSlots, put: Callable[[Column], None]) -> None:
         """Record the next slots; put: is called with each column."""
         self._each(lambda panel: _send(panel.columns(slots), put))
+
+    def conclude(self, k: int, verdict: Verdict, put: Callable[[Column], None]) -> None:
+        """Record the verdict on the run, at its last slot."""
+        self._each(lambda panel: _send(panel.conclusion(k, verdict), put))
 
     def send_notes(self, notes: Sequence[Event], put: Callable[[Column], None]) -> None:
         """Record lines about the run."""
@@ -89,8 +96,44 @@ class PanelSet:
             return ()
 
 
+def _tabbed(placed: Sequence[PlacedView]) -> rrb.Container:
+    """The verdict above two tabs, the scene and the numbers; only the numbers where no panel has a place in the scene."""
+    above = [view for view in placed if view.side == "verdict"]
+    tabs: list[rrb.Container] = [_arranged([view for view in placed if view.side not in {"verdict", *SCENE}])]
+    if any(view.side == "worlds" for view in placed):
+        tabs.insert(0, _scene([view for view in placed if view.side in SCENE]))
+    body = tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0)
+    if not above:
+        return body
+    height = max(view.height for view in above)
+    return rrb.Vertical(*(view.view for view in above), body, row_shares=[*(height for _ in above), 1.0 - height])
+
+
+def _scene(placed: Sequence[PlacedView]) -> rrb.Container:
+    """What happens, beside it a grid with the world as each listener believes it, and below both a strip over time."""
+    truth, worlds, strip = ([view for view in placed if view.side == side] for side in SCENE)
+    grid = rrb.Vertical(*(rrb.Horizontal(*(view.view for view in row)) for row in _rows(worlds)))
+    above = rrb.Horizontal(*(view.view for view in truth), grid, column_shares=[*(1.0 for _ in truth), _GRID])
+    if not strip:
+        return rrb.Vertical(above, name=SCENE_TAB)
+    height = max(view.height for view in strip)
+    row = rrb.Horizontal(*(view.view for view in strip), column_shares=[view.share for view in strip])
+    return rrb.Vertical(above, row, row_shares=[1.0 - height, height], name=SCENE_TAB)
+
+
+def _rows(worlds: Sequence[PlacedView]) -> list[Sequence[PlacedView]]:
+    """The rows of a grid without empty cells, which are about square: rows differ by one cell at most."""
+    count = math.ceil(len(worlds) / math.ceil(math.sqrt(len(worlds))))
+    bounds = [-(-i * len(worlds) // count) for i in range(count + 1)]
+    return [worlds[first:last] for first, last in pairwise(bounds)]
+
+
+SCENE_TAB, NUMBERS_TAB = "Scene", "Numbers"
+_GRID = 1.25  # times as wide as what happens
+
+
 def _arranged(placed: Sequence[PlacedView]) -> rrb.Container:
-    """Rows above, columns, and rows below; each takes the share of the height that its views need, and columns the rest."""
+    """The tab with numbers: rows above, columns, and rows below; rows have the height that they need, and columns the rest."""
     sides = {side: [view for view in placed if view.side == side] for side in (*ROWS_ABOVE, *COLUMNS, *ROWS_BELOW)}
     columns = [
         (rrb.Vertical(*(view.view for view in sides[side]), row_shares=[view.share for view in sides[side]]), width)
@@ -110,7 +153,7 @@ def _arranged(placed: Sequence[PlacedView]) -> rrb.Container:
                 *(view.view for view in sides[side]), column_shares=[view.share for view in sides[side]]
             )
             rows.append((row, max(heights[side], _LEAST_ROW)))
-    return rrb.Vertical(*(row for row, _ in rows), row_shares=[share for _, share in rows])
+    return rrb.Vertical(*(row for row, _ in rows), row_shares=[share for _, share in rows], name=NUMBERS_TAB)
 
 
 def _views(panel: ViewPanel, check: Callable[[PlacedView], PlacedView]) -> list[PlacedView]:
@@ -119,7 +162,7 @@ def _views(panel: ViewPanel, check: Callable[[PlacedView], PlacedView]) -> list[
 
 def _placed(view: PlacedView) -> PlacedView:
     """The same view, if a layout can contain it. Raises an error otherwise."""
-    sides = (*ROWS_ABOVE, *COLUMNS, *ROWS_BELOW)
+    sides = ("verdict", *ROWS_ABOVE, *COLUMNS, *ROWS_BELOW, *SCENE)
     if (
         not isinstance(view, PlacedView)
         or view.side not in sides
@@ -309,6 +352,7 @@ class ViewRecording(RecordingThread[SceneSlots, Event]):
         live: whether viewers are to follow a run in real time, by files beside the recording; see `live_files`.
         """
         self._scene, self._warn, self._recorded = scene, warn, 0
+        self._verdict: Verdict | None = None
         self._staged: StagedChunks | None = None
         period = _PACED_PERIOD if scene.pace > 0 else _FAST_PERIOD
         self._sizes = chunk_sizes(scene.pace, period) if live else []
@@ -318,6 +362,10 @@ class ViewRecording(RecordingThread[SceneSlots, Event]):
         """Record the next slots. Waits only for a disk that is thousands of slots behind, and for a few seconds at most."""
         if slots.count:
             self._append(slots, slots.count, _MOST_WAITING, self._patience)
+
+    def conclude(self, verdict: Verdict | None) -> None:
+        """Show the verdict on the run after its last slot; without one, that on its slots so far remains."""
+        self._verdict = verdict
 
     def note(self, k: int, level: str, text: str) -> None:
         """Add a line to the events: level is INFO, WARN or ERROR."""
@@ -346,11 +394,13 @@ class ViewRecording(RecordingThread[SceneSlots, Event]):
             slots = SceneSlots.joined(chunks)
             self._recorded = slots.first + slots.count
             self._panels.send(slots, put)
+        if self._last and self._verdict is not None and self._recorded:
+            self._panels.conclude(self._recorded - 1, self._verdict, put)
         if notes:
             self._panels.send_notes(notes, put)
         if self._staged is not None and (chunks or notes or self._last):
             self._staged.pass_on(self._recorded, self._patience, self._last)
-        return bool(chunks or notes)
+        return bool(chunks or notes or (self._last and self._verdict is not None))
 
     def _finish(self) -> None:
         super()._finish()

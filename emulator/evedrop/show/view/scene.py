@@ -32,6 +32,13 @@ class Shown:
     quality: float | None
     """Probability that its link delivers a packet; None if it is unknown, because the loss model is not built in."""
 
+    @property
+    def world_title(self) -> str:
+        """The title of the world as it believes it."""
+        if self.role == "legitimate":
+            return "The estimator believes"
+        return f"{self.name} believes" if self.name == self.strategy else f"{self.name} ({self.strategy}) believes"
+
 
 @dataclass(frozen=True)
 class Scene:

@@ -215,6 +215,8 @@ def replay(folder: Path, path: Path | None = None) -> Path:
             recording.add(SceneSlots(first, some.x[:, :, 0], some.nu[:, 0], shown, moved, sent))
         for event in results.events:
             recording.note(event.slot, "INFO", event.line)
+        if results.remark is None:
+            recording.conclude(results.typed_summary.verdict)
     if recording.failure is not None:
         path.unlink(missing_ok=True)
         raise UsageError(f"{path} cannot be written ({recording.failure}); make the folder writable")

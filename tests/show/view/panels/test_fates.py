@@ -89,6 +89,7 @@ def test_with_many_receivers_the_lanes_of_packets_have_its_place(simulated: Call
     scene = simulated(20, copies=2).scene
     for count in (1, 4, 5, 7):
         some = replace(scene, receivers=scene.receivers[:count])
-        (packets,) = Packets(some).views()
+        strip, packets = Packets(some).views()
+        assert strip.side == "strip"
         drawn = [*LastPacket(some).views()]
         assert (len(drawn), packets.side) == ((1, "left") if count <= 4 else (0, "top"))

@@ -14,14 +14,14 @@ from evedrop.show.view.panels.curves import (
 from evedrop.show.view.panels.fates import LastPacket, Packets, WhoKnowsWhat
 from evedrop.show.view.panels.panel import ViewPanel
 from evedrop.show.view.panels.plane import GroundMap, StatePlane
-from evedrop.show.view.panels.texts import Events, Legend, Title
+from evedrop.show.view.panels.texts import Events, Legend, VerdictLine
 
 PANELS: Registry[ViewPanel] = Registry(
     "panel",
     ViewPanel,  # type: ignore[type-abstract]
     "evedrop.panels",
     {
-        "title": Title,
+        "verdict": VerdictLine,
         "knowledge": WhoKnowsWhat,
         "fates": LastPacket,
         "plant": WhatMovesThePlant,

@@ -177,6 +177,20 @@ class TraceOfP(ViewPanel):
             yield from logarithms(self.scene, f"{_THEORY}/{shown.name}", slots.numbers, peer.theoretical_trace)
 
 
+def worlds_over_time(scene: Scene, path: str, axis: rrb.TimeAxis) -> Iterator[PlacedView]:
+    """The first state as it is, and as each receiver believes it: curves below a path, named as truth and receivers."""
+    label = scene.states[0] if scene.states else "the state"
+    legend = rrb.PlotLegend(visible=False)
+
+    def view(title: str, *names: str) -> rrb.TimeSeriesView:
+        contents = [f"{path}/{name}" for name in names]
+        return rrb.TimeSeriesView(name=title, origin=path, contents=contents, axis_x=axis, plot_legend=legend)
+
+    yield PlacedView(view(f"What happens: {label}", TRUTH_NAME), "truth")
+    for shown in scene.receivers:
+        yield PlacedView(view(f"{shown.world_title}   grey: truth", TRUTH_NAME, shown.name), "worlds")
+
+
 _STATE_PATH = "plane"
 
 
@@ -199,6 +213,7 @@ class StateOverTime(ViewPanel):
                 plot_legend=rrb.PlotLegend(visible=False),
             )
             yield PlacedView(view, "right")
+            yield from worlds_over_time(self.scene, _STATE_PATH, recent_slots(self.scene))
 
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each estimate in its receiver's colour; the truth grey and wide."""
@@ -233,6 +248,7 @@ class Levels(ViewPanel):
             label = self.scene.states[i] if self.scene.states else f"state {i}"
             title = f"{label}   grey: truth"
             yield PlacedView(curves_view(title, f"{_LEVELS_PATH}/{i}", whole_run(self.scene), legend=False), "left")
+        yield from worlds_over_time(self.scene, f"{_LEVELS_PATH}/0", whole_run(self.scene))
 
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each estimate in its receiver's colour; the truth grey and wide."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rerun import AsComponents
 
 from evedrop.model import receiver
+from evedrop.model.schemes import SCHEMES
 from evedrop.score.synchronisation import Synchronisation
 from evedrop.show.view import lanes
 from evedrop.show.view.column import Column
@@ -118,6 +119,13 @@ class Packets(ViewPanel):
     def views(self) -> Iterator[PlacedView]:
         """One view, as high as the lanes need: above the events, or, with many receivers or a closed loop, at the top."""
         view = rrb.StateTimelineView(name="Packets", origin=_PACKETS_PATH, time_view=recent_slots(self.scene))
+        strip = rrb.StateTimelineView(
+            name=f"Packets sent   blue: a state{self._other}",
+            origin=_PACKETS_PATH,
+            contents=[self._lanes.paths[0]],
+            time_view=recent_slots(self.scene),
+        )
+        yield PlacedView(strip, "strip", 1.5, lanes_height(1))
         receivers = len(self.scene.receivers)
         height = lanes_height(receivers + 1)
         if self.scene.moving or crowded(self.scene):
@@ -125,6 +133,13 @@ class Packets(ViewPanel):
         else:
             column = 1.0 - FIXED_HEIGHT - lanes_height(receivers)
             yield PlacedView(view, "left", height / (column - height))
+
+    @property
+    def _other(self) -> str:
+        """What the title says of the scheme's other packets; empty if there are none."""
+        scheme = self.scene.receivers[0].strategy
+        sends = scheme in SCHEMES.names and SCHEMES[scheme].sends_states_and_innovations
+        return ", purple: an innovation" if sends else ""
 
     def styles(self) -> dict[str, rr.StateConfiguration]:
         """Colours; the legend says what they mean."""

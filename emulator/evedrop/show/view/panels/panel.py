@@ -15,13 +15,19 @@ from typing import Literal
 import rerun as rr
 import rerun.blueprint as rrb
 
+from evedrop.score.verdict import Verdict
 from evedrop.show.view.column import Column
 from evedrop.show.view.events import Event
 from evedrop.show.view.scene import Scene, SceneSlots
 
-Side = Literal["title", "top", "left", "middle", "right", "legend"]
-"""`title`, `top` and `legend` are rows; `left`, `middle` and `right` are columns between them."""
-ROWS_ABOVE: tuple[Side, ...] = ("title", "top")
+Side = Literal["verdict", "top", "left", "middle", "right", "legend", "truth", "worlds", "strip"]
+"""A place in the view: `verdict` is the row above both tabs.
+
+The tab with numbers has the rows `top` and `legend`, and the columns `left`, `middle` and `right` between them. The tab with the
+scene has `truth` on the left, `worlds` in a grid beside it, and the row `strip` below.
+"""
+SCENE: tuple[Side, ...] = ("truth", "worlds", "strip")
+ROWS_ABOVE: tuple[Side, ...] = ("top",)
 COLUMNS: tuple[Side, ...] = ("left", "middle", "right")
 ROWS_BELOW: tuple[Side, ...] = ("legend",)
 
@@ -65,6 +71,11 @@ class ViewPanel(ABC):
     def columns(self, slots: SceneSlots) -> Iterable[Column]:
         """Its values in the next slots. Calls are in order of slot; the arrays cannot be written to."""
 
+    def conclusion(self, k: int, verdict: Verdict) -> Iterable[Column]:
+        """Its values for the verdict on the run, at its last slot k; by default none."""
+        del k, verdict
+        return ()
+
     def notes(self, notes: Sequence[Event]) -> Iterable[Column]:
         """Its values for lines about the run, such as "cut smart"; by default none."""
         del notes
@@ -75,9 +86,9 @@ _PIXELS = 654.0  # between the viewer's own bars
 _MOST = 0.57
 _HEAD, _LANE = 48.0, 40.0  # title bar and ruler of a view of lanes; a lane with its name
 
-TITLE_HEIGHT = 0.06
+VERDICT_HEIGHT = 0.125
 LEGEND_HEIGHT = 0.075
-FIXED_HEIGHT = TITLE_HEIGHT + LEGEND_HEIGHT
+FIXED_HEIGHT = VERDICT_HEIGHT + LEGEND_HEIGHT
 """The height of the rows that every view has."""
 
 

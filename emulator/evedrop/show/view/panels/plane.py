@@ -9,7 +9,7 @@ The map, for links whose losses depend on distance, is drawn by Evedrop: Rerun's
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, final
 
@@ -24,10 +24,11 @@ from evedrop.show.view.column import TIMELINE, Column
 from evedrop.show.view.lanes import ErrorDistance
 from evedrop.show.view.palette import GROUND, TRUTH, Colour, colour, dim
 from evedrop.show.view.panels.panel import PlacedView, ViewPanel
-from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots
+from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots, Shown
 
 _PLANE_PATH = "plane"
 _FRAME = f"{_PLANE_PATH}/frame"
+_HEADING, _SCALE = f"{_PLANE_PATH}/{TRUTH_NAME}/heading", f"{_PLANE_PATH}/scale"
 _TRAIL = 30
 _TRUTH_TRAIL = 130
 
@@ -39,6 +40,7 @@ class StatePlane(ViewPanel):
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
         self._frame, every = Frame(), stride(scene)
+        self._moves = TruthDirection()
         self._distance = ErrorDistance(scene)
         self._trails = {name: Trail(every) for name in (TRUTH_NAME, *(shown.name for shown in scene.receivers))}
 
@@ -62,6 +64,36 @@ class StatePlane(ViewPanel):
             overrides=trails,  # type: ignore[arg-type]
         )
         yield PlacedView(view, "right")
+        past = {_trail(TRUTH_NAME): trails[_trail(TRUTH_NAME)]}
+        yield PlacedView(
+            rrb.Spatial2DView(
+                name="What happens",
+                origin=_PLANE_PATH,
+                contents=[_FRAME, f"{_PLANE_PATH}/{TRUTH_NAME}/**", f"{_SCALE}/**"],
+                background=list(GROUND),
+                overrides=past,  # type: ignore[arg-type]
+            ),
+            "truth",
+        )
+        for shown in self.scene.receivers:
+            yield PlacedView(self._world(shown, trails), "worlds")
+
+    def _world(self, shown: Shown, trails: Mapping[str, rrb.VisibleTimeRanges]) -> rrb.Spatial2DView:
+        """The world as a receiver believes it: its estimate, path and ellipse, over the faded truth."""
+        name, faded = shown.name, [dim(TRUTH, 0.45)]
+        shown_paths = [_trail(name), _ellipse(name), _point(name), _off(name)]
+        overrides = {
+            _trail(TRUTH_NAME): [rr.LineStrips2D.from_fields(colors=faded), trails[_trail(TRUTH_NAME)]],
+            _point(TRUTH_NAME): [rr.Points2D.from_fields(colors=faded)],
+            _trail(name): [trails[_trail(name)]],
+        }
+        return rrb.Spatial2DView(
+            name=shown.world_title,
+            origin=_PLANE_PATH,
+            contents=[_FRAME, _trail(TRUTH_NAME), _point(TRUTH_NAME), *shown_paths],
+            background=list(GROUND),
+            overrides=overrides,  # type: ignore[arg-type]
+        )
 
     def _past(self, slots: int) -> rrb.VisibleTimeRanges:
         # A piece of a trail is recorded at its end, so the oldest piece shown begins a frame earlier.
@@ -79,8 +111,15 @@ class StatePlane(ViewPanel):
     def styles(self) -> dict[str, rr.AsComponents]:
         """Each estimate in its receiver's colour; the truth white, on top of the others."""
         styles = _point_styles(TRUTH_NAME, TRUTH, radius=3.5, order=40.0)
+        styles[_HEADING] = rr.LineStrips2D.from_fields(colors=[TRUTH], radii=rr.Radius.ui_points(2.0), draw_order=41.0)
+        styles[_SCALE] = rr.LineStrips2D.from_fields(
+            colors=[dim(TRUTH, 0.6)], radii=rr.Radius.ui_points(1.5), show_labels=True
+        )
         for i, shown in enumerate(self.scene.receivers):
             styles |= _point_styles(shown.name, colour(i), radius=5.0, order=30.0 - i)
+            styles[_off(shown.name)] = rr.Points2D.from_fields(
+                colors=[TRUTH], radii=rr.Radius.ui_points(0.0), show_labels=True
+            )
             if i > 0:
                 styles[_arrow(shown.name)] = rr.LineStrips2D.from_fields(
                     colors=[colour(i)], radii=rr.Radius.ui_points(1.5)
@@ -97,6 +136,7 @@ class StatePlane(ViewPanel):
         k, at = slots.numbers, frames(self.scene, slots.first, slots.count)
         positions = {TRUTH_NAME: on_plane(slots.x)}
         positions |= {name: on_plane(peer.x_hat) for name, peer in slots.peers.items()}
+        headings = self._moves.directions(positions[TRUTH_NAME], at)
         pieces = {name: self._trails[name].pieces(points, at) for name, points in positions.items()}
         followed = np.stack([positions[TRUTH_NAME], positions[self.scene.receivers[0].name]])
         boxes = self._frame.boxes(followed.min(axis=0), followed.max(axis=0), at)
@@ -107,6 +147,11 @@ class StatePlane(ViewPanel):
         truth = positions[TRUTH_NAME][at]
         labels: list[Points] = []
         yield Column(_FRAME, k[at], rr.LineStrips2D.columns(strips=boxes))
+        size = boxes[:, 2] - boxes[:, 0]
+        yield Column(_HEADING, k[at], rr.LineStrips2D.columns(strips=heading_strips(truth, headings, size)))
+        bars, lengths = scale_bars(boxes[:, 0], boxes[:, 2])
+        texts = [self._distance.text(length) for length in lengths.tolist()]
+        yield Column(_SCALE, k[at], rr.LineStrips2D.columns(strips=bars, labels=texts))
         for name, points in positions.items():
             trail = within(pieces[name], low, high, truth)
             yield Column(_trail(name), k[at], rr.LineStrips2D.columns(strips=trail))
@@ -116,8 +161,12 @@ class StatePlane(ViewPanel):
             outlines = np.clip(ellipses(peer.x_hat[at], peer.P[at]), low[:, None], high[:, None])
             outlines = np.where(inside(positions[shown.name][at], low, high)[:, None, None], outlines, truth[:, None])
             yield Column(_ellipse(shown.name), k[at], rr.LineStrips2D.columns(strips=outlines))
+            distances = self._distance.of(slots.x[at], peer.x_hat[at])
+            offs = [f"{self._distance.text(distance)} off" for distance in distances.tolist()]
+            seen_at = borders(truth, positions[shown.name][at], low, high)
+            below = rr.Points2D.columns(positions=labels_below(seen_at, low, high), labels=offs)
+            yield Column(_off(shown.name), k[at], below)
             if i > 0:
-                distances = self._distance.of(slots.x[at], peer.x_hat[at])
                 seen = truth, positions[shown.name][at], low, high
                 yield from self._far(shown.name, k[at], seen, distances, labels)
 
@@ -178,6 +227,10 @@ def _away(name: str) -> str:
     return f"{_PLANE_PATH}/{name}/away"
 
 
+def _off(name: str) -> str:
+    return f"{_PLANE_PATH}/{name}/off"
+
+
 Points = NDArray[np.float32]
 
 _FRAMES_PER_SECOND = 30.0
@@ -191,6 +244,8 @@ _BORDER = 0.04  # of the frame's sides, where a dot would be cut
 _EDGE = 0.1  # of a frame's sides: the room between the arrows' tips and its border
 _LABEL = 0.18  # the same for the labels: half the width of one
 _LINE = 0.11  # of a frame's height: what a label needs
+_VEHICLE = 0.09  # length of the vehicle, compared with the longer side
+_SCALE_BAR = 0.25  # of a frame's width: the longest scale
 _ARROW = 0.08  # length of an arrow, compared with the longer side
 _FRAME_ROOM = 0.3  # around what the frame follows, compared with its longer side
 
@@ -269,6 +324,33 @@ def arrows(truth: Points, points: Points, low: Points, high: Points) -> Points:
     return _shown(np.stack([tips - length * direction, tips, heads[0], tips, heads[1]], axis=1))
 
 
+def heading_strips(truth: Points, headings: Points, size: Points) -> Points:
+    """Arrows at the truth, (f, 2), in its directions, (f, 2), as lines, (f, 5, 2); size: of the frames."""
+    length = _VEHICLE * size.max(axis=1, keepdims=True)
+    across = np.stack([-headings[:, 1], headings[:, 0]], axis=1)
+    tips = truth + 0.6 * length * headings
+    sides = [tips - 0.5 * length * (headings + sign * 0.7 * across) for sign in (1.0, -1.0)]
+    return _shown(np.stack([truth - 0.4 * length * headings, tips, sides[0], tips, sides[1]], axis=1))
+
+
+def scale_bars(low: Points, high: Points) -> tuple[Points, Floats]:
+    """A bar in the lower left corner of each frame, (f, 2, 2), and its length, (f,): 1, 2 or 5 times a power of ten."""
+    width = np.maximum((high - low)[:, 0].astype(np.float64), 1e-30)
+    decade = 10.0 ** np.floor(np.log10(_SCALE_BAR * width))
+    lengths = decade * np.select([_SCALE_BAR * width >= 5 * decade, _SCALE_BAR * width >= 2 * decade], [5.0, 2.0], 1.0)
+    left = np.stack([low[:, 0] + 0.06 * width, high[:, 1] - 0.06 * (high - low)[:, 1]], axis=1)
+    right = left + np.stack([lengths, np.zeros_like(lengths)], axis=1)
+    return _shown(np.stack([left, right], axis=1)), lengths
+
+
+def labels_below(points: Points, low: Points, high: Points) -> Points:
+    """Where the labels of points, (f, 2), are drawn: below them, or above them near the lower border."""
+    size = high - low
+    line = np.where(points[:, 1] > high[:, 1] - 2 * _LINE * size[:, 1], -_LINE, 0.5 * _LINE) * size[:, 1]
+    moved = points + np.stack([np.zeros_like(line), line], axis=1)
+    return _shown(np.clip(moved, low + size * [_LABEL, 0.0], high - size * [_LABEL, 0.5 * _LABEL]))
+
+
 def labels_of(truth: Points, tips: Points, low: Points, high: Points) -> Points:
     """Where the labels of arrows with these tips, (f, 2), are drawn: away from the truth, with room for their letters."""
     size = high - low
@@ -322,6 +404,33 @@ class Frame:
         low, high = (np.floor(low / step) - 0.5) * step, (np.ceil(high / step) + 0.5) * step
         corners = [(low, low), (high, low), (high, high), (low, high), (low, low)]
         return _shown(np.stack([np.stack([x[:, 0], y[:, 1]], axis=1) for x, y in corners], axis=1))
+
+
+@final
+@dataclass
+class TruthDirection:
+    """The direction in which the truth moved over the last slots."""
+
+    _recent: Points = field(default_factory=lambda: np.empty((0, 2), np.float32))
+    _last: Points = field(default_factory=lambda: np.array([1.0, 0.0], np.float32))
+
+    def directions(self, positions: Points, offsets: NDArray[np.intp]) -> Points:
+        """Unit vectors (len(offsets), 2) at these offsets of the next positions (c, 2); where nothing moved, the last one."""
+        before = len(self._recent)
+        path = np.concatenate([self._recent, positions]).astype(np.float64)
+        ends = offsets + before
+        moved = path[ends] - path[np.maximum(ends - _HEADED_SLOTS, 0)]
+        lengths = np.hypot(moved[:, 0], moved[:, 1])
+        directions = np.empty((len(offsets), 2), np.float32)
+        for i, length in enumerate(lengths.tolist()):
+            if 0.0 < length < _LARGEST:
+                self._last = (moved[i] / length).astype(np.float32)
+            directions[i] = self._last
+        self._recent = path[-_HEADED_SLOTS:].astype(np.float32)
+        return directions
+
+
+_HEADED_SLOTS = 8
 
 
 @final

@@ -1,6 +1,6 @@
-"""The panels of words: the scenario's title, the legend of all panels, and events.
+"""The panels of words: the verdict and the scenario's title, the legend of all panels, and events.
 
-The title and the legend, which says what each colour stands for, do not change. The events are those of the scenario and the
+The legend, which says what each colour stands for, does not change. The events are those of the scenario and the
 operator, and long stretches without a usable packet.
 """
 
@@ -14,35 +14,63 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
+from evedrop.score.after_start import BatchMeans, leading_states
+from evedrop.score.verdict import Verdict, verdict_so_far
 from evedrop.show.view import lanes
 from evedrop.show.view.column import TIMELINE, Column
 from evedrop.show.view.events import Event, Watcher
 from evedrop.show.view.lanes import received
 from evedrop.show.view.palette import GROUND, TRUTH, Colour, colour
-from evedrop.show.view.panels.panel import LEGEND_HEIGHT, TITLE_HEIGHT, PlacedView, ViewPanel
+from evedrop.show.view.panels.panel import LEGEND_HEIGHT, VERDICT_HEIGHT, PlacedView, ViewPanel, lanes_height
 from evedrop.show.view.scene import Scene, SceneSlots
 
 _TITLE_PATH = "title"
 
 
 @final
-class Title(ViewPanel):
-    """A line over the whole width: the title, and which trials the panels show."""
+class VerdictLine(ViewPanel):
+    """Whether the state is kept secret, so far and at the end of the run; and the title, and which trials the panels show."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self._states = leading_states(scene.units, scene.n)
+        self._batches = {shown.name: BatchMeans() for shown in scene.receivers}
+        self._every = max(1, round(1.0 / scene.pace)) if scene.pace > 0 else 1
+        self._next, self._shown = 0, ""
 
     def views(self) -> Iterator[PlacedView]:
-        """One view without a title bar."""
-        yield PlacedView(rrb.TextDocumentView(origin=_TITLE_PATH, titlebar=False), "title", height=TITLE_HEIGHT)
-
-    def styles(self) -> dict[str, rr.TextDocument]:
-        """The text, which does not change."""
-        trials = self.scene.trials
-        of = "" if trials == 1 else f" · curves: means of {trials:,} trials, everything else: the first of them"
-        return {_TITLE_PATH: rr.TextDocument(f"**{_plain(self.scene.title)}**{of}", media_type="text/markdown")}
+        """One view without a title bar, above both tabs."""
+        yield PlacedView(rrb.TextDocumentView(origin=_TITLE_PATH, titlebar=False), "verdict", height=VERDICT_HEIGHT)
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
-        """Nothing: the title is a style."""
-        del slots
-        yield from ()
+        """The verdict on the slots so far, about once a second, if it has changed."""
+        for name, batches in self._batches.items():
+            peer = slots.peers[name]
+            apart = (slots.x - peer.x_hat)[:, : self._states]
+            batches.add(peer.squared_error, np.sum(apart * apart, axis=1))
+        last = slots.first + slots.count - 1
+        if last < self._next:
+            return
+        self._next = last - last % self._every + self._every
+        (_, ours), *theirs = self._batches.items()
+        unit = self.scene.units[0] if self.scene.units else ""
+        verdict = verdict_so_far(ours, theirs, unit, self.scene.noise, self.scene.trials)
+        at = 0 if not self._shown else last  # the first one is shown from slot 0 on
+        yield from self._text(at, "" if verdict is None else f"{verdict.sentence}, so far")
+
+    def conclusion(self, k: int, verdict: Verdict) -> Iterator[Column]:
+        """The verdict on the run."""
+        yield from self._text(k, verdict.sentence)
+
+    def _text(self, k: int, sentence: str) -> Iterator[Column]:
+        trials = self.scene.trials
+        of = "" if trials == 1 else f" · curves: means of {trials:,} trials, everything else: the first of them"
+        title = f"**{_plain(self.scene.title)}**{of}"
+        text = f"#### {_plain(sentence)}\n\n{title}" if sentence else f"### {title}"
+        if text != self._shown:
+            self._shown = text
+            documents = rr.TextDocument.columns(text=[text], media_type=["text/markdown"])
+            yield Column(_TITLE_PATH, np.array([k], np.int64), documents)
 
 
 def _plain(text: str) -> str:
@@ -110,8 +138,16 @@ class Events(ViewPanel):
         self._watchers = [(shown, Watcher(shown, scene)) for shown in scene.receivers]
 
     def views(self) -> Iterator[PlacedView]:
-        """One view: below the packets, or at the bottom right for a closed loop."""
-        view = rrb.TextLogView(
+        """Two views: beside the strip of the scene, and below the packets or at the bottom right for a closed loop."""
+        yield PlacedView(self._view(), "strip", 1.0, lanes_height(1))
+        if self.scene.moving:
+            yield PlacedView(self._view(), "right", 0.7)
+        else:
+            yield PlacedView(self._view(), "left")
+
+    @staticmethod
+    def _view() -> rrb.TextLogView:
+        return rrb.TextLogView(
             name="Events",
             origin=_EVENTS_PATH,
             columns=rrb.TextLogColumns(
@@ -120,10 +156,6 @@ class Events(ViewPanel):
             ),
             format_options=rrb.TextLogFormat(monospace_body=True),
         )
-        if self.scene.moving:
-            yield PlacedView(view, "right", 0.7)
-        else:
-            yield PlacedView(view, "left")
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The events that the watcher of each receiver noticed."""
