@@ -54,7 +54,6 @@ if TYPE_CHECKING:
     )
     from evedrop.scenario.table import Table
     from evedrop.show.view.column import Column, scalars
-    from evedrop.show.view.palette import colour
     from evedrop.show.view.panels.curves import curves_view, line_style, recent_slots, whole_run
     from evedrop.show.view.panels.panel import PlacedView, ViewPanel
     from evedrop.show.view.scene import PeerSlots, Scene, SceneSlots, Shown
@@ -130,7 +129,6 @@ __all__ = [
     "Table",
     "UsageError",
     "ViewPanel",
-    "colour",
     "curves_view",
     "elementary",
     "fates_of",

@@ -22,7 +22,7 @@ from evedrop.model.metrics import expectable_metrics
 from evedrop.scenario.loading import load
 from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.writing import write_report
-from evedrop.show.view.palette import colour, hexadecimal
+from evedrop.show.view.palette import paper_inks
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode, Simulation
 from evedrop.studies.sweep import grid_of, sweep_over
@@ -192,7 +192,8 @@ def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> Non
     assert f"{command} --trials 5 --covariance-only" in page.texts
     assert "All 4 points were done" in page.texts
     assert "4 points of eavesdroppers.smart.strategy, slots · 10 to 20 slots · 5 trials" in page.texts
-    inks = {f"fill: none; stroke: {hexadecimal(colour(i))}; stroke-width: 2" for i in range(4)}
+    colours = paper_inks([row["peer"] for row in table.to_pylist()], {"smart": "smart", "naive": "naive"})
+    inks = {f"fill: none; stroke: {colour}; stroke-width: 2" for colour in colours.values()}
     assert inks & {*page.values("style")}, "there are no error bars"
 
 

@@ -154,7 +154,7 @@ class ProgressLine:
                 )
             case ViewOpened() if not self._quiet:
                 if event.address:
-                    self._print(f"live view, open to anybody who has this address: {event.address}")
+                    self._print(f"live view, open to anybody who has this address:\n{event.address}")
                 if event.warning:
                     self._print(f"warning: {event.warning}")
             case ConnectionOutage() if not self._quiet:

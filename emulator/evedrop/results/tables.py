@@ -5,6 +5,7 @@ Source: docs/results.md, tables.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -157,3 +158,18 @@ def input_columns(slots: Slots, plant: Plant, disturbances: Floats, first_trial:
         plant.clips(u).reshape(-1),
         *rows_of(sensor, _OF_A_MONITOR, recorded),
     ]
+
+
+_STRATEGIES = b"strategies"
+
+
+def with_strategies(table: pa.Table, strategies: Mapping[str, str]) -> pa.Table:
+    """The table of a sweep that says, in its metadata, which strategy each receiver has: pictures take their colours from it."""
+    metadata = {**(table.schema.metadata or {}), _STRATEGIES: json.dumps(dict(strategies)).encode()}
+    return table.replace_schema_metadata(metadata)
+
+
+def swept_strategies(table: pa.Table) -> dict[str, str]:
+    """Receiver → the strategy that it has at the first point of a sweep; empty if its table does not say it."""
+    text = (table.schema.metadata or {}).get(_STRATEGIES, b"{}")
+    return {str(name): str(strategy) for name, strategy in json.loads(text).items()}

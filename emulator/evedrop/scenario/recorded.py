@@ -92,6 +92,14 @@ def recorded_noise(folder: Path) -> float:
         return 0.0
 
 
+def recorded_strategies(folder: Path) -> Mapping[str, str]:
+    """Receiver → its strategy, as the scenario in a results folder names it; empty if it cannot be read."""
+    try:
+        return recorded(folder).words
+    except UsageError:
+        return {}
+
+
 def _words(tables: Mapping[str, Any]) -> dict[str, str]:
     """Receiver → its scheme or strategy, as far as the tables are valid."""
     encoding, others = tables.get("encoding"), tables.get("eavesdroppers")

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
 from evedrop.model.metrics import all_metrics, error_column, estimated_metrics, z_column
 from evedrop.results.folder import disk_errors, private_pictures, private_replacement, write_private
+from evedrop.results.tables import with_strategies
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.loading import prepared, value_of
 from evedrop.scenario.progress_events import OnEvent
@@ -99,6 +100,7 @@ def sweep_over(
     scenarios = _checked(source, changes, grid, plan)
     total = sum(scenario.trials * scenario.slots for _, scenario in scenarios)
     rows: list[dict[str, Any]] = []
+    strategies = {name: given.strategy for name, given in scenarios[0][1].eavesdroppers.items()}
     failure: RunError | None = None
     done = 0
     description = {"scenario": _title(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
@@ -127,14 +129,14 @@ def sweep_over(
                         rows += _rows(point, scenario, summary)
                         done += 1
                         if time.monotonic() - written > _WRITE_SECONDS:
-                            _write_table(folder, rows)
+                            _write_table(folder, rows, strategies)
                             written = time.monotonic()
                 except RunError as error:
                     failure = error
             if not rows:
                 finished.remove_unless_any()
                 raise failure or finished.interrupted("a point was done")
-            table = _write_table(folder, rows)
+            table = _write_table(folder, rows, strategies)
             used = dict.fromkeys(name for _, scenario in scenarios for name in scenario.applications)
             _draw(folder, table, grid, used)
         if failure is not None:
@@ -145,9 +147,9 @@ def sweep_over(
     return table
 
 
-def _write_table(folder: Path, rows: list[dict[str, Any]]) -> pa.Table:
-    """Write the table of the points so far; replaces the file atomically."""
-    table = pa.Table.from_pylist(rows)
+def _write_table(folder: Path, rows: list[dict[str, Any]], strategies: Mapping[str, str]) -> pa.Table:
+    """Write the table of the points so far; replaces the file atomically. strategies: as in `with_strategies`."""
+    table = with_strategies(pa.Table.from_pylist(rows), strategies)
     with private_replacement(folder / "sweep.parquet") as unfinished:
         pq.write_table(table, unfinished)
     return table

@@ -20,7 +20,8 @@ from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
 from evedrop.model.process import Floats
 from evedrop.show.view.column import ELAPSED, laid_out
-from evedrop.show.view.palette import DROPPED_TEXT, TRUTH, TRUTH_CURVE, colour, dim
+from evedrop.show.view.palette import TRUTH, dim, series
+from evedrop.show.view.panels.curves import dark_ground
 from evedrop.show.view.panels.fates import LETTER, LINE, DrawnGraph, StateLanes
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.time_steps import (
@@ -41,7 +42,6 @@ from evedrop.wire.time_steps import (
 
 _LANES, _RATES, _DELAYS, _TABLE, _EVENTS = "links", "rates", "delays", "table", "events"
 _WHOLE = "–"
-_DIM = 0.55
 _ROOM = 0.24  # of the window, to the right of the present, kept free for the legend
 _LANES_OF_A_SCREEN = 17.0  # lanes that would fill the usual window from top to bottom
 _MOST_IN_LEGEND = 6  # links
@@ -132,8 +132,8 @@ class WirePanels:
         """Record names and colours, once."""
         for path, lane in self._lanes.styles().items():
             to.log(path, lane, static=True, strict=True)
-        bright = [colour(i) for i in range(len(self._names))]
-        colours = [*bright, *(dim(shade, _DIM) for shade in bright)]
+        bright = series(len(self._names))
+        colours = [*bright, *(dim(shade) for shade in bright)]
         widths = [2.0] * len(bright) + [1.2] * len(bright)
         for path, first in ((_RATES, "heard"), (_DELAYS, "99 %")):
             names = [*self._names, *(f"{name} {first}" for name in self._names)]
@@ -210,7 +210,7 @@ class WirePanels:
                 self._cut_word = word
                 self._cut_words[word] = " " if word == _WHOLE else word
                 colours = [
-                    LaneState.QUIET.colour if step == _WHOLE else LaneState.MOST.colour for step in self._cut_words
+                    LaneState.QUIET.colour if step == _WHOLE else LaneState.CUT.colour for step in self._cut_words
                 ]
                 labels = [*self._cut_words.values()]
                 shown = rr.StateConfiguration(values=[*self._cut_words], labels=labels, colors=colours)
@@ -245,7 +245,7 @@ class WirePanels:
 
 def _curves(title: str, path: str, axis: rrb.TimeAxis, *, named: bool) -> rrb.TimeSeriesView:
     corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=named)
-    return rrb.TimeSeriesView(name=title, origin=path, axis_x=axis, plot_legend=corner)
+    return rrb.TimeSeriesView(name=title, origin=path, axis_x=axis, plot_legend=corner, background=dark_ground())
 
 
 def _sliding(before: Counts | None, counts: Counts, over: int) -> tuple[Counts, Counts]:
@@ -274,7 +274,6 @@ def _send(to: rr.RecordingStream, path: str, seconds: Iterable[float], columns: 
 GRAPH = "graph"
 """The graph's path in the recording."""
 _LONGEST = ": 12.3 % lost"
-_TEXTS = {LaneState.QUIET: TRUTH_CURVE, LaneState.MOST: DROPPED_TEXT}  # for states whose lane is too dark for letters
 
 
 @final
@@ -309,7 +308,7 @@ class WireGraph:
             labels += [*self._sides, *(f"{link.name}: {loss_of(counts[at])}" for at, link in enumerate(self._links))]
             colours += [TRUTH] * len(self._sides)
             states = [loss_state_of(counts[at]) for at in range(len(self._links))]
-            colours += [_TEXTS.get(state, state.colour) for state in states]
+            colours += [state.colour for state in states]
         return self._drawn.columns(labels, colours)
 
 

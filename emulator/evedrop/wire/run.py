@@ -182,7 +182,7 @@ def live_view(plan: WirePlan, out: Path, mode: str, say: Callable[[str], None]) 
     viewer = Viewer.start(shown, out / "logs", path)
     try:
         if viewer is not None and viewer.address is not None:
-            say(f"the wire is shown at {viewer.address}, to anybody who has this address")
+            say(f"the wire is shown to anybody who has this address:\n{viewer.address}")
         if viewer is not None and viewer.warning is not None:
             warn(viewer.warning)
         view = WireView(path, plan, out.resolve().name, time.time())

@@ -145,13 +145,13 @@ def quantile(delays: Counts, fraction: float) -> NDArray[np.float64]:
 class LaneState(Enum):
     """A word for a step of a lane, its colour, and the colour's name."""
 
-    QUIET = ("no message", palette.SILENT, "dark")
-    DELIVERED = ("all delivered", palette.STATE, "blue")
-    SOME = ("some lost", palette.MISLED, "amber")
-    MOST = ("most lost", palette.DROPPED, "red")
-    CUT = ("cut", palette.TRUTH, "white")
-    FULL = ("queue full", palette.DISCARDED, "purple")
-    OWN = ("not by the link", palette.DECODED, "green")
+    QUIET = ("no message", palette.SILENT, "black")
+    DELIVERED = ("all delivered", palette.DROPPED, "slate")
+    SOME = ("some lost", palette.MISLED, "sand")
+    MOST = ("most lost", palette.DECODED, "light blue")
+    CUT = ("cut", palette.STATE, "ivory")
+    FULL = ("queue full", palette.STEEL, "steel")
+    OWN = ("not by the link", palette.DISCARDED, "brown")
 
     def __init__(self, word: str, colour: Colour, name_of_colour: str) -> None:
         self.word = word

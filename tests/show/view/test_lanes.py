@@ -14,7 +14,7 @@ from scipy import stats
 from evedrop.model.process import Floats
 from evedrop.score.synchronisation import FACTOR, Synchronisation
 from evedrop.score.verdict import Verdict
-from evedrop.show.view.lanes import KNOWLEDGE, ErrorDistance, knowledge
+from evedrop.show.view.lanes import KNOWLEDGE, SPIED, ErrorDistance, knowledge
 from evedrop.show.view.panels.fates import WhoKnowsWhat
 from evedrop.show.view.panels.texts import VerdictLine
 from evedrop.show.view.recording import ViewRecording
@@ -23,7 +23,8 @@ from evedrop.show.view.scene_slots import drawable
 from tests.show.view.read_back import lane, rows
 from tests.show.view.simulated_run import Simulated
 
-SCENE = Scene("", "r", 10, 1, 2, 0.0, (Shown("smart", "eavesdropper", "smart", 1.0),), noise=0.05, units=("m", "m"))
+SMART = Shown("smart", "eavesdropper", "smart", 1.0)
+SCENE = Scene("", "r", 10, 1, 2, 0.0, (SMART,), noise=0.05, units=("m", "m"))
 
 
 def known(error: float, trace: float, scene: Scene = SCENE) -> Synchronisation:
@@ -65,7 +66,7 @@ def walk(errors: list[float], levels: list[int], distance: ErrorDistance) -> lis
     """The words for distances along the first state."""
     x: Floats = np.array([[error, 0.0] for error in errors])
     codes = distance.codes(np.array(levels, np.uint8), distance.of(x, np.zeros_like(x)))
-    return [distance.lane.words[code] for code in codes]
+    return [distance.lane(SMART).words[code] for code in codes]
 
 
 def test_words_say_the_largest_distance_of_a_stretch() -> None:
@@ -86,10 +87,12 @@ def test_words_say_the_largest_distance_of_a_stretch() -> None:
         f"uncertain, {more} 1 m",
     ]
     assert walk([np.inf, np.nan], [2, 2], distance)[0] == f"overconfident, {more} 1e+09 m"
-    words, colours = distance.lane.words, distance.lane.colours
+    words, colours = distance.lane(SMART).words, distance.lane(SMART).colours
     assert len(set(words)) == len(words)
-    inks = dict(zip(KNOWLEDGE.words, KNOWLEDGE.colours, strict=True))
+    inks = dict(zip(SPIED.words, SPIED.colours, strict=True))
     assert [inks[word.partition(",")[0]] for word in words] == list(colours)
+    legitimate = distance.lane(replace(SMART, role="legitimate"))
+    assert (legitimate.words, {*legitimate.colours}) == (words, {*KNOWLEDGE.colours})
 
 
 def test_distances_have_a_unit() -> None:

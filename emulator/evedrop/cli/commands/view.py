@@ -181,8 +181,10 @@ def _view_wire(options: argparse.Namespace) -> int:
 
 def _hold(subject: str, viewer: Viewer) -> None:
     """Say where a viewer is, and wait until it is closed."""
-    where = f" at {viewer.address}, to anybody who has this address" if viewer.address else ""
-    print(f"the {subject} is shown{where}; Ctrl-C ends it", flush=True)
+    if viewer.address:  # on a line of its own: a browser would take what follows as part of it
+        print(f"the {subject} is shown to anybody who has this address; Ctrl-C ends it:\n{viewer.address}", flush=True)
+    else:
+        print(f"the {subject} is shown; Ctrl-C ends it", flush=True)
     if viewer.warning is not None:
         print(f"evedrop: warning: {viewer.warning}", file=sys.stderr)
     hold(viewer)

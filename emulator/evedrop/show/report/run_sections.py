@@ -27,7 +27,7 @@ from evedrop.model.metrics.text import number_text
 from evedrop.model.process import Floats
 from evedrop.model.receiver import NOTHING, SILENT, Codes
 from evedrop.results.reading import Results
-from evedrop.scenario.recorded import recorded_noise
+from evedrop.scenario.recorded import recorded_noise, recorded_strategies
 from evedrop.score.expectations_held import repeating
 from evedrop.score.summary import Summary
 from evedrop.score.synchronisation import FACTOR, LongestSpans, LostSpan, Synchronisation, synchronisation_of
@@ -35,9 +35,9 @@ from evedrop.show.report import closing
 from evedrop.show.report.chart import POINTS, Curve, GroupCounts, GroupMeans, LogChart
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.text_table import TextTable
-from evedrop.show.view import palette
 from evedrop.show.view.error_floor import error_floor
-from evedrop.show.view.lanes import EAVESDROPPER, KNOWLEDGE, Lane
+from evedrop.show.view.lanes import EAVESDROPPER, KNOWLEDGE, SPIED, Lane, knowledge_lane
+from evedrop.show.view.palette import paper_inks
 from evedrop.system.files import Unreadable, text_of
 
 
@@ -175,7 +175,11 @@ class RunSource:
 
     def colour(self, receiver: str) -> str:
         """The colour of a receiver, as in the view."""
-        return palette.hexadecimal(palette.colour(list(self.summary.peers).index(receiver)))
+        return self._colours[receiver]
+
+    @cached_property
+    def _colours(self) -> dict[str, str]:
+        return paper_inks(self.summary.peers, recorded_strategies(self.folder))
 
     @cached_property
     def means(self) -> dict[str, SlotMeans]:
@@ -300,7 +304,8 @@ def _lost_synchronisation(of: RunSource) -> Iterator[Markup]:
         )
     yield made("table", table, "Fractions of the slots, and spans in which the receiver lost synchronisation")
     used = {code for lanes in of.trial.values() for code, fraction in enumerate(lanes.outcome.fractions) if fraction}
-    yield made("legend", "Upper lanes:", KNOWLEDGE.legend())
+    yield made("legend", "Upper lane of the legitimate estimator:", KNOWLEDGE.legend())
+    yield made("legend", "Upper lanes of eavesdroppers:", SPIED.legend())
     yield made("legend", "Lower lanes, packets:", EAVESDROPPER.legend(used))
     for name, recorded in of.trial.items():
         yield from _lanes(name, recorded)
@@ -316,7 +321,7 @@ def _lanes(name: str, recorded: RecordedTrial) -> Iterator[Markup]:
     yield made("heading", name)
     fraction = recorded.synchronisation.fractions[Synchronisation.SYNCHRONISED]
     label = f"{name}: synchronised in {fraction:.1%} of the slots 0 to {recorded.last:,}"
-    yield lane_picture(KNOWLEDGE, recorded.synchronisation.highest, label)
+    yield lane_picture(knowledge_lane(name), recorded.synchronisation.highest, label)
     counted = ", ".join(
         f"{fraction:.1%} {word}"
         for word, fraction in zip(OUTCOMES, recorded.outcome.fractions, strict=True)

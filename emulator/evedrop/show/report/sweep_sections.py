@@ -19,11 +19,12 @@ from evedrop.errors import UsageError
 from evedrop.model.checks import toml_of
 from evedrop.model.metrics import all_metrics, error_column, shown_metric
 from evedrop.model.process import Floats
+from evedrop.results.tables import swept_strategies
 from evedrop.scenario.loading import value_of
 from evedrop.show.report.chart import Curve, LogChart
 from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.page import made
-from evedrop.show.view import palette
+from evedrop.show.view.palette import paper_inks
 from evedrop.system.files import text_of
 
 SWEEP_TABLE = "sweep.parquet"
@@ -47,18 +48,23 @@ class SweepSource:
     """How much was run."""
     outcome: str
     """How many points were done, as a sentence."""
+    inks: Mapping[str, str]
+    """Receiver → its colour."""
 
     @classmethod
     def read(cls, folder: Path) -> SweepSource:
         """Read a folder. Raises UsageError if it is not that of a sweep."""
         try:
             entries = json.loads(text_of(folder / "sweep.json", _MOST_BYTES))
-            rows, grid = pq.read_table(folder / SWEEP_TABLE).to_pylist(), entries["over"]
+            table, grid = pq.read_table(folder / SWEEP_TABLE), entries["over"]
+            rows = table.to_pylist()
+            inks = paper_inks(dict.fromkeys(row["peer"] for row in rows), swept_strategies(table))
             done, planned = len({tuple(row[key] for key in grid) for row in rows}), math.prod(map(len, grid.values()))
             sizes = (_size([row[name] for row in rows], name) for name in ("slots", "trials"))
             amount = " · ".join((f"{done:,} points of {', '.join(grid)}", *sizes))
             outcome = f"All {planned:,} points were done" if done == planned else f"{done:,} of {planned:,} points"
-            return cls(folder, rows, entries["scenario"], entries["changes"], grid, entries["mode"], amount, outcome)
+            changes, mode = entries["changes"], entries["mode"]
+            return cls(folder, rows, entries["scenario"], changes, grid, mode, amount, outcome, inks)
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{folder} cannot be read as a sweep ({error}); run the sweep again") from error
 
@@ -91,8 +97,8 @@ def _errors(of: SweepSource) -> Iterator[Markup]:
         if not all(isinstance(row[first], (int, float)) for row in rows):
             words = list(dict.fromkeys(str(row[first]) for row in rows))
         curves = [
-            _curve(name, i, [row for row in rows if row["peer"] == name], first, words)
-            for i, name in enumerate(dict.fromkeys(row["peer"] for row in rows))
+            _curve(name, of.inks[name], [row for row in rows if row["peer"] == name], first, words)
+            for name in dict.fromkeys(row["peer"] for row in rows)
         ]
         label = (
             f"Mean error of every receiver against {first}, with what theory expects. The table has the values. {where}"
@@ -101,17 +107,15 @@ def _errors(of: SweepSource) -> Iterator[Markup]:
         yield LogChart(label, first, shown, curves, words).figure or Markup()
 
 
-def _curve(name: str, i: int, rows: Sequence[Mapping[str, Any]], key: str, words: Sequence[str] | None) -> Curve:
-    """The curve of the i-th receiver; words: the names of the places of the axis, if it has names."""
+def _curve(name: str, ink: str, rows: Sequence[Mapping[str, Any]], key: str, words: Sequence[str] | None) -> Curve:
+    """The curve of a receiver; words: the names of the places of the axis, if it has names."""
     marks, lines = (
         [metric for metric, kind in all_metrics().items() if kind.sweep_picture == way] for way in ("marks", "lines")
     )
     x = [float(row[key]) if words is None else float(words.index(str(row[key]))) for row in rows]
     y, theory = (_values(rows, names) for names in (marks, lines))
     scatter = 1.96 * np.nan_to_num(_values(rows, [error_column(metric) for metric in marks]))
-    return Curve(
-        name, palette.hexadecimal(palette.colour(i)), np.array(x), y, y - scatter, y + scatter, theory, bars=True
-    )
+    return Curve(name, ink, np.array(x), y, y - scatter, y + scatter, theory, bars=True)
 
 
 def _values(rows: Sequence[Mapping[str, Any]], names: list[str]) -> Floats:

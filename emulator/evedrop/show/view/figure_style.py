@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from evedrop.show.view.shown_figure import ShownFigure
 
-BLUE, RED, GREEN, ORANGE, GREY = map(hexadecimal, FIGURES)
-"""The colours of `FIGURES`, as matplotlib writes them."""
+SLATE, OCHRE, GREY = map(hexadecimal, FIGURES)
+"""The colours of `FIGURES`, as matplotlib writes them: for curves that do not belong to a receiver."""
 
 _STYLE: Any = {
     "axes.axisbelow": True,

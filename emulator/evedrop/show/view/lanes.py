@@ -56,7 +56,9 @@ LEGITIMATE = Lane(
 )
 EAVESDROPPER = Lane((*LEGITIMATE.words, MISLED), (*LEGITIMATE.colours, palette.MISLED))
 KNOWLEDGE = Lane(tuple(status.word for status in Synchronisation), palette.KNOWLEDGE)
-"""What a receiver knows; a `Synchronisation` is its code."""
+"""What the legitimate estimator knows; a `Synchronisation` is its code."""
+SPIED = Lane(KNOWLEDGE.words, palette.SPIED)
+"""What an eavesdropper knows, with the same codes."""
 SILENT_CODE = np.uint8(EAVESDROPPER.words.index(SILENT))
 """Code of a slot in which nothing was sent, so that nothing could be lost."""
 MISLED_CODE = np.uint8(EAVESDROPPER.words.index(MISLED))
@@ -71,6 +73,11 @@ def legend() -> list[tuple[str, Colour]]:
 def lane_of(shown: Shown) -> Lane:
     """The lane of a receiver."""
     return LEGITIMATE if shown.role == "legitimate" else EAVESDROPPER
+
+
+def knowledge_lane(role: str) -> Lane:
+    """The lane of what a receiver of this role knows."""
+    return KNOWLEDGE if role == "legitimate" else SPIED
 
 
 def sent(slots: SceneSlots) -> Codes:
@@ -119,18 +126,18 @@ class ErrorDistance:
         first = math.floor(math.log10(self._near)) + 1
         self._steps = np.array([self._near, *(10.0**decade for decade in range(first, first + _DECADES))])
 
-    @property
-    def lane(self) -> Lane:
-        """All words of `codes`, such as "uncertain, off by more than 10 m", in the colours of what they say."""
+    def lane(self, shown: Shown) -> Lane:
+        """All words of `codes`, such as "uncertain, off by more than 10 m", in the colours of what they say of this receiver."""
+        inks = knowledge_lane(shown.role).colours
         near = self._text(self._near)
         words, colours = (
             [f"{Synchronisation.SYNCHRONISED.word}, within {near}"],
-            [KNOWLEDGE.colours[Synchronisation.SYNCHRONISED]],
+            [inks[Synchronisation.SYNCHRONISED]],
         )
         for status in (Synchronisation.UNCERTAIN, Synchronisation.OVERCONFIDENT):
             words.append(f"{status.word}, off by less than {near}")
             words += [f"{status.word}, off by more than {self._text(step)}" for step in self._steps]
-            colours += [KNOWLEDGE.colours[status]] * (1 + len(self._steps))
+            colours += [inks[status]] * (1 + len(self._steps))
         return Lane(tuple(words), tuple(colours))
 
     def of(self, x: Floats, x_hat: Floats) -> Floats:

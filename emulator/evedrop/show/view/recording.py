@@ -267,6 +267,8 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
         """Begin the file, with layout and styles."""
         self._file.save(private_file(path), default_blueprint=self._blueprint)
         self._style(self._file)
+        # Otherwise slots may overtake the styles, and a viewer shows the first of them in Rerun's own colours.
+        self._file.flush(timeout_sec=self._patience)
 
     def _finish(self) -> None:
         """Finish the file."""

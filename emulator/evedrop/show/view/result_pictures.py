@@ -9,6 +9,7 @@ Source: docs/python.md.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -24,14 +25,15 @@ from evedrop.model.metrics import all_metrics, error_column, shown_metric
 from evedrop.model.process import Floats
 from evedrop.model.receiver import NOTHING, SILENT
 from evedrop.results.reading import Results
+from evedrop.results.tables import swept_strategies
 from evedrop.scenario.arguments import refuse_unless
-from evedrop.scenario.recorded import recorded, recorded_noise
+from evedrop.scenario.recorded import recorded, recorded_noise, recorded_strategies
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.view import palette
 from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
 from evedrop.show.view.figure_style import drawing, panels
 from evedrop.show.view.lanes import EAVESDROPPER
-from evedrop.show.view.palette import RECEIVERS, TRUTH_CURVE, colour, hexadecimal
+from evedrop.show.view.palette import TRUTH_CURVE, hexadecimal, paper_inks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,7 +47,8 @@ _WIDTH = 8.4
 _LAST = 300  # slots of lanes and plane unless told otherwise
 _MARGIN = 0.25  # around the truth in the plane, as a fraction of its extent
 _LINES, _DOTS = ("-", "-.", ":"), (".", "x", "+")
-"""Of the first receivers with different colours, of the next ones, whose colours are the same, and so on."""
+"""Of the receivers in turn if there are more than `_ALIKE`, because colours alone would not suffice."""
+_ALIKE = 7
 _HEIGHTS: Mapping[str, Callable[[int], float]] = {
     "errors": lambda _: 3.2,
     "lanes": lambda receivers: 0.9 + 0.3 * receivers,
@@ -67,37 +70,37 @@ def run_figure(results: Results, wanted: Sequence[str], slots: range | None, tri
         raise UsageError(f"plot: {slots} are not slots of the run; expected some such as range(0, {last + 1})")
     receivers = rows["peer"].unique().to_pylist()
     noise = recorded_noise(results.folder)
-    recorded_trial = None if names == ["errors"] else _RecordedTrial(results, receivers, trial, slots)
+    inks = paper_inks(receivers, recorded_strategies(results.folder))
+    recorded_trial = None if names == ["errors"] else _RecordedTrial(results, inks, trial, slots)
     heights = [_HEIGHTS[name](len(receivers)) for name in names]
     with drawing(_WIDTH, sum(heights)) as figure:
         figure.suptitle(str(results.summary["scenario"]), x=0.02, ha="left", fontsize=11)
         places = figure.subplots(len(names), 1, height_ratios=heights, squeeze=False)[:, 0]
         for name, axes in zip(names, places, strict=True):
             if name == "errors":
-                _errors(axes, rows, receivers, slots, error_floor(noise, pc.max(rows["trials"]).as_py()))
+                _errors(axes, rows, inks, slots, error_floor(noise, pc.max(rows["trials"]).as_py()))
             elif recorded_trial is not None:
                 (recorded_trial.lanes if name == "lanes" else recorded_trial.plane)(axes)
     return figure
 
 
-def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | None, floor: float) -> None:
+def _errors(axes: Axes, rows: pa.Table, inks: Mapping[str, str], slots: range | None, floor: float) -> None:
     """The mean squared error of each slot, theory dashed, and a band of two standard errors of its logarithm.
 
-    floor: values below it are drawn at it.
+    inks: of each receiver; floor: values below it are drawn at it.
     """
     many, heights = False, list[Floats]()
-    for i, name in enumerate(receivers):
+    for i, (name, ink) in enumerate(inks.items()):
         mine = rows.filter(pc.equal(rows["peer"], name))
         if slots is not None:
             mine = mine.filter(pc.is_in(mine["slot"], pa.array(slots, pa.int64())))
         columns = {column: mine[column].to_numpy() for column in mine.column_names if column != "peer"}
-        ink = hexadecimal(colour(i))
         error, theory = columns["mean_squared_error"], columns["theoretical_trace_covariance"]
         if np.isnan(error).all():
             error = columns["mean_actual_trace_covariance"]
         heights += [error, theory]
         dot = "o" if len(error) == 1 else ""  # a line through one slot cannot be seen
-        line = _LINES[i // len(RECEIVERS) % len(_LINES)]
+        line = _LINES[i % len(_LINES)] if len(inks) > _ALIKE else _LINES[0]
         axes.plot(columns["slot"], np.maximum(error, floor), line, color=ink, label=name, linewidth=1.3, marker=dot)
         axes.plot(columns["slot"], np.maximum(theory, floor), "--", color=ink, linewidth=0.9)
         if (columns["trials"] > 1).any():
@@ -121,7 +124,8 @@ def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | Non
 class _RecordedTrial:
     """One recorded trial in the slots that are shown."""
 
-    def __init__(self, results: Results, receivers: list[str], trial: int | None, slots: range | None) -> None:
+    def __init__(self, results: Results, inks: Mapping[str, str], trial: int | None, slots: range | None) -> None:
+        self.inks = inks
         rows = results.trials
         trials = rows["trial"].unique().to_pylist()
         if trial is None and trials:
@@ -135,7 +139,7 @@ class _RecordedTrial:
         last = int(pc.max(rows["slot"]).as_py())
         self.slots = slots or range(max(0, last + 1 - _LAST), last + 1)
         rows = rows.filter(pc.is_in(rows["slot"], pa.array(self.slots, pa.int64())))
-        self.rows = {name: rows.filter(pc.equal(rows["peer"], name)) for name in receivers}
+        self.rows = {name: rows.filter(pc.equal(rows["peer"], name)) for name in inks}
         self.title = f"trial {trial}, slots {self.slots[0]} to {self.slots[-1]}"
         process = recorded(results.folder).scenario.process
         states = process.states or [f"x[{i}]" for i in range(len(process.A))]
@@ -171,11 +175,11 @@ class _RecordedTrial:
         truth = _path(first, "x")
         axes.plot(*truth, color=hexadecimal(TRUTH_CURVE), linewidth=2.6, alpha=0.8, label="truth")
         for i, (name, rows) in enumerate(self.rows.items()):
-            dot = _DOTS[i // len(RECEIVERS) % len(_DOTS)]
+            dot = _DOTS[i % len(_DOTS)] if len(self.inks) > _ALIKE else _DOTS[0]
             manner: dict[str, Any] = (
                 {"linewidth": 1.2} if i == 0 else {"marker": dot, "markersize": 4.0, "linewidth": 0.0}
             )
-            axes.plot(*_path(rows, "x_hat"), color=hexadecimal(colour(i)), label=name, **manner)
+            axes.plot(*_path(rows, "x_hat"), color=self.inks[name], label=name, **manner)
         for limits, values in ((axes.set_xlim, truth[0]), (axes.set_ylim, truth[1])):
             margin = _MARGIN * (np.ptp(values) or 1.0)
             limits(values.min() - margin, values.max() + margin)
@@ -193,7 +197,6 @@ def _path(rows: pa.Table, column: str) -> tuple[NDArray[np.float64], NDArray[np.
     return values[:, 0], values[:, 1]
 
 
-_COLOURS = tuple(hexadecimal(one) for one in RECEIVERS)
 _MARKS = "osD^vPX*"
 _MOST_PANELS = 6
 
@@ -203,18 +206,16 @@ def draw_sweep(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
 
     Bars at the marks are standard errors.
     """
-    rows = table.to_pylist()
-    count = len(_others(rows, keys))
+    count = len(_others(table.to_pylist(), keys))
     with panels(path, count, *_sweep_size(count)) as axes:
-        _draw_sweep_on(axes, rows, keys)
+        _draw_sweep_on(axes, table, keys)
 
 
 def sweep_figure(table: pa.Table, keys: Sequence[str]) -> ShownFigure:
     """The plot of a sweep as a figure."""
-    rows = table.to_pylist()
-    count = len(_others(rows, keys))
+    count = len(_others(table.to_pylist(), keys))
     with drawing(*_sweep_size(count)) as figure:
-        _draw_sweep_on(list(figure.subplots(1, count, squeeze=False)[0]), rows, keys)
+        _draw_sweep_on(list(figure.subplots(1, count, squeeze=False)[0]), table, keys)
     return figure
 
 
@@ -228,13 +229,14 @@ def _others(rows: list[dict[str, Any]], keys: Sequence[str]) -> list[tuple[Any, 
     return list(dict.fromkeys(tuple(row[key] for key in keys[1:]) for row in rows))[:_MOST_PANELS]
 
 
-def _draw_sweep_on(axes: list[Axes], rows: list[dict[str, Any]], keys: Sequence[str]) -> None:
+def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> None:
+    rows, strategies = table.to_pylist(), swept_strategies(table)
     marks, lines = (
         [name for name, scheme in all_metrics().items() if scheme.sweep_picture == way] for way in ("marks", "lines")
     )
-    peers = list(dict.fromkeys(row["peer"] for row in rows))
+    inks = paper_inks(dict.fromkeys(row["peer"] for row in rows), strategies)
     for scheme, values in zip(axes, _others(rows, keys), strict=True):
-        for peer, ink, mark in zip(peers, _COLOURS * 10, _MARKS * 9, strict=False):
+        for (peer, ink), mark in zip(inks.items(), itertools.cycle(_MARKS), strict=False):
             mine = [row for row in rows if row["peer"] == peer and tuple(row[key] for key in keys[1:]) == values]
             x = _positions([row[keys[0]] for row in mine])
             theory = [_height(row, lines) for row in mine]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 from evedrop.model.record import Record, RecordColumn, column
 from evedrop.scenario.application import Panel
+from evedrop.show.view.palette import Colour, identities
 
 TRUTH_NAME = "truth"
 """The name of the true state where receivers' names are those of their estimates."""
@@ -67,6 +69,11 @@ class Scene:
     """Receiver → the ways of sender and receiver on the ground, for links whose losses depend on them."""
     panels: tuple[Panel, ...] = ()
     """The panels of applications."""
+
+    @cached_property
+    def colours(self) -> Mapping[str, Colour]:
+        """Receiver → its colour: green for the legitimate estimator, that of its strategy for an eavesdropper."""
+        return identities({shown.name: shown.strategy for shown in self.receivers})
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from evedrop.model.schedule import Schedule
 from evedrop.model.slot.link import deliveries, link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.model.theory.closed_forms import step_probabilities, word_probability
-from evedrop.show.view.figure_style import BLUE, RED, panels
+from evedrop.show.view.figure_style import OCHRE, SLATE, panels
 
 CASES = ((0.9, 0.6), (0.6, 0.3))
 WORDS = ("D", "DI", "DD", "DII", "DID", "DDI", "DDD")
@@ -63,7 +63,7 @@ def draw(path: Path, result: list[Occupation]) -> str:
     """Draw the figure; returns its caption."""
     with panels(path, 2, 9.6, 4.0) as (left, right):
         for index, ((mu, mu_d), occupation, colour, mark) in enumerate(
-            zip(CASES, result, (BLUE, RED), ("o", "s"), strict=True)
+            zip(CASES, result, (SLATE, OCHRE), ("o", "s"), strict=True)
         ):
             label = rf"$\mu = {mu}$, $\mu_d = {mu_d}$"
             theory = step_probabilities(mu, mu_d, STEPS)

@@ -18,7 +18,8 @@ from evedrop.model.slot.link import deliveries, link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.model.theory.covariances import Outcomes, misled_covariances, theoretical_traces
 from evedrop.model.update import actual_covariance
-from evedrop.show.view.figure_style import BLUE, GREEN, GREY, RED, panels
+from evedrop.show.view.figure_style import GREY, panels
+from evedrop.show.view.palette import paper_inks
 
 MU = 0.6
 STATE_PROBABILITIES = tuple(round(0.1 * i, 1) for i in range(1, 10))
@@ -108,11 +109,12 @@ def draw(path: Path, day: Day) -> str:
     """Draw the figure; returns its caption."""
     fine = np.linspace(0.1, 0.9, 33)
     curves = theory(day.slots, fine.tolist())
+    inks = paper_inks(RECEIVERS, {})
     with panels(path, 2, 9.6, 4.0) as (left, right):
         for row, axes, colour, mark, label in (
-            (0, left, BLUE, "o", "legitimate"),
-            (1, left, RED, "s", "smart eavesdropper"),
-            (2, right, GREEN, "^", "naive eavesdropper"),
+            (0, left, inks["legitimate"], "o", "legitimate"),
+            (1, left, inks["smart"], "s", "smart eavesdropper"),
+            (2, right, inks["naive"], "^", "naive eavesdropper"),
         ):
             axes.plot(fine, curves[row], "--" if row == 1 else "-", color=colour, label=f"{label}, theory")
             axes.errorbar(

@@ -13,15 +13,16 @@ from evedrop.model.process import Process
 from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bound
 from evedrop.model.theory.design import Against, design
 from evedrop.model.theory.ratio import Adversary
-from evedrop.show.view.figure_style import panels
+from evedrop.show.view.figure_style import GREY, panels
+from evedrop.show.view.palette import paper_inks
 
 MU = 0.9
 QUALITIES = (0.85, 0.90, 0.95, 0.99)
 _LOOKS = {
-    0.85: ("#c800c8", ":", "worse"),
-    0.90: ("#0000e0", "--", "equal"),
-    0.95: ("black", "-", "better"),
-    0.99: ("#e00000", "-.", "much better"),
+    0.85: (":", "worse"),
+    0.90: ("--", "equal"),
+    0.95: ("-", "better"),
+    0.99: ("-.", "much better"),
 }
 
 
@@ -51,12 +52,14 @@ def draw(path: Path, result: dict[float, Against]) -> str:
         start = max(low, against.bound)
         mu_d = start + (1.0 - start) * np.geomspace(1e-4, 1.0, 240)
         curves[mu_e] = mu_d, [gain(mu_e, value) for value in mu_d]
+    names = [f"{mu_e:g}" for mu_e in result]
+    inks = paper_inks(names, dict.fromkeys(names, "smart"))
     with panels(path, 2, 9.6, 4.1) as (whole, close):
         for axes in (whole, close):
             axes.axhline(0.0, color="#888888", linewidth=0.8)
             axes.axvline(low, color="#888888", linewidth=0.8)
             for mu_e, against in result.items():
-                colour, line, word = _LOOKS[mu_e]
+                colour, (line, word) = inks[f"{mu_e:g}"], _LOOKS[mu_e]
                 label = f"$\\mu_e = {mu_e:.2f}$ ({word})"
                 axes.plot(*curves[mu_e], line, color=colour, label=label)
                 if against.best_ratio is not None:
@@ -69,9 +72,9 @@ def draw(path: Path, result: dict[float, Against]) -> str:
             axes.set_xlabel(r"probability of sending the state, $\mu_d$")
         perfect = result[0.85].perfect
         if perfect is not None:
-            whole.axvspan(*perfect, color="#c800c8", alpha=0.13, linewidth=0)
+            whole.axvspan(*perfect, color=GREY, alpha=0.2, linewidth=0)
             whole.text(
-                0.5 * sum(perfect), 7.2, "perfect secrecy vs 0.85", rotation=90, ha="center", va="center", color="#900090",
+                0.5 * sum(perfect), 7.2, "perfect secrecy vs 0.85", rotation=90, ha="center", va="center", color="#555555",
             )  # fmt: skip
         whole.set_ylabel(r"relative gain $J_r / J$ (dimensionless)")
         whole.set_title("(a) all admissible $\\mu_d$")

@@ -19,16 +19,17 @@ from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.slot.link import deliveries, link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.model.theory.covariances import Outcomes, theoretical_traces
-from evedrop.show.view.figure_style import BLUE, GREEN, ORANGE, RED, panels
+from evedrop.show.view.figure_style import panels
+from evedrop.show.view.palette import paper_inks
 
 MU, MU_D, SLOTS = 0.9, 0.85, 26
 _BATCH = 2000
 _SUSPICIOUS = {"use_state": 0.8, "use_innovation": 0.3}
 _LOOKS = {
-    "legitimate": (BLUE, "o", "-"),
-    "smart": (RED, "s", "--"),
-    "suspicious": (ORANGE, "D", "-."),
-    "naive": (GREEN, "^", ":"),
+    "legitimate": ("o", "-"),
+    "smart": ("s", "--"),
+    "suspicious": ("D", "-."),
+    "naive": ("^", ":"),
 }
 
 
@@ -72,9 +73,10 @@ def simulate(trials: int, progress: Callable[[str], None]) -> SimulatedRuns:
 
 def draw(path: Path, runs: SimulatedRuns) -> str:
     """Draw the figure; returns its caption."""
-    k = np.arange(SLOTS)
+    k, inks = np.arange(SLOTS), paper_inks(_LOOKS, {})
     with panels(path, 2, 9.6, 4.2) as (actual, reported):
-        for name, (colour, mark, line) in _LOOKS.items():
+        for name, (mark, line) in _LOOKS.items():
+            colour = inks[name]
             theory = outcomes()[name]
             for axes, expected, (mean, error) in (
                 (actual, theory, runs.squared_error[name]),

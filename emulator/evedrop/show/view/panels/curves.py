@@ -15,11 +15,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
+from rerun.blueprint.archetypes import PlotBackground
 
 from evedrop.model.process import Floats
 from evedrop.show.view.column import Column, scalars
 from evedrop.show.view.error_floor import error_floor
-from evedrop.show.view.palette import PLANT, TRUTH_CURVE, Colour, colour, dim
+from evedrop.show.view.palette import GROUND, PLANT, TRUTH_CURVE, Colour, dim
 from evedrop.show.view.panels.panel import PlacedView, ViewPanel
 from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots
 
@@ -48,6 +49,11 @@ def whole_run(scene: Scene) -> rrb.TimeAxis:
     return rrb.TimeAxis(view_range=whole, zoom_lock=True)
 
 
+def dark_ground() -> PlotBackground:
+    """The background of curves, which is dark in both themes: most of their colours would be illegible on white."""
+    return PlotBackground(color=GROUND)
+
+
 def receivers_view(title: str, kinds: list[str], axis: rrb.TimeAxis) -> rrb.TimeSeriesView:
     """A view of the curves below some paths, in the receivers' colours, which the legend of the whole view explains."""
     return rrb.TimeSeriesView(
@@ -56,6 +62,7 @@ def receivers_view(title: str, kinds: list[str], axis: rrb.TimeAxis) -> rrb.Time
         contents=[f"/{kind}/**" for kind in kinds],
         axis_x=axis,
         plot_legend=rrb.PlotLegend(visible=False),
+        background=dark_ground(),
     )
 
 
@@ -67,7 +74,9 @@ def curves_view(
     legend: whether it names its curves, which those of truth and receivers do not need.
     """
     corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
-    return rrb.TimeSeriesView(name=title, origin=f"/{path}", axis_x=axis, axis_y=values, plot_legend=corner)
+    return rrb.TimeSeriesView(
+        name=title, origin=f"/{path}", axis_x=axis, axis_y=values, plot_legend=corner, background=dark_ground()
+    )
 
 
 def line_style(label: str, bright: Colour, width: float, *, steps: bool = False) -> rr.SeriesLines:
@@ -123,13 +132,14 @@ class SquaredError(ViewPanel):
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each curve in its receiver's colour, and the edges of its band dim."""
         styles = {}
-        for i, shown in enumerate(self.scene.receivers):
+        for shown in self.scene.receivers:
+            bright = self.scene.colours[shown.name]
             styles[f"{_ERROR_PATH}/{shown.name}"] = rr.SeriesLines(
-                names=shown.name, colors=colour(i), widths=1.5, aggregation_policy=LARGEST
+                names=shown.name, colors=bright, widths=1.5, aggregation_policy=LARGEST
             )
             for side in _SIDES if self._with_bands else ():
                 styles[f"{_BAND}/{shown.name}/{side}"] = rr.SeriesLines(
-                    names=_NO_NAME, colors=dim(colour(i), 0.5), widths=1.0, aggregation_policy=LARGEST
+                    names=_NO_NAME, colors=dim(bright), widths=1.0, aggregation_policy=LARGEST
                 )
         return styles
 
@@ -159,13 +169,13 @@ class TraceOfP(ViewPanel):
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each receiver's colour: bright for its belief, dim for theory."""
         styles = {}
-        for i, shown in enumerate(self.scene.receivers):
-            bright, label = colour(i), shown.name
+        for shown in self.scene.receivers:
+            bright, label = self.scene.colours[shown.name], shown.name
             styles[f"{_REPORTED}/{label}"] = rr.SeriesLines(
                 names=label, colors=bright, widths=1.5, interpolation_mode="StepAfter", aggregation_policy=LARGEST
             )
             styles[f"{_THEORY}/{label}"] = rr.SeriesLines(
-                names=f"{label}, theory", colors=dim(bright, 0.6), widths=1.0, aggregation_policy=LARGEST
+                names=f"{label}, theory", colors=dim(bright), widths=1.0, aggregation_policy=LARGEST
             )
         return styles
 
@@ -211,6 +221,7 @@ class StateOverTime(ViewPanel):
                 origin=_STATE_PATH,
                 axis_x=recent_slots(self.scene),
                 plot_legend=rrb.PlotLegend(visible=False),
+                background=dark_ground(),
             )
             yield PlacedView(view, "right")
             yield from worlds_over_time(self.scene, _STATE_PATH, recent_slots(self.scene))
@@ -218,8 +229,8 @@ class StateOverTime(ViewPanel):
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each estimate in its receiver's colour; the truth grey and wide."""
         styles = {f"{_STATE_PATH}/{TRUTH_NAME}": rr.SeriesLines(names="truth", colors=TRUTH_CURVE, widths=2.5)}
-        for i, shown in enumerate(self.scene.receivers):
-            styles[f"{_STATE_PATH}/{shown.name}"] = rr.SeriesLines(names=shown.name, colors=colour(i), widths=1.5)
+        for name, bright in self.scene.colours.items():
+            styles[f"{_STATE_PATH}/{name}"] = rr.SeriesLines(names=name, colors=bright, widths=1.5)
         return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
@@ -255,8 +266,8 @@ class Levels(ViewPanel):
         styles = {}
         for i in range(self.scene.n):
             styles[f"{_LEVELS_PATH}/{i}/{TRUTH_NAME}"] = line_style("truth", TRUTH_CURVE, 1.8)
-            for j, shown in enumerate(self.scene.receivers):
-                styles[f"{_LEVELS_PATH}/{i}/{shown.name}"] = line_style(shown.name, colour(j), 0.9)
+            for name, bright in self.scene.colours.items():
+                styles[f"{_LEVELS_PATH}/{i}/{name}"] = line_style(name, bright, 0.9)
         return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
@@ -325,11 +336,10 @@ class ApplicationPanels(ViewPanel):
 
     def styles(self) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:
         """The styles that the application describes; a receiver's own colour if it gives none."""
-        colours = {shown.name: colour(i) for i, shown in enumerate(self.scene.receivers)}
         styles: dict[str, rr.SeriesLines | rr.SeriesPoints] = {}
         for panel in self.scene.panels:
             for curve in panel.curves:
-                bright = curve.colour or colours[curve.name]
+                bright = curve.colour or self.scene.colours[curve.name]
                 styles[f"{panel.path}/{curve.name}"] = (
                     rr.SeriesPoints(names=curve.name, colors=bright, markers="circle", marker_sizes=curve.width)
                     if curve.drawn == "points"

@@ -23,7 +23,7 @@ from evedrop.score.synchronisation import Synchronisation
 from evedrop.show.view import lanes
 from evedrop.show.view.column import Column
 from evedrop.show.view.lanes import ErrorDistance, Lane, knowledge
-from evedrop.show.view.palette import DROPPED_TEXT, MISLED, STATE, SYNCHRONISED_TEXT, TRUTH, TRUTH_CURVE, Colour
+from evedrop.show.view.palette import ALARM, MISLED, STEEL, TRUTH, Colour, letters
 from evedrop.show.view.panels.curves import recent_slots
 from evedrop.show.view.panels.panel import FIXED_HEIGHT, PlacedView, ViewPanel, crowded, lanes_height
 from evedrop.show.view.panels.plane import frames
@@ -80,7 +80,7 @@ class WhoKnowsWhat(ViewPanel):
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
         self._distances = {shown.name: ErrorDistance(scene) for shown in scene.receivers}
-        named = [(name, distance.lane) for name, distance in self._distances.items()]
+        named = [(shown.name, self._distances[shown.name].lane(shown)) for shown in scene.receivers]
         self._lanes = StateLanes(_KNOWLEDGE_PATH, named, first=1, labelled=True)
 
     def views(self) -> Iterator[PlacedView]:
@@ -120,7 +120,7 @@ class Packets(ViewPanel):
         """One view, as high as the lanes need: above the events, or, with many receivers or a closed loop, at the top."""
         view = rrb.StateTimelineView(name="Packets", origin=_PACKETS_PATH, time_view=recent_slots(self.scene))
         strip = rrb.StateTimelineView(
-            name=f"Packets sent   blue: a state{self._other}",
+            name=f"Packets sent   bright: a state{self._other}",
             origin=_PACKETS_PATH,
             contents=[self._lanes.paths[0]],
             time_view=recent_slots(self.scene),
@@ -139,7 +139,7 @@ class Packets(ViewPanel):
         """What the title says of the scheme's other packets; empty if there are none."""
         scheme = self.scene.receivers[0].strategy
         sends = scheme in SCHEMES.names and SCHEMES[scheme].sends_states_and_innovations
-        return ", purple: an innovation" if sends else ""
+        return ", dark: an innovation" if sends else ""
 
     def styles(self) -> dict[str, rr.StateConfiguration]:
         """Colours; the legend says what they mean."""
@@ -186,7 +186,7 @@ class DrawnGraph:
     def columns(self, labels: Sequence[str], colours: Sequence[Colour]) -> rr.ComponentColumnList:
         """Labels and colours of all nodes at some times: those of the first time, then those of the second, and so on."""
         lengths = [len(self.nodes)] * (len(labels) // len(self.nodes))
-        return rr.GraphNodes.columns(labels=labels, colors=colours).partition(lengths)
+        return rr.GraphNodes.columns(labels=labels, colors=[letters(colour) for colour in colours]).partition(lengths)
 
 
 @dataclass(frozen=True)
@@ -204,20 +204,14 @@ _GRAPH_PATH = "graph"
 _SENSOR, _ROUTER = "the sensor", "the router"
 _LINKS, _RECEIVERS = 150.0, 320.0  # where their columns are, right of sensor and router
 FATES = {
-    receiver.STATE: STATE,
-    receiver.INNOVATION: STATE,
+    receiver.STATE: TRUTH,
+    receiver.INNOVATION: TRUTH,
     receiver.MISLED: MISLED,
-    receiver.DISCARDED: TRUTH_CURVE,
-    receiver.DROPPED: DROPPED_TEXT,
-    receiver.SILENT: TRUTH_CURVE,
+    receiver.DISCARDED: STEEL,
+    receiver.DROPPED: STEEL,
+    receiver.SILENT: STEEL,
 }
-"""The colour of each word of a lane."""
-KNOWN = {
-    Synchronisation.SYNCHRONISED: SYNCHRONISED_TEXT,
-    Synchronisation.UNCERTAIN: MISLED,
-    Synchronisation.OVERCONFIDENT: DROPPED_TEXT,
-}
-"""The colour of what a receiver knows."""
+"""The colour of each word of a lane: bright where the packet was used, sand where it misled, steel where it was not used."""
 
 
 @final
@@ -284,6 +278,11 @@ class LastPacket(ViewPanel):
         distances = self._distance.of(slots.x[at], peer.x_hat[at]).tolist()
         statuses = [Synchronisation(code) for code in knowledge(self.scene, slots.x, peer)[at].tolist()]
         return [
-            (f"{shown.name}: {status.word}, {self._distance.text(distance)} off", KNOWN[status])
+            (f"{shown.name}: {status.word}, {self._distance.text(distance)} off", self._ink(shown, status))
             for status, distance in zip(statuses, distances, strict=True)
         ]
+
+    def _ink(self, shown: Shown, status: Synchronisation) -> Colour:
+        """The receiver's own colour, unless it is an eavesdropper that knows the state."""
+        spied = shown.role != "legitimate" and status is Synchronisation.SYNCHRONISED
+        return ALARM if spied else self.scene.colours[shown.name]

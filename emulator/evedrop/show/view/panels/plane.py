@@ -22,7 +22,7 @@ from evedrop.model.links.way import Way
 from evedrop.model.process import Floats
 from evedrop.show.view.column import TIMELINE, Column
 from evedrop.show.view.lanes import ErrorDistance
-from evedrop.show.view.palette import GROUND, TRUTH, Colour, colour, dim
+from evedrop.show.view.palette import GROUND, TRUTH, Colour, dim
 from evedrop.show.view.panels.panel import PlacedView, ViewPanel
 from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots, Shown
 
@@ -80,7 +80,7 @@ class StatePlane(ViewPanel):
 
     def _world(self, shown: Shown, trails: Mapping[str, rrb.VisibleTimeRanges]) -> rrb.Spatial2DView:
         """The world as a receiver believes it: its estimate, path and ellipse, over the faded truth."""
-        name, faded = shown.name, [dim(TRUTH, 0.45)]
+        name, faded = shown.name, [dim(TRUTH)]
         shown_paths = [_trail(name), _ellipse(name), _point(name), _off(name)]
         overrides = {
             _trail(TRUTH_NAME): [rr.LineStrips2D.from_fields(colors=faded), trails[_trail(TRUTH_NAME)]],
@@ -113,16 +113,17 @@ class StatePlane(ViewPanel):
         styles = _point_styles(TRUTH_NAME, TRUTH, radius=3.5, order=40.0)
         styles[_HEADING] = rr.LineStrips2D.from_fields(colors=[TRUTH], radii=rr.Radius.ui_points(2.0), draw_order=41.0)
         styles[_SCALE] = rr.LineStrips2D.from_fields(
-            colors=[dim(TRUTH, 0.6)], radii=rr.Radius.ui_points(1.5), show_labels=True
+            colors=[dim(TRUTH)], radii=rr.Radius.ui_points(1.5), show_labels=True
         )
         for i, shown in enumerate(self.scene.receivers):
-            styles |= _point_styles(shown.name, colour(i), radius=5.0, order=30.0 - i)
+            bright = self.scene.colours[shown.name]
+            styles |= _point_styles(shown.name, bright, radius=5.0, order=30.0 - i)
             styles[_off(shown.name)] = rr.Points2D.from_fields(
                 colors=[TRUTH], radii=rr.Radius.ui_points(0.0), show_labels=True
             )
             if i > 0:
                 styles[_arrow(shown.name)] = rr.LineStrips2D.from_fields(
-                    colors=[colour(i)], radii=rr.Radius.ui_points(1.5)
+                    colors=[bright], radii=rr.Radius.ui_points(1.5)
                 )
                 styles[_away(shown.name)] = rr.Points2D.from_fields(
                     colors=[TRUTH], radii=rr.Radius.ui_points(0.0), show_labels=True
@@ -199,9 +200,7 @@ class StatePlane(ViewPanel):
 def _point_styles(name: str, bright: Colour, *, radius: float, order: float) -> dict[str, rr.AsComponents]:
     pixels = rr.Radius.ui_points
     return {
-        _trail(name): rr.LineStrips2D.from_fields(
-            colors=[dim(bright, 0.55)], radii=pixels(0.9), draw_order=order - 20.0
-        ),
+        _trail(name): rr.LineStrips2D.from_fields(colors=[dim(bright)], radii=pixels(0.9), draw_order=order - 20.0),
         _ellipse(name): rr.LineStrips2D.from_fields(colors=[bright], radii=pixels(0.9), draw_order=order - 10.0),
         _point(name): rr.Points2D.from_fields(colors=[bright], radii=pixels(radius), draw_order=order),
     }
@@ -487,16 +486,15 @@ class GroundMap(ViewPanel):
         """The ways of the whole run as lines; receivers in their colours, senders white."""
         styles: dict[str, rr.AsComponents] = {}
         size = rr.Radius.ui_points
-        for i, shown in enumerate(self.scene.receivers):
+        for shown in self.scene.receivers:
             if shown.name in self.scene.ways:
+                bright = self.scene.colours[shown.name]
                 ways = [self._corners(way) for way in self.scene.ways[shown.name]]
-                lines = rr.LineStrips2D(ways, colors=[dim(TRUTH, 0.45), dim(colour(i), 0.55)], radii=size(1.0))
+                lines = rr.LineStrips2D(ways, colors=[dim(TRUTH), dim(bright)], radii=size(1.0))
                 styles[f"{_MAP_PATH}/{shown.name}/ways"] = lines
-                styles[f"{_MAP_PATH}/{shown.name}/link"] = rr.LineStrips2D.from_fields(
-                    colors=[colour(i)], radii=size(0.7)
-                )
+                styles[f"{_MAP_PATH}/{shown.name}/link"] = rr.LineStrips2D.from_fields(colors=[bright], radii=size(0.7))
                 styles[f"{_MAP_PATH}/{shown.name}/at"] = rr.Points2D.from_fields(
-                    colors=[TRUTH, colour(i)], radii=size(5.0), show_labels=True
+                    colors=[TRUTH, bright], radii=size(5.0), show_labels=True
                 )
         return styles
 

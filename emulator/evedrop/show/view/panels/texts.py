@@ -20,7 +20,7 @@ from evedrop.show.view import lanes
 from evedrop.show.view.column import TIMELINE, Column
 from evedrop.show.view.events import Event, Watcher
 from evedrop.show.view.lanes import received
-from evedrop.show.view.palette import GROUND, TRUTH, Colour, colour
+from evedrop.show.view.palette import GROUND, TRUTH, Colour
 from evedrop.show.view.panels.panel import LEGEND_HEIGHT, VERDICT_HEIGHT, PlacedView, ViewPanel, lanes_height
 from evedrop.show.view.scene import Scene, SceneSlots
 
@@ -110,8 +110,7 @@ class Legend(ViewPanel):
         yield from ()
 
     def _entries(self) -> list[tuple[str, Colour]]:
-        receivers = [(shown.name, colour(i)) for i, shown in enumerate(self.scene.receivers)]
-        return [("truth", TRUTH), *receivers, *lanes.legend()]
+        return [("truth", TRUTH), *self.scene.colours.items(), *lanes.legend()]
 
     def _places(self) -> list[tuple[float, float]]:
         places, at = [], 0.0

@@ -8,9 +8,10 @@ from typing import Any
 import pyarrow as pa
 
 from evedrop.model.metrics import error_column
-from evedrop.show.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
+from evedrop.results.tables import swept_strategies
+from evedrop.show.view.figure_style import GREY, OCHRE, SLATE, panels
+from evedrop.show.view.palette import paper_inks
 
-_COLOURS = (BLUE, RED, ORANGE, GREEN, GREY)
 _MARKS = "osD^v"
 _LIMIT = 1.58  # per cent, the paper's bound on the difference of its grid power
 
@@ -19,12 +20,13 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
     """Draw `path`.png and `path`.pdf against the values of one entry; for other entries, only the first values are shown."""
     rows = _of_one_line(table.to_pylist(), key)
     peers = list(dict.fromkeys(row["peer"] for row in rows))
+    inks = paper_inks(peers, swept_strategies(table))
     mine = {peer: [row for row in rows if row["peer"] == peer] for peer in peers}
     house = mine[peers[0]]
     numbers = all(isinstance(row[key], (int, float)) for row in house)
     x = [float(row[key]) if numbers else float(i) for i, row in enumerate(house)]
     with panels(path, 3, 12.6, 3.9) as (energies, fractions, told):
-        for name, colour, mark in (("bought", BLUE, "o"), ("sold", GREEN, "s")):
+        for name, colour, mark in (("bought", SLATE, "o"), ("sold", OCHRE, "s")):
             bars = _bars(house, f"{name}_energy")
             energies.errorbar(
                 x, [row[f"{name}_energy"] for row in house], bars, fmt=f"{mark}-", color=colour, label=name
@@ -32,7 +34,7 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
         energies.set_ylabel("energy (kWh)")
         energies.set_ylim(bottom=0.0)
         energies.set_title("(a) energy")
-        for name, colour, mark in (("net", BLUE, "o"), ("total", GREEN, "s"), ("summed", ORANGE, "D")):
+        for name, colour, mark in (("net", SLATE, "o"), ("total", OCHRE, "s"), ("summed", GREY, "D")):
             result = [row[f"{name}_difference"] for row in house]
             percent = [
                 float("nan") if difference is None or difference <= 0.0 else 100.0 * difference for difference in result
@@ -43,9 +45,9 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
         fractions.set_yscale("log")
         fractions.set_ylabel("difference of grid power (%)")
         fractions.set_title("(b) from a controller that sees the truth")
-        for peer, colour, mark in zip(peers, _COLOURS * len(peers), _MARKS * len(peers), strict=False):
+        for peer, mark in zip(peers, _MARKS * len(peers), strict=False):
             areas = [float("nan") if row["activity_area"] is None else row["activity_area"] for row in mine[peer]]
-            told.errorbar(x, areas, _bars(mine[peer], "activity_area"), fmt=f"{mark}-", color=colour, label=peer)
+            told.errorbar(x, areas, _bars(mine[peer], "activity_area"), fmt=f"{mark}-", color=inks[peer], label=peer)
         told.axhline(0.5, color=GREY, linewidth=0.9, linestyle=":", label="a coin")
         told.set_ylim(0.4, 1.02)
         told.set_ylabel("area under the curve")
