@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from collections import Counter
 from html.parser import HTMLParser
@@ -62,7 +63,9 @@ def checked(folder: Path) -> Checked:
     assert "@import" not in text
     ids = page.values("id")
     assert len(ids) == len(set(ids))
-    assert {link.removeprefix("#") for link in page.values("href")} <= set(ids)
+    files, links = downloads(page), page.values("href")
+    assert {link.removeprefix("#") for link in links if not link.startswith("data:")} <= set(ids)
+    assert len(files) == sum(link.startswith("data:") for link in links)
     assert page.tags["img"] == sum(bool(words) for words in page.values("alt"))
     assert page.tags["svg"] == len(
         [attribute for attribute in page.attributes if attribute == ("svg", "aria-hidden", "true")]
@@ -71,3 +74,12 @@ def checked(folder: Path) -> Checked:
     assert page.values("role").count("region") == page.values("tabindex").count("0") == scrolling
     assert page.headings[0]
     return page
+
+
+def downloads(page: Checked) -> dict[str, str]:
+    """The files that the page lets its reader save: name → text."""
+    links = [
+        value for _, key, value in page.attributes if key == "href" and value.startswith("data:text/plain;base64,")
+    ]
+    texts = [base64.b64decode(link.partition(",")[2]).decode() for link in links]
+    return dict(zip(page.values("download"), texts, strict=True))

@@ -36,7 +36,9 @@ STUDY = (
     *("--record-trials", "2100", "--workers", "1", "--set", "expect=[]"),
 )
 """Three tasks."""
-_TIMES = re.compile(r'"(wall_seconds|slots_per_second)": [^,\n]*|[0-9,]+ trial-slots/s|<td>[0-9.]+ s</td>')
+_TIMES = re.compile(
+    r'"(wall_seconds|slots_per_second)": [^,\n]*|[0-9,]+ trial-slots/s|<td>[0-9.]+ s</td>|[0-9-]+ [0-9:]+ UTC'
+)
 
 
 def files(folder: Path, name: str = "") -> dict[str, bytes | str]:

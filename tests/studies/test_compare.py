@@ -19,11 +19,12 @@ from evedrop.results.summary_file import plain
 from evedrop.scenario.loading import load
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.comparison import verdict
+from evedrop.show.report.comparison_sections import COMPARISON_SECTIONS, ComparisonSource
 from evedrop.show.report.writing import write_report
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.studies.matchups import ATTACKERS, usual_adversaries
-from tests.pages import checked
+from tests.pages import Checked, checked
 
 MARGINAL: dict[str, Any] = {"slots": 100, "trials": 30, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}
 """Changes of `bayesian`: long enough for verdicts, and trials that lose the first slot do not dominate the mean."""
@@ -101,6 +102,17 @@ def test_a_comparison_is_read_back_and_has_its_page(everything: Everything) -> N
     assert page.values("class").count("verdict") == len(comparison.schemes) * len(comparison.adversaries)
     for scheme in comparison.schemes.values():
         assert {verdict(cell) for cell in scheme.cells.values() if cell.verdict is not None} <= set(page.texts)
+
+
+def test_the_matrix_leaves_out_adversaries_that_no_scheme_defines(everything: Everything) -> None:
+    """Their columns would be empty; the caption names them."""
+    comparison, folder = everything
+    alone = replace(comparison, schemes={"cipher": comparison.schemes["cipher"]})
+    (matrix,) = COMPARISON_SECTIONS["Verdicts"](ComparisonSource(folder, alone))
+    page = Checked(matrix)
+    assert {"scheme", "naive", "cipher"} <= set(page.texts)
+    assert "smart" not in page.texts
+    assert any("smart" in text and "for every scheme" in text for text in page.texts)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.model.metrics import expectable_metrics
 from evedrop.scenario.loading import load
+from evedrop.scenarios import shipped
 from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.writing import write_report
 from evedrop.show.view.palette import paper_inks
@@ -29,7 +30,7 @@ from evedrop.studies.sweep import grid_of, sweep_over
 from tests.conftest import Evedrop
 from tests.examples import examples
 from tests.golden.pages import Golden
-from tests.pages import checked
+from tests.pages import checked, downloads
 
 decimals = st.decimals(-1000, 1000, places=3, allow_nan=False, allow_infinity=False)
 steps = st.decimals("0.001", 50, places=3)
@@ -187,7 +188,9 @@ def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> Non
     assert (tmp_path / "run" / "sweep.png").is_file()
     write_report(tmp_path / "run")
     page = checked(tmp_path / "run")
-    assert (page.tags["svg"], page.tags["tr"]) == (2, 1 + 2 * 2 * 4)
+    facts = {"date", "machine", "operating system", "commit", "python", "numpy", "evedrop"} & set(page.texts)
+    assert (page.tags["svg"], page.tags["tr"]) == (2, 1 + 2 * 2 * 4 + 1 + len(facts))
+    assert not downloads(page), "a built-in scenario needs no file"
     command = "evedrop sweep eavesdroppers --over eavesdroppers.smart.strategy=smart,naive --over slots=10,20"
     assert f"{command} --trials 5 --covariance-only" in page.texts
     assert "All 4 points were done" in page.texts
@@ -195,6 +198,22 @@ def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> Non
     colours = paper_inks([row["peer"] for row in table.to_pylist()], {"smart": "smart", "naive": "naive"})
     inks = {f"fill: none; stroke: {colour}; stroke-width: 2" for colour in colours.values()}
     assert inks & {*page.values("style")}, "there are no error bars"
+
+
+def test_the_page_of_a_sweep_over_a_file_has_the_file(tmp_path: Path) -> None:
+    """So that whoever receives it can repeat the sweep; it says that files that the scenario names are missing."""
+    text = shipped()["eavesdroppers"].read_text()
+    for scenario, missing in ((text, False), (f'secret_file = "secret"\n{text}', True)):
+        (tmp_path / "mine.toml").write_text(scenario)
+        (tmp_path / "secret").write_bytes(bytes(32))
+        folder = tmp_path / f"run-{missing}"
+        changes = {"trials": 2, "slots": 2}
+        sweep_over(tmp_path / "mine.toml", changes, {"seed": [1, 2]}, folder, lambda _: None, Plan(workers=1))
+        write_report(folder)
+        page = checked(folder)
+        assert downloads(page) == {"scenario.toml": scenario}
+        assert any(line.startswith("evedrop sweep scenario.toml --over seed=1,2") for line in page.texts)
+        assert any("do not travel" in line for line in page.texts) == missing
 
 
 def test_the_page_quotes_all_values_of_an_entry_if_one_needs_it(tmp_path: Path) -> None:

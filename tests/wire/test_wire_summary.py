@@ -25,7 +25,7 @@ from evedrop.wire.running_link import KeyFates
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.tables import WireExpectTable
 from evedrop.wire.tallies import WIRE_METRICS, LinkTally
-from tests.pages import checked
+from tests.pages import checked, downloads
 from tests.wire.wire_links import LOSSES
 from tests.wire.wire_plans import wire_plan
 
@@ -269,7 +269,14 @@ link = "scan"
     (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
     write_report(tmp_path)
     page = checked(tmp_path)
-    assert page.headings == ["Wire of robot and base", "Expectations", "Links", "Losses by reason", "Repeat it"]
+    assert page.headings == [
+        "Wire of robot and base",
+        "Expectations",
+        "Links",
+        "Over time",
+        "Losses by reason",
+        "Repeat it",
+    ]
     assert "2 of 5 expectations FAILED" in page.texts
     assert {cell for row in wire_table(summary).rows for cell in row} <= set(page.texts)
     assert {"{:.4f} to {:.4f}".format(*written["links"]["scan"]["bounds"]), "lost: loss"} <= set(page.texts)
@@ -290,6 +297,37 @@ link = "scan"
     assert {"5 of 5 expectations FAILED", "expected scan.gap_messages below 3: FAILED, the link heard nothing"} <= set(
         page.texts
     )
+
+
+def test_the_wire_file_travels_with_the_page_without_its_passwords(tmp_path: Path) -> None:
+    """A wire of the same links, events and expectations on any machine; nothing in the page tells addresses or users."""
+    text = """
+        [side.robot]
+        listen = "tcp/127.0.0.1:7448"
+        users = { ada = "a long password" }
+        keys = "robot/**"
+        [side.base]
+        connect = "tcp/192.0.2.7:7447"
+        [[link]]
+        from = "robot"
+        to = "base"
+        quality = 0.7
+        [[event]]
+        at = "12 s"
+        note = "the lift"
+        """
+    plan = wire_of(tomllib.loads(text))
+    run(tmp_path, plan)
+    (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
+    page = checked(write_report(tmp_path).parent)
+    travelling = downloads(page)[WIRE_FILE]
+    again = wire_of(tomllib.loads(travelling))
+    assert (again.seed, again.links, again.events) == (plan.seed, plan.links, plan.events)
+    assert again.sides["robot"].keys == plan.sides["robot"].keys
+    for private in ("long password", "ada", "7448", "192.0.2.7"):
+        assert private not in travelling
+        assert private not in "".join(page.texts)
+    assert "evedrop wire wire.toml --out again" in "".join(page.texts)
 
 
 @pytest.mark.parametrize(

@@ -28,12 +28,12 @@ _RUN = {Claim.HELD.value: "the run shows it", Claim.FAILED.value: "the run shows
 
 def replay_of(folder: Path, scenario: Scenario, mode: str = "live") -> str:
     """The command that repeats the run in a results folder, to the same bits."""
-    return repeating(folder, scenario.trials, mode)
+    return repeating(folder.absolute(), scenario.trials, mode)
 
 
-def repeating(folder: Path, trials: int, mode: str) -> str:
-    """The same; trials: of the run, mode: as in the summary."""
-    where = shlex.quote(str(folder.absolute()))
+def repeating(source: Path, trials: int, mode: str) -> str:
+    """The same for a scenario's file or folder; trials: of the run, mode: as in the summary."""
+    where = shlex.quote(str(source))
     if mode == "live":
         return f"evedrop run {where}"
     return f"evedrop montecarlo {where} --trials {trials}{MODES[mode]}"

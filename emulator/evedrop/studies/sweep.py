@@ -21,9 +21,10 @@ from evedrop.model.metrics import all_metrics, error_column, estimated_metrics, 
 from evedrop.results.folder import disk_errors, private_pictures, private_replacement, write_private
 from evedrop.results.tables import with_strategies
 from evedrop.scenario.application import APPLICATIONS
-from evedrop.scenario.loading import prepared, value_of
+from evedrop.scenario.loading import prepared, read, value_of
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
+from evedrop.scenarios import shipped
 from evedrop.score.scorekeeper import RunOutcome
 from evedrop.score.summary import Summary
 from evedrop.simulate.finished_tasks import finished_tasks, study_of
@@ -117,8 +118,9 @@ def sweep_over(
         everything = list(itertools.chain(*tasks))
         with disk_errors(folder):
             write_private(folder / "sweep.json", text + "\n")
-            if isinstance(source, Scenario):  # there is no other file from which the sweep could be repeated
-                write_private(folder / "scenario.toml", source.to_toml())
+            if str(source) not in shipped():  # the report has it, so that whoever receives it can repeat the sweep
+                text = source.to_toml() if isinstance(source, Scenario) else read(source)
+                write_private(folder / "scenario.toml", text)
             with contextlib.closing(crew.results(everything, on_progress, stop.is_set, finished)) as results:
                 written = time.monotonic()
                 try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 import shutil
 import stat
 import subprocess
@@ -31,10 +32,11 @@ from PIL import Image
 
 from evedrop import montecarlo
 from evedrop.errors import UsageError
+from evedrop.model.metrics.text import ShownNumber, estimate, number_text, short_text
 from evedrop.results.reading import Results
 from evedrop.score.synchronisation import LongestSpans, LostSpan, Synchronisation, lost_spans, synchronisation_of
 from evedrop.show.report import closing
-from evedrop.show.report.chart import Curve, GroupCounts, GroupMeans, LogChart
+from evedrop.show.report.chart import Curve, GroupCounts, GroupMeans, LogChart, label_places
 from evedrop.show.report.page import Page, Part, made
 from evedrop.show.report.run_sections import (
     OUTCOMES,
@@ -45,14 +47,15 @@ from evedrop.show.report.run_sections import (
     RunSource,
     lane_picture,
 )
-from evedrop.show.report.text_table import TextTable
+from evedrop.show.report.text_table import TextTable, aligned, far
 from evedrop.show.report.writing import REPORT, try_report, write_report
+from evedrop.show.view.axis_name import as_mathematics, axis_name
 from evedrop.show.view.lanes import Lane
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from tests.conftest import LIMIT, Evedrop
 from tests.examples import examples
-from tests.pages import Checked, checked
+from tests.pages import Checked, checked, downloads
 
 HOSTILE = "<script>alert('&amp;')</script>\"></title>"
 """A title that tries to inject code into the page."""
@@ -82,18 +85,81 @@ def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -
     ]  # fmt: skip
     assert summary.verdict is not None
     assert f"{summary.verdict.sentence}. 1 of 2 expectations FAILED" in page.texts
-    cells = [cell for row in closing.receivers_table(summary).rows for cell in row]
+    cells = [cell for row in aligned(closing.receivers_table(summary)).rows for cell in row]
     assert Counter(cells) <= Counter(page.texts)
     for line in (*closing.details(summary), *(expectation.sentence for expectation in summary.expectations)):
         assert line in page.texts
     for name, link in summary.links.items():
         assert {name, f"{link.offered:,}", f"{link.rate:.4f}", f"{link.expected_rate:.4f}"} <= set(page.texts)
-    assert f"evedrop montecarlo {study} --trials 20" in text
+    assert "evedrop montecarlo scenario.toml --trials 20 --out again" in text
+    assert str(study) not in text
+    assert {"date", "machine", "operating system", "python", "numpy", "evedrop"} <= set(page.texts)
     assert {str(summary.seed), summary.peers["smart"].digest} <= set(page.texts)
     assert page.tags["svg"] == 1
     assert page.tags["img"] == 8
     assert (study / REPORT).stat().st_size < 300_000
     assert stat.S_IMODE((study / REPORT).stat().st_mode) == 0o600
+
+
+def test_the_numbers_of_a_column_have_the_same_format() -> None:
+    """All with an exponent if one is very small or large; 0, dashes, bounds, units and counts are as they were."""
+    table = TextTable.headed(["receiver"], ["error", "theory", "fraction", "count"])
+    table.add("a", estimate(1.325e-4, 5e-7), number_text(0.0001333), number_text(0.5), number_text(7))
+    table.add("b", estimate(30223.0, 3908.0) + " Wh", number_text(48.48), number_text(0.25), number_text(1_000_000))
+    table.add("c", number_text(None), ShownNumber("≥ 6.2", 6.2, after="at least"), number_text(0.0), number_text(0))
+    table.add("d", estimate(math.inf, 1.0), number_text(0.0), estimate(0.25, 1e-20), number_text(None))
+    assert [row[1:] for row in aligned(table).rows] == [
+        ("1.325e-4 ± 5e-7", "1.333e-4", "0.5", "7"),
+        ("3.0e4 ± 4e3 Wh", "4.848e1", "0.25", "1e+06"),
+        ("–", "≥ 6.2", "0", "0"),
+        ("inf", "0", "0.25", "–"),
+    ]
+    assert aligned(TextTable.headed(["a"], ["b"])).rows == []
+    assert number_text(-0.01, "+.1f") == "+0.0"
+    assert number_text(-0.06, "+.1f") == "-0.1"
+    assert [short_text(value) for value in (None, math.inf, 0.0123, 57.1, 123.4, 3.42e5)] == [
+        *("–", "∞", "0.012", "57", "123", "3.4e5"),
+    ]  # fmt: skip
+
+
+def test_a_z_beyond_four_is_marked() -> None:
+    """In columns of z-scores only; the caption says what the mark means."""
+    table = TextTable.headed(["receiver"], ["error", "z"])
+    for z in (-48.5, 4.0, 4.1, None):
+        table.add("one", number_text(z), number_text(z, "+.1f"))
+    assert far(table) == {(0, 2), (2, 2)}
+    page = Checked(made("table", table, "caption"))
+    assert page.values("class").count("number far") == 2
+    assert any("▲: beyond 4" in text for text in page.texts)
+    table.rows = table.rows[3:]
+    assert "caption" in Checked(made("table", table, "caption")).texts
+
+
+def test_whoever_receives_a_page_can_repeat_its_run(study: Path, tmp_path: Path) -> None:
+    """With nothing but the page: its scenario, and its command, give the digests that it names."""
+    page = checked(study)
+    (tmp_path / "scenario.toml").write_text(downloads(page)["scenario.toml"])
+    again = montecarlo(tmp_path / "scenario.toml", trials=20, plan=Plan(workers=1))
+    digests = [str(peer.digest) for peer in again.peers.values()]
+    assert len(digests) == 4
+    assert set(digests) <= set(page.texts)
+
+
+def test_a_page_names_what_does_not_travel_with_it(study: Path, tmp_path: Path) -> None:
+    """A secret in a file, and states that are too large; a run without a scenario cannot be repeated."""
+    shutil.copytree(study, tmp_path / "run")
+    scenario = tmp_path / "run" / "scenario.toml"
+    scenario.write_text(f'secret_file = "/elsewhere/secret"\n{scenario.read_text()}')
+    (tmp_path / "run" / "states.csv").write_text("0\n" * 2**20)
+    (tmp_path / "run" / "disturbances.csv").write_text("0\n")
+    write_report(tmp_path / "run")
+    page = checked(tmp_path / "run")
+    assert any("secret is in a file" in text for text in page.texts)
+    assert any("states.csv, which is too large" in text for text in page.texts)
+    assert downloads(page).keys() == {"scenario.toml", "disturbances.csv"}
+    scenario.unlink()
+    write_report(tmp_path / "run")
+    assert any("cannot be repeated" in text for text in checked(tmp_path / "run").texts)
 
 
 def test_a_report_that_cannot_be_written_leaves_everything_as_it_was(
@@ -151,7 +217,7 @@ def test_a_page_has_cautions_events_and_outages_and_does_not_depend_on_the_order
         page.texts
     )
     (failed,) = (expectation for expectation in Results.read(study).typed_summary.expectations if not expectation.held)
-    assert before.texts[before.texts.index(failed.sentence) + 1] == failed.replay
+    assert before.texts[before.texts.index(failed.sentence) + 1] == "see it again"
     for name in ("d", "src"):  # the curves and the lanes
         assert page.values(name) == before.values(name)
 
@@ -395,6 +461,48 @@ def test_a_chart_of_any_size_has_an_axis() -> None:
     bars = Curve("one", "#123456", x, y, y - 3.0, np.full(4, np.inf), theory=y, bars=True)
     for curve in (bars, replace(bars, bars=False)):
         assert outlines(drawn(LogChart("label", "key", "error", [curve], ["a", "b", "c", "d"])), "#123456")
+
+
+@given(st.lists(st.floats(0, 1), max_size=12))
+@settings(deadline=None, max_examples=examples(200))
+def test_labels_beside_curves_do_not_cover_each_other(ends: list[float]) -> None:
+    """They are in the order of the ends, within the axis, a line of text apart, and at their ends where these are apart."""
+    gap = 1 / 12
+    places = label_places(ends, gap)
+    ordered = [place for _, place in sorted(zip(ends, places, strict=True))]
+    assert all(after - before > gap * 0.999 for before, after in pairwise(ordered))
+    assert all(-1e-9 <= place <= 1 + 1e-9 for place in places)
+    if all(after - before >= gap for before, after in pairwise(sorted(ends))):
+        assert places == ends
+
+
+def test_a_chart_names_its_axes_and_its_curves_beside_their_ends() -> None:
+    """With units; more curves than there is room for have a legend below."""
+    x = np.arange(3.0)
+    curves = [Curve(f"receiver {i}", "#123456", x, 10.0 ** (x + i)) for i in range(13)]
+    figure = drawn(LogChart("label", "slot", "error", curves[:12], y_axis="squared error (m²)"))
+    texts = [str(text.text) for text in figure.iter("text")]
+    assert {"squared error (m²)", *(curve.name for curve in curves[:12])} <= set(texts)
+    heights = [
+        float(re.findall(r"-?[0-9.]+", str(text.get("transform", "")))[1])
+        for text in figure.iter("text")
+        if text.text in {curve.name for curve in curves}
+    ]
+    assert heights == sorted(heights, reverse=True)
+    assert not list(figure.iter("figcaption"))
+    legend = "".join(
+        "".join(part.itertext()) for part in drawn(LogChart("label", "slot", "error", curves)).iter("figcaption")
+    )
+    assert "receiver 12" in legend
+
+
+def test_a_sweep_names_its_axis_by_the_symbol_of_the_paper() -> None:
+    """An entry without a symbol has its key."""
+    assert axis_name("encoding.state_probability").startswith("μ_d: ")
+    assert as_mathematics(axis_name("encoding.state_probability")).startswith(r"$\mu_d$: ")
+    assert axis_name("eavesdroppers.smart.link.quality").startswith("μ of smart: ")
+    assert axis_name("legitimate.link.quality").startswith("μ: ")
+    assert axis_name("process.Q") == "process.Q"
 
 
 def test_texts_are_escaped_wherever_they_stand() -> None:

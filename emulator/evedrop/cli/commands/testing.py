@@ -16,6 +16,7 @@ def test(options: argparse.Namespace) -> int:
     """Run scenarios as tests; returns the worst of their exit statuses."""
     from evedrop.studies.junit import write_junit
     from evedrop.studies.scenario_tests import Finding, Manner, results, scenarios_of
+    from evedrop.studies.tests_page import write_tests_page
 
     if options.jobs < 1:
         raise UsageError(f"--jobs {options.jobs}: expected 1 or more")
@@ -36,11 +37,14 @@ def test(options: argparse.Namespace) -> int:
     finally:
         if options.junit is not None:
             write_junit(options.junit, tested, started)
+        page = write_tests_page(manner.folder, tested, started)
     counts = Counter(finding.outcome for finding in tested)
     printed = ", ".join(
         f"{count} {outcome.word}" for outcome, count in sorted(counts.items(), key=lambda at: at[0].value)
     )
     print(f"{printed}, in {time.time() - started:.1f} s")
+    if page is not None:
+        print(f"report: {page}")
     return max(outcome.value for outcome in counts)
 
 

@@ -38,12 +38,26 @@ class ShownNumber(str):
 _SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE, _LAST_PLACE = 0.01, 1e5, -4, -6  # beyond them estimates have exponents
 _ROUNDING = 1e-12  # a standard error below this part of the estimate comes from the rounding of equal trials
 _MOST_DIGITS = 8  # significant digits of an estimate
-_LARGE_COUNT, _NEARLY_ALL = 1e7, 0.99
+_LARGE_COUNT, _NEARLY_ALL, _LARGE_SHORT = 1e7, 0.99, 1e4
 
 
 def number_text(value: float | None, how: str = ".4g") -> ShownNumber:
-    """A metric of the summary as text; a dash for None."""
-    return ShownNumber("–" if value is None else format(value, how), value)
+    """A metric of the summary as text; a dash for None. One that rounds to 0 has no minus."""
+    text = "–" if value is None else format(value, how)
+    return ShownNumber(
+        format(0.0, how) if value is not None and text.startswith("-") and not float(text) else text, value
+    )
+
+
+def short_text(value: float | None) -> str:
+    """A number for a narrow place: 2.3, 57, 3.4e5; a dash for None."""
+    if value is None:
+        return "–"
+    if not math.isfinite(value):
+        return "∞"
+    if _SMALL_NUMBER <= value < _LARGE_SHORT:
+        return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
+    return _scientific(value, 1)
 
 
 def finite_text(value: float, how: str = ".4g") -> ShownNumber:
@@ -84,6 +98,17 @@ def _estimate(value: float | None, error: float | None, how: str) -> str:
         return f"{value:.{places}f} ± {error:.{places}f}"
     digits = max(0, math.floor(math.log10(abs(value))) - place) if value else 0
     return f"{_scientific(value, digits)} ± {_scientific(error, 0)}"
+
+
+def scientific(value: float, error: float | None) -> str:
+    """An estimate to the place of its standard error's first digit, or a number with four digits, with an exponent."""
+    if not math.isfinite(value) or (error is not None and not math.isfinite(error)):
+        return _estimate(value, error, ".4g")
+    if not error or error <= _ROUNDING * abs(value):
+        return _scientific(value, 3) if value else "0"
+    place = int(f"{error:.0e}".partition("e")[2])
+    digits = max(0, math.floor(math.log10(abs(value))) - place) if value else 0
+    return f"{_scientific(value, min(digits, _MOST_DIGITS))} ± {_scientific(error, 0)}"
 
 
 def _scientific(value: float, digits: int) -> str:

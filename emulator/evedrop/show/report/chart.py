@@ -104,6 +104,10 @@ _INK, _DIM, _LINE = "#16191d", "#5a6068", "#d5d9de"
 _THEME: Mapping[str, str] = {_INK: "var(--ink)", _DIM: "var(--dim)", _LINE: "var(--line)"}
 """Ink of the drawing → that of the page, which is another one in its dark theme and on paper."""
 _DOTTED = (0, (0.1, 3.0))
+_MOST_LABELS, _LABEL_GAP = (
+    12,
+    0.075,
+)  # curves that are named beside their ends; a line of text as a fraction of the height
 _CLOSE = 100.0  # limits of an axis whose ratio is less have 2 and 5 times the powers of ten, too
 
 
@@ -137,17 +141,22 @@ class LogChart:
     """The ends of the x axis; None: the least and the greatest x."""
     floor: float = 0.0
     """Lesser values lie on the lower edge, and the chart says so. 0: all are shown that are not too far below the highest."""
+    y_axis: str = ""
+    """The title of the y axis, with its unit."""
+    linear: bool = False
+    """Whether the y axis is not logarithmic, but linear from 0."""
 
     @property
     def figure(self) -> Markup | None:
         """The chart as a figure of the page; None if it has nothing to show."""
         curves = [curve if curve.bars else _thinned(curve) for curve in self.curves]
-        heights = [part for curve in curves for part in (curve.y, curve.theory) if part is not None]
-        axis = ErrorAxis.of(heights, self.floor)
+        parts = [(curve.y, curve.theory, *([curve.high] if self.linear else [])) for curve in curves]
+        heights = [part for of_curve in parts for part in of_curve if part is not None]
+        axis = _linear_axis(heights) if self.linear else ErrorAxis.of(heights, self.floor)
         if axis is None:
             return None
         above = f"{self.y_name}; {floor_words(self.floor)}" if axis.below else self.y_name
-        names = [(curve.name, curve.colour) for curve in curves]
+        names = [(curve.name, curve.colour) for curve in curves] if len(curves) > _MOST_LABELS else []
         return made("chart", self.label, above, self._drawing(curves, axis), self.x_name, names)
 
     def _drawing(self, curves: Sequence[Curve], axis: ErrorAxis) -> Markup:
@@ -159,6 +168,7 @@ class LogChart:
             "svg.fonttype": "none",
             "svg.hashsalt": self.label,
             "text.parse_math": False,
+            "axes.labelsize": 9.0,
             "xtick.bottom": False,
             "xtick.labelcolor": _DIM,
             "ytick.left": False,
@@ -182,6 +192,8 @@ class LogChart:
                         dash_capstyle="round",
                         clip_on=False,
                     )
+            if len(curves) <= _MOST_LABELS:
+                _label(axes, curves, axis)
             figure.savefig(svg, format="svg", transparent=True, metadata={"Date": None})
         return _embedded(svg.getvalue())
 
@@ -198,9 +210,11 @@ class LogChart:
         room = 0.04 * (right - left) if self.x_words is None and any(curve.bars for curve in curves) else 0.0
         room = room or (0.0 if right > left else 0.5)
         axes.set_xlim(left - room, right + room)
-        axes.set_yscale("log")
+        axes.set_ylabel(printable(self.y_axis), color=_DIM)
+        if not self.linear:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if axis.high / axis.low < _CLOSE else (1,)))
         axes.set_ylim(axis.low, axis.high)
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if axis.high / axis.low < _CLOSE else (1,)))
         axes.yaxis.set_major_formatter(lambda at, _: f"{at:g}")
         axes.minorticks_off()
         for line in axes.get_ygridlines():
@@ -225,6 +239,48 @@ def _draw(axes: Axes, curve: Curve, axis: ErrorAxis) -> None:
     marked = finite if curve.bars else finite & ~between[:-2] & ~between[2:]  # a line through one point cannot be seen
     if marked.any():
         axes.plot(x[marked], y[marked], "o", color=ink, markersize=6.5 if curve.bars else 4.0, clip_on=False)
+
+
+def _linear_axis(heights: Sequence[Floats]) -> ErrorAxis | None:
+    finite = np.concatenate([np.empty(0), *(part[np.isfinite(part)] for part in heights)])
+    return ErrorAxis(0.0, 1.05 * float(finite.max(initial=0.0)) or 1.0, below=False) if finite.size else None
+
+
+def _label(axes: Axes, curves: Sequence[Curve], axis: ErrorAxis) -> None:
+    """Write the name of each curve to the right of its end, in its order, with a mark of its colour; none covers another."""
+    ends = [_end(axes, curve, axis) for curve in curves]
+    for curve, place in zip(curves, label_places(ends, _LABEL_GAP), strict=True):
+        axes.text(1.005, place, "■", color=curve.colour, fontsize=9.0, va="center", transform=axes.transAxes)
+        axes.text(1.027, place, printable(curve.name), color=_INK, fontsize=9.0, va="center", transform=axes.transAxes)
+
+
+def _end(axes: Axes, curve: Curve, axis: ErrorAxis) -> float:
+    """Where a curve ends: the height of its last point, as a fraction of the axis."""
+    finite = axis.inside(curve.y[np.isfinite(curve.y)])
+    height = float(finite[-1]) if finite.size else axis.low
+    return float(axes.transAxes.inverted().transform(axes.transData.transform((0.0, height)))[1])
+
+
+def label_places(ends: Sequence[float], gap: float) -> list[float]:
+    """Places for labels beside the ends of curves, which are fractions of an axis: at least `gap` apart, and near the ends."""
+    order = sorted(range(len(ends)), key=lambda i: ends[i])
+    places = [ends[i] for i in order]
+    for _ in range(len(places) ** 2):
+        close = next((i for i in range(1, len(places)) if places[i] - places[i - 1] < gap * (1 - 1e-9)), None)
+        if close is None:
+            break
+        first, last = close - 1, close  # a group of labels that are a gap apart around the middle of their ends
+        while True:
+            middle = sum(ends[i] for i in order[first : last + 1]) / (last + 1 - first)
+            start = min(max(0.0, middle - gap * (last - first) / 2), max(0.0, 1.0 - gap * (last - first)))
+            if first and places[first - 1] > start - gap * (1 - 1e-9):
+                first -= 1
+            elif last + 1 < len(places) and places[last + 1] < start + gap * (last + 1 - first) * (1 - 1e-9):
+                last += 1
+            else:
+                break
+        places[first : last + 1] = [start + gap * i for i in range(last + 1 - first)]
+    return [place for _, place in sorted(zip(order, places, strict=True))]
 
 
 def _embedded(svg: str) -> Markup:

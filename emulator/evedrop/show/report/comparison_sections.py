@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -9,13 +10,15 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from evedrop.model.metrics.text import estimate
-from evedrop.results.comparison import Cell, Comparison, read_comparison
+from evedrop.model.metrics.text import short_text
+from evedrop.results.comparison import COMPARISON, Cell, Comparison, read_comparison
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.comparison import comparison_lines, pairs_table, schemes_table, verdict
-from evedrop.show.report.page import made
+from evedrop.show.report.page import facts_table, made
+from evedrop.show.report.travel import circumstances, download, input_files
 from evedrop.show.view import palette
 from evedrop.show.view.palette import hexadecimal
+from evedrop.system.files import Unreadable, text_of
 
 _GROUND = {
     SecrecyOutcome.PERFECT: palette.PERFECT,
@@ -25,6 +28,7 @@ _GROUND = {
 }
 _INK = {SecrecyOutcome.PERFECT: "#fff"}
 _DARK = "#16191d"
+_MOST_BYTES = 2**20
 
 
 @dataclass(frozen=True)
@@ -51,12 +55,15 @@ class ComparisonSource:
 def _matrix(of: ComparisonSource) -> Iterator[Markup]:
     """The verdict on each scheme against each adversary."""
     comparison = of.comparison
-    caption = "The adversary's error over the legitimate one, and the verdict on secrecy; ·: not defined"
-    rows = [
-        (name, [_cell(scheme.cells[adversary]) for adversary in comparison.adversaries])
-        for name, scheme in comparison.schemes.items()
+    schemes = comparison.schemes.values()
+    shown = [
+        name for name in comparison.adversaries if any(scheme.cells[name].verdict is not None for scheme in schemes)
     ]
-    yield made("matrix", ["scheme", *comparison.adversaries], rows, caption)
+    caption = "The adversary's error over the legitimate one, and the verdict on secrecy; ·: not defined"
+    if left_out := [name for name in comparison.adversaries if name not in shown]:
+        caption += f", as against {', '.join(left_out)} for every scheme"
+    rows = [(scheme.name, [_cell(scheme.cells[adversary]) for adversary in shown]) for scheme in schemes]
+    yield made("matrix", ["scheme", *shown], rows, caption)
 
 
 def _cell(cell: Cell) -> Mapping[str, str | None]:
@@ -66,7 +73,7 @@ def _cell(cell: Cell) -> Mapping[str, str | None]:
         return {"verdict": None, "why": cell.match.not_defined}
     return {
         "verdict": verdict(cell),
-        "ratio": f"{estimate(cell.ratio, None, '.3g')}×",
+        "ratio": f"{short_text(cell.ratio)}×",
         "ground": hexadecimal(_GROUND[kept]),
         "ink": _INK.get(kept, _DARK),
     }
@@ -86,17 +93,21 @@ def _pairs(of: ComparisonSource) -> Iterator[Markup]:
 
 
 def _repeat(of: ComparisonSource) -> Iterator[Markup]:
-    """How to repeat the simulations."""
-    comparison = of.comparison
+    """The scenarios of the simulations to save, with the command that repeats each, and when and where they were made."""
+    comparison, folder = of.comparison, of.folder / "scenarios"
     yield made(
         "paragraph",
-        f"Seed {comparison.seed}, trials from {comparison.first_trial:,} on. Each simulation of the comparison again:",
+        f"Seed {comparison.seed}, trials from {comparison.first_trial:,} on. Each simulation of the comparison again: save its "
+        "scenario, and run it in its folder.",
     )
-    commands = [
-        f"evedrop montecarlo {shlex.quote(str(path.absolute()))} --trials {comparison.trials}"
-        for path in sorted((of.folder / "scenarios").glob("*.toml"))
-    ]
-    yield made("code", "\n".join(commands))
+    yield from input_files(folder)
+    files, commands = list[Markup](), list[str]()
+    for path in sorted(folder.glob("*.toml")):
+        with contextlib.suppress(OSError, Unreadable):
+            files.append(download(path.name, text_of(path, _MOST_BYTES)))
+            commands.append(f"evedrop montecarlo {shlex.quote(path.name)} --trials {comparison.trials}")
+    yield made("details", f"The {len(files)} scenarios", made("block", *files, made("code", "\n".join(commands))))
+    yield facts_table(circumstances(of.folder / COMPARISON), "Date and machine")
 
 
 COMPARISON_SECTIONS: Mapping[str, Callable[[ComparisonSource], Iterator[Markup]]] = {

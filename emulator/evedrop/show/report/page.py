@@ -19,7 +19,7 @@ from markupsafe import Markup
 
 from evedrop.errors import UsageError
 from evedrop.score.verdict import SecrecyOutcome
-from evedrop.show.report.text_table import TextTable
+from evedrop.show.report.text_table import TextTable, aligned, far
 from evedrop.show.view import palette
 from evedrop.show.view.palette import hexadecimal
 
@@ -113,4 +113,5 @@ def _template(name: str) -> Template:
     templates = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
+    templates.filters |= {"aligned": aligned, "far": far}
     return templates.get_template(name)

@@ -7,7 +7,6 @@ receiver, in the order of the slots, piece by piece: memory does not grow with t
 from __future__ import annotations
 
 import base64
-import shlex
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,6 +34,7 @@ from evedrop.show.report import closing
 from evedrop.show.report.chart import POINTS, Curve, GroupCounts, GroupMeans, LogChart
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.text_table import TextTable
+from evedrop.show.report.travel import SCENARIO, circumstances, download, input_files
 from evedrop.show.view.error_floor import error_floor
 from evedrop.show.view.lanes import EAVESDROPPER, KNOWLEDGE, SPIED, Lane, knowledge_lane
 from evedrop.show.view.palette import paper_inks
@@ -111,7 +111,7 @@ class SlotMeans(NamedTuple):
     slot: Floats
     error: Floats
     low: Floats
-    """The 95 % interval of the mean over trials."""
+    """The 95 % interval of the mean over trials, by the standard error of its logarithm: the interval stays above 0."""
     high: Floats
     theory: Floats
 
@@ -160,7 +160,7 @@ class RunSource:
         """Read a folder. Raises UsageError if it is not a results folder of this version."""
         results = Results.read(folder)
         try:
-            text = text_of(folder / "scenario.toml", _MOST_BYTES)
+            text = text_of(folder / SCENARIO, _MOST_BYTES)
         except (OSError, Unreadable):
             text = ""
         return cls(folder, results, results.typed_summary, text)
@@ -202,6 +202,18 @@ class RunSource:
             trials[name].add(rows)
         return trials
 
+    @property
+    def unit(self) -> str:
+        """The unit of a squared error, to follow its name; empty if the states have none."""
+        process = self.tables.get("process")
+        units = process.get("units") if isinstance(process, dict) else None
+        distinct = list(dict.fromkeys(map(str, units))) if isinstance(units, list) else []
+        return (
+            f" ({' + '.join(f'({unit})²' if set('/ *·') & set(unit) else f'{unit}²' for unit in distinct)})"
+            if any(distinct)
+            else ""
+        )
+
     @cached_property
     def noise(self) -> float:
         """The process noise tr Q; 0 if the scenario cannot be read."""
@@ -213,9 +225,12 @@ def _means(rows: pa.Table) -> Floats:
     error = _numbers(rows["mean_squared_error"])
     actual = _numbers(rows["mean_actual_trace_covariance"])
     error = np.where(np.isnan(error), actual, error)
-    scatter = _INTERVAL * _numbers(rows["standard_error"])
+    with np.errstate(all="ignore"):
+        factor = np.exp(
+            _INTERVAL * _numbers(rows["standard_error"]) / error
+        )  # of its logarithm, so that it stays above 0
     theory = _numbers(rows["theoretical_trace_covariance"])
-    return np.stack([_numbers(rows["slot"]), error, error - scatter, error + scatter, theory])
+    return np.stack([_numbers(rows["slot"]), error, error / factor, error * factor, theory])
 
 
 def _numbers(column: pa.ChunkedArray) -> Floats:
@@ -260,6 +275,12 @@ def _metrics(of: RunSource) -> Iterator[Markup]:
             "Errors in the directions of the scenario",
         )
     yield made("sentences", list(closing.remarks(of.summary)))
+    table = TextTable.headed(["receiver"], ["5 %", "median", "95 %"])
+    for name, peer in of.summary.peers.items():
+        if peer.error_quantiles and of.summary.trials > 1:
+            table.add(name, *(number_text(value) for value in peer.error_quantiles.values()))
+    if table.rows:
+        yield made("table", table, f"Quantiles over trials of a trial's mean error{of.unit}")
 
 
 def _errors(of: RunSource) -> Iterator[Markup]:
@@ -280,6 +301,7 @@ def _errors(of: RunSource) -> Iterator[Markup]:
         curves,
         x_range=(min(curve.first for curve in of.means.values()), max(curve.last for curve in of.means.values())),
         floor=error_floor(of.noise, of.summary.trials),
+        y_axis=f"squared error{of.unit}",
     )
     yield chart.figure or Markup()
 
@@ -387,21 +409,32 @@ def _events(of: RunSource) -> Iterator[Markup]:
 
 
 def _repeat(of: RunSource) -> Iterator[Markup]:
-    """How to repeat the run, and with which versions it was made."""
-    summary, where = of.summary, shlex.quote(str(of.folder.absolute()))
-    yield made("paragraph", "The same run to the same bits, and a look at it:")
-    commands = [repeating(of.folder, summary.trials, summary.mode), f"evedrop view {where}"]
-    yield made("code", "\n".join(commands))
+    """The scenario to save, the command that repeats the run with it, and when, where and with which versions it was made."""
+    summary = of.summary
+    if of.scenario_text:
+        yield made(
+            "paragraph",
+            "Save the scenario, and run it in its folder: the same results to the same bits, and a look at them.",
+        )
+        yield download(SCENARIO, of.scenario_text)
+        yield from input_files(of.folder)
+        if "secret_file" in of.tables:
+            yield made("paragraph", "Its secret is in a file, which does not travel with this page.")
+        command = repeating(Path(SCENARIO), summary.trials, summary.mode)
+        yield made("code", f"{command} --out again\nevedrop view again")
+    else:
+        yield made("paragraph", f"The run cannot be repeated: its folder has no {SCENARIO} that can be read.")
     versions = of.tables.get("made_with", {})
     facts = {
         "seed": summary.seed,
         "trials": f"{summary.first_trial:,} to {summary.first_trial + summary.trials - 1:,}",
         "mode": summary.mode,
+        **circumstances(of.folder / "summary.json"),
         "time": f"{summary.wall_seconds:,.1f} s",
         **(versions if isinstance(versions, dict) else {}),
         **{f"digest of {name}": peer.digest or "–" for name, peer in summary.peers.items()},
     }
-    yield facts_table(facts, "Seed, versions and digests")
+    yield facts_table(facts, "Seed, machine, versions and digests")
     if of.scenario_text and len(of.scenario_text) <= _MOST_TEXT:
         yield made("details", "The scenario with all its entries", made("code", of.scenario_text))
 

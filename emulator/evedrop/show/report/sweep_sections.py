@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import platform
+import re
 import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from evedrop.errors import UsageError
 from evedrop.model.checks import toml_of
@@ -23,13 +27,16 @@ from evedrop.results.tables import swept_strategies
 from evedrop.scenario.loading import value_of
 from evedrop.show.report.chart import Curve, LogChart
 from evedrop.show.report.closing import sweep_table
-from evedrop.show.report.page import made
+from evedrop.show.report.page import facts_table, made
+from evedrop.show.report.travel import SCENARIO, circumstances, download
+from evedrop.show.view.axis_name import axis_name
 from evedrop.show.view.palette import paper_inks
-from evedrop.system.files import text_of
+from evedrop.system.files import Unreadable, text_of
 
 SWEEP_TABLE = "sweep.parquet"
 _MOST_BYTES = 2**24
 _MOST_CHARTS = 12
+_NAMES_A_FILE = re.compile(r"\bfile\w*\s*=|_file\s*=")
 _MODES = {"covariance-only": ["--covariance-only"], "error-coordinates": ["--error-coordinates"]}
 
 
@@ -104,7 +111,11 @@ def _errors(of: SweepSource) -> Iterator[Markup]:
             f"Mean error of every receiver against {first}, with what theory expects. The table has the values. {where}"
         )
         shown = f"Mean error with its 95 % interval; dotted: theory{'; ' if where else ''}{where}"
-        yield LogChart(label, first, shown, curves, words).figure or Markup()
+        yield LogChart(label, _axis(first), shown, curves, words, y_axis="mean error").figure or Markup()
+
+
+def _axis(key: str) -> Markup:
+    return Markup(escape(axis_name(key)).replace("μ_d", Markup("μ<sub>d</sub>")))  # noqa: S704 - escaped
 
 
 def _curve(name: str, ink: str, rows: Sequence[Mapping[str, Any]], key: str, words: Sequence[str] | None) -> Curve:
@@ -114,8 +125,9 @@ def _curve(name: str, ink: str, rows: Sequence[Mapping[str, Any]], key: str, wor
     )
     x = [float(row[key]) if words is None else float(words.index(str(row[key]))) for row in rows]
     y, theory = (_values(rows, names) for names in (marks, lines))
-    scatter = 1.96 * np.nan_to_num(_values(rows, [error_column(metric) for metric in marks]))
-    return Curve(name, ink, np.array(x), y, y - scatter, y + scatter, theory, bars=True)
+    with np.errstate(all="ignore"):
+        factor = np.exp(1.96 * np.nan_to_num(_values(rows, [error_column(metric) for metric in marks])) / y)
+    return Curve(name, ink, np.array(x), y, y / factor, y * factor, theory, bars=True)
 
 
 def _values(rows: Sequence[Mapping[str, Any]], names: list[str]) -> Floats:
@@ -133,15 +145,24 @@ def _metrics(of: SweepSource) -> Iterator[Markup]:
 
 
 def _repeat(of: SweepSource) -> Iterator[Markup]:
-    """How to repeat the sweep."""
-    given = of.folder / "scenario.toml"  # of a scenario that was made in Python, whose name is only its title
-    words = ["evedrop", "sweep", str(given.absolute()) if given.exists() else of.scenario]
+    """The scenario to save unless it is built in, the command that repeats the sweep, and when and where it was made."""
+    name = of.scenario
+    with contextlib.suppress(OSError, Unreadable):
+        text = text_of(of.folder / SCENARIO, _MOST_BYTES)
+        name = SCENARIO
+        yield made("paragraph", "Save the scenario, and run the command in its folder.")
+        yield download(SCENARIO, text)
+        if _NAMES_A_FILE.search(text):
+            yield made("paragraph", "Files that the scenario names do not travel with this page.")
+    words = ["evedrop", "sweep", name]
     for key, values in of.grid.items():
         words += ["--over", f"{key}={','.join(_listed(values))}"]
     for key, value in of.changes.items():
         words += [f"--{key}", _toml(value)] if key == "trials" else ["--set", f"{key}={_toml(value)}"]
     words += _MODES.get(of.mode, [])
     yield made("code", shlex.join(words))
+    facts = {**circumstances(of.folder / SWEEP_TABLE), "python": platform.python_version(), "numpy": np.__version__}
+    yield facts_table({**facts, "evedrop": version("evedrop")}, "Date, machine and versions")
 
 
 def _listed(values: Sequence[Any]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,12 +12,20 @@ from markupsafe import Markup
 
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, WireSummary
+from evedrop.scenario.words import toml_text
+from evedrop.show.report.chart import Curve, LogChart
 from evedrop.show.report.page import facts_table, made
+from evedrop.show.report.run_sections import lane_picture
 from evedrop.show.report.text_table import TextTable
+from evedrop.show.report.travel import circumstances, download
 from evedrop.show.report.wire import reasons_table, unlinked_sentence, wire_faults, wire_outcome, wire_table, wire_title
+from evedrop.show.report.wire_history import LANE, WireHistory
+from evedrop.show.view import palette
+from evedrop.show.view.palette import hexadecimal
 from evedrop.system.files import Unreadable, text_of
 
 _MOST_BYTES = 2**24
+_OF_ANY_MACHINE = ("keys", "peers")  # of the entries of a side
 _MOST_EVENTS = 500
 _MOST_WORDS = 120  # characters about a loss model
 
@@ -36,7 +43,9 @@ class WireSource:
     outcome: tuple[str, bool | None]
     """In a sentence, and whether it is good."""
     models: Mapping[str, str]
-    """Link → its loss model in words; empty if wire.toml cannot be read. Nothing else of this file is kept: it has passwords."""
+    """Link → its loss model in words; empty if wire.toml cannot be read."""
+    travelling: str
+    """The wire file without what is only this machine's: addresses, users with their passwords, certificates. Empty as above."""
     events: Sequence[tuple[str, str]]
     """When, and what."""
 
@@ -59,9 +68,14 @@ class WireSource:
         try:
             tables = tomllib.loads(text_of(folder / WIRE_FILE, _MOST_BYTES))
             models = {entry["name"]: _model(entry["loss"]) for entry in tables["link"]}
+            anywhere = {
+                name: {key: side[key] for key in _OF_ANY_MACHINE if key in side}
+                for name, side in tables["side"].items()
+            }
+            travelling = toml_text({**tables, "side": anywhere})
         except (OSError, Unreadable, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            models = {}
-        return cls(folder, summary, title, wire_title(summary), wire_outcome(summary), models, events)
+            models, travelling = {}, ""
+        return cls(folder, summary, title, wire_title(summary), wire_outcome(summary), models, travelling, events)
 
 
 def _model(loss: Mapping[str, Any]) -> str:
@@ -94,6 +108,48 @@ def _links(of: WireSource) -> Iterator[Markup]:
     )
 
 
+def _over_time(of: WireSource) -> Iterator[Markup]:
+    """A lane for each link, the fractions of messages lost, and the delays, over the time since the start."""
+    history = WireHistory.read(of.folder, of.summary)
+    links = {name: link for name, link in history.links.items() if link.heard.any()}
+    if not links:
+        return
+    yield made("legend", "Lanes:", LANE.legend({int(code) for link in links.values() for code in link.codes}))
+    for name, link in links.items():
+        yield made("heading", name)
+        lost = f"{link.lost.sum() / link.heard.sum():.1%} of {int(link.heard.sum()):,} messages were not delivered"
+        yield lane_picture(LANE, link.codes, f"{name}, {of.summary.seconds:,.1f} s: {lost}")
+    history = history.coarser
+    links = {name: history.links[name] for name in links}
+    steps = f"in steps of {history.step:.3g} s"
+    curves = [Curve(name, _ink(i), history.seconds, link.loss) for i, (name, link) in enumerate(links.items())]
+    ends = (0.0, of.summary.seconds)
+    yield (
+        LogChart(
+            f"The fraction of the messages of every link that were not delivered, {steps}",
+            "seconds since the start", f"Messages that were not delivered, {steps}", curves,
+            x_range=ends, y_axis="fraction lost", linear=True,
+        ).figure
+        or Markup()
+    )  # fmt: skip
+    curves = [
+        Curve(name, _ink(i), history.seconds, link.delay(0.5), link.delay(0.05), link.delay(0.95))
+        for i, (name, link) in enumerate(links.items())
+        if link.delayed
+    ]
+    delays = LogChart(
+        f"The delays of the delivered messages of every link, {steps}",
+        "seconds since the start", f"Median delay of delivered messages, {steps}; bands: nine messages of ten", curves,
+        x_range=ends, y_axis="delay (s)", linear=True,
+    )  # fmt: skip
+    yield (delays.figure if curves else None) or Markup()
+
+
+def _ink(i: int) -> str:
+    """The colour of the i-th link of a chart, whose curves have their names beside them."""
+    return hexadecimal((palette.BLUE, palette.RED, palette.GREY)[i % 3])
+
+
 def _losses(of: WireSource) -> Iterator[Markup]:
     """Why messages did not arrive."""
     table = reasons_table(of.summary)
@@ -112,23 +168,29 @@ def _events(of: WireSource) -> Iterator[Markup]:
 
 
 def _repeat(of: WireSource) -> Iterator[Markup]:
-    """How to start the wire again, and with which versions it was made."""
-    where = of.folder.absolute()
-    yield made("paragraph", "A wire whose messages have the same fates, and a look at this one:")
-    commands = [["evedrop", "wire", str(where / WIRE_FILE)], ["evedrop", "view", str(where)]]
-    yield made("code", "\n".join(map(shlex.join, commands)))
+    """The wire file to save, the command that starts it again, and when, where and with which versions it was made."""
+    if of.travelling:
+        yield made(
+            "paragraph",
+            "Save the wire file, and start it in its folder: the same messages have the same fates. Its sides listen on free "
+            "ports of this machine: the addresses, users and certificates of this wire do not travel with the page.",
+        )
+        yield download(WIRE_FILE, of.travelling)
+        yield made("code", f"evedrop wire {WIRE_FILE} --out again\nevedrop view again")
     facts = {
         "seed": of.summary.seed,
         "start": f"{of.summary.start:,} in this folder",
+        **circumstances(of.folder / WIRE_SUMMARY_FILE),
         "time": f"{of.summary.seconds:,.1f} s",
         **of.summary.made_with,
     }
-    yield facts_table(facts, "Seed and versions")
+    yield facts_table(facts, "Seed, machine and versions")
 
 
 WIRE_SECTIONS: Mapping[str, Callable[[WireSource], Iterator[Markup]]] = {
     "Expectations": _expectations,
     "Links": _links,
+    "Over time": _over_time,
     "Losses by reason": _losses,
     "Events": _events,
     "Repeat it": _repeat,

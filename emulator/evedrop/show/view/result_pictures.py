@@ -22,6 +22,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from evedrop.errors import UsageError
 from evedrop.model.metrics import all_metrics, error_column, shown_metric
+from evedrop.model.metrics.text import short_text
 from evedrop.model.process import Floats
 from evedrop.model.receiver import NOTHING, SILENT
 from evedrop.results.reading import Results
@@ -30,6 +31,7 @@ from evedrop.scenario.arguments import refuse_unless
 from evedrop.scenario.recorded import recorded, recorded_noise, recorded_strategies
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.view import palette
+from evedrop.show.view.axis_name import as_mathematics, axis_name
 from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
 from evedrop.show.view.figure_style import drawing, panels
 from evedrop.show.view.lanes import EAVESDROPPER
@@ -257,7 +259,7 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
                 scheme.set_xticks(x, [str(row[keys[0]]) for row in mine])
                 scheme.set_xlim(-0.5, len(x) - 0.5)
         scheme.set_yscale("log")
-        scheme.set_xlabel(keys[0])
+        scheme.set_xlabel(as_mathematics(axis_name(keys[0])))
         scheme.set_title(", ".join(f"{key} = {value}" for key, value in zip(keys[1:], values, strict=True)))
     limits = [limit for scheme in axes for limit in scheme.get_ylim()]
     for scheme in axes:
@@ -359,9 +361,9 @@ def _draw_comparison_on(axes: Axes, comparison: Comparison) -> None:
 def _facts(scheme: SchemeResult) -> Iterator[str]:
     needs = scheme.needs
     error = scheme.legitimate.standard_error
-    yield _number(scheme.legitimate.typical) + (f"\n± {_number(error)}" if error else "")
+    yield short_text(scheme.legitimate.typical) + (f"\n± {short_text(error)}" if error else "")
     yield "needed" if needs.acknowledgements else "–"
-    yield _number(needs.bits_per_slot)
+    yield short_text(needs.bits_per_slot)
     yield f"{needs.energy_per_slot:.3g}"
     once = f" (+ {needs.initial_secret_bits})" if needs.initial_secret_bits else ""
     yield f"{needs.secret_bits_per_slot}{once}" if needs.secret_bits_per_slot else "–"
@@ -377,11 +379,11 @@ def _cell(axes: Axes, column: int, row: int, scheme: SchemeResult, cell: Cell) -
     axes.add_patch(Rectangle(**box, facecolor=_GROUND[word]))
     axes.text(column + 0.5, row - 0.17, word.glyph, ha="center", va="center", color=_INK[word], fontsize=11)
     legitimate = cell.legitimate.typical / scheme.legitimate.typical if scheme.legitimate.typical else math.inf
-    raised = f"\nlegitimate {_number(legitimate)}×" if legitimate > _NOTABLE else ""
+    raised = f"\nlegitimate {short_text(legitimate)}×" if legitimate > _NOTABLE else ""
     axes.text(
         column + 0.5,
         row + 0.24,
-        f"{_number(cell.ratio)}×{raised}",
+        f"{short_text(cell.ratio)}×{raised}",
         ha="center",
         va="center",
         color=_INK[word],
@@ -404,13 +406,3 @@ def _legend(axes: Axes, comparison: Comparison, left: float) -> None:
         "·: not defined." + (f" Bold: dominates ({', '.join(comparison.dominant)})." if comparison.dominant else ""),
     ]
     axes.text(-left - 1.9, rows + 0.55, "\n".join(notes), ha="left", va="top", fontsize=8.8, linespacing=1.5)
-
-
-def _number(value: float) -> str:
-    """A number in short form: 2.3, 57, 3.4e5."""
-    if not math.isfinite(value):
-        return "∞"
-    if 0.01 <= value < 1e4:
-        return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
-    mantissa, exponent = f"{value:.1e}".split("e")
-    return f"{mantissa}e{int(exponent)}"

@@ -1,0 +1,22 @@
+"""What the axis of a scenario's entry is called in pictures."""
+
+from __future__ import annotations
+
+_NAMES = {
+    "encoding.state_probability": "μ_d: probability of sending a state",
+    "link.quality": "μ: probability that a packet arrives",
+}
+
+
+def axis_name(key: str) -> str:
+    """The symbol of the paper and its meaning, where `_` begins an index; of an entry without a symbol, the key."""
+    table, _, rest = key.partition(".")
+    receiver, _, entry = rest.partition(".")
+    if table == "eavesdroppers" and entry == "link.quality":
+        return f"μ of {receiver}: probability that a packet arrives"
+    return _NAMES.get(key.removeprefix("legitimate."), key)
+
+
+def as_mathematics(name: str) -> str:
+    """The same for matplotlib, with the symbol as mathematics."""
+    return name.replace("μ_d", r"$\mu_d$")
