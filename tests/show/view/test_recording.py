@@ -62,6 +62,14 @@ def test_curves_are_logarithms_at_full_rate(run: Simulated, rrd: Path) -> None:
     assert max(lowest) == min(lowest)
 
 
+def test_styles_come_before_the_first_slot(rrd: Path) -> None:
+    """Otherwise a viewer shows the first slots in colours of Rerun's choice."""
+    chunks = [chunk for chunk in RrdReader(rrd).stream() if "properties" not in chunk.entity_path]
+    static = [chunk.is_static for chunk in chunks]
+    assert static.count(True) > 10
+    assert static == sorted(static, reverse=True)
+
+
 def test_bands_of_several_trials(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
     """Their edges are 1.96 standard errors from the mean, in every slot; a single trial has none."""
     several, alone = simulated(30, trials=12), simulated(30)
