@@ -41,6 +41,7 @@ OTHER_OPTIONS = {
     "emulator/evedrop/simulate/cluster.py",  # those of dask worker
     "emulator/evedrop/cli/pytest_plugin.py",
     "emulator/evedrop/show/report/chart.py",  # names in its style sheet
+    "emulator/evedrop/show/report/travel.py",  # git's
     "emulator/evedrop/show/view/picture.py",  # the viewer's
     "emulator/evedrop/show/view/viewer.py",  # the viewer's, and the sandbox's
 }

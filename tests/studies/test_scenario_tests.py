@@ -75,10 +75,11 @@ def test_a_folder_of_scenarios_is_tested_in_memory(evedrop: Evedrop) -> None:
     assert lines[2:4] == ["    results: kept/fails", "    report: kept/fails/report.html"]
     assert re.fullmatch(r"passed    +\d+\.\d s  cases/holds.toml", lines[4])
     assert re.fullmatch(r"MISTAKES  +\d+\.\d s  cases/wrong.toml", lines[5])
-    assert [line.split()[0] for line in lines[6:-1]] == ["slots:", "seed:", "sluts:"]
-    assert re.fullmatch(r"1 passed, 1 FAILED, 1 MISTAKES, in \d+\.\d s", lines[-1])
+    assert [line.split()[0] for line in lines[6:-2]] == ["slots:", "seed:", "sluts:"]
+    assert re.fullmatch(r"1 passed, 1 FAILED, 1 MISTAKES, in \d+\.\d s", lines[-2])
+    assert lines[-1] == "report: kept/tests.html"
     assert Results.read(evedrop.folder / "kept" / "holds").summary["trials"] == 3
-    assert sorted(path.name for path in (evedrop.folder / "kept").iterdir()) == ["fails", "holds"]
+    assert sorted(path.name for path in (evedrop.folder / "kept").iterdir()) == ["fails", "holds", "tests.html"]
 
     suites = ET.parse(evedrop.folder / "reports" / "junit.xml").getroot()  # noqa: S314 - our own
     (suite,) = suites
@@ -163,7 +164,7 @@ def test_a_run_that_fails_is_neither_passed_nor_failed(
     assert told[1:4] == [
         "    smart was ended by signal 9", "    logs/smart.log: the last lines", f"    results: {tmp_path}/runs/one",
     ]  # fmt: skip
-    assert told[-1].startswith("2 BROKEN, in ")
+    assert told[-2].startswith("2 BROKEN, in ")
     assert [case[1].get("type") for case in ET.parse(report).getroot()[0]] == ["broken", "broken"]  # noqa: S314 - our own
 
 

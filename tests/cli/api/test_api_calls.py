@@ -230,7 +230,8 @@ def test_a_sweep_takes_arrays_and_gives_a_table() -> None:
     (command,) = (text for text in checked(result.folder).texts if text.startswith("evedrop sweep"))
     options = parser_of("sweep").parse_whole(shlex.split(command)[1:])
     assert grid_of(options.over) == {"encoding.state_probability": [0.2, 0.6], "slots": [5, 7], "title": ["1:2"]}
-    assert load(options.scenario, changes_of(options)) == SMALL.replace(trials=3, legitimate__link=link)
+    assert options.scenario == "scenario.toml"  # which the page carries
+    assert load(result.folder / options.scenario, changes_of(options)) == SMALL.replace(trials=3, legitimate__link=link)
 
 
 @pytest.mark.parametrize(
