@@ -101,7 +101,7 @@ def test_a_folder_of_scenarios_is_tested_in_memory(evedrop: Evedrop) -> None:
     }  # fmt: skip
     assert f"{verdict.sentence}. 1 of 2 expectations FAILED" in checked(evedrop.folder / "kept/fails").texts
     assert str(suite[0][1].get("message")).startswith(failed)
-    assert str(suite[2][0].text).splitlines() == [line.strip() for line in lines[6:-1]]
+    assert str(suite[2][0].text).splitlines() == [line.strip() for line in lines[6:-2]]
 
 
 @pytest.mark.long

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +144,7 @@ def test_a_sweep_is_drawn_as_its_file_is() -> None:
     result: SweepResults = sweep(SCENARIO, {"encoding.state_probability": [0.3, 0.7], "slots": [4, 6]}, trials=3)
     axes = result.plot().axes
     assert [axis.get_title("left") for axis in axes] == ["slots = 4", "slots = 6"]
-    assert axes[0].get_xlabel() == "encoding.state_probability"
+    assert axes[0].get_xlabel() == r"$\mu_d$: probability of sending a state"
 
 
 @pytest.fixture
@@ -181,3 +182,28 @@ def test_results_write_their_page(results: RunResults) -> None:
     """The page is written into their folder."""
     assert results.report() == results.folder / REPORT
     assert SCENARIO.title in checked(results.folder).headings
+
+
+@pytest.mark.parametrize("receivers", [1, 4, 9])
+def test_a_figure_for_a_column_of_a_journal(receivers: int, tmp_path: Path) -> None:
+    """89 mm wide, letters of at least 7 points in embedded fonts, names beside the curves, without title and legend."""
+    link = {"quality": 0.9}
+    eavesdroppers = {f"e{i}": {"strategy": "naive", "link": link} for i in range(receivers - 1)}
+    made = montecarlo(SCENARIO.replace(eavesdroppers=eavesdroppers, expect=[]), trials=3)
+    figure = made.plot("errors", width="column")
+    assert figure.get_size_inches()[0] == pytest.approx(3.5)
+    (axes,) = figure.axes
+    assert (axes.get_title(), axes.get_title("left"), axes.get_legend(), figure._suptitle) == ("", "", None, None)  # type: ignore[attr-defined]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("slot", "squared error")
+    names = {text.get_text(): text.get_position()[1] for text in axes.texts}
+    assert list(names) == list(made.peers)
+    places = sorted(names.values())
+    assert all(after - before > 0.05 for before, after in pairwise(places))
+    texts = [*axes.texts, axes.xaxis.label, axes.yaxis.label, *axes.get_xticklabels()]
+    assert {(text.get_fontfamily()[0], text.get_fontsize()) for text in texts} == {("STIXGeneral", 8.0)}
+    figure.savefig(tmp_path / "figure.pdf")
+    assert b"/CIDFontType2" in (tmp_path / "figure.pdf").read_bytes()
+    lanes, plane = made.plot("lanes", "plane", width="column").axes
+    assert all(panel.get_legend() is not None for panel in (lanes, plane))
+    with pytest.raises(UsageError, match="column"):
+        made.plot(width="wide")  # type: ignore[arg-type]

@@ -36,7 +36,7 @@ from evedrop.model.metrics.text import ShownNumber, estimate, number_text, short
 from evedrop.results.reading import Results
 from evedrop.score.synchronisation import LongestSpans, LostSpan, Synchronisation, lost_spans, synchronisation_of
 from evedrop.show.report import closing
-from evedrop.show.report.chart import Curve, GroupCounts, GroupMeans, LogChart, label_places
+from evedrop.show.report.chart import Curve, GroupCounts, GroupMeans, LogChart
 from evedrop.show.report.page import Page, Part, made
 from evedrop.show.report.run_sections import (
     OUTCOMES,
@@ -50,6 +50,7 @@ from evedrop.show.report.run_sections import (
 from evedrop.show.report.text_table import TextTable, aligned, far
 from evedrop.show.report.writing import REPORT, try_report, write_report
 from evedrop.show.view.axis_name import as_mathematics, axis_name
+from evedrop.show.view.label_places import label_places
 from evedrop.show.view.lanes import Lane
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode

@@ -15,7 +15,7 @@ import pyarrow as pa
 from evedrop.cli.api.notebook import table_text
 from evedrop.model.metrics import shown_metric
 from evedrop.model.metrics.text import number_text
-from evedrop.results.comparison import Comparison
+from evedrop.results.comparison import COMPARISON, Comparison, read_comparison
 from evedrop.results.reading import ByName, Results
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary, Summary
 from evedrop.score.verdict import Verdict
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from evedrop.show.view.shown_figure import ShownFigure
 
 Panels = Literal["errors", "lanes", "plane"]
+Width = Literal["page", "column"]
 _MOST_ROWS = 40  # of a table in a notebook
 
 
@@ -127,18 +128,21 @@ class RunResults(Results, ReportedResults):
             yield from lines(self._typed)
         yield from (expectation.sentence for expectation in self.expectations)
 
-    def plot(self, *panels: Panels, slots: range | None = None, trial: int | None = None) -> ShownFigure:
+    def plot(
+        self, *panels: Panels, slots: range | None = None, trial: int | None = None, width: Width = "page"
+    ) -> ShownFigure:
         """A figure: the errors of all trials with bands, and the lanes and the plane of one recorded trial.
 
         panels: some of `errors`, `lanes` and `plane`, by default all; slots: those shown, by default all errors and at most the
-        last 300 slots of lanes and plane; trial: by default the first recorded one. The figure is one of matplotlib:
+        last 300 slots of lanes and plane; trial: by default the first recorded one; width: "column" for a column of a journal,
+        with serif letters of 8 points, names beside the curves, and without a title. The figure is one of matplotlib:
         `savefig` writes it to a file. Source: docs/python.md.
 
         Raises UsageError if there is no such panel, slot or recorded trial.
         """
         from evedrop.show.view.result_pictures import run_figure  # matplotlib takes half a second
 
-        return run_figure(self, panels, slots, trial)
+        return run_figure(self, panels, slots, trial, width)
 
     def __repr__(self) -> str:
         error = ("mean_squared_error", "mean_actual_trace_covariance")
@@ -245,3 +249,15 @@ def load_results(folder: str | Path) -> RunResults:
     Raises UsageError naming the missing or broken file if it is not a results folder.
     """
     return RunResults.read(folder)
+
+
+def study_in(folder: Path) -> RunResults | SweepResults | ComparisonResults:
+    """The results in the folder of a run, a sweep or a comparison. Raises UsageError if they cannot be read."""
+    if (folder / COMPARISON).exists():
+        return ComparisonResults.of(read_comparison(folder), folder)
+    if (folder / "sweep.json").exists():
+        from evedrop.show.report.sweep_sections import SweepSource  # templates, which no other results need
+
+        source = SweepSource.read(folder)
+        return SweepResults(folder, pa.Table.from_pylist(list(source.rows)), tuple(source.grid))
+    return load_results(folder)

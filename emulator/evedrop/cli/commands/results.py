@@ -31,7 +31,11 @@ _LONGEST = 3600.0  # seconds per slot, as for pace
 
 
 def export(options: argparse.Namespace) -> int:
-    """Write the results of a run as an MCAP file."""
+    """Write the results of a run as an MCAP file, or the picture or the tables of any study; the file's ending decides."""
+    if (kind := options.file.suffix.lower()) in {*_PICTURES, *_TABLES}:
+        return _export_study(options, kind)
+    if options.width != "page":
+        raise UsageError(f"--width is for pictures, whose files end in {', '.join(_PICTURES)}; leave it out")
     from evedrop.results.mcap_export import export_mcap
     from evedrop.results.reading import Results
     from evedrop.results.wire_summary import is_wire
@@ -48,8 +52,43 @@ def export(options: argparse.Namespace) -> int:
     return 0
 
 
+_PICTURES, _TABLES = (".pdf", ".png", ".svg"), (".csv", ".tex")
+_DOTS_PER_INCH = 300
+
+
+def _export_study(options: argparse.Namespace, kind: str) -> int:
+    from evedrop.cli.api.results import RunResults, study_in
+    from evedrop.results.wire_summary import is_wire
+
+    if is_wire(options.run):
+        raise UsageError(
+            f"{options.run} is the folder of a wire; its report has its pictures: evedrop report {options.run}"
+        )
+    study = study_in(options.run)
+    if kind in _TABLES:
+        files = study.to_csv(options.file) if kind == ".csv" else [study.to_latex(options.file)]
+        print("\n".join(map(str, files)))
+        return 0
+    if isinstance(study, RunResults):
+        panels = ("errors",) if study.typed_summary.mode in {"covariance-only", "error-coordinates"} else ()
+        picture = study.plot(*panels, width=options.width)
+    elif options.width != "page":
+        raise UsageError(f"--width {options.width} is for the picture of a run; {options.run} is another study")
+    else:
+        picture = study.plot()
+    try:
+        picture.savefig(options.file, dpi=_DOTS_PER_INCH)
+    except OSError as error:
+        raise UsageError(f"{options.file} cannot be written ({error.strerror}); give another file") from error
+    print(options.file)
+    return 0
+
+
 def _written(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, metavar="FILE.mcap")
+    parser.add_argument("file", type=Path, metavar="FILE", help=".mcap, .pdf, .png, .svg, .csv or .tex")
+    parser.add_argument(
+        "--width", choices=("page", "column"), default="page", help="of the picture of a run; column: that of a journal"
+    )
     parser.add_argument(
         "--period",
         type=number_type(math.ulp(0.0), _LONGEST, f"a number of seconds above 0 and up to {_LONGEST:.0f}"),
@@ -88,8 +127,8 @@ COMMANDS = (
     Command(
         "export",
         export,
-        "write a finished run as an MCAP file, for Foxglove",
-        (argument("run", "RUN"), _written),
+        "write a run as an MCAP file, or any study's picture or tables",
+        (argument("run", "FOLDER"), _written),
         section="inspect",
         example="export runs/vehicle vehicle.mcap",
         page="results",

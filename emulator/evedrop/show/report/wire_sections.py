@@ -19,7 +19,7 @@ from evedrop.show.report.run_sections import lane_picture
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.travel import circumstances, download
 from evedrop.show.report.wire import reasons_table, unlinked_sentence, wire_faults, wire_outcome, wire_table, wire_title
-from evedrop.show.report.wire_history import LANE, WireHistory
+from evedrop.show.report.wire_over_time import LANE, WireOverTime
 from evedrop.show.view import palette
 from evedrop.show.view.palette import hexadecimal
 from evedrop.system.files import Unreadable, text_of
@@ -110,7 +110,7 @@ def _links(of: WireSource) -> Iterator[Markup]:
 
 def _over_time(of: WireSource) -> Iterator[Markup]:
     """A lane for each link, the fractions of messages lost, and the delays, over the time since the start."""
-    history = WireHistory.read(of.folder, of.summary)
+    history = WireOverTime.read(of.folder, of.summary)
     links = {name: link for name, link in history.links.items() if link.heard.any()}
     if not links:
         return

@@ -30,7 +30,7 @@ from evedrop.results.tables import swept_strategies
 from evedrop.scenario.arguments import refuse_unless
 from evedrop.scenario.recorded import recorded, recorded_noise, recorded_strategies
 from evedrop.score.verdict import SecrecyOutcome
-from evedrop.show.view import palette
+from evedrop.show.view import journal_column, palette
 from evedrop.show.view.axis_name import as_mathematics, axis_name
 from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
 from evedrop.show.view.figure_style import drawing, panels
@@ -57,15 +57,21 @@ _HEIGHTS: Mapping[str, Callable[[int], float]] = {
     "plane": lambda _: 3.8,
 }
 """Panel → its height in inches, for a number of receivers."""
+_WIDTHS: Mapping[str, float] = {"page": 1.0, "column": 0.72}
+"""Width of a figure → the factor of these heights."""
 
 
-def run_figure(results: Results, wanted: Sequence[str], slots: range | None, trial: int | None) -> ShownFigure:
+def run_figure(
+    results: Results, wanted: Sequence[str], slots: range | None, trial: int | None, width: str = "page"
+) -> ShownFigure:
     """Draw these panels, all of them if none is named, one below the other; arguments and errors as `RunResults.plot`."""
     names = list(wanted) or list(_HEIGHTS)
     for name in names:
         if name not in _HEIGHTS:
             raise UsageError(f"plot: there is no panel {name!r}; expected {', '.join(_HEIGHTS)}")
     refuse_unless(slots is None or isinstance(slots, range), "slots", slots, "a range of slots, such as range(0, 50)")
+    refuse_unless(width in _WIDTHS, "width", width, '"page", or "column" for a column of a journal')
+    column = width == "column"
     rows = results.slots
     last = pc.max(rows["slot"]).as_py()
     if slots is not None and (not slots or slots.step != 1 or not 0 <= slots[0] <= slots[-1] <= last):
@@ -74,15 +80,20 @@ def run_figure(results: Results, wanted: Sequence[str], slots: range | None, tri
     noise = recorded_noise(results.folder)
     inks = paper_inks(receivers, recorded_strategies(results.folder))
     recorded_trial = None if names == ["errors"] else _RecordedTrial(results, inks, trial, slots)
-    heights = [_HEIGHTS[name](len(receivers)) for name in names]
-    with drawing(_WIDTH, sum(heights)) as figure:
-        figure.suptitle(str(results.summary["scenario"]), x=0.02, ha="left", fontsize=11)
+    heights = [_HEIGHTS[name](len(receivers)) * _WIDTHS[width] for name in names]
+    with drawing(
+        journal_column.WIDTH if column else _WIDTH, sum(heights), journal_column.STYLE if column else None
+    ) as figure:
+        if not column:
+            figure.suptitle(str(results.summary["scenario"]), x=0.02, ha="left", fontsize=11)
         places = figure.subplots(len(names), 1, height_ratios=heights, squeeze=False)[:, 0]
         for name, axes in zip(names, places, strict=True):
             if name == "errors":
                 _errors(axes, rows, inks, slots, error_floor(noise, pc.max(rows["trials"]).as_py()))
             elif recorded_trial is not None:
                 (recorded_trial.lanes if name == "lanes" else recorded_trial.plane)(axes)
+            if column:
+                journal_column.fit(axes, name == "errors", heights[names.index(name)] - 0.5)
     return figure
 
 
@@ -118,6 +129,7 @@ def _errors(axes: Axes, rows: pa.Table, inks: Mapping[str, str], slots: range | 
         axes.set_yscale("log")
         axes.set_ylim(axis.low, axis.high)
     axes.set_xlabel("slot")
+    axes.set_ylabel("squared error")
     title = "squared error" + (", mean ± 2 standard errors" if many else "") + "; dashed: theory"
     axes.set_title(f"{title}; {floor_words(floor)}" if axis is not None and axis.below else title)
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))

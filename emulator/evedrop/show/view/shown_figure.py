@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 from io import BytesIO
-from typing import final
+from typing import Any, final
 
+import matplotlib as mpl
 from matplotlib.figure import Figure
 
 _DOTS_PER_INCH = 110
+_STYLED = {"axes", "font", "mathtext", "pdf", "xtick", "ytick"}
 
 
 @final
 class ShownFigure(Figure):
-    """A figure; `savefig` writes it to a file."""
+    """A figure; `savefig` writes it to a file, in the style in which it was made."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        """As of `Figure`."""
+        super().__init__(*arguments, **options)
+        self._style = {name: value for name, value in mpl.rcParams.items() if name.partition(".")[0] in _STYLED}
+
+    def savefig(self, *arguments: Any, **options: Any) -> None:
+        """Write the figure to a file, as `Figure` does: PDF, SVG or PNG by the ending of its name."""
+        with mpl.rc_context(self._style):  # labels of ticks are made only now, and fonts looked up
+            super().savefig(*arguments, **options)
 
     def _repr_png_(self) -> bytes:
         written = BytesIO()

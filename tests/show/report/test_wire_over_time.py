@@ -11,7 +11,7 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WIRE_FILE, WireSummary
-from evedrop.show.report.wire_history import LANE, WireHistory
+from evedrop.show.report.wire_over_time import LANE, WireOverTime
 from evedrop.show.report.writing import write_report
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.journal import WireJournal
@@ -47,7 +47,7 @@ def wire(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_message_counts_in_its_step(wire: Path) -> None:
     """All of the summary; the cut links have lost everything in its seconds; delays are those of the model; none is invented."""
     summary = WireSummary.read(wire / "summary.json")
-    history = WireHistory.read(wire, summary)
+    history = WireOverTime.read(wire, summary)
     assert history.step == 0.2
     for name, account in summary.links.items():
         link = history.links[name]
@@ -81,11 +81,11 @@ def test_a_wire_of_another_start_or_without_a_journal(wire: Path, tmp_path: Path
     """No row of another start counts; what cannot be read is said in its part of the page."""
     summary = WireSummary.read(wire / "summary.json")
     with pytest.raises(UsageError, match="cannot be read"):
-        WireHistory.read(tmp_path, summary)
+        WireOverTime.read(tmp_path, summary)
     text = (wire / "journal" / "history.jsonl").read_text()
     (tmp_path / "journal").mkdir()
     (tmp_path / "journal" / "history.jsonl").write_text(
         text + text.splitlines()[0].replace('"start": 1', '"start": 2') + "\n"
     )
-    history = WireHistory.read(tmp_path, replace(summary, start=2, seconds=0.0))
+    history = WireOverTime.read(tmp_path, replace(summary, start=2, seconds=0.0))
     assert not any(link.heard.any() for link in history.links.values())

@@ -41,7 +41,7 @@ LANE = Lane(
 
 @final
 @dataclass
-class LinkHistory:
+class LinkOverTime:
     """A link in c steps of time."""
 
     steps: int
@@ -70,9 +70,9 @@ class LinkHistory:
         cells = step[~lost] * _BUCKETS + buckets
         self._delays += np.bincount(cells, minlength=self._delays.size).reshape(self._delays.shape)
 
-    def coarser(self, factor: int) -> LinkHistory:
+    def coarser(self, factor: int) -> LinkOverTime:
         """The same in longer steps, each of so many of these; their number must be a multiple of it."""
-        link = LinkHistory(self.steps // factor)
+        link = LinkOverTime(self.steps // factor)
         for name in ("heard", "lost", "cut", "_delays"):
             counts = getattr(self, name)
             setattr(link, name, counts.reshape(link.steps, factor, *counts.shape[1:]).sum(1))
@@ -107,18 +107,18 @@ class LinkHistory:
 
 
 @dataclass(frozen=True)
-class WireHistory:
+class WireOverTime:
     """The links of a wire over the time since its start."""
 
     step: float
     """Seconds."""
-    links: Mapping[str, LinkHistory]
+    links: Mapping[str, LinkOverTime]
 
     @property
-    def coarser(self) -> WireHistory:
+    def coarser(self) -> WireOverTime:
         """The same in longer steps, for curves."""
         links = {name: link.coarser(_STEPS_OF_A_POINT) for name, link in self.links.items()}
-        return WireHistory(self.step * _STEPS_OF_A_POINT, links)
+        return WireOverTime(self.step * _STEPS_OF_A_POINT, links)
 
     @property
     def seconds(self) -> Floats:
@@ -127,12 +127,12 @@ class WireHistory:
         return np.asarray((np.arange(count) + 0.5) * self.step, np.float64)
 
     @classmethod
-    def read(cls, folder: Path, summary: WireSummary) -> WireHistory:
+    def read(cls, folder: Path, summary: WireSummary) -> WireOverTime:
         """Read the journal of the start that a summary is about. Raises UsageError if a file of it cannot be read."""
         most = min(_MOST_STEPS, math.ceil(summary.seconds / _SHORTEST_STEP))
         steps = max(1, math.ceil(most / _STEPS_OF_A_POINT)) * _STEPS_OF_A_POINT
         step = max(summary.seconds, _SHORTEST_STEP) / steps
-        links = {name: LinkHistory(steps) for name in summary.links}
+        links = {name: LinkOverTime(steps) for name in summary.links}
         try:
             began = _began(folder / _JOURNAL / "history.jsonl", summary.start)
             for table in _parts(folder / _JOURNAL, summary.start):

@@ -1,0 +1,75 @@
+"""Pictures as wide as a column of a journal: serif letters of 8 points, names beside the curves, and no titles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evedrop.show.view.label_places import label_places
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
+
+WIDTH = 3.5
+"""Inches: 89 mm, as of IEEE and Elsevier."""
+_POINTS, _LINE_OF_TEXT = 8.0, 9.5
+STYLE: Mapping[str, Any] = {
+    "axes.labelsize": _POINTS,
+    "axes.titlesize": _POINTS,
+    "font.family": ["STIXGeneral", "DejaVu Serif"],
+    "font.size": _POINTS,
+    "legend.fontsize": 7.0,
+    "lines.linewidth": 1.0,
+    "mathtext.fontset": "stix",
+    "xtick.labelsize": _POINTS,
+    "ytick.labelsize": _POINTS,
+}
+"""What differs from other figures."""
+
+
+def fit(axes: Axes, direct: bool, height: float) -> None:
+    """Make axes fit a column: without a title, and with names beside the ends of the curves, or else a legend below.
+
+    direct: whether the names stand beside the curves; height: of the axes, in inches, about.
+    """
+    axes.set_title("")
+    legend = axes.get_legend()
+    if direct:
+        _name_curves(axes, height)
+    elif legend is not None:
+        handles = [handle for handle in legend.legend_handles if handle is not None]
+        texts = [text.get_text() for text in legend.get_texts()]
+        axes.legend(
+            handles, texts, loc="upper center", bbox_to_anchor=(0.5, -0.28 / height * 1.6), ncols=3, frameon=False,
+            handlelength=1.2, columnspacing=0.8, handletextpad=0.4,
+        )  # fmt: skip
+        return
+    if legend is not None:
+        legend.remove()
+
+
+def _name_curves(axes: Axes, height: float) -> None:
+    """Write the name of each curve to the right of its end, with a line to it in its colour."""
+    curves = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
+    ends = [_end(axes, line) for line in curves]
+    for line in axes.get_lines():
+        line.set_linewidth(0.8)
+    for line, end, place in zip(curves, ends, label_places(ends, _LINE_OF_TEXT / (72.0 * height)), strict=True):
+        ink, style = line.get_color(), line.get_linestyle()
+        axes.plot(
+            [1.0, 1.06], [end, place], linestyle=style, color=ink, transform=axes.transAxes, clip_on=False, linewidth=1.0,
+            label="_name",
+        )  # fmt: skip
+        axes.text(1.075, place, str(line.get_label()), transform=axes.transAxes, va="center")
+
+
+def _end(axes: Axes, line: Line2D) -> float:
+    """Where a curve ends: the height of its last point, as a fraction of the axis."""
+    heights = np.asarray(line.get_ydata(), float)
+    finite = heights[np.isfinite(heights)]
+    low, high = axes.get_ylim()
+    height = float(np.clip(finite[-1], low, high)) if finite.size else low
+    return float(axes.transAxes.inverted().transform(axes.transData.transform((0.0, height)))[1])

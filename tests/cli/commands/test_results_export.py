@@ -1,0 +1,45 @@
+"""`evedrop export` with the ending of a picture or a table."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+from PIL import Image
+
+from tests.conftest import Evedrop
+
+SMALL = ("--slots", "20", "--trials", "2", "--out", "study")
+STUDIES = {
+    "run": ("montecarlo", "eavesdroppers", *SMALL),
+    "without states": ("montecarlo", "eavesdroppers", "--covariance-only", *SMALL),
+    "sweep": ("sweep", "eavesdroppers", "--over", "seed=1,2", *SMALL),
+    "comparison": ("compare", "eavesdroppers", "--schemes", "plain", "--adversaries", "naive", *SMALL),
+}
+
+
+@pytest.mark.parametrize("study", STUDIES)
+def test_the_picture_and_the_tables_of_any_study(study: str, evedrop: Evedrop) -> None:
+    """As PDF, PNG and SVG, as CSV and LaTeX; the command says which files it wrote."""
+    assert evedrop(*STUDIES[study]).status in {0, 1}
+    for ending, begin in (("pdf", b"%PDF"), ("png", b"\x89PNG"), ("svg", b"<?xml"), ("tex", b"")):
+        done = evedrop("export", "study", f"out.{ending}")
+        assert (done.status, done.out) == (0, f"out.{ending}\n")
+        assert (evedrop.folder / f"out.{ending}").read_bytes().startswith(begin)
+    assert "\\begin{tabular}" in (evedrop.folder / "out.tex").read_text()
+    done = evedrop("export", "study", "out.csv")
+    tables = [list(csv.reader((evedrop.folder / name).read_text().splitlines())) for name in done.out.split()]
+    assert all(len(table) > 1 for table in tables)
+    done = evedrop("export", "study", "column.png", "--width", "column")
+    assert done.status == (0 if study in {"run", "without states"} else 2)
+    if done.status == 0:
+        with Image.open(evedrop.folder / "column.png") as picture:
+            assert picture.width == 1050
+
+
+def test_what_cannot_be_exported(evedrop: Evedrop) -> None:
+    """A width without a picture, a folder without results, a file that cannot be written."""
+    assert evedrop(*STUDIES["run"]).status in {0, 1}
+    assert evedrop("export", "study", "out.mcap", "--width", "column").status == 2
+    assert evedrop("export", "nowhere", "out.pdf").status == 2
+    assert evedrop("export", "study", "nowhere/out.pdf").status == 2
