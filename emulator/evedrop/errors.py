@@ -18,7 +18,7 @@ EvedropError                    exit status
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 MOST_MISTAKES = 100
 """The most mistakes of a scenario in one message: more would not be read."""
@@ -35,6 +35,11 @@ class EvedropError(Exception):
     resumable: str | None = None
     """The folder of the study that the error ended, if the study can go on from there."""
 
+    @property
+    def illustrated(self) -> str:
+        """The message as a terminal shows it: with the lines of a file that it is about, where there are any."""
+        return str(self)
+
 
 class UsageError(EvedropError):
     """The command line, or a file it names, cannot be used."""
@@ -45,8 +50,10 @@ class UsageError(EvedropError):
 class ScenarioError(UsageError):
     """A scenario with mistakes: `mistakes` lists them, one line each, up to `MOST_MISTAKES`."""
 
-    def __init__(self, source: str, mistakes: list[str]) -> None:
+    def __init__(self, source: str, mistakes: list[str], excerpts: Sequence[str] = ()) -> None:
+        """excerpts: for each mistake, the line of the file with carets below what is wrong; empty for none."""
         self.source = source
+        self._excerpts = excerpts
         self._all = mistakes
         more = len(mistakes) - MOST_MISTAKES
         short = [line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}…" for line in mistakes[:MOST_MISTAKES]]
@@ -54,12 +61,30 @@ class ScenarioError(UsageError):
         count = "1 mistake" if len(mistakes) == 1 else f"{len(mistakes)} mistakes"
         super().__init__("\n".join([f"{source}: {count}, nothing was started", *(f"  {line}" for line in mistakes)]))
 
-    def numbered(self, line_of: Callable[[str], int | None]) -> ScenarioError:
-        """The same with the line of each mistake's entry; line_of: dotted path → line, None if the file has no such entry."""
-        lines = [(mistake, line_of(mistake.partition(":")[0])) for mistake in self._all]
+    def numbered(self, line_of: Callable[[str], int | None], excerpt: Callable[[str, int], str]) -> ScenarioError:
+        """The same with the line of each mistake's entry.
+
+        line_of: dotted path → line, None if the file has no such entry; excerpt: mistake and line → the line as it is shown.
+        """
+        paths = [mistake.partition(":")[0] for mistake in self._all]
+        lines = [line_of(path) for path in paths]
         return ScenarioError(
-            self.source, [mistake if line is None else f"{mistake} (line {line})" for mistake, line in lines]
+            self.source,
+            [
+                mistake if line is None else f"{mistake} (line {line})"
+                for mistake, line in zip(self._all, lines, strict=True)
+            ],
+            ["" if line is None else excerpt(mistake, line) for mistake, line in zip(self._all, lines, strict=True)],
         )
+
+    @property
+    def illustrated(self) -> str:
+        """The message, with the lines of the file."""
+        first, *lines = str(self).split("\n")
+        if not any(self._excerpts) or len(lines) != len(self._excerpts):
+            return str(self)
+        pairs = zip(lines, self._excerpts, strict=True)
+        return "\n".join([first, *(part for pair in pairs for part in pair if part)])
 
 
 class TraceError(UsageError):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import sys
 
 import pytest
@@ -11,14 +10,7 @@ from rich.text import Text
 
 from evedrop.cli.console import ProgressLine
 from evedrop.scenario.progress_events import Held, RunProgress, Started
-
-
-class Terminal(io.StringIO):
-    """What was written to a terminal."""
-
-    def isatty(self) -> bool:
-        """It is one."""
-        return True
+from tests.cli.terminal import Terminal
 
 
 def test_a_held_run_shows_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,6 +56,26 @@ def test_a_narrow_terminal_shows_what_is_done_and_the_time_left(monkeypatch: pyt
 
 
 ERRORS = {"legitimate": 0.0081, "naive": 3.2e2, "suspicious": 0.61, "smart": 0.0234}
+
+
+@pytest.mark.parametrize("columns", [40, 60, 80, 100, 120, 200])
+@pytest.mark.parametrize("unit", ["slots", "trial-slots"])
+def test_slots_and_the_time_left_fit_every_width(monkeypatch: pytest.MonkeyPatch, columns: int, unit: str) -> None:
+    """Of a long study too, with many receivers; an error that is only rounding is 0."""
+    errors = {"legitimate": 8e-31, **{f"eavesdropper-{i}": 10.0**i for i in range(8)}}
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with ProgressLine(200_000_000, unit) as line:
+        line.on_event(RunProgress(50_000_000, 12_345_678.0, f"{unit}/s", errors))
+        line.on_event(RunProgress(123_456_789, 12_345_678.0, f"{unit}/s", errors))
+    written = [line for line in Text.from_ansi(terminal.getvalue()).plain.splitlines() if "123456789" in line]
+    assert written
+    assert all(cell_len(line) <= columns for line in written)
+    assert all("123456789/200000000" in line and " left" in line for line in written)
+    assert columns < 200 or all("legitimate 0 " in line for line in written), written
+    assert "e-31" not in terminal.getvalue()
 
 
 @pytest.mark.parametrize(

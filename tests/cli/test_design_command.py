@@ -6,8 +6,10 @@ import json
 import shlex
 from typing import Any
 
+import numpy as np
 import pytest
 
+from evedrop import design
 from tests.conftest import Evedrop
 from tests.golden.pages import Golden
 
@@ -269,3 +271,67 @@ def test_what_is_refused_can_be_measured(evedrop: Evedrop, scenario: str, entrie
     words = shlex.split(command)
     assert words[1] in {"sweep", "montecarlo"}
     assert evedrop(*words[1:], "--trials", "2", "--slots", "4", "--set", "expect=[]", "--out", "measured").status == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "answer"),
+    [
+        (("--min-ratio", "2"), "choose μ_d = 0.76145: perfect secrecy against naive, and the error of much-better"),
+        (
+            changes(eavesdroppers="{smart={strategy='smart',link={quality=0.85}}}"),
+            "choose μ_d = 0.56562: perfect secrecy",
+        ),
+        (
+            changes(legitimate__link__quality=0.6),
+            "no μ_d keeps the error of every eavesdropper above the legitimate one",
+        ),
+        (changes(legitimate__link__quality=1.0), "choose μ_d = 1: the legitimate error is 0; costs 1 ×"),
+    ],
+)
+def test_a_design_answers_first(evedrop: Evedrop, options: tuple[str, ...], answer: str) -> None:
+    """Which μ_d to choose, what it gives and what it costs, in the first line."""
+    done = evedrop("design", "numerical", *options)
+    assert (done.status, done.err) == (0, "")
+    assert done.out.startswith(answer), done.out.splitlines()[0]
+
+
+def test_the_suggestion_is_the_cheapest_with_nearly_the_largest_ratio() -> None:
+    """90 % of it, as a search over a grid finds it too; the μ_d is in the intervals of perfect secrecy where that is possible."""
+    made = design("numerical")
+    assert made.suggestion is not None
+    ratios = {}
+    for mu_d in np.linspace(LOW + 1e-3, 1.0, 400):
+        at = made.traces_at(float(mu_d))
+        ratios[float(mu_d)] = min(trace for name, trace in at.items() if name != "legitimate") / at["legitimate"]
+    wanted = 0.9 * max(ratios.values())
+    assert made.suggestion.mu_d == pytest.approx(max(mu_d for mu_d in ratios if ratios[mu_d] >= wanted), abs=0.003)
+    alone = design("numerical", changes={"eavesdroppers": {"smart": {"strategy": "smart", "link": {"quality": 0.85}}}})
+    assert alone.suggestion is not None
+    assert alone.eavesdroppers["smart"].perfect is not None
+    assert alone.suggestion.mu_d == pytest.approx(alone.eavesdroppers["smart"].perfect[1])
+    assert design("numerical", changes={"eavesdroppers": {}}).suggestion is None
+
+
+@pytest.mark.parametrize("suffix", ["pdf", "png", "svg"])
+def test_a_design_has_a_plot(evedrop: Evedrop, suffix: str) -> None:
+    """As the kind of file that its name says."""
+    path = evedrop.folder / f"plot.{suffix}"
+    assert evedrop("design", "numerical", "--plot", path.name).status == 0
+    begins = {"pdf": b"%PDF", "png": b"\x89PNG", "svg": b"<?xml"}
+    assert path.read_bytes().startswith(begins[suffix])
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--plot", "plot.gif"), "expected a name that ends in .pdf, .png or .svg"),
+        (("--plot", "nowhere/plot.pdf"), "cannot be written"),
+        (("--plot", "plot.pdf", "--schedule", "3"), "leave it out"),
+        (("--plot", "plot.pdf", *changes(legitimate__link__quality=0.4)), "there is nothing to draw"),
+    ],
+)
+def test_a_plot_that_cannot_be_drawn_is_refused(evedrop: Evedrop, options: tuple[str, ...], sentence: str) -> None:
+    """With status 2 and what to do."""
+    done = evedrop("design", "numerical", *options)
+    assert done.status == 2
+    assert sentence in done.err

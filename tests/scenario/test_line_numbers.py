@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError
-from evedrop.scenario.line_numbers import line_of, lines_of_entries
+from evedrop.scenario.line_numbers import excerpt, line_of, lines_of_entries
 from evedrop.scenario.loading import load, parse
 from evedrop.scenarios import shipped
 
@@ -146,3 +146,45 @@ def test_no_pattern_repeats_a_group_possessively() -> None:
     sources = [path for folder in ("emulator", "peers", "tools") for path in (root / folder).rglob("*.py")]
     assert len(sources) > 200
     assert [path for path in sources if re.search(r"\)(?:[*+?]|\{[\d,]+\})\+", path.read_text("utf-8"))] == []
+
+
+@pytest.mark.parametrize(
+    ("row", "name", "marked"),
+    [
+        ('scheme = "innovatoin"   # a slip', "scheme", '"innovatoin"'),
+        ("link = { quality = 1.5, loss = 3 }", "quality", "1.5"),
+        ("link = { quality = 1.5, loss = 3 }", "loss", "3"),
+        ("  A = [[1.0, 2.0], [3.0]]", "A", "[[1.0, 2.0], [3.0]]"),
+        ("[process]", "initial_covariance", "[process]"),
+        ('"a b".c = 1 # note', "d", '"a b".c = 1'),
+        ("tabs\t= 1", "tabs", "1"),
+    ],
+)
+def test_an_excerpt_marks_the_value_of_an_entry(row: str, name: str, marked: str) -> None:
+    """Or the statement, where the entry has no value of its own in that line."""
+    shown, carets = excerpt(row, 12, name).split("\n")
+    assert shown.startswith("   12 | ")
+    assert shown[carets.index("^") : carets.rindex("^") + 1] == marked
+
+
+def test_an_excerpt_of_a_long_line_fits_a_terminal() -> None:
+    """What is too far right to be shown has none."""
+    long = f'title = "{"x" * 300}"'
+    assert max(map(len, excerpt(long, 3, "title").split("\n"))) <= 80
+    assert excerpt(f"{long}, b = 1", 3, "b") == ""
+
+
+def test_mistakes_are_illustrated_by_the_lines_of_the_file(tmp_path: Path) -> None:
+    """Each below its sentence; the message itself, which programs read, has none."""
+    path = tmp_path / "mine.toml"
+    text = shipped()["numerical"].read_text(encoding="utf-8").replace("slots = 80", "slots = -80")
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ScenarioError) as caught:
+        load(path)
+    first, mistake, row, carets = caught.value.illustrated.split("\n")
+    assert [first, mistake] == str(caught.value).split("\n")
+    assert row.endswith(" | slots = -80")
+    assert row[carets.index("^") :].strip() == "-80"
+    with pytest.raises(ScenarioError) as caught:
+        parse("slots = 10\ntrials == 3\n", "mine.toml")
+    assert caught.value.illustrated.split("\n")[-2:] == ["   2 | trials == 3", "     |         ^"]

@@ -200,3 +200,17 @@ def test_the_command_runs_a_wire(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert (tmp_path / "out" / "summary.json").is_file()
     assert main(["wire", str(path), "--for", "10 ms", "--out", str(tmp_path / "again"), "--quiet"]) == 0
     assert capsys.readouterr().out == ""
+
+
+def test_keys_may_follow_the_option(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As the usage line says; argparse takes the keys before an option for all of them. Unknown options are still refused."""
+    path = tmp_path / "robot.toml"
+    path.write_text(example_wire())
+    shown = []
+    for words in (["--check", str(path), "robot/stop"], [str(path), "--check", "robot/stop"]):
+        assert main(["wire", *words]) == 0
+        shown.append(capsys.readouterr().out)
+    assert shown[0] == shown[1]
+    assert "key  robot/stop" in shown[0]
+    assert main(["wire", str(path), "--check", "robot/stop", "--chekc"]) == 2
+    assert "unknown option --chekc" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -35,7 +36,7 @@ from evedrop.scenario.progress_events import (
     Started,
     ViewOpened,
 )
-from evedrop.system.output import escaped
+from evedrop.system.output import columns_of, escaped, takes_styles, wrapped
 
 
 class StyledConsole(Console):
@@ -44,6 +45,13 @@ class StyledConsole(Console):
     def __init__(self, file: Any, **named: Any) -> None:
         """Draw on a stream; named: as for Rich's own console."""
         super().__init__(file=getattr(file, "styled", file), **named)
+        if not takes_styles(file):  # Rich takes a terminal without TERM for one that knows colours
+            self._color_system = None
+
+    @property
+    def is_dumb_terminal(self) -> bool:
+        """Whether the terminal knows no styles and no movement of the cursor, as without TERM."""
+        return (self.is_terminal and not os.environ.get("TERM")) or super().is_dumb_terminal
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """The pieces of text of what is drawn; Rich measures and cuts them afterwards."""
@@ -76,11 +84,14 @@ class _Facts(ProgressColumn):
         room = self._room()
         state = Text(f"{task.description} ")
         done = self._done.render(task) + Text(f" {self._unit}")
+        bare = self._done.render(task)
         rate = Text(f" · {task.fields['rate']}" if task.fields["rate"] else "")
         # While a run is held, or no total is known, any time left would be a guess.
         left = Text(" ") + self._left.render(task) + Text(" left") if rate and task.total is not None else Text()
-        shortened = ((state, done, rate, left), (done, rate, left), (done, left), (state, done), (done,))
-        line = next((fits for parts in shortened if (fits := Text.assemble(*parts)).cell_len <= room), done)
+        shortened: list[tuple[Text, ...]] = [(state, done, rate, left), (done, rate, left), (done, left), (bare, left)]
+        if not left:  # the state says why
+            shortened = [(state, done, rate), (state, done), (state, bare)]
+        line = next((fits for parts in shortened if (fits := Text.assemble(*parts)).cell_len <= room), bare)
         return line + _that_fit(task.fields["errors"], room - line.cell_len)
 
 
@@ -88,7 +99,7 @@ def _that_fit(errors: Mapping[str, float], room: int) -> Text:
     """The errors of the first receivers, as many as fit into this number of columns, and `…` if these are not all."""
     text = ""  # which has room for the mark behind it
     for i, (name, error) in enumerate(errors.items()):
-        longer = f"{text}  {name} {error:.2g}"
+        longer = f"{text}  {name} {error if error >= _DUST else 0:.2g}"
         if cell_len(longer if i == len(errors) - 1 else longer + _MORE) > room:
             return Text(text and text + _MORE)
         text = longer
@@ -96,6 +107,7 @@ def _that_fit(errors: Mapping[str, float], room: int) -> Text:
 
 
 _MORE = "  …"
+_DUST = 1e-12  # a smaller error comes from rounding
 
 
 @final
@@ -125,7 +137,7 @@ class ProgressLine:
 
     def __enter__(self) -> Self:
         if (warning := fallback_warning()) is not None:
-            self.console.print(f"warning: {warning}", soft_wrap=True)
+            self._print(f"warning: {warning}", "yellow")
         self._progress.start()
         return self
 
@@ -156,17 +168,17 @@ class ProgressLine:
                 if event.address:
                     self._print(f"live view, open to anybody who has this address:\n{event.address}")
                 if event.warning:
-                    self._print(f"warning: {event.warning}")
+                    self._print(f"warning: {event.warning}", "yellow")
             case ConnectionOutage() if not self._quiet:
-                self._print(outage_line(event))
+                self._print(outage_line(event), "yellow")
             case FolderMoved():
                 self.moved = Path(event.folder)
                 self._print(f"the results folder was renamed while the run went on; it is {self.moved}")
             case RunEnded() if event.view:
-                self._print(f"the view stopped early: {event.view}")
+                self._print(f"the view stopped early: {event.view}", "yellow")
 
-    def _print(self, line: str) -> None:
-        self.console.print(line, soft_wrap=True)
+    def _print(self, line: str, style: str = "") -> None:
+        self.console.print(wrapped(line, columns_of(sys.stderr)), style=style, soft_wrap=True)
 
 
 def outage_line(outage: ConnectionOutage) -> str:

@@ -25,9 +25,11 @@ if TYPE_CHECKING:
 def print_design(design: Design) -> None:
     """Print a design as text: bounds, intervals, optima and the price of secrecy."""
     console = terminal()
-    console.print(f"spectral radius {design.rho:.6g}; legitimate link quality μ = {design.mu:g}")
+    if (answer := _answer(design)) is not None:
+        console.say(answer, "bold")
+    console.say(f"spectral radius {design.rho:.6g}; legitimate link quality μ = {design.mu:g}")
     if design.remark is not None:
-        console.print(design.remark)
+        console.say(design.remark)
     else:
         error = "error is unbounded"
         if math.isfinite(design.trace):
@@ -35,14 +37,14 @@ def print_design(design: Design) -> None:
                 f"trace is {design.trace:.4g}, {design.cost:.3g} times that of sending every state "
                 f"({design.plain_trace:.4g})"
             )
-        console.print(
+        console.say(
             f"admissible: {design.bound:.6g} < μ_d ≤ 1; at this scenario's μ_d = {design.mu_d:g} the legitimate {error}"
         )
     if design.minimum is not None:
-        console.print(f"least μ_d for the wanted trace: {design.minimum:.6g}")
+        console.say(f"least μ_d for the wanted trace: {design.minimum:.6g}")
     if design.choice is not None:
         for line in _chosen(design.choice, design.left_out):
-            console.print(line)
+            console.say(line)
     heads = (
         "bounded from",
         "perfect secrecy",
@@ -53,7 +55,8 @@ def print_design(design: Design) -> None:
         "J_e/J",
         "from slot",
     )
-    table = TextTable.headed(["against"], heads)
+    least = ("from slot", "its trace", "argmax J_r", "bounded from", "relative secrecy", "J_e/J", "perfect secrecy")
+    table = TextTable.headed(["against"], heads, least=least)
     for name, against in design.eavesdroppers.items():
         table.add(
             name,
@@ -70,7 +73,30 @@ def print_design(design: Design) -> None:
         )
     console.show(table)
     if design.omission is not None:
-        console.print(design.omission)
+        console.say(design.omission)
+
+
+def _answer(design: Design) -> str | None:
+    """The μ_d to choose, what it gives and what it costs, in a sentence; None if no μ_d is admissible or nobody listens."""
+    if design.remark is not None or not design.eavesdroppers:
+        return None
+    choice = design.choice or design.suggestion
+    if choice is None:
+        return "no μ_d keeps the error of every eavesdropper above the legitimate one: improve the legitimate link"
+    perfect = [name for name, ratio in choice.ratios.items() if math.isinf(ratio) and choice.trace > 0.0]
+    closest = min(choice.ratios, key=lambda name: choice.ratios[name])
+    gives = [f"perfect secrecy against {', '.join(perfect)}"] if perfect else []
+    if closest not in perfect and choice.trace > 0.0:
+        gives.append(f"the error of {closest}, the closest, is {choice.ratios[closest]:.3g} × the legitimate one")
+    if not gives:
+        gives = ["the legitimate error is 0"]
+    cost = f"costs {choice.cost:.3g} × the error of sending every state"
+    return f"choose μ_d = {_rounded_down(choice.mu_d)}: {', and '.join(gives)}; {cost}"
+
+
+def _rounded_down(mu_d: float) -> str:
+    """A μ_d with five digits that is not larger, for what holds at it may not hold above it."""
+    return "1−" if 1.0 - 1e-9 < mu_d < 1.0 else f"{math.floor(mu_d * 1e5) / 1e5:.5g}"
 
 
 def _largest(largest: LargestRatio) -> str:
@@ -104,7 +130,7 @@ def _half_open(interval: tuple[float, float], bound: float) -> str:
 def print_budget(design: BudgetDesign) -> None:
     """Print the thresholds as a table, the one for the budget among them."""
     console = terminal()
-    console.print(
+    console.say(
         f"an unencrypted packet costs {design.unencrypted:g}, an encrypted one {design.encrypted:g}; errors are traces in the "
         f"limit; the legitimate one is {finite_text(design.legitimate)}"
     )
@@ -122,8 +148,8 @@ def print_budget(design: BudgetDesign) -> None:
         )
     console.show(shown)
     if design.left_out:
-        console.print(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
-    console.print(f"threshold = {design.best.threshold!r}")
+        console.say(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
+    console.say(f"threshold = {design.best.threshold!r}")
 
 
 _METRICS = ("legitimate error", "its error", "sent")
@@ -132,25 +158,23 @@ _METRICS = ("legitimate error", "its error", "sent")
 def print_policies(design: PolicyDesign) -> None:
     """Print the fronts as text."""
     console = terminal()
-    console.print(
+    console.say(
         f"legitimate link quality μ = {design.mu:g}; errors are traces in the limit; sent: the fraction of slots with a packet"
     )
     for name, front in design.fronts.items():
-        console.print(f"\nagainst {name}, the scheme with its threshold:")
+        console.say(f"\nagainst {name}, the scheme with its threshold:")
         console.show(_thresholds(front))
-        console.print(f"the best policy if the sensor also knew how long ago {name} heard a packet, which it does not:")
+        console.say(f"the best policy if the sensor also knew how long ago {name} heard a packet, which it does not:")
         console.show(_policies(front, design.states))
         if front.never:
             for price in sorted({price for _, price in front.never}):
                 weights = ", ".join(f"{weight:g}" for weight, never_price in front.never if never_price == price)
-                console.print(
-                    f"left out, because the best policy never sends: with λ = {price:g} the weights {weights}"
-                )
+                console.say(f"left out, because the best policy never sends: with λ = {price:g} the weights {weights}")
         if front.dominated:
             policies = "policy" if front.dominated == 1 else "policies"
-            console.print(f"left out: {front.dominated} {policies} that another one dominates")
+            console.say(f"left out: {front.dominated} {policies} that another one dominates")
     if design.left_out:
-        console.print(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
+        console.say(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
 
 
 def _thresholds(front: Front) -> TextTable:
@@ -192,7 +216,7 @@ def print_schedules(design: ScheduleDesign) -> None:
     """Print the schedules as text."""
     console = terminal()
     for name, schedule in design.schedules.items():
-        console.print(
+        console.say(
             f"against {name}: the sum is {schedule.best.value:.6g} with this schedule, "
             f"and {schedule.constant.value:.6g} with the best constant μ_d, {schedule.constant.mu_d[1]:.6g}"
         )
@@ -202,15 +226,15 @@ def print_schedules(design: ScheduleDesign) -> None:
             if schedule.exact
             else "the best schedule found on the part of the grid that was searched"
         )
-        console.print(
+        console.say(
             f"{on_grid} has {schedule.grid.value:.6g}; "
             "none of the changes tried, of one μ_d or of two neighbouring ones, improves this schedule"
         )
         numbers = list(schedule.best.mu_d)
-        console.print(f"to run it, with slots = {len(numbers)}, write in [encoding]:")
-        console.print(f"state_probability = {toml_of(numbers)}\n", soft_wrap=True, highlight=False, markup=False)
+        console.say(f"to run it, with slots = {len(numbers)}, write in [encoding]:")
+        console.print(f"state_probability = {toml_of(numbers)}\n", soft_wrap=True)
     if design.left_out:
-        console.print(left_out_line(design.left_out, "no closed form of its error is known"))
+        console.say(left_out_line(design.left_out, "no closed form of its error is known"))
 
 
 def _slots(schedule: MeanSchedule) -> TextTable:

@@ -71,7 +71,7 @@ def _status_of(given: list[str]) -> int:
             return command(options)
     except EvedropError as error:
         sys.stdout.flush()
-        say(str(error))
+        say(error.illustrated, "evedrop:")
         if error.resumable is not None and hasattr(options, "resume"):
             say(f"go on with: {_resuming(given, options, error.resumable)}")
         return error.exit_status

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evedrop.errors import UsageError
+from evedrop.system.output import warn
 
 if TYPE_CHECKING:
     from evedrop.scenario.tables import Scenario
@@ -182,7 +183,7 @@ def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenari
         tables = scenario.model_dump(mode="json", exclude_none=True)
         scenario = checked(tables, str(options.wire), network, beyond_horizon=beyond_horizon)
     for warning in warnings_of(scenario):
-        print(f"evedrop: warning: {warning}", file=sys.stderr)
+        warn(warning)
     return scenario
 
 

@@ -10,6 +10,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from evedrop.system.hints import near
@@ -145,12 +146,23 @@ class Parser(argparse.ArgumentParser):
         self._check_commands(given)
         options, unknown = self.parse_known_args(given)
         if unknown:
+            unknown = getattr(options, "parser", self)._take_rest(options, unknown)
+        if unknown:
             parser: Parser = getattr(options, "parser", self)
             word = unknown[0]
             names = [name for name in parser._own_options() if name.startswith("--")]
             kind = "option" if word.startswith("-") else "argument"
             parser.error(f"unknown {kind} {word}{near(word.partition('=')[0], names)}")
         return options
+
+    def _take_rest(self, options: argparse.Namespace, unknown: list[str]) -> list[str]:
+        """Add words after an option to the last argument, if it takes any number: argparse took it for complete. The others."""
+        arguments = [action for action in self._actions if not action.option_strings]
+        if not arguments or arguments[-1].nargs != argparse.ZERO_OR_MORE or unknown[0].startswith("-"):
+            return unknown
+        words = [*takewhile(lambda word: not word.startswith("-"), unknown)]
+        setattr(options, arguments[-1].dest, [*getattr(options, arguments[-1].dest), *words])
+        return unknown[len(words) :]
 
     def _check_commands(self, given: Sequence[str]) -> None:
         """Exit with a hint if a word that must be a command is not one. After an option, argparse finds out by itself."""

@@ -7,10 +7,7 @@ import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-from rich.table import Table
-from rich.text import Text
+from typing import TYPE_CHECKING, Any
 
 from evedrop.cli.console import StyledConsole
 from evedrop.cli.tables import TAKEN
@@ -21,10 +18,18 @@ from evedrop.score.summary import Summary
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report import closing
 from evedrop.show.report.closing import sweep_table
-from evedrop.show.report.comparison import comparison_heading, comparison_lines, pairs_table, schemes_table
+from evedrop.show.report.comparison import (
+    comparison_heading,
+    comparison_lines,
+    conclusion,
+    left_out_schemes,
+    pairs_table,
+    schemes_table,
+)
 from evedrop.show.report.text_table import TextTable
-from evedrop.show.terminal_tables import fitted, rich_table
-from evedrop.system.output import print_json, say
+from evedrop.show.report.verdict_matrix import matrix_lines
+from evedrop.show.terminal_tables import alarming, fitted
+from evedrop.system.output import columns_of, print_json, say, wrapped, wrapped_command
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -51,54 +56,50 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None, verb
     """
     console = terminal()
     if summary.ended != "complete":
-        console.line_of(f"{summary.ended.splitlines()[0]}; the results so far:", _WARNING)
-    console.show(closing.receivers_table(summary), closing_table(summary, console.width))
+        console.say(f"{summary.ended.splitlines()[0]}; the results so far:", _WARNING)
+    wide = console.width >= _DIGEST_WIDTH
+    shown = closing.receivers_table(summary, wide)
+    console.show(closing.receivers_table(summary), shown, tight=not wide, heads="" if wide else "short")
     if summary.verdict is not None:
-        console.line_of(summary.verdict.sentence, f"bold {_STYLES.get(SecrecyOutcome(summary.verdict.outcome), '')}")
+        console.say(summary.verdict.sentence, f"bold {_STYLES.get(SecrecyOutcome(summary.verdict.outcome), '')}")
         for outcome, line in closing.verdict_lines(summary):
-            console.line_of(f"  {line}", _STYLES.get(outcome, ""))
+            console.say(f"  {line}", _STYLES.get(outcome, ""))
     for line in closing.remarks(summary):
-        console.line_of(line)
+        console.say(line)
     doubts = list(closing.doubts(summary))
     if verbose:
         _print_details(console, summary, replay)
     elif doubts:
-        console.line_of(f"{len(doubts)} of the means above {_UNCERTAIN[len(doubts) > 1]}; --verbose says why", _WARNING)
+        console.say(f"{len(doubts)} of the means above {_UNCERTAIN[len(doubts) > 1]}; --verbose says why", _WARNING)
     for line in closing.application_lines(summary):
-        console.line_of(line)
+        console.say(line)
     for expectation in summary.expectations:
-        console.line_of(expectation.sentence, "" if expectation.held else _FAILURE)
+        console.say(expectation.sentence)
         if expectation.replay is not None:
-            console.line_of(f"    see it again: {expectation.replay}")
-    console.line_of(f"results: {folder}; to look at them: evedrop view {folder}")
+            console.command(f"    see it again: {expectation.replay}")
+    console.say(f"results: {folder}; to look at them: evedrop view {folder}")
 
 
 def _print_details(console: _Console, summary: Summary, replay: str | None) -> None:
     """Print what the report page says besides: theory, leaks, directions, doubts, and the most surprising trial."""
     for line in closing.details(summary):
-        console.line_of(line)
+        console.say(line)
     if summary.directions:
         console.show(closing.directions_table(summary.directions), tight=True)
     for line in closing.doubts(summary):
-        console.line_of(line)
+        console.say(line, _WARNING)
     surprise = closing.surprise(summary)
     if surprise is not None and summary.surprising is not None:
-        console.line_of(surprise)
+        console.say(surprise)
         if replay is not None:
-            console.line_of(f"    watch it live: {replay} --first-trial {summary.surprising.trial} --trials 1")
-
-
-def closing_table(summary: Summary, width: int) -> Table:
-    """The table of the receivers: their metrics and, if there is room, their digests; width: of the terminal, in columns."""
-    wide = width >= _DIGEST_WIDTH
-    return rich_table(closing.receivers_table(summary, wide), tight=not wide, short_heads=not wide)
+            console.command(f"    watch it live: {replay} --first-trial {summary.surprising.trial} --trials 1")
 
 
 def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
     """Print the table of a sweep: one row for each point and peer."""
     console = terminal()
     console.show(sweep_table(table.to_pylist(), keys))
-    console.print(f"results: {folder}/sweep.parquet, sweep.png")
+    console.say(f"results: {folder}/sweep.parquet, sweep.png")
 
 
 def left_out_line(left_out: Mapping[str, str], why: str) -> str:
@@ -108,41 +109,57 @@ def left_out_line(left_out: Mapping[str, str], why: str) -> str:
 
 
 class _Console(StyledConsole):
-    def show(self, table: TextTable, drawn: Table | None = None, **how: bool) -> None:
-        """Show a table, row by row if it is wider than the terminal; drawn: what is shown of it, if that is not all.
+    def show(self, table: TextTable, drawn: TextTable | None = None, **how: Any) -> None:
+        """Show a table as far as the terminal is wide enough; drawn: what is shown of it, if that is not all.
 
-        how: arguments of `rich_table`.
+        how: arguments of `fitted`.
         """
+        self.take(table)
+        self.print(fitted(table if drawn is None else drawn, self, **how))
+
+    def take(self, *tables: TextTable) -> None:
+        """Keep tables for the files of `--csv` and `--latex`."""
         taken = TAKEN.get()
         if taken is not None:
-            taken.append(table)
-        self.print(fitted(rich_table(table, **how) if drawn is None else drawn, self))
+            taken += tables
 
-    def line_of(self, text: str, style: str = "") -> None:
-        """Print a line; on a terminal, one that is too long is divided between words."""
-        self.print(Text(text, style), soft_wrap=not self.is_terminal)
+    def say(self, line: str, style: str = "") -> None:
+        """Print a paragraph, on a terminal in lines that are broken between words; words of failure are red."""
+        self._print_whole(wrapped(line, columns_of(sys.stdout)), style)
+
+    def command(self, line: str) -> None:
+        """Print a command, on a terminal in lines that a shell can still read."""
+        self._print_whole(wrapped_command(line, columns_of(sys.stdout)))
+
+    def _print_whole(self, text: str, style: str = "") -> None:
+        self.print(alarming(text, style), soft_wrap=True)
 
 
 def terminal() -> _Console:
     """A console on standard output; 140 columns wide if that is not a terminal."""
-    return _Console(
-        sys.stdout,
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-        width=None if sys.stdout.isatty() else 140,
-    )
+    return _Console(sys.stdout, highlight=False, markup=False, width=columns_of(sys.stdout) or 140, height=_HEIGHT)
 
 
-def print_comparison(comparison: Comparison, folder: str) -> None:
-    """Print a comparison on standard output."""
+_HEIGHT = 25  # which nothing depends on; without it Rich makes a dumb terminal 80 columns wide
+
+
+def print_comparison(comparison: Comparison, folder: str, verbose: bool = False) -> None:
+    """Print a comparison on standard output: the matrix of verdicts and the conclusion; verbose: all tables and notes too."""
     console = terminal()
-    console.print(comparison_heading(comparison))
-    console.show(schemes_table(comparison), tight=True)
-    console.show(pairs_table(comparison), tight=True, sections=True)
-    for line in comparison_lines(comparison):
-        console.print(line)
-    console.print(f"results: {folder}/compare.json, compare.png, scenarios/")
+    console.say(comparison_heading(comparison))
+    for line in matrix_lines(comparison, console.width):
+        console.say(line)
+    tables = schemes_table(comparison), pairs_table(comparison)
+    if verbose:
+        console.show(tables[0], tight=True)
+        console.show(tables[1], tight=True, sections=True)
+    else:
+        console.take(*tables)
+    for line in comparison_lines(comparison) if verbose else left_out_schemes(comparison):
+        console.say(line)
+    console.say(conclusion(comparison), "bold")
+    rest = "" if verbose else "; every error, cost and note: --verbose, --csv FILE or report.html"
+    console.say(f"results: {folder}/compare.json, compare.png, scenarios/{rest}")
 
 
 def print_results(folder: Path, as_json: bool = False, verbose: bool = False) -> None:

@@ -57,8 +57,41 @@ def with_line_numbers(text: str, changed: Iterable[str] = ()) -> Iterator[None]:
     except ScenarioError as error:
         lines = lines_of_entries(text)
         begins = tuple(f"{path}." for path in changed)
-        numbered = error.numbered(lambda path: None if f"{path}.".startswith(begins) else line_of(path, lines))
-        raise numbered from None
+        rows = text.split("\n")
+        raise error.numbered(
+            lambda path: None if f"{path}.".startswith(begins) else line_of(path, lines),
+            lambda mistake, line: _excerpt_of(mistake, rows[line - 1], line),
+        ) from None
+
+
+def _excerpt_of(mistake: str, row: str, line: int) -> str:
+    path, _, rest = mistake.partition(":")
+    return excerpt(row, line, path.rpartition(".")[2], whole="is not an entry" in rest)
+
+
+_LONGEST = 68  # characters of a line that is shown, so that it fits 80 columns
+_VALUE = r"""("[^"]*"|'[^']*'|\[.*\]|\{.*\}|[^\s,}\]\#]+)"""
+
+
+def excerpt(row: str, line: int, name: str = "", *, whole: bool = False, column: int | None = None) -> str:
+    """A line of a file, and below it carets: below the value of the entry `name`, if it is there, else below the statement.
+
+    whole: the carets are below the key, too; column: where a single caret is, from 0, in place of them. Empty if that is too
+    far right to be shown.
+    """
+    statement = row.strip() if row.lstrip().startswith("[") else row.partition(" #")[0].strip()
+    begin, end = row.find(statement), row.find(statement) + len(statement)
+    value = re.search(rf"(?<![\w-]){re.escape(name)}\s*=\s*{_VALUE}", row) if name else None
+    if column is not None:
+        begin, end = column, column + 1
+    elif value is not None:
+        begin, end = value.start() if whole else value.start(1), value.end()
+    shown = row[:_LONGEST].expandtabs(1)
+    if begin >= len(shown) + 1:
+        return ""
+    marks = " " * begin + "^" * max(1, min(end, len(shown)) - begin)
+    margin = " " * len(str(line))
+    return f"   {line} | {shown}{'…' if len(row) > _LONGEST else ''}\n   {margin} | {marks}"
 
 
 def line_of(path: str, lines: Mapping[str, int]) -> int | None:

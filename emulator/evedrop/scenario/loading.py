@@ -32,7 +32,7 @@ from evedrop.scenario.drawn import with_faults
 from evedrop.scenario.dry_run import dry_run, has_foreign
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.input_files import locate_recordings, locate_tables, read_recordings, read_tables
-from evedrop.scenario.line_numbers import given_twice, with_line_numbers
+from evedrop.scenario.line_numbers import excerpt, given_twice, with_line_numbers
 from evedrop.scenario.plugins import elsewhere, named_in
 from evedrop.scenario.process_noise import replace_filter_noise
 from evedrop.scenario.stream_keys import secret_in
@@ -130,7 +130,7 @@ def tables_in(text: str, source: str) -> dict[str, Any]:
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables nested without end
-        raise ScenarioError(source, [_no_toml(text, error)]) from None
+        raise ScenarioError(source, [_no_toml(text, error)], [_where(text, error)]) from None
     if mistakes := list(unusable(tables)):
         raise ScenarioError(source, mistakes)
     return tables
@@ -138,11 +138,23 @@ def tables_in(text: str, source: str) -> dict[str, Any]:
 
 def _no_toml(text: str, error: Exception) -> str:
     """Why a text is not TOML, in words that name an entry that is given twice."""
-    place = re.search(r"\(at line (\d+), column \d+\)", str(error))
+    place = _PLACE.search(str(error))
     twice = None
     if place is not None and str(error).startswith(_TWICE):
         twice = given_twice(text, int(place[1]))
     return f"not TOML: {error if twice is None else twice}"
+
+
+_PLACE = re.compile(r"\(at line (\d+), column (\d+)\)")
+
+
+def _where(text: str, error: Exception) -> str:
+    """The line that is not TOML, with a caret; empty if the error does not say where it is."""
+    place = _PLACE.search(str(error))
+    if place is None:
+        return ""
+    line = int(place[1])
+    return excerpt(text.split("\n")[line - 1], line, column=int(place[2]) - 1)
 
 
 def checked(

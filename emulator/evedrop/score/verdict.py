@@ -30,7 +30,7 @@ class SecrecyOutcome(StrEnum):
 
 
 _GLYPHS = {
-    SecrecyOutcome.PERFECT: "✓",
+    SecrecyOutcome.PERFECT: "✔",
     SecrecyOutcome.RELATIVE: "✓",
     SecrecyOutcome.OPEN: "?",
     SecrecyOutcome.BROKEN: "✗",

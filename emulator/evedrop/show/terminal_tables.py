@@ -1,66 +1,112 @@
-"""Tables on the terminal, drawn by Rich: one that does not fit is shown row by row, one entry per line. Nothing is cut off."""
+"""Tables on the terminal, drawn by Rich: one that does not fit leaves out standard errors, then columns, and says which."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 
 from rich.box import SIMPLE_HEAD
 from rich.cells import cell_len
 from rich.console import Console, Group
 from rich.measure import Measurement
-from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from evedrop.model.metrics.text import ShownNumber
 from evedrop.show.report.text_table import TextTable
 
 _ENDLESS = 10_000  # columns
+_ALARMS = re.compile("FAILED|BROKEN|✕|\\bNO\\b")
+_PARTS_OF_KEYS = re.compile(r"(?<=\w\w[._])(?=\w\w)")
 
 
-def rich_table(table: TextTable, *, tight: bool = False, short_heads: bool = False, sections: bool = False) -> Table:
+def rich_table(table: TextTable, *, tight: bool = False, sections: bool = False, heads: str = "") -> Table:
     """A table for the terminal.
 
-    tight: without room at its sides and between columns; short_heads: on two lines; sections: with a line above each row whose
-    first cell is not empty.
+    tight: without room at its sides and between columns; sections: with a line above each row whose first cell is not empty;
+    heads: "short" breaks headings at their first space, "broken" between all words, and keys of entries at dots.
     """
     shown = Table(
-        title=table.title or None,
+        title=alarming(table.title) if table.title else None,
         title_justify="left",
         box=SIMPLE_HEAD,
         pad_edge=not tight,
         collapse_padding=tight,
     )
     for column in table.columns:
-        heading = column.heading.replace(" ", "\n", 1) if short_heads else column.heading
+        heading = column.heading.replace(" ", "\n", {"": 0, "short": 1}.get(heads, -1))
+        heading = _PARTS_OF_KEYS.sub("\n", heading) if heads == "broken" else heading
         shown.add_column(heading, justify="right" if column.number else "left", no_wrap=not column.wraps)
     for row, following in pairwise([*table.rows, ("",)]):
-        shown.add_row(*row, end_section=sections and bool(following[0]))
+        shown.add_row(*map(alarming, row), end_section=sections and bool(following[0]))
     return shown
 
 
-def fitted(table: Table, console: Console) -> Table | Group:
-    """The table if the console is wide enough for it; otherwise its rows, each with its first cell as a heading."""
+def alarming(text: str, style: str = "") -> Text:
+    """A text in a style, with the words that report a failure in red."""
+    shown = Text(text, style)
+    shown.highlight_regex(_ALARMS, "bold red")
+    return shown
+
+
+def fitted(
+    table: TextTable, console: Console, *, tight: bool = False, sections: bool = False, heads: str = ""
+) -> Table | Group:
+    """A table that is no wider than the console, and below it the names of the columns that had no room.
+
+    tight, sections, heads: as for `rich_table`.
+    """
+    forms = ((tight, heads), (True, heads), (True, "short"), (True, "broken"))
+    folded, without = rich_table(table, sections=sections, tight=True, heads="broken"), list[str]()
+    for version, left_out in _versions(table):
+        for narrow, broken in forms:
+            drawn = rich_table(version, tight=narrow, sections=sections, heads=broken)
+            if _fits(drawn, console):
+                return _noted(drawn, left_out)
+        if not table.least or len(left_out) <= len(table.least):
+            folded, without = drawn, left_out
+    for column in folded.columns:
+        column.min_width, column.no_wrap, column.overflow = None, False, "fold"
+    return _noted(folded, without)
+
+
+def _noted(drawn: Table, left_out: list[str]) -> Table | Group:
+    return Group(drawn, Text(f"no room for: {', '.join(left_out)}", "dim")) if left_out else drawn
+
+
+def _fits(table: Table, console: Console) -> bool:
+    """Whether a table is no wider than the console; its cells then keep their width."""
     for column in table.columns:
-        if column.no_wrap:  # Rich would rather cut such a cell off than make the table wider; it wraps the head
-            column.min_width = max(map(cell_len, (*str(column.header).split(), *map(str, column.cells))), default=0)
-    wanted = Measurement.get(console, console.options.update(width=_ENDLESS), table).minimum
-    if wanted <= console.width:
-        return table
-    return Group(*([Text(str(table.title))] if table.title else []), *_rows(table))
+        if column.no_wrap:  # Rich would rather cut such a cell off than make the table wider
+            texts = (*str(column.header).split("\n"), *map(str, column.cells))
+            column.min_width = max(map(cell_len, texts), default=0)
+    return Measurement.get(console, console.options.update(width=_ENDLESS), table).minimum <= console.width
 
 
-def _rows(table: Table) -> Iterator[Padding | Text]:
-    heads = [" ".join(str(column.header).split()) for column in table.columns]
-    cells = [list(column.cells) for column in table.columns]
-    above = ""
-    for row in zip(*cells, strict=True):
-        first, *others = [str(cell) for cell in row]
-        above = first or above  # a cell that is left empty repeats the one above it
-        yield Text()
-        yield Text(f"{heads[0]} {above}".strip())
-        inner = Table.grid(padding=(0, 2))
-        for head, cell in zip(heads[1:], others, strict=True):
-            if cell:
-                inner.add_row(head, cell)
-        yield Padding(inner, (0, 0, 0, 2))
+def _versions(table: TextTable) -> Iterator[tuple[TextTable, list[str]]]:
+    """The table, each time with less in it, and what is left out; it keeps its first column and another."""
+    yield table, []
+    left_out: list[str] = []
+    bare = replace(table, rows=[tuple(map(_without_error, row)) for row in table.rows])
+    if bare.rows != table.rows:
+        left_out.append("± standard errors")
+        yield bare, [*left_out]
+    heads = [column.heading for column in table.columns]
+    order = [*table.least, *(head for head in dict.fromkeys(reversed(heads)) if head not in table.least)]
+    kept = [i for i in range(len(heads)) if any(row[i] for row in table.rows)]
+    for heading in order:
+        fewer = [i for i in kept if heads[i] != heading or i == 0]
+        if len(fewer) < 2 or len(fewer) == len(kept):
+            continue
+        kept = fewer
+        left_out.append(heading or "notes")
+        columns = [table.columns[i] for i in kept]
+        yield replace(bare, columns=columns, rows=[tuple(row[i] for i in kept) for row in bare.rows]), [*left_out]
+
+
+def _without_error(cell: str) -> str:
+    if isinstance(cell, ShownNumber) and cell.error is not None:
+        return cell.partition(" ± ")[0] + cell.after
+    return cell

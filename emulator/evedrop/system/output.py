@@ -45,15 +45,94 @@ def escaped(text: str) -> str:
     )
 
 
-def say(text: str) -> None:
-    """Write a line to standard error, unless its terminal is gone."""
+def columns_of(stream: TextIO) -> int | None:
+    """The width of a stream's terminal, in columns, or that of the variable COLUMNS; None if it is not a terminal."""
+    if not stream.isatty():
+        return None
+    with contextlib.suppress(ValueError):
+        if (columns := int(os.environ.get("COLUMNS", ""))) > 0:
+            return columns
+    try:
+        return os.get_terminal_size(stream.fileno()).columns or _USUAL_COLUMNS
+    except OSError:
+        return _USUAL_COLUMNS
+
+
+_USUAL_COLUMNS = 80
+_WORD = re.compile(r"\s*\S+")
+_EXCERPT = re.compile(r"\s+\d* \| ")  # of a file, with carets below it, which must stay below
+_ARGUMENT = re.compile(r"""\s*(?:'[^']*'|"[^"]*"|\S)+""")
+
+
+def wrapped(text: str, columns: int | None, hanging: int = 2) -> str:
+    """Text in lines of at most this many columns, broken between words; the lines of a paragraph hang below its first.
+
+    A word that is longer than a line, such as a path, stays whole. columns: None leaves the text as it is.
+    """
+    if columns is None:
+        return text
+    return "\n".join("\n".join(_broken(line, columns, hanging, _WORD)) for line in text.split("\n"))
+
+
+def wrapped_command(line: str, columns: int | None) -> str:
+    """A command of the shell, with a backslash wherever it is broken between arguments."""
+    return line if columns is None else " \\\n".join(_broken(line, columns - 2, 4, _ARGUMENT))
+
+
+def _broken(line: str, columns: int, hanging: int, part: re.Pattern[str]) -> list[str]:
+    if _EXCERPT.match(line):
+        return [line if len(line) <= columns else f"{line[: columns - 1]}…"]
+    lines, room = [""], columns
+    indent = " " * (len(line) - len(line.lstrip()) + hanging)
+    for word in part.findall(line):
+        if lines[-1].strip() and (wide := _cells(word)) > room:
+            lines.append(indent + word.lstrip())
+            room = columns - len(indent) - wide + len(word) - len(word.lstrip())
+        else:
+            lines[-1] += word
+            room -= _cells(word)
+    return lines
+
+
+def _cells(text: str) -> int:
+    """The columns that a text takes."""
+    if text.isascii():
+        return len(text)
+    import unicodedata  # noqa: PLC0415 - as below
+
+    return sum(
+        0 if unicodedata.combining(character) else 1 + (unicodedata.east_asian_width(character) in "WF")
+        for character in text
+    )
+
+
+def takes_styles(stream: TextIO) -> bool:
+    """Whether a stream is a terminal that knows styles and movements of the cursor, as far as TERM says."""
+    return stream.isatty() and os.environ.get("TERM", "").lower() not in {"", "dumb", "unknown"}
+
+
+RED, YELLOW = "\x1b[1;31m", "\x1b[33m"
+_PLAIN = "\x1b[0m"
+
+
+def tell(text: str, alarm: str = "", colour: str = RED, stream: TextIO | None = None) -> None:
+    """Write a paragraph, wrapped between words on a terminal; alarm: the word that is coloured there, unless NO_COLOR is set."""
+    stream = sys.stdout if stream is None else stream
+    shown = escaped(wrapped(text, columns_of(stream))) + "\n"
+    if alarm and takes_styles(stream) and not os.environ.get("NO_COLOR"):
+        shown = shown.replace(alarm, f"{colour}{alarm}{_PLAIN}", 1)
+    getattr(stream, "styled", stream).write(shown)
+
+
+def say(text: str, alarm: str = "", colour: str = RED) -> None:
+    """Write a line to standard error as `tell` does, unless its terminal is gone."""
     with contextlib.suppress(OSError, AttributeError):
-        sys.stderr.write(f"evedrop: {text}\n")
+        tell(f"evedrop: {text}", alarm, colour, sys.stderr)
 
 
 def warn(text: str) -> None:
     """Write a warning to standard error, as `say` does."""
-    say(f"warning: {text}")
+    say(f"warning: {text}", "warning:", YELLOW)
 
 
 def print_json(value: object) -> None:

@@ -8,7 +8,7 @@ Source: docs/wire.md, from Python, and the summary.
 from __future__ import annotations
 
 import io
-import shutil
+import sys
 from pathlib import Path
 
 from rich.console import Console
@@ -16,7 +16,8 @@ from rich.console import Console
 from evedrop.results.reading import results_of_this_version
 from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, WireSummary
 from evedrop.show.report.wire import wire_sentences, wire_table
-from evedrop.show.terminal_tables import rich_table
+from evedrop.show.terminal_tables import fitted
+from evedrop.system.output import columns_of
 from evedrop.wire.file import load_wire
 from evedrop.wire.journal import JournalOnDisk
 from evedrop.wire.plan import WirePlan
@@ -43,11 +44,14 @@ def scorekeeper_on_disk(folder: Path, plan: WirePlan) -> WireScorekeeper:
 
 
 def closing_lines(summary: WireSummary) -> list[str]:
-    """The table of the links, and the sentences."""
+    """The table of the links, as wide as the terminal allows, and the sentences."""
     text = io.StringIO()
-    console = Console(file=text, force_terminal=False, width=max(100, shutil.get_terminal_size().columns))
-    console.print(rich_table(wire_table(summary)))
+    console = Console(file=text, force_terminal=False, width=columns_of(sys.stdout) or _COLUMNS)
+    console.print(fitted(wire_table(summary), console))
     return [*(line.rstrip() for line in text.getvalue().splitlines()), *wire_sentences(summary)]
+
+
+_COLUMNS = 100  # where there is no terminal
 
 
 def write_wire_report(folder: Path) -> Path:

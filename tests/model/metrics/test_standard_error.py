@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Callable
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 from scipy.stats import kurtosis, norm, skew
 from scipy.stats import t as student
 
 from evedrop.cli.api import montecarlo, run
-from evedrop.cli.report import closing_table, print_summary
+from evedrop.cli.report import print_summary
 from evedrop.model.metrics.built_in import UsedFraction
 from evedrop.model.metrics.metric import MeanMetric, ScoredSlots
 from evedrop.model.metrics.standard_error import ratio_error, standard_error, z_of
@@ -31,10 +30,12 @@ from evedrop.scenario.theory import expectations_of
 from evedrop.score.scorekeeper import RunOutcome
 from evedrop.score.summary import RARE_FRACTION, Summary
 from evedrop.score.sums import Tally
+from evedrop.show.report.closing import receivers_table
 from evedrop.simulate.montecarlo import Merger, Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import carry_out, tasks_of
 from tests.builders import scalar_tables
+from tests.cli.terminal import Terminal
 from tests.examples import mostly_long
 
 ALONE = Plan(workers=1)
@@ -214,7 +215,7 @@ def test_a_summary_of_an_older_version_can_be_read(recorded: Results) -> None:
     peer = Summary.read(text).peers["smart"]
     assert (peer.standard_errors, peer.z, peer.rare_events) == ({}, {}, None)
     assert peer.metrics == recorded.typed_summary.peers["smart"].metrics
-    assert closing_table(Summary.read(text), 100).row_count == 4
+    assert len(receivers_table(Summary.read(text)).rows) == 4
 
 
 @pytest.mark.parametrize(
@@ -379,14 +380,21 @@ def test_rare_events_are_those_of_theory(recorded: Results) -> None:
         }
 
 
-def test_the_closing_table_fits_80_columns(recorded: Results) -> None:
+def test_the_closing_table_fits_80_columns(recorded: Results, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the standard error and z of the error; in a wide terminal every metric has its standard error."""
     shown = {}
     for width in (80, 140):
-        console = Console(width=width, file=StringIO())
-        with console.capture() as captured:
-            console.print(closing_table(recorded.typed_summary, width))
-        shown[width] = captured.get()
+        terminal = Terminal()
+        monkeypatch.setattr(sys, "stdout", terminal)
+        monkeypatch.setenv("COLUMNS", str(width))
+        monkeypatch.setenv("TERM", "dumb")
+        print_summary(recorded.typed_summary, "folder")
+        rows = [
+            line
+            for line in terminal.getvalue().splitlines()
+            if line.split()[:1] and line.split()[0] in recorded.summary["peers"]
+        ]
+        shown[width] = "\n".join(rows[:4])
     assert max(map(len, shown[80].splitlines())) <= 80
     assert "…" not in shown[80]
     assert shown[80].count(" ± ") == 4

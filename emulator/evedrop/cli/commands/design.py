@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Protocol
 
 from evedrop.cli.options import Command, as_json, changes, changes_of, scenario
@@ -20,6 +21,8 @@ def design(options: argparse.Namespace) -> int:
     chosen = {"--policy": options.policy, "--schedule": options.schedule, "--budget": options.budget}
     kind = next((name for name, value in chosen.items() if value is not None and value is not False), None)
     given, changed = _given(options, kind), changes_of(options)
+    if options.plot is not None and kind is not None:
+        raise UsageError(f"--plot is for the design of μ_d, and {kind} is another; leave it out")
     if kind == "--policy":
         policies = api.design_policy(options.scenario, changes=changed, **given)
         return _show(options, policies, lambda: print_policies(policies))
@@ -30,6 +33,10 @@ def design(options: argparse.Namespace) -> int:
         budget = api.design_budget(options.scenario, options.budget, changes=changed)
         return _show(options, budget, lambda: print_budget(budget))
     designed = api.design(options.scenario, changes=changed, **given)
+    if options.plot is not None:
+        from evedrop.show.view.design_picture import draw_design
+
+        draw_design(options.plot, designed)
     return _show(options, designed, lambda: print_design(designed))
 
 
@@ -81,6 +88,9 @@ def _designs(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="R",
         help="find the cheapest μ_d at which every eavesdropper's error is at least R times the estimator's in the limit",
+    )
+    parser.add_argument(
+        "--plot", type=Path, metavar="FILE", help="draw the errors over μ_d: a picture as .pdf, .png or .svg"
     )
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument(

@@ -87,7 +87,7 @@ def _print(reproduction: Reproduction) -> None:
     from evedrop.show.report.text_table import TextTable
 
     console = terminal()
-    console.print(f"{reproduction.title} · {reproduction.authors} · {reproduction.published}")
+    console.say(f"{reproduction.title} · {reproduction.authors} · {reproduction.published}")
     words, numbers = ["where", "what"], ["theirs", "ours", "tolerance"]
     table = TextTable.headed(words, numbers, ["verdict"], wrapped=[*words, *numbers])
     reasons: dict[str, int] = {}
@@ -96,12 +96,12 @@ def _print(reproduction: Reproduction) -> None:
         table.add(row.where, row.quantity, row.their_text, row.our_text, row.tolerance or "–", f"{row.verdict}{note}")
     console.show(table, tight=True)
     for reason, number in reasons.items():
-        console.print(f"[{number}] {reason}")
-    console.print(
+        console.say(f"[{number}] {reason}")
+    console.say(
         f"{', '.join(f'{verdict}: {count}' for verdict, count in reproduction.counts.items())}. {reproduction.scope}"
     )
     if reproduction.quick:
-        console.print("these are quick estimates: without --quick the standard errors are smaller")
+        console.say("these are quick estimates: without --quick the standard errors are smaller")
 
 
 def _papers(parser: argparse.ArgumentParser) -> None:

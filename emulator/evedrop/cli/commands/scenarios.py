@@ -8,6 +8,7 @@ from typing import Any
 
 from evedrop.cli.options import Command, argument, changes, changes_of
 from evedrop.errors import UsageError
+from evedrop.system.output import YELLOW, tell
 
 
 def list_scenarios(_: argparse.Namespace) -> int:
@@ -61,12 +62,12 @@ def check(options: argparse.Namespace) -> int:
         try:
             scenario = load(name, changes_of(options))
         except UsageError as error:
-            print(error, file=sys.stderr)
+            tell(error.illustrated, stream=sys.stderr)
             status = error.exit_status
             continue
-        print(f"{name}: {scenario.title}: {scenario.slots} slots, {', '.join(scenario.receivers)}: no mistakes")
+        tell(f"{name}: {scenario.title}: {scenario.slots} slots, {', '.join(scenario.receivers)}: no mistakes")
         for warning in warnings_of(scenario):
-            print(f"  warning: {warning}")
+            tell(f"  warning: {warning}", "warning:", YELLOW)
     return status
 
 
@@ -81,9 +82,9 @@ def _check_classes(names: dict[str, str], parameters: dict[str, Any]) -> int:
             + ("" if broken else " kept")
         )
         for verdict in examination.verdicts:
-            print(f"  {'ok' if verdict.broken is None else 'BROKEN':<8}{verdict.rule}")
+            tell(f"  {'ok' if verdict.broken is None else 'BROKEN':<8}{verdict.rule}", "BROKEN")
             if verdict.broken is not None:
-                print(f"          {verdict.broken}")
+                tell(f"          {verdict.broken}")
         status = UsageError.exit_status if broken else status
     return status
 

@@ -121,7 +121,7 @@ def compare(options: argparse.Namespace) -> int:
     if options.json:
         print_json(plain(comparison.as_dict()))
     else:
-        print_comparison(comparison, str(folder))
+        print_comparison(comparison, str(folder), options.verbose)
     report_page(folder, options.json)
     return 0
 
@@ -170,7 +170,7 @@ def _print_cost(reproduction: SecrecyCost) -> None:
         for measure, measured in measures.items():
             table.add(f"{measure}: {names[ours]} from {names[theirs]}", *_cells(measured, 100.0, " %"))
     console = terminal()
-    console.print(
+    console.say(
         f"{reproduction.trials} days, each with {reproduction.scheme} and with plain, over the same link and with the same noise"
     )
     console.show(table)
@@ -203,7 +203,7 @@ def _print_learned(rows: list[LearningRow], trials: int) -> None:
     from evedrop.show.report.text_table import TextTable
 
     console = terminal()
-    console.print(
+    console.say(
         f"{trials} trials: the error of each estimate over the truth, median over trials (mean ± standard error)"
     )
     heads = ["slots", "learner", "A", "Q", "μ_d"]
@@ -216,7 +216,7 @@ def _print_learned(rows: list[LearningRow], trials: int) -> None:
             )
             table.add(str(row.stop), learner, *cells)
     console.show(table)
-    console.print("mean |x − x̂|² of the slots between, ± standard error, and the learner's over it")
+    console.say("mean |x − x̂|² of the slots between, ± standard error, and the learner's over it")
     ratios_of = [f"{name} / it" for name in rows[0].parameters]
     heads = ["from slot", "before", "receiver", "mean |x − x̂|²", *ratios_of]
     table = TextTable.headed([], heads, wrapped=heads)

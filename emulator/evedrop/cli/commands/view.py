@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from evedrop.cli.options import Command, argument, hold, number_type, served, verbose
 from evedrop.cli.tables import tables
 from evedrop.errors import UsageError
+from evedrop.system.output import tell
 
 if TYPE_CHECKING:
     from evedrop.show.view.viewer import Viewer
@@ -164,7 +165,10 @@ def _view_wire(options: argparse.Namespace) -> int:
         raise UsageError(f"--slot is for runs, and {options.run} is the folder of a wire; give --time")
     if options.table:
         summary = summary_of_wire(options.run)
-        print("\n".join([*closing_lines(summary), *wire_failures(summary)]))
+        for line in closing_lines(summary):
+            tell(line)
+        for line in wire_failures(summary):
+            tell(line, line)
         return 0
     web_address = None if options.serve is None else WebAddress.of(options.serve)
     with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:

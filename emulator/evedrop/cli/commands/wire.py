@@ -10,6 +10,7 @@ from pathlib import Path
 from evedrop.cli.options import Command, changes_of
 from evedrop.errors import UsageError
 from evedrop.system.output import say as complain
+from evedrop.system.output import tell, warn
 
 
 def wire(options: argparse.Namespace) -> int:
@@ -34,10 +35,10 @@ def wire(options: argparse.Namespace) -> int:
     if options.check:
         lines = [*wire_lines(plan), *key_lines(plan, options.keys)]
         links, events = len(plan.links), len(plan.events)
-        print(f"{options.file}: {len(plan.sides)} sides, {links} links, {events} events: no mistakes")
-        print("\n".join(f"  {line}" for line in lines))
+        tell(f"{options.file}: {len(plan.sides)} sides, {links} links, {events} events: no mistakes")
+        tell("\n".join(f"  {line}" for line in lines))
     for warning in warnings_of_wire(plan):
-        print(f"evedrop: warning: {warning}", file=sys.stderr)
+        warn(warning)
     if options.check:
         return 0
     from evedrop.cli.report import report_page
@@ -56,7 +57,8 @@ def wire(options: argparse.Namespace) -> int:
 
 def _say(line: str) -> None:
     """Print a line at once, for programs that wait for the endpoints."""
-    print(line, flush=True)
+    tell(line)
+    sys.stdout.flush()
 
 
 def _hush(line: str) -> None:

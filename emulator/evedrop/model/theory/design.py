@@ -28,8 +28,10 @@ from evedrop.model.theory.ratio import (
     largest_ratio,
     points_between,
     ratio_of,
+    suggestion,
     traces_of,
 )
+from evedrop.names import LEGITIMATE
 
 Interval = tuple[float, float]
 
@@ -95,6 +97,11 @@ class Design:
     eavesdroppers: dict[str, Against]
     choice: Choice | None = None
     """The cheapest μ_d with the ratio asked for; None if none was."""
+    suggestion: Choice | None = None
+    """The cheapest μ_d with nearly the largest ratio against every eavesdropper, which keeps Ω; None without a ratio above 1."""
+    process: Process | None = field(default=None, repr=False)
+    adversaries: tuple[Adversary, ...] = field(default=(), repr=False)
+    """Whose errors `traces_at` gives, in the order of `eavesdroppers`."""
     left_out: dict[str, str] = field(default_factory=dict)
     """Eavesdropper → strategy, for those whose error has no closed form, which cannot be designed for."""
     measuring: str = ""
@@ -104,6 +111,13 @@ class Design:
     def cost(self) -> float:
         """J(μ_d) / J(1), the factor by which secrecy raises the legitimate error: 1 for a lossless link, nan for a bad one."""
         return 1.0 if self.plain_trace == 0.0 else self.trace / self.plain_trace
+
+    def traces_at(self, mu_d: float) -> dict[str, float]:
+        """J_e of each eavesdropper at μ_d, and that of the legitimate estimator under its name; inf where unbounded."""
+        if self.process is None:
+            return {}
+        theirs = {each.name: limit_trace(self.process, each.outcomes(mu_d)) for each in self.adversaries}
+        return {LEGITIMATE: limit_trace(self.process, Outcomes.legitimate(self.mu, mu_d)), **theirs}
 
     @property
     def remark(self) -> str | None:
@@ -195,6 +209,9 @@ def design(
         plain_trace=limit_trace(process, Outcomes.plain(mu)),
         eavesdroppers={adversary.name: against(adversary) for adversary in eavesdroppers},
         choice=None if min_ratio is None else cheapest(process, mu, eavesdroppers, min_ratio, minimum, max_trace),
+        suggestion=suggestion(process, mu, eavesdroppers, minimum) if min_ratio is None else None,
+        process=process,
+        adversaries=tuple(eavesdroppers),
     )
 
 

@@ -179,6 +179,25 @@ def cheapest(
     )
 
 
+_NEARLY = 0.9  # of the largest ratio: the rest of it may cost many times as much
+
+
+def suggestion(
+    process: Process, mu: float, adversaries: Sequence[Adversary], minimum: float | None = None
+) -> Choice | None:
+    """The cheapest μ_d with at least 90 % of the largest J_e / J that is possible against every eavesdropper.
+
+    If that is unbounded, so is the ratio at this μ_d. minimum: as for `cheapest`. None if there is no eavesdropper, or the
+    error of one is never larger than the legitimate one.
+
+    Source: docs/mathematics.md, design.
+    """
+    most = largest_ratio(process, mu, adversaries, minimum) if adversaries else None
+    if most is None or most.ratio <= 1.0 + _ROUNDING:
+        return None
+    return cheapest(process, mu, adversaries, max(1.0, _NEARLY * most.ratio), minimum)
+
+
 def large_enough(
     process: Process, mu: float, adversaries: Sequence[Adversary], min_ratio: float
 ) -> tuple[tuple[float, float], ...]:

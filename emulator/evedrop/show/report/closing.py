@@ -274,7 +274,8 @@ def sweep_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> TextT
     metrics = columns("sweep_column")
     compared = [z_column(name) for name in all_metrics() if rows and z_column(name) in rows[0]]
     heads = [*keys, "peer", *(column.heading for column in metrics), "z", "ratio", "relative secrecy"]
-    table = TextTable([TextColumn(head, head not in {"peer", "relative secrecy"}) for head in heads])
+    least = ["z", *(column.heading for column in list(metrics)[:0:-1])]
+    table = TextTable([TextColumn(head, head not in {"peer", "relative secrecy"}) for head in heads], least=least)
     for row in rows:
         table.add(
             *(f"{row[key]}" for key in keys),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from evedrop.model.metrics.text import ShownNumber, estimate, fraction_text, number_text
 from evedrop.score.summary import RARE_FRACTION
+from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.closing import rare_events_words
 from evedrop.show.report.text_table import TextTable
 
@@ -24,9 +25,32 @@ def comparison_heading(comparison: Comparison) -> str:
     return f"{comparison.title} · {comparison.slots:,} slots · {trials}"
 
 
+def conclusion(comparison: Comparison) -> str:
+    """Which schemes dominate, and how many pairs are undecided, in a sentence."""
+    verdicts = [
+        cell.verdict for scheme in comparison.schemes.values() for cell in scheme.cells.values() if cell.verdict
+    ]
+    undecided = verdicts.count(SecrecyOutcome.OPEN)
+    more = f"; {undecided:,} of {len(verdicts):,} pairs need more trials" if undecided else ""
+    if comparison.dominant:
+        return _dominant(comparison) + more
+    return (
+        "no scheme dominates: each one costs the legitimate estimator more in the long run than another scheme, or gives the "
+        f"closest adversary a smaller error{more}"
+    )
+
+
+def _dominant(comparison: Comparison) -> str:
+    more = "each of them dominates" if len(comparison.dominant) > 1 else "dominates"
+    return (
+        f"{', '.join(comparison.dominant)}: {more}: no other scheme costs the legitimate estimator less in the long run, "
+        "and no other scheme gives the closest adversary a larger error"
+    )
+
+
 def comparison_lines(comparison: Comparison) -> Iterator[str]:
     """Notes to the tables: what was left out or is not defined, what their words mean, and which schemes dominate."""
-    yield from _left_out(comparison)
+    yield from left_out_schemes(comparison)
     yield from _undefined(comparison)
     yield from _remarks(comparison)
 
@@ -34,7 +58,8 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
 def schemes_table(comparison: Comparison) -> TextTable:
     """A row for each scheme: its error, its cost, and its closest adversary."""
     numbers = ("legitimate", "theory", "ACKs", "sent", "bits", "energy", "secret", "clear", "leak")
-    table = TextTable.headed(["scheme"], numbers, ["closest adversary", "verdict"])
+    least = ("theory", "leak", "clear", "sent", "secret", "ACKs", "bits", "energy", "legitimate", "closest adversary")
+    table = TextTable.headed(["scheme"], numbers, ["closest adversary", "verdict"], least=least)
     for name, scheme in comparison.schemes.items():
         cell, needs = scheme.closest, scheme.needs
         once = f" + {needs.initial_secret_bits}" if needs.initial_secret_bits else ""
@@ -60,7 +85,8 @@ def schemes_table(comparison: Comparison) -> TextTable:
 def pairs_table(comparison: Comparison) -> TextTable:
     """A row for each pair of scheme and adversary that is defined."""
     numbers = ("its error", "theory", "z", "legitimate", "theory", "ratio")
-    table = TextTable.headed(["scheme", "adversary"], numbers, ["verdict"])
+    least = ("theory", "legitimate", "z", "its error", "ratio")
+    table = TextTable.headed(["scheme", "adversary"], numbers, ["verdict"], least=least)
     for name, scheme in comparison.schemes.items():
         shown = name
         for adversary, cell in scheme.cells.items():
@@ -105,7 +131,7 @@ def _rare_fraction(of: SimulatedError | None) -> float:
     return 0.0 if of is None or of.rare_events is None or of.infinite_variance else of.rare_events.fraction
 
 
-def _left_out(comparison: Comparison) -> Iterator[str]:
+def left_out_schemes(comparison: Comparison) -> Iterator[str]:
     """A line for each scheme that cannot be used with the process."""
     for scheme, why in comparison.left_out.items():
         yield f"left out: {scheme}: {'; '.join(why)}"
@@ -147,8 +173,4 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
     if any(scheme is not None and scheme.theory is not None and scheme.theory.bound for scheme in measured):
         yield "≥: no closed form is known; a lower bound on the expected error of any receiver without the secret"
     if comparison.dominant:
-        more = "each of them dominates" if len(comparison.dominant) > 1 else "dominates"
-        yield (
-            f"{', '.join(comparison.dominant)}: {more}: no other scheme costs the legitimate estimator less in the long run, "
-            "and no other scheme gives the closest adversary a larger error"
-        )
+        yield _dominant(comparison)

@@ -38,6 +38,8 @@ class TextTable:
     columns: Sequence[TextColumn]
     rows: list[tuple[str, ...]] = field(default_factory=list)
     title: str = ""
+    least: Sequence[str] = ()
+    """The headings of the columns that a narrow terminal leaves out first; after them it goes from right to left."""
 
     @classmethod
     def headed(
@@ -47,12 +49,16 @@ class TextTable:
         after: Sequence[str] = (),
         title: str = "",
         wrapped: Collection[str] = (),
+        least: Sequence[str] = (),
     ) -> TextTable:
-        """A table without rows: columns of words, then of numbers, then again of words; wrapped: the headings that may wrap."""
+        """A table without rows: columns of words, then of numbers, then again of words.
+
+        wrapped: the headings of the columns that may wrap; least: as the attribute.
+        """
         heads = (
             [(head, False) for head in words] + [(head, True) for head in numbers] + [(head, False) for head in after]
         )
-        return cls([TextColumn(head, number, head in wrapped) for head, number in heads], title=title)
+        return cls([TextColumn(head, number, head in wrapped) for head, number in heads], title=title, least=least)
 
     def add(self, *cells: str) -> None:
         """Add a row."""
