@@ -70,7 +70,7 @@ _SPINNER_WIDTH = 1
 
 @final
 class _Facts(ProgressColumn):
-    """What is done, how fast, the time left and the errors, in one line; what does not fit is left out, the errors first."""
+    """What is done, the time left, how fast, and the errors, in one line; what does not fit is left out, the errors first."""
 
     def __init__(self, unit: str, room: Callable[[], int]) -> None:
         """room: gives the columns that the text may have."""
@@ -88,7 +88,7 @@ class _Facts(ProgressColumn):
         rate = Text(f" · {task.fields['rate']}" if task.fields["rate"] else "")
         # While a run is held, or no total is known, any time left would be a guess.
         left = Text(" ") + self._left.render(task) + Text(" left") if rate and task.total is not None else Text()
-        shortened: list[tuple[Text, ...]] = [(state, done, rate, left), (done, rate, left), (done, left), (bare, left)]
+        shortened: list[tuple[Text, ...]] = [(state, done, left, rate), (done, left, rate), (done, left), (bare, left)]
         if not left:  # the state says why
             shortened = [(state, done, rate), (state, done), (state, bare)]
         line = next((fits for parts in shortened if (fits := Text.assemble(*parts)).cell_len <= room), bare)

@@ -25,7 +25,12 @@ def wire_title(summary: WireSummary) -> str:
 def wire_table(summary: WireSummary) -> TextTable:
     """The table of the links."""
     heads = ["heard", "delivered", "lost", "dropped", "rate", "model", "within", "delay", "gap"]
-    table = TextTable.headed(["link"], heads, title=wire_title(summary), least=["gap", "model", "delay", "dropped"])
+    table = TextTable.headed(
+        ["link"],
+        heads,
+        title=wire_title(summary),
+        least=["gap", "model", "delay", "dropped", "lost", "heard", "delivered"],
+    )
     for name, link in summary.links.items():
         median = link.delays.get("0.5")
         table.add(
