@@ -156,7 +156,7 @@ def test_what_no_scheme_can_use_is_refused() -> None:
 def test_the_command_prints_a_table_and_writes_its_folder(evedrop: Evedrop) -> None:
     """Every scheme and pair in the table; compare.json, two pictures and the scenarios in the folder."""
     names = ("--schemes", "innovation,acknowledged", "--adversaries", "smart,reference,blocks-critical")
-    done = evedrop("compare", "acknowledged", *names, "--trials", "30", "--out", "found")
+    done = evedrop("compare", "acknowledged", *names, "--trials", "30", "--out", "found", "--verbose")
     assert (done.status, done.err) == (0, "")
     for text in ("innovation", "acknowledged", "blocks-critical (reference)", "✗ not secret", "not defined: smart"):
         assert text in done.out
@@ -215,7 +215,7 @@ def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
 def test_rare_events_are_said_below_the_table(evedrop: Evedrop) -> None:
     """For schemes whose adversaries have more than a tenth of their expected error from them, in these trials."""
     names = ("--schemes", "innovation,plain", "--adversaries", "naive,smart", "--slots", "100", "--out", "found")
-    done = evedrop("compare", "eavesdroppers", *names, "--trials", "30")
+    done = evedrop("compare", "eavesdroppers", *names, "--trials", "30", "--verbose")
     (line,) = (
         line
         for line in done.out.splitlines()
