@@ -20,8 +20,7 @@ from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.travel import circumstances, download
 from evedrop.show.report.wire import reasons_table, unlinked_sentence, wire_faults, wire_outcome, wire_table, wire_title
 from evedrop.show.report.wire_over_time import LANE, WireOverTime
-from evedrop.show.view import palette
-from evedrop.show.view.palette import hexadecimal
+from evedrop.show.view.palette import hexadecimal, on_paper, series
 from evedrop.system.files import Unreadable, text_of
 
 _MOST_BYTES = 2**24
@@ -122,7 +121,8 @@ def _over_time(of: WireSource) -> Iterator[Markup]:
     history = history.coarser
     links = {name: history.links[name] for name in links}
     steps = f"in steps of {history.step:.3g} s"
-    curves = [Curve(name, _ink(i), history.seconds, link.loss) for i, (name, link) in enumerate(links.items())]
+    inks = {name: hexadecimal(on_paper(of_link)) for name, of_link in zip(links, series(len(links)), strict=True)}
+    curves = [Curve(name, inks[name], history.seconds, link.loss) for name, link in links.items()]
     ends = (0.0, of.summary.seconds)
     yield (
         LogChart(
@@ -133,8 +133,8 @@ def _over_time(of: WireSource) -> Iterator[Markup]:
         or Markup()
     )  # fmt: skip
     curves = [
-        Curve(name, _ink(i), history.seconds, link.delay(0.5), link.delay(0.05), link.delay(0.95))
-        for i, (name, link) in enumerate(links.items())
+        Curve(name, inks[name], history.seconds, link.delay(0.5), link.delay(0.05), link.delay(0.95))
+        for name, link in links.items()
         if link.delayed
     ]
     delays = LogChart(
@@ -143,11 +143,6 @@ def _over_time(of: WireSource) -> Iterator[Markup]:
         x_range=ends, y_axis="delay (s)", linear=True,
     )  # fmt: skip
     yield (delays.figure if curves else None) or Markup()
-
-
-def _ink(i: int) -> str:
-    """The colour of the i-th link of a chart, whose curves have their names beside them."""
-    return hexadecimal((palette.BLUE, palette.RED, palette.GREY)[i % 3])
 
 
 def _losses(of: WireSource) -> Iterator[Markup]:
