@@ -142,11 +142,11 @@ def test_failures_are_red_where_there_are_colours(
     monkeypatch.setattr(sys, "stderr", err)
     terminal().say("the expectation FAILED")
     made = TextTable.headed(["receiver", "verdict"], [])
-    made.add("smart", "✕ broken")
+    made.add("smart", "✗ broken")
     terminal().show(made)
     say("warning: this is slow", "warning:", YELLOW)
     assert ("\x1b[1;31mFAILED" in out.getvalue()) is red
-    assert ("\x1b[1;31m✕" in out.getvalue()) is red
+    assert ("\x1b[1;31m✗" in out.getvalue()) is red
     assert ("\x1b[33mwarning:" in err.getvalue()) is red
     coloured = re.search(r"\x1b\[[0-9;]*3[0-9]", out.getvalue() + err.getvalue())
     assert (coloured is not None) is red

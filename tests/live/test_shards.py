@@ -384,7 +384,17 @@ def test_shards_that_cannot_be_made_one_are_kept(tmp_path: Path, monkeypatch: py
 def test_the_trial_to_watch_is_run_without_shards(evedrop: Evedrop) -> None:
     """A single trial has one shard, and the command that shows it says so."""
     done = evedrop(
-        "montecarlo", "eavesdroppers", "--trials", "20", "--slots", "50", "--set", "shards=2", "--out", "study"
+        "montecarlo",
+        "eavesdroppers",
+        "--trials",
+        "20",
+        "--slots",
+        "50",
+        "--set",
+        "shards=2",
+        "--out",
+        "study",
+        "--verbose",
     )
     assert done.status in {0, 1}
     assert "--set shards=1 --first-trial" in done.out

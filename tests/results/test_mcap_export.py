@@ -114,7 +114,7 @@ def test_mistakes_are_said(live: Results, tmp_path: Path, evedrop: Evedrop) -> N
     """The command ends with status 2 and leaves no file."""
     with pytest.raises(UsageError, match="give a --period"):
         export_mcap(live, tmp_path / "r.mcap", 1e9)
-    assert ".mcap" in evedrop("export", str(live.folder), "r.csv").err
+    assert ".mcap" in evedrop("export", str(live.folder), "r.txt").err
     assert "seconds above 0" in evedrop("export", str(live.folder), "r.mcap", "--period", "0").err
     assert "not a results folder" in evedrop("export", str(tmp_path), "r.mcap").err
     damaged = tmp_path / "damaged"

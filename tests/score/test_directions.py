@@ -84,7 +84,7 @@ def test_a_summary_is_read_again_with_and_without_directions(results: Results) -
 
 def test_the_report_has_a_table(results: Results, capsys: pytest.CaptureFixture[str]) -> None:
     """Each receiver and direction, theory, and the verdicts."""
-    print_summary(results.typed_summary, "FOLDER")
+    print_summary(results.typed_summary, "FOLDER", verbose=True)
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     (position,) = (line for line in lines if line[:2] == ["antenna", "position"])
     assert position[-3:] == ["unbounded", "held", "held"]

@@ -270,7 +270,9 @@ def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: 
 def test_one_trial_of_a_study_can_be_watched_whatever_was_expected(evedrop: Evedrop) -> None:
     """The most surprising trial's command leaves out expectations that one trial cannot meet."""
     expect = "expect.0={metric = 'smart.mean_squared_error', quantile = 0.9, above = 0.0}"
-    done = evedrop("montecarlo", "eavesdroppers", "--slots", "40", "--trials", "30", "--set", expect, "--out", "study")
+    done = evedrop(
+        "montecarlo", "eavesdroppers", "--slots", "40", "--trials", "30", "--set", expect, "--out", "study", "--verbose"
+    )
     assert (done.status, done.err) == (0, "")
     line = next(line for line in done.out.splitlines() if "watch it live: " in line)
     again = evedrop("check", "study", *shlex.split(line.partition("run study ")[2])[2:4])

@@ -177,7 +177,17 @@ def test_a_trial_surprises_only_where_its_own_expectation_is_known(
 def test_the_printed_command_shows_the_surprising_trial_live(evedrop: Evedrop) -> None:
     """It is run as printed, with a folder whose name has a blank in it: same digests, same error, one trial."""
     done = evedrop(
-        "montecarlo", "eavesdroppers", "--slots", "300", "--trials", "30", "--record-trials", "2", "--out", "a study"
+        "montecarlo",
+        "eavesdroppers",
+        "--slots",
+        "300",
+        "--trials",
+        "30",
+        "--record-trials",
+        "2",
+        "--out",
+        "a study",
+        "--verbose",
     )
     assert (done.status, done.err) == (0, "")
     study = Results.read(evedrop.folder / "a study")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import silent
 from evedrop.simulate.montecarlo import simulate
 from evedrop.system.output import Output, escaped, print_json
+from tests.cli.terminal import Terminal
 from tests.conftest import Evedrop
 
 STEERING = [chr(one) for one in (*range(9), *range(11, 32), *range(127, 160))]
@@ -34,9 +34,11 @@ def test_no_character_that_steers_is_left(text: str) -> None:
         assert shown == text
 
 
-def test_output_is_escaped_and_styles_are_not() -> None:
+def test_output_is_escaped_and_styles_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """A console's own styles reach the stream; what it is given to draw does not steer."""
-    stream = io.StringIO()
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    stream = Terminal()
     output = Output(stream)
     output.write(f"{EVIL}\n")
     assert stream.getvalue() == f"{SHOWN}\n"

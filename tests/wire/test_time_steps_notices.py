@@ -110,4 +110,4 @@ def test_the_main_reason_decides_on_a_lane() -> None:
         assert state_of(steps_of({WireFate.DELIVERED: 9, WireFate.LOST: 1, fate: 3}).counts[0, 0]) is state
     assert state_of(steps_of({WireFate.UNDERWAY: 3}).counts[0, 0]) is LaneState.QUIET
     assert "queue" not in legend(robot_plan())
-    assert "purple: queue full" in legend(plan_of(("a", "b", "c", {"rate": 1000.0})))
+    assert "steel: queue full" in legend(plan_of(("a", "b", "c", {"rate": 1000.0})))

@@ -6,6 +6,7 @@ import contextlib
 import shlex
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -115,7 +116,10 @@ class _Console(StyledConsole):
         how: arguments of `fitted`.
         """
         self.take(table)
-        self.print(fitted(table if drawn is None else drawn, self, **how))
+        drawn = table if drawn is None else drawn
+        if drawn.title:  # Rich would break it at the width of the table
+            self.say(drawn.title)
+        self.print(fitted(replace(drawn, title=""), self, **how))
 
     def take(self, *tables: TextTable) -> None:
         """Keep tables for the files of `--csv` and `--latex`."""

@@ -18,7 +18,7 @@ from evedrop.model.metrics.text import ShownNumber
 from evedrop.show.report.text_table import TextTable
 
 _ENDLESS = 10_000  # columns
-_ALARMS = re.compile("FAILED|BROKEN|✕|\\bNO\\b")
+_ALARMS = re.compile("FAILED|BROKEN|✗|\\bNO\\b")
 _PARTS_OF_KEYS = re.compile(r"(?<=\w\w[._])(?=\w\w)")
 
 

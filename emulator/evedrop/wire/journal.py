@@ -756,7 +756,9 @@ def _table(journal: Path, name: str, links: dict[int, list[str]], killed: bool) 
     with contextlib.suppress(FileNotFoundError):  # a running wire may just have made the Parquet file
         if not parquet_path(journal, name).exists():
             return unfinished_table(path, links, killed)
-    return pq.read_table(parquet_path(journal, name), schema=PARQUET)
+    table = pq.read_table(parquet_path(journal, name), schema=PARQUET)
+    table.validate(full=True)  # a damaged column of words may name words that are not there
+    return table
 
 
 def _start_of(name: str) -> int:

@@ -47,6 +47,7 @@ _FINISH_SECONDS = 600.0  # for it to write them: 10⁶ slots take some seconds
 _GONE_SECONDS = 5.0  # for a process that has left the network to end, and to say why in its log
 _AGAIN_SECONDS = 0.02  # until a request that cannot be carried out yet is looked at again
 _LOG_LINES = 12
+_NO_MEMORY = "memory allocation of"  # Zenoh and Rerun end the process when they get no memory
 _HUBS = frozenset({ROUTER, RELAY, RECORDER})
 _FRAME = re.compile(r"stack backtrace:$|\s+\d+: |\s+at \S+:\d+")
 """A line of a stack that Zenoh shows when it panics; the line before them says why."""
@@ -305,7 +306,7 @@ class Children:
         if accused and why:
             named, head = [name for name in accused if name in self._processes], why
         elif first is not None:
-            named, head = [first.process], f"{first.process} {first.manner}"
+            named, head = [first.process], f"{first.process} {first.manner}{self._lack(first)}"
             word = self._last_word(first.process)
             broken_by = None
             if word is not None and first.status == CONNECTION_LOST:
@@ -366,6 +367,11 @@ class Children:
                 return RELAY if RELAY in self._processes and name != SENSOR else ROUTER
             time.sleep(0.05)
         return None
+
+    def _lack(self, ended: ProcessExit) -> str:
+        """What the log of a process says that the machine lacked, as the end of a sentence; empty if nothing."""
+        aborted = ended.status == -signal.SIGABRT and any(_NO_MEMORY in line for line in self._log(ended.process))
+        return ", not enough memory" if aborted else ""
 
     def _last_word(self, name: str) -> LastWord | None:
         """Why a process ended, if it said so."""
