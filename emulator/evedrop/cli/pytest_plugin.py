@@ -111,6 +111,7 @@ class ScenarioItem(pytest.Item):
             ("evedrop_seed", tested.seed),
             ("evedrop_results", tested.folder),
             ("evedrop_report", tested.report),
+            ("evedrop_verdict", tested.verdict),
         ):
             if value is not None:
                 self.user_properties.append((name, str(value)))

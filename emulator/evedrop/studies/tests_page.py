@@ -41,7 +41,7 @@ def write_tests_page(folder: Path, tested: Sequence[Finding], started: float) ->
 def _page(folder: Path, tested: Sequence[Finding], started: float) -> Page:
     counts = [(outcome, sum(finding.outcome is outcome for finding in tested)) for outcome in Outcome]
     counted = ", ".join(f"{count} {outcome.word}" for outcome, count in counts if count)
-    table = TextTable.headed(["scenario", "outcome"], ["time"], ["reasons"], wrapped={"reasons"})
+    table = TextTable.headed(["scenario", "outcome"], ["time"], ["verdict", "reasons"], wrapped={"verdict", "reasons"})
     for finding in tested:
         mark = "✓" if finding.outcome is Outcome.PASSED else "✗"
         name = finding.scenario
@@ -51,6 +51,7 @@ def _page(folder: Path, tested: Sequence[Finding], started: float) -> Page:
             name,
             f"{mark} {finding.outcome.word}",
             f"{finding.seconds:.1f} s",
+            finding.verdict or "–",
             "; ".join(map(_travelling, finding.reasons)) or "–",
         )
     about = (
