@@ -150,6 +150,16 @@ def test_why_zenoh_panicked_is_shown_without_its_stack(bench: Bench) -> None:
     assert report.splitlines()[-1] == "    OS can't spawn worker thread: Resource temporarily unavailable (os error 11)"
 
 
+@pytest.mark.parametrize(("log", "end"), [("memory allocation of 32 bytes failed\n", ", not enough memory"), ("", "")])
+def test_a_process_that_gets_no_memory_is_named_as_such(bench: Bench, log: str, end: str) -> None:
+    """Zenoh and Rerun then abort, and only their last line says why."""
+    bench.starter.status = -6
+    bench.children.start(bench.briefs["eve"])
+    (bench.results / "logs" / "eve.log").write_text(log)
+    report = bench.children.failure_report(ProcessExit("eve", -6), None)
+    assert report.splitlines()[0] == f"eve was ended by signal 6{end}"
+
+
 @pytest.mark.parametrize("first", [ProcessExit("eve", 3), ProcessExit("recorder", 3)])
 def test_who_ends_for_lack_of_a_recorder_is_not_at_fault(bench: Bench, first: ProcessExit) -> None:
     """Cut off from the router, the recorder and all others give up after the same time; it is named, and why."""
