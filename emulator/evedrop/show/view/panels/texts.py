@@ -25,6 +25,7 @@ from evedrop.show.view.panels.panel import LEGEND_HEIGHT, VERDICT_HEIGHT, Placed
 from evedrop.show.view.scene import Scene, SceneSlots
 
 _TITLE_PATH = "title"
+_VERDICTS = 60  # of a run that is as fast as possible
 
 
 @final
@@ -35,8 +36,8 @@ class VerdictLine(ViewPanel):
         super().__init__(scene)
         self._states = leading_states(scene.units, scene.n)
         self._batches = {shown.name: BatchMeans() for shown in scene.receivers}
-        self._every = max(1, round(1.0 / scene.pace)) if scene.pace > 0 else 1
-        self._next, self._shown = 0, ""
+        self._every = max(1, round(1.0 / scene.pace) if scene.pace > 0 else scene.slots // _VERDICTS)
+        self._next, self._shown = self._every, ""
 
     def views(self) -> Iterator[PlacedView]:
         """One view without a title bar, above both tabs."""
@@ -44,19 +45,28 @@ class VerdictLine(ViewPanel):
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The verdict on the slots so far, about once a second, if it has changed."""
+        if not self._shown:
+            yield from self._so_far(slots.first)
+        at = 0
+        while at < slots.count:
+            stop = min(slots.count, self._next - slots.first)
+            self._add(slots, slice(at, stop))
+            at = stop
+            if slots.first + at == self._next:
+                yield from self._so_far(self._next - 1)
+                self._next += self._every
+
+    def _add(self, slots: SceneSlots, some: slice) -> None:
         for name, batches in self._batches.items():
             peer = slots.peers[name]
-            apart = (slots.x - peer.x_hat)[:, : self._states]
-            batches.add(peer.squared_error, np.sum(apart * apart, axis=1))
-        last = slots.first + slots.count - 1
-        if last < self._next:
-            return
-        self._next = last - last % self._every + self._every
+            apart = (slots.x[some] - peer.x_hat[some])[:, : self._states]
+            batches.add(peer.squared_error[some], np.sum(apart * apart, axis=1))
+
+    def _so_far(self, k: int) -> Iterator[Column]:
         (_, ours), *theirs = self._batches.items()
         unit = self.scene.units[0] if self.scene.units else ""
         verdict = verdict_so_far(ours, theirs, unit, self.scene.noise, self.scene.trials)
-        at = 0 if not self._shown else last  # the first one is shown from slot 0 on
-        yield from self._text(at, "" if verdict is None else f"{verdict.sentence}, so far")
+        yield from self._text(k, "" if verdict is None else f"{verdict.sentence}, so far")
 
     def conclusion(self, k: int, verdict: Verdict) -> Iterator[Column]:
         """The verdict on the run."""
