@@ -20,7 +20,7 @@ DOCS = ROOT / "docs"
 SQUARE = 10
 """Pixels along a side of the squares whose mean colours are compared, so that the edges of letters matter little."""
 TOLERANCE = 0.002
-"""Of the mean difference, on a scale from 0 to 1: the same slot, drawn again, differed by 0.0002, and one a second later by 0.005."""
+"""Of the mean difference, from 0 to 1: the same slot, drawn again, differed by 0.0002, and one a second later by 0.005."""
 
 
 def evedrop(*words: str | Path) -> None:
