@@ -67,6 +67,17 @@ def test_a_short_trial_does_not_decide() -> None:
     assert np.isnan(nothing.ratio)
 
 
+def test_a_trial_without_states_has_a_verdict_without_distances() -> None:
+    """As in a covariance-only study."""
+    draw, unknown = np.random.default_rng(4), np.full(5000, np.nan)
+    ours, theirs = BatchMeans(), BatchMeans()
+    ours.add(draw.lognormal(size=5000), unknown)
+    theirs.add(20.0 * draw.lognormal(size=5000), unknown)
+    values = AfterStart.of_batches(ours, theirs)
+    assert (values.larger, values.distances) == (True, None)
+    assert "eve has " in verdict_on(Compared("eve", values)).sentence
+
+
 def test_errors_of_rounding_are_equal() -> None:
     """Two receivers that both know the state: neither is better by the noise of its arithmetic."""
     draw = np.random.default_rng(4)

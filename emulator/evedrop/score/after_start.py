@@ -57,7 +57,8 @@ class AfterStart:
         over, under = theirs.later, ours.later
         if not len(under):
             return cls(math.nan, in_one_trial=True)
-        distances = math.sqrt(float(under[:, 1].mean())), math.sqrt(float(over[:, 1].mean()))
+        squares = float(under[:, 1].mean()), float(over[:, 1].mean())
+        distances = None if any(map(math.isnan, squares)) else (math.sqrt(squares[0]), math.sqrt(squares[1]))
         floor = max(_ROUNDING * noise, np.finfo(float).tiny)
         mean, other = float(under[:, 0].mean()), float(over[:, 0].mean())
         ratio = 1.0 if max(mean, other) <= floor else math.inf if mean <= floor else other / mean
