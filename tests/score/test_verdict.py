@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from evedrop.model.process import Floats
 from evedrop.scenario.loading import load
+from evedrop.scenario.theory import expectations_of
 from evedrop.score.after_start import AfterStart, BatchMeans, DistanceTally, leading_states
+from evedrop.score.scorekeeper import verdicts
 from evedrop.score.secrecy import MeanErrors, _larger, sign_of_mean
 from evedrop.score.sums import WINDOWS
 from evedrop.score.verdict import Compared, SecrecyOutcome, verdict_of, verdict_on, verdict_so_far
@@ -65,6 +67,15 @@ def test_a_short_trial_does_not_decide() -> None:
     assert (values.larger, values.why_open) == (None, "the run has too few slots")
     nothing = AfterStart.of_batches(BatchMeans(), BatchMeans())
     assert np.isnan(nothing.ratio)
+
+
+def test_a_run_of_one_slot_does_not_decide() -> None:
+    """Neither of several trials, whose errors are all 0 there, nor of one."""
+    for trials in (1, 20):
+        scenario = load("vehicle", {"slots": 1, "trials": trials})
+        _, verdict = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
+        assert verdict is not None
+        assert verdict.outcome == SecrecyOutcome.OPEN
 
 
 def test_a_trial_without_states_has_a_verdict_without_distances() -> None:

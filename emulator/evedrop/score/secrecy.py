@@ -283,7 +283,11 @@ def secrecy(
         name,
         after_start,
         grows=perfect is Claim.HELD and (perfect_by_theory is True or (perfect_by_theory is None and floor_grows())),
-        denied=both_known and not bounded and not perfect_by_theory and holds_from is None,
+        denied=both_known
+        and not bounded
+        and not perfect_by_theory
+        and holds_from is None
+        and legitimate.slots > WINDOWS,
         why_open=missing.removeprefix(": "),
     )
     return Secrecy(
@@ -336,6 +340,8 @@ def _after_start(
     if ours is not None and theirs is not None and ours.distance is not None and theirs.distance is not None:
         distances = ours.distance, theirs.distance
     value, scatter = ratio
+    if legitimate.slots <= WINDOWS:
+        return AfterStart(value, None, None, distances, "the run has too few slots")
     if is_rounding:
         return AfterStart(1.0, None, False, distances)
     if legitimate.done != legitimate.slots:
