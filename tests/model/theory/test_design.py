@@ -63,6 +63,14 @@ def test_numerical_illustration(
     assert against.perfect == (pytest.approx((LOW, 0.565630), abs=1e-6) if mu_e == 0.85 else None)
 
 
+def test_the_errors_at_a_choice_are_those_of_theory() -> None:
+    """Of the legitimate estimator and of each eavesdropper; infinite where an error is unbounded."""
+    traces = design(UNSTABLE, 0.9, 0.6, [smart(0.99), NAIVE], 100).traces_at(0.55)
+    assert traces["legitimate"] == J(UNSTABLE, 0.9, 0.55)
+    assert traces["smart"] == limit_trace(UNSTABLE, smart(0.99).outcomes(0.55))
+    assert traces["naive"] == np.inf
+
+
 @pytest.mark.thorough
 def test_optima_are_no_worse_than_any_other_choice() -> None:
     """A plain search over a grid finds no larger J_r, nor J_r/J, than the optima."""

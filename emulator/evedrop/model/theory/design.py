@@ -114,8 +114,7 @@ class Design:
 
     def traces_at(self, mu_d: float) -> dict[str, float]:
         """J_e of each eavesdropper at μ_d, and that of the legitimate estimator under its name; inf where unbounded."""
-        if self.process is None:
-            return {}
+        assert self.process is not None  # noqa: S101 - `design` sets it
         theirs = {each.name: limit_trace(self.process, each.outcomes(mu_d)) for each in self.adversaries}
         return {LEGITIMATE: limit_trace(self.process, Outcomes.legitimate(self.mu, mu_d)), **theirs}
 
