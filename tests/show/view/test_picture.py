@@ -73,14 +73,24 @@ def test_nobody_can_connect_to_who_draws(simulated: Callable[..., Simulated], tm
 
 
 @pytest.mark.pictures
+@pytest.mark.parametrize(("tab", "panels"), [(0, 8), (1, 9)], ids=["scene", "numbers"])
 @pytest.mark.parametrize(
     ("n", "growth"),
     [pytest.param(1, 1.0, marks=pytest.mark.long), (2, 1.12), pytest.param(4, 1.0, marks=pytest.mark.long)],
 )
-def test_every_panel_is_filled(n: int, growth: float, simulated: Callable[..., Simulated], tmp_path: Path) -> None:
-    """For every process, each panel draws something, in more than one colour, without a warning."""
+def test_every_panel_is_filled(
+    n: int,
+    growth: float,
+    tab: int,
+    panels: int,
+    simulated: Callable[..., Simulated],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """For every process, each panel of both tabs draws something, in more than one colour, without a warning."""
+    monkeypatch.setattr("evedrop.show.view.recording.FIRST_TAB", tab)
     rrd = recorded(simulated(120, n=n, growth=growth), tmp_path / "r.rrd")
-    panels_are_filled(rrd, 9)
+    panels_are_filled(rrd, panels)
 
 
 @pytest.mark.pictures

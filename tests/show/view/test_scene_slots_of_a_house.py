@@ -96,9 +96,13 @@ def test_slots_may_come_in_any_pieces() -> None:
 
 
 @pytest.mark.pictures
-def test_every_panel_of_a_house_is_filled(day: Path) -> None:
+@pytest.mark.parametrize(("tab", "panels"), [(0, 8), (1, 11)], ids=["scene", "numbers"])
+def test_every_panel_of_a_house_is_filled(
+    tab: int, panels: int, day: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each draws something, and complains of nothing."""
-    panels_are_filled(replay(day), 11)
+    monkeypatch.setattr("evedrop.show.view.recording.FIRST_TAB", tab)
+    panels_are_filled(replay(day, tmp_path / "day.rrd"), panels)
 
 
 def test_inputs_that_do_not_fit_are_refused(day: Path, tmp_path: Path) -> None:

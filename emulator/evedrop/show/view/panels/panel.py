@@ -82,21 +82,21 @@ class ViewPanel(ABC):
         return ()
 
 
-_PIXELS = 654.0  # between the viewer's own bars
+_PIXELS = 544.0  # of the tab with numbers, below the verdict and between the viewer's own bars
 _MOST = 0.57
 _HEAD, _LANE = 48.0, 40.0  # title bar and ruler of a view of lanes; a lane with its name
 
 VERDICT_HEIGHT = 0.125
-LEGEND_HEIGHT = 0.075
-FIXED_HEIGHT = VERDICT_HEIGHT + LEGEND_HEIGHT
-"""The height of the rows that every view has."""
+LEGEND_HEIGHT = 0.085
+FIXED_HEIGHT = LEGEND_HEIGHT
+"""The height of the rows that the numbers of every run have."""
 
 
 def lanes_height(count: int) -> float:
-    """The fraction that a view of `count` lanes needs; eight lanes fit, and more can be reached by scrolling."""
+    """The fraction of a tab that a view of `count` lanes needs; eight lanes fit, and more can be reached by scrolling."""
     return min(_MOST, (_HEAD + _LANE * count) / _PIXELS)
 
 
 def crowded(scene: Scene) -> bool:
     """Whether two views of lanes do not fit below each other, so that both are in the row at the top."""
-    return 1.0 - FIXED_HEIGHT - lanes_height(len(scene.receivers)) - lanes_height(len(scene.receivers) + 1) < 0.1
+    return 1.0 - FIXED_HEIGHT - lanes_height(len(scene.receivers)) - lanes_height(len(scene.receivers) + 1) < 0.05

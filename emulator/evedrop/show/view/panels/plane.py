@@ -60,6 +60,7 @@ class StatePlane(ViewPanel):
         view = rrb.Spatial2DView(
             name="State plane   ellipses: 2σ reported",
             origin=_PLANE_PATH,
+            contents=["$origin/**", *(f"- /{path}" for path in (_HEADING, _SCALE, *map(_off, self._trails)))],
             background=list(GROUND),
             overrides=trails,  # type: ignore[arg-type]
         )

@@ -147,12 +147,12 @@ class Events(ViewPanel):
         self._watchers = [(shown, Watcher(shown, scene)) for shown in scene.receivers]
 
     def views(self) -> Iterator[PlacedView]:
-        """Two views: beside the strip of the scene, and below the packets or at the bottom right for a closed loop."""
+        """Two views: beside the strip of the scene, and at the bottom right of the numbers."""
         yield PlacedView(self._view(), "strip", 1.0, lanes_height(1))
         if self.scene.moving:
             yield PlacedView(self._view(), "right", 0.7)
         else:
-            yield PlacedView(self._view(), "left")
+            yield PlacedView(self._view(), "right", 0.45)
 
     @staticmethod
     def _view() -> rrb.TextLogView:
