@@ -29,6 +29,7 @@ _ROUNDING = 1e-6
 """The fraction of tr Q below which a squared error is only that of rounding."""
 _CORRELATION = 0.9  # the largest correlation of neighbouring batches that is corrected for
 _LARGEST = 1e300
+_HELD = 512  # slots
 
 
 @dataclass(frozen=True)
@@ -131,8 +132,9 @@ class DistanceTally:
         """states: how many of the first states a distance counts, None for all; slots: of the whole run."""
         self._states, self._first = states, slots // 2
         self._total, self._counted = 0.0, 0
-        self.batches = BatchMeans() if trials == 1 else None
-        """None for several trials, which are samples themselves."""
+        self._batches = BatchMeans() if trials == 1 else None
+        self._held: list[tuple[Floats, Floats]] = []
+        self._held_slots = self._done = 0
 
     def add_slots(self, first: int, errors: Floats, x: Floats | None = None, x_hat: Floats | None = None) -> None:
         """Add the slots from `first` on: squared errors (c, R), states and estimates (c, n, R), None in modes without states."""
@@ -142,23 +144,43 @@ class DistanceTally:
                 squares = np.full_like(errors, np.nan)
             else:
                 squares = kernels.squared_errors(x[:, : self._states], x_hat[:, : self._states])
-        later = squares[max(0, self._first - first) :]
-        self._total = float(added_in_order(np.array([self._total]), later.sum(axis=1, keepdims=True))[0])
-        self._counted += later.size
-        if self.batches is not None:
-            self.batches.add(errors[:, 0], squares[:, 0])
+        self._counted += squares[max(0, self._first - first) :].size
+        self._held.append((errors[:, 0].copy(), squares.sum(axis=1)))
+        self._held_slots += len(errors)
+        if self._held_slots >= _HELD:
+            self._add_held()
+
+    def _add_held(self) -> None:
+        """Add what is held back: messages of a few slots would each cost as much as many slots."""
+        if not self._held:
+            return
+        errors, sums = (np.concatenate(columns) for columns in zip(*self._held, strict=True))
+        later = sums[max(0, self._first - self._done) :, None]
+        self._total = float(added_in_order(np.array([self._total]), later)[0])
+        if self._batches is not None:
+            self._batches.add(errors, sums)
+        self._done, self._held, self._held_slots = self._done + len(sums), [], 0
+
+    @property
+    def batches(self) -> BatchMeans | None:
+        """The errors by batches; None for several trials, which are samples themselves."""
+        self._add_held()
+        return self._batches
 
     @property
     def distance(self) -> float | None:
         """Root mean square over slots and trials; None before the second half, and where it is not known."""
+        self._add_held()
         return math.sqrt(self._total / self._counted) if self._counted and not math.isnan(self._total) else None
 
     @classmethod
     def merged(cls, parts: Sequence[Self]) -> Self:
         """The tally of disjoint sets of trials, in their order."""
         whole = cls(parts[0]._states, 2 * parts[0]._first, 0)
+        for part in parts:
+            part._add_held()
         whole._total, whole._counted = sum(part._total for part in parts), sum(part._counted for part in parts)
-        whole.batches = parts[0].batches if len(parts) == 1 else None
+        whole._batches = parts[0].batches if len(parts) == 1 else None
         return whole
 
 
