@@ -153,7 +153,7 @@ def test_the_eavesdropper_that_knows_most_decides() -> None:
                           "here the estimator is 1 off, eve 1: 1 ×"),
         (4.0, None, False, "? cannot tell yet: 3 trials are too few; the estimator is 1 off, eve 2: 4 ×"),
         (1e7, True, False, "✓ secret: the estimator is 1 off, eve 3,200: 1e7 ×"),
-        (np.nan, None, False, "? cannot tell yet: nothing was measured"),
+        (np.nan, None, False, "? cannot tell yet: 3 trials are too few"),
     ],
 )  # fmt: skip
 def test_every_outcome_has_its_sentence(ratio: float, larger: bool | None, denied: bool, sentence: str) -> None:

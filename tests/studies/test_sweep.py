@@ -201,7 +201,7 @@ def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> Non
 
 
 def test_the_page_of_a_sweep_over_a_file_has_the_file(tmp_path: Path) -> None:
-    """So that whoever receives it can repeat the sweep; it says that files that the scenario names are missing."""
+    """A reader can repeat the sweep with it; the page says which files of the scenario are missing."""
     text = shipped()["eavesdroppers"].read_text()
     for scenario, missing in ((text, False), (f'secret_file = "secret"\n{text}', True)):
         (tmp_path / "mine.toml").write_text(scenario)

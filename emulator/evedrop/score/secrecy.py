@@ -279,6 +279,8 @@ def secrecy(
     scatter = None if heavy else scatter
     is_rounding = legitimate.done > 0 and other_theory.is_rounding(other.error / max(other.offered, 1), other.done)
     after_start = _after_start((legitimate, other), means, test, (ratio, scatter), legitimate_theory, is_rounding)
+    if missing:
+        after_start = replace(after_start, why_open=missing.removeprefix(": "))
     compared = Compared(
         name,
         after_start,
@@ -288,7 +290,6 @@ def secrecy(
         and not perfect_by_theory
         and holds_from is None
         and legitimate.slots > WINDOWS,
-        why_open=missing.removeprefix(": "),
     )
     return Secrecy(
         name,
@@ -422,7 +423,7 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
     """
     trials = means.shape[1]
     if theory.known:
-        expected = _window_averages(theory.stream(), slots)
+        expected = _expected_averages(theory.alike, slots)
         if not theory.of_model:
             return expected
         streaks = theory.streaks(slots)
@@ -433,6 +434,12 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
     if math.isnan(lost) or 0.0 < lost * trials < RARE:
         heaviest = np.maximum(heaviest, _window_averages(TheoreticalCovariance(theory.process, NOBODY), slots))
     return np.asarray(means.mean(axis=1, keepdims=True) - math.log(ERROR_RATE) / trials * heaviest)
+
+
+@lru_cache(maxsize=64)
+def _expected_averages(alike: Alike, slots: int) -> Floats:
+    """What theory expects in each window, of all receivers that are alike."""
+    return _window_averages(alike.expectation.stream(), slots)
 
 
 def _window_averages(stream: TheoreticalTraceStream, slots: int) -> Floats:

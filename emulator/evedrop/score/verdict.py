@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from evedrop.model.metrics.text import two_digits
 from evedrop.score.after_start import AfterStart, BatchMeans
 
 
@@ -74,8 +75,6 @@ class Compared:
     """Whether perfect secrecy held: its error grows without bound, by theory as well."""
     denied: bool = False
     """Whether theory says that its error is not larger in the long run."""
-    why_open: str = ""
-    """Why nothing can be decided; empty if it is only that the samples scatter."""
 
     @property
     def outcome(self) -> SecrecyOutcome:
@@ -91,7 +90,7 @@ def verdict_on(compared: Compared, unit: str = "", *, best: bool = False) -> Ver
     """The verdict on an eavesdropper; unit: of the distances; best: whether it is the best one of several."""
     name, values, outcome = compared.eavesdropper, compared.after_start, compared.outcome
     if math.isnan(values.ratio):
-        return Verdict(outcome.value, compared.why_open or "nothing was measured", name)
+        return Verdict(outcome.value, values.why_open or "nothing was measured", name)
     who = f"the best eavesdropper ({name})" if best else name
     times = times_text(values.ratio, values.interval)
     if values.distances is None:
@@ -109,7 +108,7 @@ def verdict_on(compared: Compared, unit: str = "", *, best: bool = False) -> Ver
                 return Verdict(outcome.value, reason, name, times)
             return Verdict(outcome.value, f"{name} knows {knows} the estimator; {numbers}", name, times)
         case SecrecyOutcome.OPEN:
-            return Verdict(outcome.value, f"{compared.why_open or values.why_open}; {numbers}", name, times)
+            return Verdict(outcome.value, f"{values.why_open}; {numbers}", name, times)
         case SecrecyOutcome.PERFECT:
             return Verdict(outcome.value, f"{numbers}, and growing", name, times)
         case SecrecyOutcome.RELATIVE:
@@ -129,10 +128,13 @@ def verdict_so_far(
     ours: BatchMeans, theirs: Sequence[tuple[str, BatchMeans]], unit: str = "", noise: float = 0.0, trials: int = 1
 ) -> Verdict | None:
     """The verdict on the slots of a run so far, from the mean errors of their batches, over all trials; noise: tr Q."""
-    compared = []
-    for name, batches in theirs:
-        values = replace(AfterStart.of_batches(ours, batches, noise), in_one_trial=trials == 1)
-        compared.append(Compared(name, values, why_open="" if values.larger is not None else "too early"))
+    compared = [
+        Compared(
+            name,
+            replace(AfterStart.of_batches(ours, batches, noise), in_one_trial=trials == 1, why_open="too early"),
+        )
+        for name, batches in theirs
+    ]
     return verdict_of(compared, unit)
 
 
@@ -142,19 +144,10 @@ def _sortable(ratio: float) -> float:
 
 def times_text(ratio: float, interval: tuple[float, float] | None = None) -> str:
     """A ratio with two digits and its interval, such as "17 × [13, 22]"."""
-    between = "" if interval is None else " [{}, {}]".format(*map(_two_digits, interval))
-    return f"{_two_digits(ratio)} ×{between}"
+    between = "" if interval is None else " [{}, {}]".format(*map(two_digits, interval))
+    return f"{two_digits(ratio)} ×{between}"
 
 
 def distance_text(distance: float, unit: str = "") -> str:
     """A distance with two digits and its unit, such as "0.32 m"."""
-    return f"{_two_digits(distance)} {unit}".rstrip()
-
-
-def _two_digits(number: float) -> str:
-    if not math.isfinite(number):
-        return "∞"
-    digits = f"{number:.2g}".replace("e+0", "e").replace("e+", "e").replace("e-0", "e-")
-    if "e" in digits and 1e-4 <= abs(number) < 999_500:
-        return f"{float(digits):,.0f}" if abs(number) >= 1 else f"{float(digits):f}".rstrip("0")
-    return digits
+    return f"{two_digits(distance)} {unit}".rstrip()

@@ -118,7 +118,7 @@ def sweep_over(
         everything = list(itertools.chain(*tasks))
         with disk_errors(folder):
             write_private(folder / "sweep.json", text + "\n")
-            if str(source) not in shipped():  # the report has it, so that whoever receives it can repeat the sweep
+            if str(source) not in shipped():  # the report contains it, so that a reader can repeat the sweep
                 text = source.to_toml() if isinstance(source, Scenario) else read(source)
                 write_private(folder / "scenario.toml", text)
             with contextlib.closing(crew.results(everything, on_progress, stop.is_set, finished)) as results:

@@ -86,7 +86,7 @@ def test_words_say_the_largest_distance_of_a_stretch() -> None:
         "synchronised, within 1 m",
         f"uncertain, {more} 1 m",
     ]
-    assert walk([np.inf, np.nan], [2, 2], distance)[0] == f"overconfident, {more} 1e+09 m"
+    assert walk([np.inf, np.nan], [2, 2], distance)[0] == f"overconfident, {more} 1e9 m"
     words, colours = distance.lane(SMART).words, distance.lane(SMART).colours
     assert len(set(words)) == len(words)
     inks = dict(zip(SPIED.words, SPIED.colours, strict=True))
@@ -102,7 +102,7 @@ def test_distances_have_a_unit() -> None:
     assert ErrorDistance(moving).of(x, np.zeros((1, 3)))[0] == 5.0
     assert ErrorDistance(replace(moving, units=())).of(x, np.zeros((1, 3)))[0] == 13.0
     texts = [ErrorDistance(moving).text(distance_) for distance_ in (0.0, 0.316, 12.34, 4567.0, 1e9, np.inf)]
-    assert texts == ["0 m", "0.32 m", "12 m", "4,600 m", "1e+09 m", "everything"]
+    assert texts == ["0 m", "0.32 m", "12 m", "4,600 m", "1e9 m", "everything"]
 
 
 def test_distances_of_rounding_are_none() -> None:

@@ -39,6 +39,7 @@ _SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE, _LAST_PLACE = 0.01, 1e5, -4, -6  # b
 _ROUNDING = 1e-12  # a standard error below this part of the estimate comes from the rounding of equal trials
 _MOST_DIGITS = 8  # significant digits of an estimate
 _LARGE_COUNT, _NEARLY_ALL, _LARGE_SHORT = 1e7, 0.99, 1e4
+_LEAST_PLAIN, _LARGE_PLAIN = 1e-4, 999_500  # beyond them two digits have an exponent
 
 
 def number_text(value: float | None, how: str = ".4g") -> ShownNumber:
@@ -58,6 +59,18 @@ def short_text(value: float | None) -> str:
     if _SMALL_NUMBER <= value < _LARGE_SHORT:
         return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
     return _scientific(value, 1)
+
+
+def two_digits(value: float) -> str:
+    """A number with two digits for a sentence: 0.32, 17, 9,800, 4.8e9; ∞ for one that is not finite."""
+    if not math.isfinite(value):
+        return "∞"
+    digits = f"{value:.2g}"
+    if "e" not in digits:
+        return digits
+    if _LEAST_PLAIN <= abs(value) < _LARGE_PLAIN:
+        return f"{float(digits):,.0f}" if abs(value) >= 1 else f"{float(digits):f}".rstrip("0")
+    return _scientific(value, 0 if float(digits) == float(f"{value:.0e}") else 1)
 
 
 def finite_text(value: float, how: str = ".4g") -> ShownNumber:
@@ -96,8 +109,7 @@ def _estimate(value: float | None, error: float | None, how: str) -> str:
     ):
         places = max(0, -place)
         return f"{value:.{places}f} ± {error:.{places}f}"
-    digits = max(0, math.floor(math.log10(abs(value))) - place) if value else 0
-    return f"{_scientific(value, digits)} ± {_scientific(error, 0)}"
+    return _scientific_estimate(value, error)
 
 
 def scientific(value: float, error: float | None) -> str:
@@ -106,6 +118,10 @@ def scientific(value: float, error: float | None) -> str:
         return _estimate(value, error, ".4g")
     if not error or error <= _ROUNDING * abs(value):
         return _scientific(value, 3) if value else "0"
+    return _scientific_estimate(value, error)
+
+
+def _scientific_estimate(value: float, error: float) -> str:
     place = int(f"{error:.0e}".partition("e")[2])
     digits = max(0, math.floor(math.log10(abs(value))) - place) if value else 0
     return f"{_scientific(value, min(digits, _MOST_DIGITS))} ± {_scientific(error, 0)}"

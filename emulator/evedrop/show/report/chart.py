@@ -22,7 +22,7 @@ from evedrop.model.receiver import Codes
 from evedrop.show.report.page import made, printable
 from evedrop.show.view.error_floor import ErrorAxis, floor_words
 from evedrop.show.view.figure_style import drawing
-from evedrop.show.view.label_places import label_places
+from evedrop.show.view.label_places import end_of, label_places
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -194,7 +194,7 @@ class LogChart:
                         clip_on=False,
                     )
             if len(curves) <= _MOST_LABELS:
-                _label(axes, curves, axis)
+                _label(axes, curves)
             figure.savefig(svg, format="svg", transparent=True, metadata={"Date": None})
         return _embedded(svg.getvalue())
 
@@ -247,19 +247,12 @@ def _linear_axis(heights: Sequence[Floats]) -> ErrorAxis | None:
     return ErrorAxis(0.0, 1.05 * float(finite.max(initial=0.0)) or 1.0, below=False) if finite.size else None
 
 
-def _label(axes: Axes, curves: Sequence[Curve], axis: ErrorAxis) -> None:
+def _label(axes: Axes, curves: Sequence[Curve]) -> None:
     """Write the name of each curve to the right of its end, in its order, with a mark of its colour; none covers another."""
-    ends = [_end(axes, curve, axis) for curve in curves]
+    ends = [end_of(axes, curve.y) for curve in curves]
     for curve, place in zip(curves, label_places(ends, _LABEL_GAP), strict=True):
         axes.text(1.005, place, "■", color=curve.colour, fontsize=9.0, va="center", transform=axes.transAxes)
         axes.text(1.027, place, printable(curve.name), color=_INK, fontsize=9.0, va="center", transform=axes.transAxes)
-
-
-def _end(axes: Axes, curve: Curve, axis: ErrorAxis) -> float:
-    """Where a curve ends: the height of its last point, as a fraction of the axis."""
-    finite = axis.inside(curve.y[np.isfinite(curve.y)])
-    height = float(finite[-1]) if finite.size else axis.low
-    return float(axes.transAxes.inverted().transform(axes.transData.transform((0.0, height)))[1])
 
 
 def _embedded(svg: str) -> Markup:

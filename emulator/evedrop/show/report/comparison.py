@@ -33,23 +33,19 @@ def conclusion(comparison: Comparison) -> str:
     undecided = verdicts.count(SecrecyOutcome.OPEN)
     more = f"; {undecided:,} of {len(verdicts):,} pairs need more trials" if undecided else ""
     if comparison.dominant:
-        return _dominant(comparison) + more
+        alone = "each of them dominates" if len(comparison.dominant) > 1 else "dominates"
+        return (
+            f"{', '.join(comparison.dominant)}: {alone}: no other scheme costs the legitimate estimator less in the long run, "
+            f"and no other scheme gives the closest adversary a larger error{more}"
+        )
     return (
         "no scheme dominates: each one costs the legitimate estimator more in the long run than another scheme, or gives the "
         f"closest adversary a smaller error{more}"
     )
 
 
-def _dominant(comparison: Comparison) -> str:
-    more = "each of them dominates" if len(comparison.dominant) > 1 else "dominates"
-    return (
-        f"{', '.join(comparison.dominant)}: {more}: no other scheme costs the legitimate estimator less in the long run, "
-        "and no other scheme gives the closest adversary a larger error"
-    )
-
-
 def comparison_lines(comparison: Comparison) -> Iterator[str]:
-    """Notes to the tables: what was left out or is not defined, what their words mean, and which schemes dominate."""
+    """Notes to the tables: what was left out or is not defined, and what their words mean."""
     yield from left_out_schemes(comparison)
     yield from _undefined(comparison)
     yield from _remarks(comparison)
@@ -172,5 +168,3 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
         )
     if any(scheme is not None and scheme.theory is not None and scheme.theory.bound for scheme in measured):
         yield "≥: no closed form is known; a lower bound on the expected error of any receiver without the secret"
-    if comparison.dominant:
-        yield _dominant(comparison)

@@ -13,7 +13,7 @@ from markupsafe import Markup
 from evedrop.model.metrics.text import short_text
 from evedrop.results.comparison import COMPARISON, Cell, Comparison, read_comparison
 from evedrop.score.verdict import SecrecyOutcome
-from evedrop.show.report.comparison import comparison_lines, pairs_table, schemes_table, verdict
+from evedrop.show.report.comparison import comparison_lines, conclusion, pairs_table, schemes_table, verdict
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.travel import circumstances, download, input_files
 from evedrop.show.view import palette
@@ -82,7 +82,7 @@ def _cell(cell: Cell) -> Mapping[str, str | None]:
 def _schemes(of: ComparisonSource) -> Iterator[Markup]:
     """What each scheme costs, and its closest adversary."""
     yield made("table", schemes_table(of.comparison), "Cost and secrecy of each scheme; errors ± standard errors")
-    yield made("sentences", list(comparison_lines(of.comparison)))
+    yield made("sentences", [conclusion(of.comparison), *comparison_lines(of.comparison)])
 
 
 def _pairs(of: ComparisonSource) -> Iterator[Markup]:

@@ -8,6 +8,7 @@ import platform
 import subprocess
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 
 from markupsafe import Markup
@@ -54,6 +55,7 @@ def circumstances(results: Path) -> Mapping[str, str]:
     }
 
 
+@cache
 def _commit() -> str:
     """The commit of the repository that this program runs in; empty where it is installed from a package, or git is missing."""
     root = Path(__file__).resolve().parents[4]

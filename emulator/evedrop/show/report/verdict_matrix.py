@@ -20,7 +20,7 @@ _NOT_DEFINED = "·"
 def matrix_lines(comparison: Comparison, columns: int) -> Iterator[str]:
     """A line for each scheme, with a mark for each adversary that is defined with a scheme; then what letters and marks mean.
 
-    Only the explanations may be longer than `columns`. Where there is no room for all adversaries, another block has the rest.
+    Only the explanations may be longer than `columns`. Adversaries that do not fit beside each other are in another block below.
     """
     schemes = comparison.schemes
     cells = {name: {who: cell.verdict for who, cell in scheme.cells.items()} for name, scheme in schemes.items()}

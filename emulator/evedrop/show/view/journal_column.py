@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evedrop.show.view.label_places import label_places
+from evedrop.show.view.label_places import end_of, label_places
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.lines import Line2D
 
 WIDTH = 3.5
 """Inches: 89 mm, as of IEEE and Elsevier."""
@@ -54,7 +53,7 @@ def fit(axes: Axes, direct: bool, height: float) -> None:
 def _name_curves(axes: Axes, height: float) -> None:
     """Write the name of each curve to the right of its end, with a line to it in its colour."""
     curves = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
-    ends = [_end(axes, line) for line in curves]
+    ends = [end_of(axes, np.asarray(line.get_ydata(), float)) for line in curves]
     for line in axes.get_lines():
         line.set_linewidth(0.8)
     for line, end, place in zip(curves, ends, label_places(ends, _LINE_OF_TEXT / (72.0 * height)), strict=True):
@@ -64,12 +63,3 @@ def _name_curves(axes: Axes, height: float) -> None:
             label="_name",
         )  # fmt: skip
         axes.text(1.075, place, str(line.get_label()), transform=axes.transAxes, va="center")
-
-
-def _end(axes: Axes, line: Line2D) -> float:
-    """Where a curve ends: the height of its last point, as a fraction of the axis."""
-    heights = np.asarray(line.get_ydata(), float)
-    finite = heights[np.isfinite(heights)]
-    low, high = axes.get_ylim()
-    height = float(np.clip(finite[-1], low, high)) if finite.size else low
-    return float(axes.transAxes.inverted().transform(axes.transData.transform((0.0, height)))[1])

@@ -3,6 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from evedrop.model.process import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def end_of(axes: Axes, heights: Floats) -> float:
+    """Where a curve of these heights ends: its last finite one, as a fraction of the axis; the lower end without any."""
+    finite, (low, high) = heights[np.isfinite(heights)], axes.get_ylim()
+    height = float(np.clip(finite[-1], low, high)) if finite.size else low
+    return float(axes.transAxes.inverted().transform(axes.transData.transform((0.0, height)))[1])
 
 
 def label_places(ends: Sequence[float], gap: float) -> list[float]:

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
 from evedrop.model.receiver import DISCARDED, DROPPED, INNOVATION, MISLED, SILENT, STATE, Action, Codes
+from evedrop.score.after_start import leading_states
 from evedrop.score.synchronisation import FACTOR, Synchronisation, synchronisation_of
+from evedrop.score.verdict import distance_text
 from evedrop.show.view import palette
 from evedrop.show.view.palette import Colour
 from evedrop.show.view.scene import PeerSlots, Scene, SceneSlots, Shown
@@ -116,10 +118,7 @@ class ErrorDistance:
     """
 
     def __init__(self, scene: Scene) -> None:
-        unit = scene.units[0] if scene.units else ""
-        others = [i for i, unit_ in enumerate(scene.units) if unit_ != unit]
-        self._count = others[0] if others else scene.n
-        self._unit = f" {unit}" if unit else ""
+        self._count, self._unit = leading_states(scene.units, scene.n), scene.unit
         self._level, self._step = -1, 0  # of the last slot
         self._near = math.sqrt(FACTOR * scene.noise)
         self._nothing = math.sqrt(scene.noise) * _NOTHING
@@ -127,7 +126,7 @@ class ErrorDistance:
         self._steps = np.array([self._near, *(10.0**decade for decade in range(first, first + _DECADES))])
 
     def lane(self, shown: Shown) -> Lane:
-        """All words of `codes`, such as "uncertain, off by more than 10 m", in the colours of what they say of this receiver."""
+        """All words of `codes`, such as "uncertain, off by more than 10 m", in the colours that they have for this receiver."""
         inks = knowledge_lane(shown.role).colours
         near = self._text(self._near)
         words, colours = (
@@ -168,10 +167,7 @@ class ErrorDistance:
     def _text(self, distance: float) -> str:
         if not math.isfinite(distance):
             return "everything"
-        digits = f"{distance:.2g}"
-        if "e" in digits and 1e-4 <= abs(distance) < 1e7:
-            digits = f"{float(digits):,.0f}" if distance >= 1 else f"{float(digits):f}".rstrip("0")
-        return digits + self._unit
+        return distance_text(distance, self._unit)
 
 
 _DECADES = 9

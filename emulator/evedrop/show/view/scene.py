@@ -70,6 +70,11 @@ class Scene:
     panels: tuple[Panel, ...] = ()
     """The panels of applications."""
 
+    @property
+    def unit(self) -> str:
+        """The unit of the first state, in which distances are given; empty without units."""
+        return self.units[0] if self.units else ""
+
     @cached_property
     def colours(self) -> Mapping[str, Colour]:
         """Receiver → its colour: green for the legitimate estimator, that of its strategy for an eavesdropper."""

@@ -136,7 +136,7 @@ class Packets(ViewPanel):
 
     @property
     def _other(self) -> str:
-        """What the title says of the scheme's other packets; empty if there are none."""
+        """The part of the title about the scheme's innovations; empty if it sends none."""
         scheme = self.scene.receivers[0].strategy
         sends = scheme in SCHEMES.names and SCHEMES[scheme].sends_states_and_innovations
         return ", dark: an innovation" if sends else ""

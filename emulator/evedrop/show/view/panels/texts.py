@@ -64,8 +64,7 @@ class VerdictLine(ViewPanel):
 
     def _so_far(self, k: int) -> Iterator[Column]:
         (_, ours), *theirs = self._batches.items()
-        unit = self.scene.units[0] if self.scene.units else ""
-        verdict = verdict_so_far(ours, theirs, unit, self.scene.noise, self.scene.trials)
+        verdict = verdict_so_far(ours, theirs, self.scene.unit, self.scene.noise, self.scene.trials)
         yield from self._text(k, "" if verdict is None else f"{verdict.sentence}, so far")
 
     def conclusion(self, k: int, verdict: Verdict) -> Iterator[Column]:
