@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
 from evedrop.model.process import Floats
 from evedrop.scenario.loading import load
 from evedrop.scenario.theory import expectations_of
-from evedrop.score.after_start import AfterStart, BatchMeans, DistanceTally, leading_states
+from evedrop.score.after_start import AfterStart, BatchMeans, DistanceTally, _limits, leading_states
 from evedrop.score.scorekeeper import verdicts
 from evedrop.score.secrecy import MeanErrors, _larger, sign_of_mean
 from evedrop.score.sums import WINDOWS
@@ -101,12 +102,35 @@ def test_errors_of_rounding_are_equal() -> None:
 
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.99])
 def test_equal_errors_are_rarely_called_different(memory: float) -> None:
-    """Two receivers with the same distribution of errors, correlated over up to a hundred slots: about one time in a hundred."""
+    """Two receivers with the same distribution of errors, correlated over up to a hundred slots: a few times in a hundred."""
     draw, wrong = np.random.default_rng(7), 0
     for _ in range(200):
         ours, theirs = (batches(correlated(draw, 4096, memory)) for _ in range(2))
         wrong += AfterStart.of_batches(ours, theirs).larger is True
-    assert wrong <= 9  # at 1 % fewer than one in ten thousand studies has more
+    assert wrong <= 9  # of 200: at 2 % one in a hundred studies has more
+
+
+def test_correlated_batches_count_for_less() -> None:
+    """Limits from 16 samples whose neighbours have a correlation of 1/2 are √3 times as far apart as Student's."""
+    samples = np.array([3.0, 2.0, 1.0, 0.0, -1.0, -2.0, -1.0, 0.0, 1.0, 0.0, -1.0, -2.0, -1.0, 0.0, 1.0, 2.0])
+    around = samples - samples.mean()
+    correlation = (around[1:] @ around[:-1]) / (around @ around)
+    assert 0.4 < correlation < 0.8
+    low, high = _limits(samples)
+    student = stats.t.ppf(0.99, 15) * samples.std(ddof=1) / 4.0
+    assert (high - low) / 2.0 == pytest.approx(student * np.sqrt((1.0 + correlation) / (1.0 - correlation)))
+
+
+def test_the_start_of_several_trials_does_not_count() -> None:
+    """An eavesdropper that was far off in the first half and is as good as the estimator in the second knows as much."""
+    draw = np.random.default_rng(5)
+    ours, theirs = draw.uniform(0.9, 1.1, (2, WINDOWS, 200))
+    theirs[: WINDOWS // 2] += 1000.0
+    assert _larger(MeanErrors(ours, theirs), sign_of_mean) is False
+    theirs[WINDOWS // 2 :] += 0.25
+    assert _larger(MeanErrors(ours, theirs), sign_of_mean) is True
+    doubtful = ours + draw.normal(scale=3.0, size=ours.shape)
+    assert _larger(MeanErrors(ours, doubtful), sign_of_mean) is None
 
 
 def test_half_a_median_decides_where_tails_are_heavy() -> None:

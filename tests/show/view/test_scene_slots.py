@@ -61,6 +61,9 @@ def test_silence_is_shown_as_silence(scheme: str, live: bool, tmp_path: Path) ->
     else:
         results = montecarlo("eavesdroppers", trials=2, out=tmp_path / "run", **changes)
         recording = replay(results.folder)
+    last = rows(recording, "title", "TextDocument:text")[SLOTS - 1]
+    assert results.verdict is not None
+    assert str(last[0]).replace("\\", "").startswith(f"#### {results.verdict.sentence}\n")
     table = [row for row in results.trials.to_pylist() if row["trial"] == 0]
     kinds = {"nothing": "silent"}
     for peer, path in (("legitimate", "1_legitimate"), ("eve", "2_eve")):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from evedrop.score.verdict import Verdict
 from evedrop.show.view.panels.panel import PlacedView
-from evedrop.show.view.panels.plane import TruthDirection, heading_strips, scale_bars
+from evedrop.show.view.panels.plane import StatePlane, TruthDirection, heading_strips, scale_bars
 from evedrop.show.view.recording import PanelSet, ViewRecording, _rows
 from evedrop.show.view.scene import Shown
 from tests.show.view.read_back import rows
@@ -59,17 +60,34 @@ def test_a_scale_is_a_round_length_in_the_corner(width: float, length: float) ->
     assert bars[0, 1, 0] - bars[0, 0, 0] == pytest.approx(length, rel=1e-4)
 
 
-def test_the_verdict_is_recorded_so_far_and_at_the_end(tmp_path: Path) -> None:
-    """From slot 0 on there is one; the last one is the verdict on the run."""
-    run: Simulated = simulate(orbit(), 1500)
-    recording = ViewRecording(tmp_path / "r.rrd", run.scene)
-    for slots in run.chunks(400):
+def recorded_texts(run: Simulated, path: Path, length: int) -> dict[int, str]:
+    """Slot → the line at the top from it on, of a run that is recorded some slots at a time and has a verdict."""
+    recording = ViewRecording(path, run.scene)
+    for slots in run.chunks(length):
         recording.add(slots)
     recording.conclude(Verdict("secret", "the end", "smart"))
     assert recording.close()
-    texts = rows(tmp_path / "r.rrd", "title", "TextDocument:text")
+    return {slot: str(text[0]) for slot, text in rows(path, "title", "TextDocument:text").items()}
+
+
+def test_the_verdict_is_recorded_so_far_and_at_the_end(tmp_path: Path) -> None:
+    """Sixty times in a run that is as fast as possible, never from later slots, and the verdict on the run at its last slot."""
+    run: Simulated = simulate(orbit(), 1500)
+    texts = recorded_texts(run, tmp_path / "a.rrd", 400)
+    assert texts == recorded_texts(run, tmp_path / "b.rrd", 1500)
     assert 0 in texts
-    assert all("so far" in str(text) for slot, text in texts.items() if slot < 1499)
-    assert "secret: the end" in str(texts[1499])
-    labels = rows(tmp_path / "r.rrd", "plane/smart/off", "Points2D:labels")
+    assert 40 < len(texts) <= 62
+    assert all("so far" in text for slot, text in texts.items() if slot < 1499)
+    assert "secret: the end" in texts[1499]
+    labels = rows(tmp_path / "a.rrd", "plane/smart/off", "Points2D:labels")
     assert all(str(label[0]).endswith(" off") for label in labels.values())
+
+
+def test_the_plane_of_the_numbers_has_no_labels_of_the_worlds() -> None:
+    """They would cover each other; a world has only its own receiver's."""
+    run: Simulated = simulate(orbit(), 20)
+    contents_of: list[Any] = [view.view.contents for view in StatePlane(run.scene).views()]
+    plane, _, *worlds = contents_of
+    assert {"- /plane/smart/off", "- /plane/scale", "- /plane/truth/heading"} <= set(plane)
+    for shown, contents in zip(run.scene.receivers, worlds, strict=True):
+        assert [path for path in contents if str(path).endswith("/off")] == [f"plane/{shown.name}/off"]
