@@ -112,7 +112,8 @@ def _tabbed(placed: Sequence[PlacedView]) -> rrb.Container:
 def _scene(placed: Sequence[PlacedView]) -> rrb.Container:
     """What happens, beside it a grid with the world as each listener believes it, and below both a strip over time."""
     truth, worlds, strip = ([view for view in placed if view.side == side] for side in SCENE)
-    grid = rrb.Vertical(*(rrb.Horizontal(*(view.view for view in row)) for row in _rows(worlds)))
+    shown = _rows(worlds[:MOST_WORLDS])
+    grid = rrb.Vertical(*(rrb.Horizontal(*(view.view for view in row)) for row in shown))
     above = rrb.Horizontal(*(view.view for view in truth), grid, column_shares=[*(1.0 for _ in truth), _GRID])
     if not strip:
         return rrb.Vertical(above, name=SCENE_TAB)
@@ -131,6 +132,8 @@ def _rows(worlds: Sequence[PlacedView]) -> list[Sequence[PlacedView]]:
 SCENE_TAB, NUMBERS_TAB = "Scene", "Numbers"
 FIRST_TAB = 0
 """The tab that is open at first. Public, because a viewer without a screen draws no views of another one, and tests draw them."""
+MOST_WORLDS = 9
+"""Receivers that have a world in the scene; the numbers show all."""
 _GRID = 1.25  # times as wide as what happens
 
 
@@ -201,6 +204,7 @@ _APPLICATION = "evedrop"
 _PERIOD = 0.1  # seconds between batches at most
 _MOST_SLOTS = 16_384  # in a batch
 _MOST_WAITING = 50_000  # slots that the file may be behind before the run waits for it
+_REPLAY_SECONDS = 60.0  # for the file of a run that is over, which nobody waits for in real time
 _PACED_PERIOD, _FAST_PERIOD = 0.2, 0.4  # of a run in real time, and as fast as possible: each chunk costs time
 FILE_TIMEOUT = 5.0
 """Seconds that a run waits for the file before it continues without one.
@@ -360,7 +364,7 @@ class ViewRecording(RecordingThread[SceneSlots, Event]):
         self._staged: StagedChunks | None = None
         period = _PACED_PERIOD if scene.pace > 0 else _FAST_PERIOD
         self._sizes = chunk_sizes(scene.pace, period) if live else []
-        super().__init__(path, scene.run, introduction(scene), period=period)
+        super().__init__(path, scene.run, introduction(scene), None if live else _REPLAY_SECONDS, period)
 
     def add(self, slots: SceneSlots) -> None:
         """Record the next slots. Waits only for a disk that is thousands of slots behind, and for a few seconds at most."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 from evedrop.score.verdict import Verdict
 from evedrop.show.view.panels.panel import PlacedView
 from evedrop.show.view.panels.plane import StatePlane, TruthDirection, heading_strips, scale_bars
-from evedrop.show.view.recording import PanelSet, ViewRecording, _rows
+from evedrop.show.view.recording import MOST_WORLDS, PanelSet, ViewRecording, _rows
 from evedrop.show.view.scene import Shown
 from tests.show.view.read_back import rows
 from tests.show.view.simulated_run import Simulated, orbit, simulate
@@ -36,6 +37,21 @@ def test_a_run_has_a_scene_and_numbers() -> None:
     names = [shown.world_title for shown in run.scene.receivers]
     assert names == ["The estimator believes", "naive believes", "suspicious believes", "smart believes"]
     assert Shown("eve", "eavesdropper", "smart", None).world_title == "eve (smart) believes"
+
+
+def test_no_more_than_nine_receivers_have_a_world() -> None:
+    """More would be too small to be read; the others are in the numbers."""
+    run: Simulated = simulate(orbit(), 20)
+    crowd = tuple(replace(run.scene.receivers[-1], name=f"e{i}") for i in range(64))
+    scene = replace(run.scene, receivers=(run.scene.receivers[0], *crowd))
+    names: list[str] = []
+
+    def walk(part: Any) -> None:
+        for inner in getattr(part, "contents", None) or ():
+            walk(inner) if hasattr(inner, "row_shares") else names.append(str(inner.name))
+
+    walk(PanelSet(scene, print).layout().root_container)
+    assert sum(name.endswith("believes") for name in names) == MOST_WORLDS
 
 
 def test_a_heading_is_the_direction_of_the_last_slots() -> None:

@@ -368,6 +368,8 @@ def apart(centres: Points, others: Sequence[Points], low: Points, high: Points) 
     for _ in range(2 * len(others)):  # each of them covers two lines at most
         distances = [np.abs(placed - other) for other in others]
         covered = np.any([np.all(gap < size * [2 * _LABEL, 0.99 * _LINE], axis=1) for gap in distances], axis=0)
+        if not covered.any():
+            break
         placed[:, 1] += np.where(covered, line, 0.0)
     return placed.astype(np.float32)
 
