@@ -62,7 +62,7 @@ def test_the_recipe_for_a_script_gives_table_and_status(project: Make) -> None:
     complete(tested, 600)
     ended = output.index('"ended"')
     digest = tested.results().summary["peers"]["smart"]["digest"]
-    for words in ("1 of 1 expectations FAILED", digest[:12], "relative secrecy", "results: /runs/two-eavesdroppers-"):
+    for words in ("1 of 1 expectations FAILED", digest[:12], "the estimator is", "results: /runs/two-eavesdroppers-"):
         assert output.index(words) > ended
 
 
