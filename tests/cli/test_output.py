@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from evedrop.cli.commands import MODULES, ROLES
-from evedrop.system.output import Output, print_json, standard_streams
+from evedrop.system.output import Output, print_json, standard_streams, wrapped
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
 
@@ -220,3 +220,14 @@ def test_a_stream_that_the_shell_closed_does_no_harm(closed: str, inputs: Path, 
     )
     assert (done.returncode, done.stderr) == (1, "")
     assert (evedrop.folder / "out" / "report.html").exists()
+
+
+@pytest.mark.parametrize("columns", [30, 40, 60])
+def test_the_carets_below_a_line_of_a_file_are_seen(columns: int) -> None:
+    """However narrow the terminal is: the beginning of the line is left out where it would push them off."""
+    row = '   12 | encoding = { scheme = "scheduled", threshold = 4.0, mistaken = 0.55 }'
+    carets = f"{' ' * row.index('mistaken')}^^^^^^^^"
+    shown = wrapped(f"{row}\n      | {carets[8:]}", columns).split("\n")
+    assert all(len(line) <= columns for line in shown)
+    assert shown[0].startswith("   12 | …")
+    assert shown[0][shown[1].index("^") : shown[1].rindex("^") + 1] == "mistaken"

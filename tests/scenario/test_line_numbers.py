@@ -156,12 +156,12 @@ def test_no_pattern_repeats_a_group_possessively() -> None:
         ("link = { quality = 1.5, loss = 3 }", "loss", "3"),
         ("  A = [[1.0, 2.0], [3.0]]", "A", "[[1.0, 2.0], [3.0]]"),
         ("[process]", "initial_covariance", "[process]"),
-        ('"a b".c = 1 # note', "d", '"a b".c = 1'),
+        ('"a b".c = 1 # note', "d", '"a b".c'),
         ("tabs\t= 1", "tabs", "1"),
     ],
 )
 def test_an_excerpt_marks_the_value_of_an_entry(row: str, name: str, marked: str) -> None:
-    """Or the statement, where the entry has no value of its own in that line."""
+    """Or the first key, where the entry has no value of its own in that line."""
     shown, carets = excerpt(row, 12, name).split("\n")
     assert shown.startswith("   12 | ")
     assert shown[carets.index("^") : carets.rindex("^") + 1] == marked

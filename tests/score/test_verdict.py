@@ -90,6 +90,18 @@ def test_a_trial_without_states_has_a_verdict_without_distances() -> None:
     assert "eve has " in verdict_on(Compared("eve", values)).sentence
 
 
+def test_the_interval_of_several_trials_has_no_bound_below_zero() -> None:
+    """It is that of the logarithm: with few trials an error that scatters widely is not said to be perhaps 0 times as large."""
+    scenario = load("vehicle", {"slots": 400, "trials": 8})
+    eavesdroppers, _ = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
+    compared = [secrecy.compared.after_start for secrecy in eavesdroppers if secrecy.compared is not None]
+    intervals = [(values.ratio, *values.interval) for values in compared if values.interval is not None]
+    assert len(intervals) == 3
+    for ratio, low, high in intervals:
+        assert 0.0 < low < ratio < high
+        assert low * high == pytest.approx(ratio**2)
+
+
 def test_errors_of_rounding_are_equal() -> None:
     """Two receivers that both know the state: neither is better by the noise of its arithmetic."""
     draw = np.random.default_rng(4)

@@ -148,11 +148,9 @@ def test_a_point_is_a_study_of_its_own(swept: tuple[pa.Table, Path], tmp_path: P
             assert {"fraction": row["rare_fraction"], "trials": row["rare_trials"]} == peer["rare_events"]
             for level, value in peer["error_quantiles"].items():
                 assert row[f"error_quantile_{level}"] == value
-            verdict = alone["secrecy"].get(name, {})
-            assert (row["relative_secrecy"], row["perfect_secrecy"]) == (
-                verdict.get("relative"),
-                verdict.get("perfect"),
-            )
+            verdict = alone["secrecy"].get(name, {}).get("verdict", {})
+            assert (row["verdict"], row["times"]) == (verdict.get("outcome"), verdict.get("times"))
+            assert (row["verdict"] is None) is (name == "legitimate")
 
 
 def test_the_folder_has_table_description_and_plot(swept: tuple[pa.Table, Path]) -> None:
@@ -264,4 +262,4 @@ def test_the_ratio_is_that_of_the_second_half_of_each_trial(tmp_path: Path) -> N
         left_out = (theirs.sum() - theirs) / (ours.sum() - ours)
         jackknife = np.sqrt(39 / 40 * ((left_out - left_out.mean()) ** 2).sum())
         assert row["ratio_standard_error"] == pytest.approx(jackknife, rel=0.25)
-    assert "ratio" in [column.heading for column in sweep_table(table.to_pylist(), tuple(grid)).columns]
+    assert "times the error" in [column.heading for column in sweep_table(table.to_pylist(), tuple(grid)).columns]

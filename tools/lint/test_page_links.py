@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
-MADE = {"index.md", "gallery.md", "contributing.md", "security.md", "changelog.md"}
+MADE = {"screens.md", "index.md", "gallery.md", "contributing.md", "security.md", "changelog.md"}
 """Pages of the site that tools/site/pages.py makes, besides those in reference/."""
 
 

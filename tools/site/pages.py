@@ -16,6 +16,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
+from screens import screens_page
 
 ROOT = Path(__file__).parents[2]
 _OF_THE_ROOT = {
@@ -38,6 +39,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made = {there: (ROOT / name).read_text(encoding="utf-8") for name, there in _OF_THE_ROOT.items()}
     made |= {
         "gallery.md": gallery_page(),
+        "screens.md": screens_page(),
         "reference/scenario-keys.md": keys_page(),
         "reference/commands.md": commands_page(),
         "reference/evedrop.md": "# The module `evedrop`\n\n::: evedrop\n\n## wire\n\n::: evedrop.wire.running.wire\n",

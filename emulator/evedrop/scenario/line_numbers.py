@@ -66,26 +66,26 @@ def with_line_numbers(text: str, changed: Iterable[str] = ()) -> Iterator[None]:
 
 def _excerpt_of(mistake: str, row: str, line: int) -> str:
     path, _, rest = mistake.partition(":")
-    return excerpt(row, line, path.rpartition(".")[2], whole="is not an entry" in rest)
+    return excerpt(row, line, path.rpartition(".")[2], key="is not an entry" in rest)
 
 
 _LONGEST = 68  # characters of a line that is shown, so that it fits 80 columns
 _VALUE = r"""("[^"]*"|'[^']*'|\[.*\]|\{.*\}|[^\s,}\]\#]+)"""
 
 
-def excerpt(row: str, line: int, name: str = "", *, whole: bool = False, column: int | None = None) -> str:
-    """A line of a file, and below it carets: below the value of the entry `name`, if it is there, else below the statement.
+def excerpt(row: str, line: int, name: str = "", *, key: bool = False, column: int | None = None) -> str:
+    """A line of a file, and below it carets: below the value of the entry `name`, or below its key.
 
-    whole: the carets are below the key, too; column: where a single caret is, from 0, in place of them. Empty if that is too
-    far right to be shown.
+    If the line does not have this entry, the carets are below the header or the first key. column: where a single caret is, from
+    0, in place of them. Empty if that is too far right to be shown.
     """
-    statement = row.strip() if row.lstrip().startswith("[") else row.partition(" #")[0].strip()
+    statement = row.strip() if row.lstrip().startswith("[") else row.partition("=")[0].strip()
     begin, end = row.find(statement), row.find(statement) + len(statement)
-    value = re.search(rf"(?<![\w-]){re.escape(name)}\s*=\s*{_VALUE}", row) if name else None
+    entry = re.search(rf"(?<![\w-])({re.escape(name)})\s*=\s*{_VALUE}", row) if name else None
     if column is not None:
         begin, end = column, column + 1
-    elif value is not None:
-        begin, end = value.start() if whole else value.start(1), value.end()
+    elif entry is not None:
+        begin, end = entry.span(1 if key else 2)
     shown = row[:_LONGEST].expandtabs(1)
     if begin >= len(shown) + 1:
         return ""

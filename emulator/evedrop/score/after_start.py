@@ -29,6 +29,8 @@ _ROUNDING = 1e-6
 """The fraction of tr Q below which a squared error is only that of rounding."""
 _CORRELATION = 0.9  # the largest correlation of neighbouring batches that is corrected for
 _LARGEST = 1e300
+FARTHEST = 700.0
+"""The largest logarithm of a ratio that can be written."""
 _HELD = 512  # slots
 
 
@@ -68,7 +70,7 @@ class AfterStart:
         logarithms = np.log(np.clip(over[:, 0], floor, _LARGEST)) - np.log(np.clip(under[:, 0], floor, _LARGEST))
         low, high = _limits(logarithms)
         larger = True if low > 0.0 else False if high < math.log(AS_MUCH) else None
-        interval = (math.exp(low), math.exp(high)) if math.isfinite(ratio) and high < 700.0 else None
+        interval = (math.exp(low), math.exp(high)) if math.isfinite(ratio) and high < FARTHEST else None
         if interval is not None and not interval[0] <= ratio <= interval[1]:
             interval = None
         return cls(ratio, interval, larger, distances, "the errors scatter too much in time", in_one_trial=True)

@@ -20,7 +20,7 @@ from evedrop.model.theory.covariances import NOBODY, TheoreticalCovariance
 from evedrop.model.theory.rare_events import RARE
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.theory import Alike, Expectation, TheoreticalTraceStream
-from evedrop.score.after_start import AS_MUCH, ERROR_RATE, AfterStart
+from evedrop.score.after_start import AS_MUCH, ERROR_RATE, FARTHEST, AfterStart
 from evedrop.score.rare_events import rare_events_of
 from evedrop.score.summary import RARE_FRACTION, LeakSummary, SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_bounds, window_means, window_of
@@ -348,11 +348,11 @@ def _after_start(
     if legitimate.done != legitimate.slots:
         return AfterStart(value, None, None, distances, "the run was cut short")
     interval = None
-    if scatter is not None and math.isfinite(value):
+    if scatter is not None and 0.0 < value < math.inf:
         from scipy.special import stdtrit  # noqa: PLC0415 - takes a quarter of a second, and not every process judges
 
-        reach = float(stdtrit(legitimate.trials - 1, 1.0 - ERROR_RATE / 2)) * scatter
-        interval = max(0.0, value - reach), value + reach
+        reach = float(stdtrit(legitimate.trials - 1, 1.0 - ERROR_RATE / 2)) * scatter / value
+        interval = (value * math.exp(-reach), value * math.exp(reach)) if reach + math.log(value) < FARTHEST else None
     larger = _larger(means, test)
     return AfterStart(value, interval, larger, distances, f"{legitimate.trials:,} trials are too few")
 

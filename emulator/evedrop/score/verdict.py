@@ -29,6 +29,11 @@ class SecrecyOutcome(StrEnum):
         """A letter that can be told from the others without colours."""
         return _GLYPHS[self]
 
+    @property
+    def headline(self) -> str:
+        """Glyph and word, such as "✓ secret"."""
+        return f"{self.glyph} {self.value}"
+
 
 _GLYPHS = {
     SecrecyOutcome.PERFECT: "✔",
@@ -56,8 +61,7 @@ class Verdict:
     @property
     def headline(self) -> str:
         """Glyph and word, such as "✓ secret"."""
-        outcome = SecrecyOutcome(self.outcome)
-        return f"{outcome.glyph} {outcome.value}"
+        return SecrecyOutcome(self.outcome).headline
 
     @property
     def sentence(self) -> str:

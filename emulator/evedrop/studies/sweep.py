@@ -207,7 +207,8 @@ def _title(source: str | Path | Scenario) -> str:
 def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[str, Any]]:
     """A row for each peer: the point, the metrics, the verdict."""
     for name, peer in summary.peers.items():
-        verdict = summary.secrecy.get(name)
+        secrecy = summary.secrecy.get(name)
+        verdict = None if secrecy is None else secrecy.verdict
         yield {
             **{key: json.dumps(value) if isinstance(value, (list, dict)) else value for key, value in point.items()},
             "peer": name,
@@ -229,10 +230,10 @@ def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[s
                 for application, entry in summary.applications.items()
                 for column, value in APPLICATIONS[application].sweep_columns(entry, name).items()
             },
-            "ratio": None if verdict is None else verdict.ratio,
-            "ratio_standard_error": None if verdict is None else verdict.ratio_standard_error,
-            "ratio_from": None if verdict is None else verdict.ratio_from,
-            "relative_secrecy": None if verdict is None else verdict.relative,
-            "perfect_secrecy": None if verdict is None else verdict.perfect,
+            "ratio": None if secrecy is None else secrecy.ratio,
+            "ratio_standard_error": None if secrecy is None else secrecy.ratio_standard_error,
+            "ratio_from": None if secrecy is None else secrecy.ratio_from,
+            "verdict": None if verdict is None else verdict.outcome,
+            "times": None if verdict is None else verdict.times,
             "digest": peer.digest,
         }

@@ -71,7 +71,25 @@ def wrapped(text: str, columns: int | None, hanging: int = 2) -> str:
     """
     if columns is None:
         return text
-    return "\n".join("\n".join(_broken(line, columns, hanging, _WORD)) for line in text.split("\n"))
+    lines = _within_excerpts(text.split("\n"), columns)
+    return "\n".join("\n".join(_broken(line, columns, hanging, _WORD)) for line in lines)
+
+
+def _within_excerpts(lines: list[str], columns: int) -> list[str]:
+    """The lines of a text; those of an excerpt without their beginning, where the carets below would otherwise be cut off."""
+    shown = list(lines)
+    for i in range(1, len(lines)):
+        margin = _EXCERPT.match(lines[i])
+        if margin is None or not _EXCERPT.match(lines[i - 1]) or "^" not in lines[i]:
+            continue
+        begin = margin.end()
+        most = columns - 1 - min(lines[i].count("^"), columns // 2)  # where the carets may begin
+        beyond = lines[i].index("^") - most
+        if beyond > 0:
+            cut = begin + beyond + 1
+            shown[i - 1] = f"{lines[i - 1][:begin]}…{lines[i - 1][cut:]}"
+            shown[i] = f"{lines[i][:begin]} {lines[i][cut:]}"
+    return shown
 
 
 def wrapped_command(line: str, columns: int | None) -> str:

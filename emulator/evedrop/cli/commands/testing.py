@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 from evedrop.cli.in_memory import check_resuming, resuming, scheduler
 from evedrop.cli.options import Command
 from evedrop.errors import UsageError
+from evedrop.system.output import tell
 
 
 def test(options: argparse.Namespace) -> int:
@@ -31,9 +33,10 @@ def test(options: argparse.Namespace) -> int:
     try:
         for finding in results(scenarios, manner, options.jobs):
             tested.append(finding)
-            print(f"{finding.outcome.word:<9}{finding.seconds:7.1f} s  {finding.scenario}", flush=True)
+            tell(f"{finding.outcome.word:<9}{finding.seconds:7.1f} s  {finding.scenario}", alarm="FAILED")
             for line in finding.lines:
-                print(f"    {line}", flush=True)
+                tell(f"    {line}")
+            sys.stdout.flush()
     finally:
         if options.junit is not None:
             write_junit(options.junit, tested, started)
@@ -42,9 +45,9 @@ def test(options: argparse.Namespace) -> int:
     printed = ", ".join(
         f"{count} {outcome.word}" for outcome, count in sorted(counts.items(), key=lambda at: at[0].value)
     )
-    print(f"{printed}, in {time.time() - started:.1f} s")
+    tell(f"{printed}, in {time.time() - started:.1f} s", alarm="FAILED")
     if page is not None:
-        print(f"report: {page}")
+        tell(f"report: {page}")
     return max(outcome.value for outcome in counts)
 
 

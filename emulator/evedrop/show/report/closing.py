@@ -273,9 +273,10 @@ def sweep_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> TextT
     """A row for each point and receiver; rows: those of sweep.parquet, keys: the entries that the sweep changed."""
     metrics = columns("sweep_column")
     compared = [z_column(name) for name in all_metrics() if rows and z_column(name) in rows[0]]
-    heads = [*keys, "peer", *(column.heading for column in metrics), "z", "ratio", "relative secrecy"]
-    least = ["z", *(column.heading for column in list(metrics)[:0:-1])]
-    table = TextTable([TextColumn(head, head not in {"peer", "relative secrecy"}) for head in heads], least=least)
+    heads = [*keys, "peer", *(column.heading for column in metrics), "z", "verdict", "times the error"]
+    least = ["z", *(column.heading for column in list(metrics)[:0:-1]), "times the error"]
+    words = {"peer", "verdict", "times the error"}
+    table = TextTable([TextColumn(head, head not in words) for head in heads], least=least)
     for row in rows:
         table.add(
             *(f"{row[key]}" for key in keys),
@@ -285,7 +286,7 @@ def sweep_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> TextT
                 for column, names in metrics.items()
             ),
             number_text(shown_metric(row, compared), "+.1f"),
-            estimate(row.get("ratio"), row.get("ratio_standard_error"), ".3g"),
-            row["relative_secrecy"] or "–",
+            "–" if row["verdict"] is None else SecrecyOutcome(row["verdict"]).headline,
+            row["times"] or "–",
         )
     return table

@@ -25,6 +25,7 @@ from evedrop.model.metrics import all_metrics, error_column, shown_metric
 from evedrop.model.process import Floats
 from evedrop.results.tables import swept_strategies
 from evedrop.scenario.loading import value_of
+from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.chart import Curve, LogChart
 from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.page import facts_table, made
@@ -83,14 +84,14 @@ def _size(counts: Sequence[int], of: str) -> str:
 
 
 def _verdicts(of: SweepSource) -> Iterator[Markup]:
-    """The number of points in which secrecy held."""
+    """The number of points with each verdict."""
     counts_of, lines = dict[str, Counter[str]](), list[str]()
     for row in of.rows:
-        if row["relative_secrecy"] is not None:
-            counts_of.setdefault(row["peer"], Counter())[row["relative_secrecy"]] += 1
+        if row["verdict"] is not None:
+            counts_of.setdefault(row["peer"], Counter())[SecrecyOutcome(row["verdict"]).headline] += 1
     for name, counts in counts_of.items():
         word = ", ".join(f"{word} at {count:,} point{'' if count == 1 else 's'}" for word, count in counts.items())
-        lines.append(f"{name}: relative secrecy: {word}")
+        lines.append(f"{name}: {word}")
     yield made("sentences", lines)
 
 
@@ -139,7 +140,7 @@ def _metrics(of: SweepSource) -> Iterator[Markup]:
     """The metrics of all points, with their standard errors, theory, and z."""
     caption = (
         "A row for each point and receiver: means ± standard errors; z: the z-score of the error against theory; "
-        "ratio: an eavesdropper's error over the legitimate one, in the second half of the run"
+        "times the error: an eavesdropper's squared error over the legitimate one, in the second half of the run"
     )
     yield made("table", sweep_table(of.rows, tuple(of.grid)), caption)
 
