@@ -26,7 +26,7 @@ if TYPE_CHECKING:
         sweep,
     )
     from evedrop.live.launch.starter import preloaded
-    from evedrop.scenario.tables import Scenario
+    from evedrop.scenario.loading import Scenario
     from evedrop.wire.running import wire  # the package `wire`, which can be called: see there
 
 __all__ = [

@@ -37,7 +37,8 @@ from evedrop.scenario.plugins import elsewhere, named_in
 from evedrop.scenario.process_noise import replace_filter_noise
 from evedrop.scenario.stream_keys import secret_in
 from evedrop.scenario.table import sentences, unusable
-from evedrop.scenario.tables import Builders, Scenario
+from evedrop.scenario.tables import Builders
+from evedrop.scenario.tables import Scenario as Scenario  # noqa: PLC0414 - exported with its builders, which are set here
 from evedrop.scenario.words import listed
 from evedrop.scenarios import shipped
 from evedrop.system.files import Unreadable, is_folder, is_there, shown, text_of

@@ -59,6 +59,13 @@ def test_results_without_out_live_as_long_as_their_object(tmp_path: Path, monkey
     assert not folder.exists()
 
 
+def test_a_program_may_import_the_scenario_alone() -> None:
+    """Without a function that would import what checks a scenario."""
+    code = "from evedrop import Scenario; print(Scenario.load('vehicle').slots)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "3000\n"
+
+
 def test_a_live_run_has_the_digests_of_memory_and_leaves_nothing_behind(tmp_path: Path) -> None:
     """Without `out`, in a program of its own that keeps its results until it exits."""
     (tmp_path / "s.toml").write_text(SMALL.to_toml())
