@@ -230,15 +230,6 @@ def test_editors_know_every_entry() -> None:
     assert set(ScenarioEntries.__annotations__) == set(Scenario.model_fields) - {"made_with"}
 
 
-def test_a_scenario_is_short_when_printed() -> None:
-    """Not its matrices."""
-    assert (
-        repr(vehicle())
-        == str(vehicle())
-        == ('<Scenario "A vehicle": 50 slots, 2 states, scheme innovation, smart (smart)>')
-    )
-
-
 def test_the_class_alone_says_where_scenarios_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without `evedrop.scenario.loading`, which checks whole scenarios, no scenario is made."""
     monkeypatch.setattr(Scenario, "builders", None)

@@ -55,7 +55,7 @@ from evedrop.scenario.table import (
     registered,
 )
 from evedrop.scenario.timeline import Timeline
-from evedrop.scenario.words import as_toml, dotted
+from evedrop.scenario.words import dotted
 
 
 class EncodingTable(Table):
@@ -282,9 +282,9 @@ class Scenario(Table):
         return self.model_dump(mode="json", exclude_none=True, exclude_unset=True)
 
     def __repr__(self) -> str:
-        others = [f"{name} ({table.strategy})" for name, table in self.eavesdroppers.items()]
-        facts = [f"{self.slots} slots", f"{len(self.process.A)} states", f"scheme {self.encoding.scheme}"]
-        return f"<Scenario {as_toml(self.title)}: {', '.join([*facts, *others])}>"
+        from evedrop.scenario.overview import overview  # noqa: PLC0415 - a live run does not need it
+
+        return overview({**self.as_tables(), "seed": self.seed}, len(self.process.A))
 
     def __str__(self) -> str:
         return repr(self)

@@ -161,11 +161,13 @@ def test_metrics_are_attributes_with_types(results: RunResults) -> None:
 
 def test_results_are_short_when_printed_and_a_table_in_a_notebook(results: RunResults) -> None:
     """Texts of the scenario are escaped."""
-    assert repr(results).startswith(
-        "<RunResults of '<Small> & quick': ? cannot tell yet; 12 slots, 4 trials, in memory (exact); mean error: legitimate 0."
-    )
-    assert len(repr(results)) < 150
+    verdict, facts = " ".join(repr(results).split()).split(" RunResults of ")
+    assert results.verdict is not None
+    assert verdict == results.verdict.sentence
+    assert facts.startswith("'<Small> & quick': 12 slots, 4 trials, in memory (exact); mean error: legitimate 0.")
+    assert max(map(len, repr(results).splitlines())) <= 100
     html = results._repr_html_()
+    assert html.startswith(f"<div><h3>{results.verdict.sentence}</h3>")
     assert "&lt;Small&gt; &amp; quick" in html
     assert "<Small>" not in html
     assert html.count("<tr>") == 3
@@ -228,11 +230,15 @@ def test_a_sweep_takes_arrays_and_gives_a_table() -> None:
     row = result.table.to_pylist()[-1]
     same = montecarlo(SMALL, trials=3, slots=7, encoding__state_probability=0.6, legitimate__link=link)
     assert (row["peer"], row["mean_squared_error"]) == ("smart", same.peers["smart"].mean_squared_error)
-    assert "4 points" in repr(result)
+    lines = repr(result).splitlines()
+    assert lines[0] == f"SweepResults over {', '.join(over)}: 4 points"
+    assert sum("smart" in line for line in lines) == 4
+    assert max(map(len, lines)) <= 100
     html = result._repr_html_()
     assert ("4 points" in html, html.count("<tr>"), "more:" in html) == (True, 9, False)
     wide = replace(result, table=pa.concat_tables([result.table] * 6))
-    assert "and 8 more rows: .table has all of them" in wide._repr_html_()
+    for text in (wide._repr_html_(), repr(wide)):
+        assert "and 8 more rows: .table has all of them" in text
     result.report()
     (command,) = (text for text in checked(result.folder).texts if text.startswith("evedrop sweep"))
     options = parser_of("sweep").parse_whole(shlex.split(command)[1:])

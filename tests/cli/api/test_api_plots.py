@@ -17,6 +17,7 @@ from evedrop import Scenario, montecarlo
 from evedrop.cli.api import ComparisonResults, RunResults, SweepResults, compare, sweep
 from evedrop.errors import UsageError
 from evedrop.model.eavesdroppers.fixed_rules import Naive
+from evedrop.show.report.comparison import conclusion
 from evedrop.show.report.writing import REPORT
 from evedrop.show.view.palette import DROPPED, paper_inks
 from evedrop.simulate.montecarlo import Plan
@@ -170,9 +171,16 @@ def test_a_comparison_takes_a_class_and_has_a_figure_and_a_page(own: Any) -> Non
     assert {*result.schemes, *result.adversaries} <= texts
     assert result.report() == result.folder / REPORT
     assert any("flipped:Flipped" in text for text in checked(result.folder).texts)
-    assert repr(result) == f"<ComparisonResults of {SCENARIO.title!r}: 30 slots, 2 trials, 2 schemes, 1 adversary>"
     shown = result._repr_html_()
-    cells = Checked(shown).texts[5:]  # after the caption and the heads
+    glyphs = [result.cell(scheme, "naive").verdict.glyph for scheme in result.schemes]  # type: ignore[union-attr]
+    for text in (repr(result), shown):
+        assert conclusion(result)[:60] in text
+        assert "cannot tell yet" in text
+    matrix = [line.split() for line in repr(result).splitlines() if line.endswith(tuple(glyphs))]
+    assert matrix == [[scheme, glyph] for scheme, glyph in zip(result.schemes, glyphs, strict=True)]
+    assert [f"{glyph}\u00a0" for glyph in glyphs] == [text for text in Checked(shown).texts if text[1:] == "\u00a0"]
+    texts_ = Checked(shown).texts
+    cells = texts_[texts_.index("beaten by another scheme") + 1 :]
     assert cells[::4] == ["flipped:Flipped", "plain"]
     assert float(cells[5]) == pytest.approx(result.schemes["plain"].price, rel=1e-3)
     assert cells[3::4] == ["no" if name in result.dominant else "yes" for name in result.schemes]

@@ -55,8 +55,9 @@ def bar_text(done: int, total: int, label: str) -> str:
     return printable(made("progress", min(1.0, done / total) if total else 0.0, label))
 
 
-def table_text(title: str, table: TextTable, notes: Iterable[str] = ()) -> str:
-    """A table in HTML, as the page of a report has it, with notes below it."""
+def table_text(title: str, table: TextTable, notes: Iterable[str] = (), outcome: str = "") -> str:
+    """A table in HTML, as the page of a report has it, with notes below it; outcome: a heading above it."""
     from evedrop.show.report.page import made, printable
 
-    return printable(made("block", made("table", table, title), made("sentences", list(notes))))
+    above = [made("heading", outcome)] if outcome else []
+    return printable(made("block", *above, made("table", table, title), made("sentences", list(notes))))

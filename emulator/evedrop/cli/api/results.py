@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -21,8 +22,10 @@ from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySumma
 from evedrop.score.verdict import Verdict
 from evedrop.show.report import closing
 from evedrop.show.report.closing import sweep_table
-from evedrop.show.report.comparison import pairs_table, schemes_table
+from evedrop.show.report.comparison import comparison_heading, conclusion, left_out_schemes, pairs_table, schemes_table
 from evedrop.show.report.text_table import TextTable
+from evedrop.show.report.verdict_matrix import matrix_lines
+from evedrop.system.output import wrapped
 
 if TYPE_CHECKING:
     from evedrop.show.view.shown_figure import ShownFigure
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
 Panels = Literal["errors", "lanes", "plane"]
 Width = Literal["page", "column"]
 _MOST_ROWS = 40  # of a table in a notebook
+_WIDTH = 100  # characters of the lines that Python shows
 
 
 class _InFolder(Protocol):
@@ -121,8 +125,6 @@ class RunResults(Results, ReportedResults):
     def _notes(self) -> Iterator[str]:
         if self.remark is not None:
             yield self.remark
-        if self.verdict is not None:
-            yield self.verdict.sentence
         yield from (line for _, line in closing.verdict_lines(self._typed))
         for lines in (closing.remarks, closing.details, closing.doubts, closing.application_lines):
             yield from lines(self._typed)
@@ -150,10 +152,8 @@ class RunResults(Results, ReportedResults):
             f"{name} {number_text(shown_metric(peer.all_metrics, error), '.3g')}" for name, peer in self.peers.items()
         ]
         remark = "" if self.remark is None else "; incomplete"
-        verdict = "" if self.verdict is None else f"{self.verdict.headline}; "
-        return (
-            f"<RunResults of {self._typed.scenario!r}: {verdict}{self._facts}; mean error: {', '.join(errors)}{remark}>"
-        )
+        facts = f"RunResults of {self._typed.scenario!r}: {self._facts}; mean error: {', '.join(errors)}{remark}"
+        return _in_lines([facts] if self.verdict is None else [self.verdict.sentence, facts])
 
     def _tables(self) -> list[TextTable]:
         directions = self._typed.directions
@@ -164,7 +164,8 @@ class RunResults(Results, ReportedResults):
 
     def _repr_html_(self) -> str:
         title = f"{self._typed.scenario} · {self._facts}"
-        return table_text(title, closing.receivers_table(self._typed), self._notes())
+        verdict = "" if self.verdict is None else self.verdict.sentence
+        return table_text(title, closing.receivers_table(self._typed), self._notes(), verdict)
 
 
 @dataclass(frozen=True, repr=False)
@@ -188,7 +189,7 @@ class SweepResults(ReportedResults):
         return sweep_figure(self.table, self.keys)
 
     def __repr__(self) -> str:
-        return f"<SweepResults over {self._facts}, a table of {self.table.num_rows} rows>"
+        return "\n".join([f"SweepResults over {self._facts}", *_drawn(self._shown), *self._more])
 
     @property
     def _facts(self) -> str:
@@ -198,10 +199,16 @@ class SweepResults(ReportedResults):
         return [sweep_table(self.table.to_pylist(), self.keys)]
 
     def _repr_html_(self) -> str:
+        return table_text(f"Sweep over {self._facts}", self._shown, self._more)
+
+    @property
+    def _shown(self) -> TextTable:
+        return sweep_table(self.table.slice(0, _MOST_ROWS).to_pylist(), self.keys)
+
+    @property
+    def _more(self) -> list[str]:
         more = self.table.num_rows - _MOST_ROWS
-        notes = [f"and {more} more row{'' if more == 1 else 's'}: .table has all of them"] if more > 0 else []
-        rows = self.table.slice(0, _MOST_ROWS).to_pylist()
-        return table_text(f"Sweep over {self._facts}", sweep_table(rows, self.keys), notes)
+        return [f"and {more} more row{'' if more == 1 else 's'}: .table has all of them"] if more > 0 else []
 
 
 @dataclass(frozen=True, repr=False)
@@ -221,26 +228,49 @@ class ComparisonResults(Comparison, ReportedResults):
 
         return comparison_figure(self)
 
-    @property
-    def _facts(self) -> str:
-        schemes = "1 scheme" if len(self.schemes) == 1 else f"{len(self.schemes)} schemes"
-        adversaries = "1 adversary" if len(self.adversaries) == 1 else f"{len(self.adversaries)} adversaries"
-        return f"{self.slots:,} slots, {self.trials:,} trials, {schemes}, {adversaries}"
-
     def __repr__(self) -> str:
-        return f"<ComparisonResults of {self.title!r}: {self._facts}>"
+        return _in_lines([comparison_heading(self), *matrix_lines(self, _WIDTH), conclusion(self)])
 
     def _tables(self) -> list[TextTable]:
         return [schemes_table(self), pairs_table(self)]
 
     def _repr_html_(self) -> str:
+        from evedrop.show.report.comparison_sections import verdicts_matrix  # templates, which no other method needs
+        from evedrop.show.report.page import made, printable  # the same
+
         numbers = ["largest legitimate error", "error of the closest adversary"]
         table = TextTable.headed(["scheme"], numbers, ["beaten by another scheme"])
         for scheme in self.schemes.values():
             price, protection = (None if math.isnan(error) else error for error in (scheme.price, scheme.protection))
             beaten = "–" if protection is None else "no" if scheme.name in self.dominant else "yes"
             table.add(scheme.name, number_text(price, ".3g"), number_text(protection, ".3g"), beaten)
-        return table_text(f"{self.title} · {self._facts}", table)
+        lines = [conclusion(self), *left_out_schemes(self)]
+        return printable(
+            made(
+                "block",
+                made("heading", comparison_heading(self)),
+                verdicts_matrix(self, glyphs=True),
+                made("sentences", lines),
+                made("table", table, "Price and protection of each scheme"),
+            )
+        )
+
+
+def _in_lines(paragraphs: Iterable[str]) -> str:
+    """Paragraphs, in lines of 100 characters."""
+    return "\n".join(wrapped(paragraph, _WIDTH) for paragraph in paragraphs)
+
+
+def _drawn(table: TextTable) -> list[str]:
+    """The lines of a table, which leaves out what does not fit into 100 characters, as the terminal does."""
+    from rich.console import Console  # a live run does not need it
+
+    from evedrop.show.terminal_tables import fitted  # the same
+
+    text = io.StringIO()
+    console = Console(file=text, width=_WIDTH, color_system=None)
+    console.print(fitted(table, console))
+    return [line.rstrip() for line in text.getvalue().splitlines() if line.strip()]
 
 
 def load_results(folder: str | Path) -> RunResults:

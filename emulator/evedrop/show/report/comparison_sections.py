@@ -54,25 +54,33 @@ class ComparisonSource:
 
 def _matrix(of: ComparisonSource) -> Iterator[Markup]:
     """The verdict on each scheme against each adversary."""
-    comparison = of.comparison
+    yield verdicts_matrix(of.comparison)
+
+
+def verdicts_matrix(comparison: Comparison, glyphs: bool = False) -> Markup:
+    """The verdict on each scheme against each adversary that is defined with a scheme.
+
+    glyphs: in place of the verdicts, their glyphs, which the caption explains.
+    """
     schemes = comparison.schemes.values()
     shown = [
         name for name in comparison.adversaries if any(scheme.cells[name].verdict is not None for scheme in schemes)
     ]
-    caption = "The adversary's error over the legitimate one, and the verdict on secrecy; ·: not defined"
+    meaning = f": {', '.join(f'{outcome.glyph} {outcome.value}' for outcome in SecrecyOutcome)}" if glyphs else ""
+    caption = f"The adversary's error over the legitimate one, and the verdict on secrecy{meaning}; ·: not defined"
     if left_out := [name for name in comparison.adversaries if name not in shown]:
         caption += f", as against {', '.join(left_out)} for every scheme"
-    rows = [(scheme.name, [_cell(scheme.cells[adversary]) for adversary in shown]) for scheme in schemes]
-    yield made("matrix", ["scheme", *shown], rows, caption)
+    rows = [(scheme.name, [_cell(scheme.cells[adversary], glyphs) for adversary in shown]) for scheme in schemes]
+    return made("matrix", ["scheme", *shown], rows, caption)
 
 
-def _cell(cell: Cell) -> Mapping[str, str | None]:
+def _cell(cell: Cell, glyphs: bool) -> Mapping[str, str | None]:
     """What the matrix shows of a pair."""
     kept = cell.verdict
     if kept is None:
         return {"verdict": None, "why": cell.match.not_defined}
     return {
-        "verdict": verdict(cell),
+        "verdict": f"{kept.glyph}\u00a0" if glyphs else verdict(cell),
         "ratio": f"{short_text(cell.ratio)}×",
         "ground": hexadecimal(_GROUND[kept]),
         "ink": _INK.get(kept, _DARK),
