@@ -24,3 +24,17 @@ def lane(rrd: Path, entity: str, slots: int) -> list[str]:
     for k in range(slots):
         words.append(changes[k][0] if k in changes else words[-1])
     return words
+
+
+def events(rrd: Path) -> dict[int, list[str]]:
+    """The lines of the events panel at every slot that changes them; the newest first."""
+    documents = rows(rrd, "events", "TextDocument:text")
+    return {k: text.splitlines() for k, (text,) in documents.items()}
+
+
+def new_events(rrd: Path) -> dict[int, list[str]]:
+    """The events of every slot that has any, without their number of the slot."""
+    return {
+        k: [line.split(maxsplit=1)[1] for line in lines if line.startswith(f"#{k} ")]
+        for k, lines in events(rrd).items()
+    }

@@ -11,15 +11,10 @@ from evedrop import load_results, montecarlo
 from evedrop.cli.main import main
 from evedrop.scenario.progress_events import RunEvent
 from evedrop.show.view.scene_slots import replay
-from tests.show.view.read_back import rows
+from tests.show.view.read_back import events, new_events
 
 EVENTS = [{"at": 3, "link": "legitimate", "set": {"quality": 0.2}}, {"from": 5, "to": 9, "cut": "smart"}]
 LINES = {3: ["link legitimate: quality = 0.2"], 5: ["cut smart"], 9: ["heal smart"]}
-
-
-def lines(rrd: Path) -> dict[int, list[str]]:
-    """Slot → the line of the run's events there; those of slot 0 are its introduction."""
-    return {slot: text for slot, text in rows(rrd, "events/run", "TextLog:text").items() if slot}
 
 
 def test_a_run_in_memory_shows_what_its_scenario_had_happen(tmp_path: Path) -> None:
@@ -27,7 +22,19 @@ def test_a_run_in_memory_shows_what_its_scenario_had_happen(tmp_path: Path) -> N
     results = montecarlo("eavesdroppers", trials=1, slots=30, out=tmp_path / "run", event=EVENTS)
     assert [(event["slot"], [event["event"]]) for event in results.summary["events"]] == list(LINES.items())
     assert {event["by"] for event in results.summary["events"]} == {"scenario"}
-    assert lines(replay(tmp_path / "run")) == LINES
+    shown = new_events(replay(tmp_path / "run"))
+    assert {slot: [line for line in shown[slot] if line in LINES[slot]] for slot in LINES} == LINES
+
+
+def test_no_event_is_shown_before_its_slot(tmp_path: Path) -> None:
+    """In every slot, the newest event so far is at the top, and none is of a later slot, although the whole run is recorded."""
+    montecarlo("eavesdroppers", trials=1, slots=400, out=tmp_path / "run", event=EVENTS)
+    documents = events(replay(tmp_path / "run"))
+    assert len(documents) > 5
+    for slot, lines in documents.items():
+        slots = [int(line.split()[0].removeprefix("#")) for line in lines]
+        assert slots == sorted(slots, reverse=True)
+        assert slots[0] == slot
 
 
 def test_what_comes_after_the_last_slot_did_not_happen(tmp_path: Path) -> None:
@@ -48,12 +55,10 @@ def test_a_live_run_shows_what_was_done_to_it(evedrop: Any) -> None:
     assert main(["link", str(live.folder), "legitimate", "quality=0.5"]) == 0
     assert main(["resume", str(live.folder)]) == 0
     assert live.end().status == 0
-    events = load_results(live.folder).summary["events"]
-    shown = lines(live.folder / "recording.rrd")
-    assert [event["event"] for event in events if event["by"] == "scenario"] == ["cut legitimate"]
-    assert [event["slot"] for event in events if event["event"] == "cut legitimate"] == [3]
-    assert any(event["event"].startswith("link") for event in events)
-    last = {
-        event["slot"]: RunEvent(**event).line for event in events if event["slot"]
-    }  # the recording has the last line of a slot
-    assert shown == {slot: [line] for slot, line in last.items()}
+    happened = load_results(live.folder).summary["events"]
+    shown = new_events(live.folder / "recording.rrd")
+    assert [event["event"] for event in happened if event["by"] == "scenario"] == ["cut legitimate"]
+    assert [event["slot"] for event in happened if event["event"] == "cut legitimate"] == [3]
+    assert any(event["event"].startswith("link") for event in happened)
+    for event in happened:
+        assert event["slot"] == 0 or RunEvent(**event).line in shown[event["slot"]]

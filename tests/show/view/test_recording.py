@@ -17,7 +17,7 @@ from evedrop.show.view.recording import ViewRecording
 from evedrop.show.view.scene import Scene
 from tests.conftest import LIMIT
 from tests.examples import mostly_long
-from tests.show.view.read_back import lane, rows
+from tests.show.view.read_back import lane, new_events, rows
 from tests.show.view.simulated_run import Simulated
 
 SLOTS = 400
@@ -126,9 +126,11 @@ def test_trail_passes_through_every_slot(run: Simulated, rrd: Path) -> None:
 
 def test_events_name_receivers_and_notes(run: Simulated, rrd: Path) -> None:
     """There are lines about the run, about a long stretch without packets, and the note."""
-    assert rows(rrd, "events/run", "TextLog:text")[5] == ["a note"]
-    assert any("lost synchronisation" in text[0] for text in rows(rrd, "events/smart", "TextLog:text").values())
-    assert any("for the first time" in text[0] for text in rows(rrd, "events/naive", "TextLog:text").values())
+    shown = new_events(rrd)
+    assert "WARN   a note" in shown[5]
+    lines = [line for lines in shown.values() for line in lines]
+    assert any(line.startswith("WARN   smart lost synchronisation") for line in lines)
+    assert any("for the first time" in line for line in lines)
 
 
 def test_layout_and_styles_are_in_the_file(rrd: Path) -> None:
@@ -146,7 +148,7 @@ def test_chunks_do_not_show(run: Simulated, rrd: Path, tmp_path: Path) -> None:
         ("packets/3_suspicious", "StateChange:state"),
         ("plane/smart/trail", "LineStrips2D:strips"),
         ("plane/frame", "LineStrips2D:strips"),
-        ("events/suspicious", "TextLog:text"),
+        ("events", "TextDocument:text"),
     ):
         assert rows(tmp_path / "other.rrd", entity, component) == rows(rrd, entity, component)
 

@@ -6,18 +6,18 @@ operator, and long stretches without a usable packet.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from typing import final
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
 from evedrop.score.after_start import BatchMeans, leading_states
 from evedrop.score.verdict import Verdict, verdict_so_far
 from evedrop.show.view import lanes
-from evedrop.show.view.column import TIMELINE, Column
+from evedrop.show.view.column import Column
 from evedrop.show.view.events import Event, Watcher
 from evedrop.show.view.lanes import received
 from evedrop.show.view.palette import GROUND, TRUTH, Colour
@@ -134,16 +134,20 @@ class Legend(ViewPanel):
 
 
 _EVENTS_PATH = "events"
-_RUN = "run"
+_MOST_LINES = 16  # more than fit into the panel of a window of 1080 pixels
 
 
 @final
 class Events(ViewPanel):
-    """A line for each event, with its slot and level."""
+    """The last events so far, the newest first, each with its slot; a warning has its level, too.
+
+    They are a document with a version for each slot that has events, because Rerun's log of texts shows those of later slots.
+    """
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
         self._watchers = [(shown, Watcher(shown, scene)) for shown in scene.receivers]
+        self._events: list[Event] = []  # in order of slot
 
     def views(self) -> Iterator[PlacedView]:
         """Two views: beside the strip of the scene, and at the bottom right of the numbers."""
@@ -154,30 +158,34 @@ class Events(ViewPanel):
             yield PlacedView(self._view(), "right", 0.45)
 
     @staticmethod
-    def _view() -> rrb.TextLogView:
-        return rrb.TextLogView(
-            name="Events",
-            origin=_EVENTS_PATH,
-            columns=rrb.TextLogColumns(
-                timeline_columns=[TimelineColumn(TIMELINE)],
-                text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
-            ),
-            format_options=rrb.TextLogFormat(monospace_body=True),
-        )
+    def _view() -> rrb.TextDocumentView:
+        return rrb.TextDocumentView(name="Events", origin=_EVENTS_PATH)
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The events that the watcher of each receiver noticed."""
-        for shown, watcher in self._watchers:
-            yield from _lines(shown.name, watcher.watch(slots.first, received(shown, slots)))
+        yield from self._lines(
+            [event for shown, watcher in self._watchers for event in watcher.watch(slots.first, received(shown, slots))]
+        )
 
     def notes(self, notes: Sequence[Event]) -> Iterator[Column]:
         """A line for each note."""
-        yield from _lines(_RUN, notes)
+        yield from self._lines(notes)
+
+    def _lines(self, events: Sequence[Event]) -> Iterator[Column]:
+        """The document with these events, at their slots, and again at the slots of later events."""
+        if not events:
+            return
+        self._events = sorted([*self._events, *events], key=lambda event: event.k)
+        slots = [event.k for event in self._events]
+        changed = range(bisect_left(slots, min(event.k for event in events)), len(slots))
+        ends = [i + 1 for i in changed if i + 1 == len(slots) or slots[i + 1] > slots[i]]
+        texts = ["\n".join(map(_line, reversed(self._events[max(0, end - _MOST_LINES) : end]))) for end in ends]
+        k = np.array([slots[end - 1] for end in ends], np.int64)
+        documents = rr.TextDocument.columns(text=texts, media_type=["text/plain"] * len(texts))
+        yield Column(_EVENTS_PATH, k, documents)
 
 
-def _lines(name: str, events: Sequence[Event]) -> Iterator[Column]:
-    """Lines about a receiver or the run."""
-    if events:
-        k = np.array([event.k for event in events], np.int64)
-        texts, levels = [event.text for event in events], [event.level for event in events]
-        yield Column(f"{_EVENTS_PATH}/{name}", k, rr.TextLog.columns(text=texts, level=levels))
+def _line(event: Event) -> str:
+    """Such as "#1848   WARN   smart lost 3 packets in a row"; information has no level."""
+    level = "" if event.level == "INFO" else f"{event.level}   "
+    return f"#{event.k}   {level}{event.text}"
