@@ -14,7 +14,7 @@ from scipy import stats
 from evedrop.model.process import Floats
 from evedrop.score.synchronisation import FACTOR, Synchronisation
 from evedrop.score.verdict import Verdict
-from evedrop.show.view.lanes import KNOWLEDGE, SPIED, ErrorDistance, knowledge
+from evedrop.show.view.lanes import KNOWLEDGE, SPIED, ErrorDistance, KnowledgeLane, knowledge
 from evedrop.show.view.panels.fates import WhoKnowsWhat
 from evedrop.show.view.panels.texts import VerdictLine
 from evedrop.show.view.recording import ViewRecording
@@ -62,37 +62,43 @@ def test_a_right_covariance_is_hardly_ever_called_overconfident() -> None:
         assert stats.chi2.sf(FACTOR * n, n) < stats.chi2.sf(FACTOR, 1)
 
 
-def walk(errors: list[float], levels: list[int], distance: ErrorDistance) -> list[str]:
-    """The words for distances along the first state."""
-    x: Floats = np.array([[error, 0.0] for error in errors])
-    codes = distance.codes(np.array(levels, np.uint8), distance.of(x, np.zeros_like(x)))
-    return [distance.lane(SMART).words[code] for code in codes]
+def walk(distances: list[float], levels: list[int], knows: KnowledgeLane, first: int = 0) -> dict[int, str]:
+    """Slot → the lane's word from there on, for distances in the next slots."""
+    changes = [*knows.changes(first, np.array(levels, np.uint8), np.array(distances))]
+    return {k: knows.lane.words[code] for k, code in changes}
 
 
 def test_words_say_the_largest_distance_of_a_stretch() -> None:
     """They name powers of ten, do not flicker, and continue over calls."""
-    distance = ErrorDistance(SCENE)
-    first = walk([0.2, 3.0, 30.0, 9.0], [0, 2, 2, 2], distance)
-    more = "off by more than"
-    assert first == [
-        "synchronised, within 1 m",
-        f"overconfident, {more} 1 m",
-        f"overconfident, {more} 10 m",
-        f"overconfident, {more} 10 m",
-    ]
-    assert walk([9.0, 0.5, 0.9, 5.0], [2, 1, 0, 1], distance) == [
-        f"overconfident, {more} 10 m",
-        "uncertain, off by less than 1 m",
-        "synchronised, within 1 m",
-        f"uncertain, {more} 1 m",
-    ]
-    assert walk([np.inf, np.nan], [2, 2], distance)[0] == f"overconfident, {more} 1e9 m"
-    words, colours = distance.lane(SMART).words, distance.lane(SMART).colours
+    knows = KnowledgeLane(SMART, ErrorDistance(SCENE))
+    assert walk([0.2] * 6 + [3.0] * 5 + [30.0, 9.0, 9.0, 9.0], [0] * 6 + [2] * 9, knows) == {
+        0: "synchronised <1 m",
+        6: "overconfident >1 m",
+        11: "overconfident",
+    }
+    assert walk([9.0, 9.0, 9.0, 0.5], [2, 2, 2, 1], knows, 15) == {11: "overconfident >10 m", 18: "uncertain"}
+    assert walk([np.inf, np.nan] + [0.1] * 9, [2] * 11, knows, 19)[19] == "overconfident >1e9 m"
+    words, colours = knows.lane.words, knows.lane.colours
     assert len(set(words)) == len(words)
     inks = dict(zip(SPIED.words, SPIED.colours, strict=True))
-    assert [inks[word.partition(",")[0]] for word in words] == list(colours)
-    legitimate = distance.lane(replace(SMART, role="legitimate"))
+    assert [inks[word.partition(" ")[0]] for word in words] == list(colours)
+    assert knows.labels == [word.partition(" ")[2] or " " for word in words]
+    legitimate = KnowledgeLane(replace(SMART, role="legitimate"), ErrorDistance(SCENE)).lane
     assert (legitimate.words, {*legitimate.colours}) == (words, {*KNOWLEDGE.colours})
+
+
+def test_no_word_of_a_lane_is_cut(simulated: Callable[..., Simulated]) -> None:
+    """A stretch with a word has more slots than the word has letters; the numbers come first, and are short."""
+    run = simulated(300)
+    distance = ErrorDistance(replace(run.scene, units=("m", "m")))
+    for shown in run.scene.receivers:
+        knows, peer = KnowledgeLane(shown, distance), run.slots.peers[shown.name]
+        levels = knowledge(run.scene, run.slots.x, peer)
+        changes = dict(knows.changes(0, levels, distance.of(run.slots.x, peer.x_hat)))
+        labels = [knows.labels[code] for code in changes.values()]
+        for start, end, label in zip(changes, [*[*changes][1:], 300], labels, strict=True):
+            assert label == " " or (end - start > len(label) and label[0] in "<>" and len(label) <= 8)
+        assert any(label != " " for label in labels)
 
 
 def test_distances_have_a_unit() -> None:
@@ -131,7 +137,7 @@ def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp
         changes = rows(tmp_path / "7.rrd", f"knows/{i}_{shown.name}", "StateChange:state")
         assert [word for _, (word,) in sorted(changes.items())] == [word for word, _ in groupby(lanes[shown.name, 7])]
         expected = knowledge(run.scene, run.slots.x, run.slots.peers[shown.name])
-        assert [word.split(",")[0] for word in lanes[shown.name, 7]] == [KNOWLEDGE.words[code] for code in expected]
+        assert [word.split()[0] for word in lanes[shown.name, 7]] == [KNOWLEDGE.words[code] for code in expected]
     words = {name: " ".join(words_) for (name, _), words_ in lanes.items()}
     assert "overconfident" in words["naive"]
     assert "overconfident" not in words["smart"]

@@ -8,8 +8,9 @@ Source: docs/view.md, who knows what.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import final
 
 import numpy as np
@@ -111,33 +112,18 @@ def knowledge(scene: Scene, x: Floats, peer: PeerSlots) -> Codes:
 
 @final
 class ErrorDistance:
-    """How far an estimate is from the truth, as a number with its unit and in words.
+    """How far estimates are from the truth, as numbers with their unit.
 
-    It counts the first states as far as they have the unit of the first, such as the two coordinates of a place in metres and
-    not the speeds that follow. Without units it counts all states. One instance follows one receiver.
+    They count the first states as far as they have the unit of the first, such as the two coordinates of a place in metres and
+    not the speeds that follow. Without units they count all states.
     """
 
     def __init__(self, scene: Scene) -> None:
         self._count, self._unit = leading_states(scene.units, scene.n), scene.unit
-        self._level, self._step = -1, 0  # of the last slot
         self._near = math.sqrt(FACTOR * scene.noise)
         self._nothing = math.sqrt(scene.noise) * _NOTHING
         first = math.floor(math.log10(self._near)) + 1
         self._steps = np.array([self._near, *(10.0**decade for decade in range(first, first + _DECADES))])
-
-    def lane(self, shown: Shown) -> Lane:
-        """All words of `codes`, such as "uncertain, off by more than 10 m", in the colours that they have for this receiver."""
-        inks = knowledge_lane(shown.role).colours
-        near = self._text(self._near)
-        words, colours = (
-            [f"{Synchronisation.SYNCHRONISED.word}, within {near}"],
-            [inks[Synchronisation.SYNCHRONISED]],
-        )
-        for status in (Synchronisation.UNCERTAIN, Synchronisation.OVERCONFIDENT):
-            words.append(f"{status.word}, off by less than {near}")
-            words += [f"{status.word}, off by more than {self._text(step)}" for step in self._steps]
-            colours += [inks[status]] * (1 + len(self._steps))
-        return Lane(tuple(words), tuple(colours))
 
     def of(self, x: Floats, x_hat: Floats) -> Floats:
         """The distances of estimates from true states, (c,)."""
@@ -145,24 +131,19 @@ class ErrorDistance:
         distances: Floats = np.sqrt(np.sum(apart**2, axis=1))
         return distances
 
-    def codes(self, levels: Codes, distances: Floats) -> NDArray[np.int64]:
-        """Codes of `lane` in the next slots, (c,), for what is known and distances, (c,).
-
-        A word names the largest distance since this stretch of equal knowledge began, so that it does not flicker.
-        """
-        step = np.searchsorted(self._steps, np.nan_to_num(distances, nan=np.inf), side="left")
-        level = levels.astype(np.int64)
-        begins = np.cumsum(np.diff(level, prepend=self._level) != 0)  # the number of the stretch of equal knowledge
-        if len(level):
-            carried = np.where(begins == 0, self._step, 0)
-            each = len(self._steps) + 1
-            step = np.maximum.accumulate(begins * each + np.maximum(step, carried)) - begins * each
-            self._level, self._step = int(level[-1]), int(step[-1])
-        return np.where(level == 0, 0, 1 + (level - 1) * (len(self._steps) + 1) + step)
-
     def text(self, distance: float) -> str:
         """A distance with two digits and its unit, such as "0.32 m"; "0 m" if it is less than a thousandth of √(tr Q)."""
         return self._text(0.0 if distance < self._nothing else distance)
+
+    @property
+    def bounds(self) -> list[str]:
+        """Bounds of distances in words, such as "<0.47 m", ">0.47 m", ">1 m", ">10 m"; the first is that of synchronisation."""
+        return [f"<{self._text(self._near)}", *(f">{self._text(step)}" for step in self._steps)]
+
+    def bounds_of(self, distances: Floats) -> NDArray[np.int64]:
+        """Which of `bounds` each distance has, (c,): the largest that it exceeds."""
+        reached: NDArray[np.int64] = np.searchsorted(self._steps, np.nan_to_num(distances, nan=np.inf), side="left")
+        return reached
 
     def _text(self, distance: float) -> str:
         if not math.isfinite(distance):
@@ -172,3 +153,48 @@ class ErrorDistance:
 
 _DECADES = 9
 _NOTHING = 1e-3  # the fraction of √(tr Q), the distance of one step, below which a distance is only that of rounding
+
+
+@final
+class KnowledgeLane:
+    """The lane of one receiver: its colour is what the receiver knows, its words are a bound of how far off it is.
+
+    A word stands at the start of a stretch and names the largest distance so far, so that it does not flicker. A stretch shorter
+    than its word has none, because the word would be cut: while a stretch is that short, so is every one at the present.
+    """
+
+    def __init__(self, shown: Shown, distance: ErrorDistance) -> None:
+        self._distance, self._bounds = distance, distance.bounds
+        inks = knowledge_lane(shown.role).colours
+        kinds = [(status, bound) for status in Synchronisation for bound in ("", *self._bounds)]
+        self.lane = Lane(
+            tuple(f"{status.word} {bound}".rstrip() for status, bound in kinds),
+            tuple(inks[status] for status, _ in kinds),
+        )
+        self.labels = [bound or " " for _, bound in kinds]
+        """What the lane shows for each of its words."""
+        self._level, self._bound = -1, 0  # of the last slot
+        self._since, self._worded = 0, False  # the stretch of the last slot, and whether it has its word
+
+    def changes(self, first: int, levels: Codes, distances: Floats) -> Iterator[tuple[int, int]]:
+        """Slots and the codes of `lane` from there on, for the next slots, which begin with `first`; levels, distances: (c,).
+
+        A slot may come twice, and slots before `first` may come: the word of a stretch then takes the place of its blank.
+        """
+        level, bound = levels.astype(np.int64), self._distance.bounds_of(distances)
+        starts = np.diff(level, prepend=self._level) != 0
+        stretch, each = np.cumsum(starts), len(self._bounds)
+        carried = np.where(stretch == 0, self._bound, 0)
+        bound = np.maximum.accumulate(stretch * each + np.maximum(bound, carried)) - stretch * each
+        changed = np.flatnonzero(starts | (np.diff(bound, prepend=self._bound) != 0))
+        edges = sorted({0, *changed.tolist(), len(level)})
+        for at, end in pairwise(edges):
+            code = int(level[at]) * (1 + each)
+            if starts[at] or (self._worded and bound[at] != self._bound):
+                self._since, self._worded = first + at, False
+                yield self._since, code
+            self._bound = int(bound[at])
+            if not self._worded and first + end - self._since > len(self._bounds[self._bound]):
+                self._worded = True
+                yield self._since, code + 1 + self._bound
+        self._level = int(level[-1]) if len(level) else self._level

@@ -22,7 +22,7 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.score.synchronisation import Synchronisation
 from evedrop.show.view import lanes
 from evedrop.show.view.column import Column
-from evedrop.show.view.lanes import ErrorDistance, Lane, knowledge
+from evedrop.show.view.lanes import ErrorDistance, KnowledgeLane, Lane, knowledge
 from evedrop.show.view.palette import ALARM, MISLED, STEEL, TRUTH, Colour, letters
 from evedrop.show.view.panels.curves import recent_slots
 from evedrop.show.view.panels.panel import FIXED_HEIGHT, PlacedView, ViewPanel, crowded, lanes_height
@@ -34,29 +34,30 @@ from evedrop.show.view.scene import Scene, SceneSlots, Shown
 class StateLanes:
     """The lanes of one view."""
 
-    def __init__(self, origin: str, lanes: Iterable[tuple[str, Lane]], first: int, *, labelled: bool = False) -> None:
+    def __init__(
+        self, origin: str, lanes: Iterable[tuple[str, Lane]], first: int, labels: Sequence[Sequence[str]] | None = None
+    ) -> None:
         """origin: the path of the view; lanes: each with its name; first: the number of the first lane.
 
-        labelled: whether a lane shows its words. Mostly a slot is too narrow for one, and a legend says what the colours mean.
+        labels: what each lane shows for its words; by default nothing, because a slot is too narrow for a word, and a legend
+        says what the colours mean.
         """
         given = list(lanes)
         self._lanes = [lane for _, lane in given]
+        self._labels = labels or [[" "] * len(lane.words) for lane in self._lanes]
         # The viewer sorts lanes by path, hence the numbers.
         digits = len(str(first + len(given) - 1))
         self.paths = [
             f"{origin}/{rr.escape_entity_path_part(f'{i:0{digits}d}_{name}')}"
             for i, (name, _) in enumerate(given, first)
         ]
-        self._labelled = labelled
         self._last = [-1] * len(given)
 
     def styles(self) -> dict[str, rr.StateConfiguration]:
         """The words and colours of each lane."""
         return {
-            path: rr.StateConfiguration(
-                values=lane.words, labels=None if self._labelled else [" "] * len(lane.words), colors=lane.colours
-            )
-            for path, lane in zip(self.paths, self._lanes, strict=True)
+            path: rr.StateConfiguration(values=lane.words, labels=labels, colors=lane.colours)
+            for path, lane, labels in zip(self.paths, self._lanes, self._labels, strict=True)
         }
 
     def changes(
@@ -67,7 +68,12 @@ class StateLanes:
             at = np.flatnonzero(np.diff(steps.astype(np.int64), prepend=self._last[i]))
             self._last[i] = int(steps[-1])
             if len(at):
-                yield path, at, rr.StateChange.columns(state=[lane.words[code] for code in steps[at].tolist()])
+                yield path, at, states(lane, steps[at].tolist())
+
+
+def states(lane: Lane, codes: Iterable[int]) -> rr.ComponentColumnList:
+    """The words of codes of a lane, as Rerun's states."""
+    return rr.StateChange.columns(state=[lane.words[code] for code in codes])
 
 
 _KNOWLEDGE_PATH = "knows"
@@ -75,17 +81,19 @@ _KNOWLEDGE_PATH = "knows"
 
 @final
 class WhoKnowsWhat(ViewPanel):
-    """A lane for each receiver: synchronised, uncertain or overconfident, with its error in words."""
+    """A lane for each receiver: its colour is whether it is synchronised, uncertain or overconfident, its words how far off."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
-        self._distances = {shown.name: ErrorDistance(scene) for shown in scene.receivers}
-        named = [(shown.name, self._distances[shown.name].lane(shown)) for shown in scene.receivers]
-        self._lanes = StateLanes(_KNOWLEDGE_PATH, named, first=1, labelled=True)
+        self._distance = ErrorDistance(scene)
+        self._knowledge = [KnowledgeLane(shown, self._distance) for shown in scene.receivers]
+        named = [(shown.name, knows.lane) for shown, knows in zip(scene.receivers, self._knowledge, strict=True)]
+        self._lanes = StateLanes(_KNOWLEDGE_PATH, named, first=1, labels=[knows.labels for knows in self._knowledge])
 
     def views(self) -> Iterator[PlacedView]:
         """One view, at the top."""
-        view = rrb.StateTimelineView(name="Who knows what", origin=_KNOWLEDGE_PATH, time_view=recent_slots(self.scene))
+        title = "Who knows what   number: how far off · light: uncertain · dark: overconfident"
+        view = rrb.StateTimelineView(name=title, origin=_KNOWLEDGE_PATH, time_view=recent_slots(self.scene))
         yield PlacedView(view, "top", 1.2, lanes_height(len(self.scene.receivers)))
 
     def styles(self) -> dict[str, rr.StateConfiguration]:
@@ -94,13 +102,13 @@ class WhoKnowsWhat(ViewPanel):
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The lanes' changes."""
-        codes = (self._codes(shown.name, slots) for shown in self.scene.receivers)
-        for path, at, words in self._lanes.changes(codes):
-            yield Column(path, slots.numbers[at], words)
-
-    def _codes(self, name: str, slots: SceneSlots) -> NDArray[np.int64]:
-        peer, distance = slots.peers[name], self._distances[name]
-        return distance.codes(knowledge(self.scene, slots.x, peer), distance.of(slots.x, peer.x_hat))
+        for shown, path, knows in zip(self.scene.receivers, self._lanes.paths, self._knowledge, strict=True):
+            peer = slots.peers[shown.name]
+            distances = self._distance.of(slots.x, peer.x_hat)
+            changes = [*knows.changes(slots.first, knowledge(self.scene, slots.x, peer), distances)]
+            if changes:
+                k, codes = zip(*changes, strict=True)
+                yield Column(path, np.array(k, np.int64), states(knows.lane, codes))
 
 
 _PACKETS_PATH = "packets"
@@ -240,8 +248,8 @@ class LastPacket(ViewPanel):
         """One view, right of the strip; with many receivers, packets have this place, and the letters would be too small."""
         if crowded(self.scene):
             return
-        longest = max(len(shown.name) for shown in self.scene.receivers) + len(": overconfident, 0.32 m off")
-        view: rrb.View = self._drawn.view("The last packet, and what each knows", (LETTER * longest / 2, LINE / 2))
+        longest = max(len(shown.name) for shown in self.scene.receivers) + len(": 0.00032 m off")
+        view: rrb.View = self._drawn.view("The last packet, and how far off each is", (LETTER * longest / 2, LINE / 2))
         yield PlacedView(view, "top", 0.8, lanes_height(len(self.scene.receivers)))
 
     def styles(self) -> dict[str, AsComponents]:
@@ -278,7 +286,7 @@ class LastPacket(ViewPanel):
         distances = self._distance.of(slots.x[at], peer.x_hat[at]).tolist()
         statuses = [Synchronisation(code) for code in knowledge(self.scene, slots.x, peer)[at].tolist()]
         return [
-            (f"{shown.name}: {status.word}, {self._distance.text(distance)} off", self._ink(shown, status))
+            (f"{shown.name}: {self._distance.text(distance)} off", self._ink(shown, status))
             for status, distance in zip(statuses, distances, strict=True)
         ]
 
