@@ -4,6 +4,8 @@ from __future__ import annotations
 
 # The C module under `signal`; see `evedrop.system.signals`.
 import _signal as signal  # type: ignore[import-not-found]
+import atexit
+import gc
 import os
 import sys
 
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
 
 _WITH_VALUES = ("--seed", "--set", "--over")
 _HIDDEN = "..."
+_COLLECT_AFTER = 20_000
+"""New objects, before cycles among them are searched for: almost all that a command makes are its modules, and stay."""
 
 
 def without_values(words: Sequence[str]) -> list[str]:
@@ -58,13 +62,19 @@ def program() -> NoReturn:
 
     from evedrop.cli.main import is_role, main  # noqa: PLC0415 - the handlers come first
 
-    status = main()
     if is_role(sys.argv[1:]) or sys.argv[1:2] in (["wire"], ["view"]):
         # Threads may still be in Zenoh, or in Rerun: an interpreter that exits meanwhile aborts (Python 3.11), or hangs.
-        os._exit(status)
-    for number in heeded():  # the command is over: ignore signals while the interpreter exits
+        os._exit(main())
+    gc.set_threshold(_COLLECT_AFTER)
+    status = main()
+    for number in heeded():  # the command is over: ignore signals while it exits
         signal.signal(number, signal.SIG_IGN)
-    sys.exit(status)
+    if "threading" in sys.modules and sys.modules["threading"].active_count() > 1:
+        sys.exit(status)  # waits for them
+    atexit._run_exitfuncs()
+    os._exit(
+        status
+    )  # the interpreter would free every object of every module, which takes a quarter of a second after a study
 
 
 if __name__ == "__main__":

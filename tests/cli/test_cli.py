@@ -8,6 +8,7 @@ import os
 import re
 import socket
 import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from importlib import resources
@@ -367,3 +368,22 @@ def test_absurd_arguments_are_refused(evedrop: Evedrop, arguments: tuple[str, ..
     done = evedrop(*arguments)
     assert done.status == 2
     assert "Traceback" not in done.err
+
+
+ENDING = """
+import atexit, sys, threading, time
+from evedrop.__main__ import program
+atexit.register(lambda: print("callbacks have run"))
+if sys.argv.pop() == "thread":
+    threading.Thread(target=lambda: [time.sleep(0.2), print("the thread has ended")]).start()
+program()
+"""
+
+
+@pytest.mark.parametrize(("last", "lines"), [("alone", []), ("thread", ["the thread has ended"])])
+def test_a_command_leaves_nothing_undone(last: str, lines: list[str]) -> None:
+    """It exits without freeing its modules, after its threads have ended and all callbacks have run; its output is complete."""
+    words = [sys.executable, "-u", "-c", ENDING, "docs", "--nothing", last]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stdout.splitlines() == [*lines, "callbacks have run"]

@@ -194,7 +194,10 @@ def simulate(scenario: Scenario, folder: Path, on_event: OnEvent, plan: Plan = P
                 try:
                     for result in results:
                         merger.add_batch(result, writer)
-                        writer.checkpoint(merger.at, lambda: merger.summary(ending("")), lambda: merger.write(writer))
+                        if plan.rare or not merger.complete:  # otherwise all of it follows at once
+                            writer.checkpoint(
+                                merger.at, lambda: merger.summary(ending("")), lambda: merger.write(writer)
+                            )
                 except RunError as error:
                     failure = error
                 how = str(failure) if failure else "complete" if merger.complete else "interrupted"

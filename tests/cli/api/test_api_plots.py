@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from itertools import pairwise
@@ -122,6 +124,19 @@ def test_a_figure_shows_itself_in_a_notebook_without_a_display(
     figure = results.plot()
     assert len(figure.axes) == 3
     assert figure._repr_png_().startswith(b"\x89PNG")
+
+
+def test_a_figure_looks_for_no_windows() -> None:
+    """Nobody imports pyplot, which would try each windowing toolkit in turn."""
+    program = """
+import io, sys
+from evedrop.show.view.figure_style import drawing
+with drawing(3.0, 2.0) as figure:
+    figure.savefig(io.BytesIO(), format="svg")
+sys.exit("matplotlib.pyplot" in sys.modules)
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"}
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True)
 
 
 def test_what_cannot_be_drawn_is_refused(results: RunResults) -> None:

@@ -19,7 +19,8 @@ class ShownFigure(Figure):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         """As of `Figure`."""
         super().__init__(*arguments, **options)
-        self._style = {name: value for name, value in mpl.rcParams.items() if name.partition(".")[0] in _STYLED}
+        # Read by name: reading the setting `backend` looks for a windowing toolkit.
+        self._style = {name: mpl.rcParams[name] for name in mpl.rcParams if name.partition(".")[0] in _STYLED}
 
     def savefig(self, *arguments: Any, **options: Any) -> None:
         """Write the figure to a file, as `Figure` does: PDF, SVG or PNG by the ending of its name."""
