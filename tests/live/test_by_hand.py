@@ -116,7 +116,7 @@ def test_by_hand_the_recorder_prints_and_ends_as_run_does(below: float, evedrop:
     assert {done.status for name, done in ended.items() if name != "recorder"} == {0}
     actual, expected = closing(ended["recorder"]), comparable(launched.out.replace("launched", "results").splitlines())
     assert actual == expected
-    assert any("relative secrecy" in line for line in actual)
+    assert any("✓ secret" in line for line in actual)
 
 
 @pytest.mark.long

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from evedrop.model.metrics.standard_error import ratio_error, skewed_test, student_test
-from evedrop.model.metrics.text import count_text, estimate
+from evedrop.model.metrics.text import count_text
 from evedrop.model.process import Floats, parts_of
 from evedrop.model.theory.covariances import NOBODY, TheoreticalCovariance
 from evedrop.model.theory.rare_events import RARE
@@ -94,7 +94,7 @@ class Secrecy:
 
     @property
     def sentence(self) -> str:
-        """One sentence for the closing report."""
+        """What theory promises, and in which windows of the run the error was larger; the verdict is apart from it."""
         theory = "perfect" if self.perfect_by_theory else "relative" if self.relative_by_theory else "no"
         promise = self.unknown
         if self.relative_by_theory is not None:
@@ -103,22 +103,19 @@ class Secrecy:
             promise = f"theory promises relative secrecy from slot {self.relative_from} on"
         if math.isnan(self.ratio):
             return f"{self.eavesdropper}: nothing was measured; {promise}"
-        times = "∞" if math.isinf(self.ratio) else estimate(self.ratio, self.ratio_error, ".3g")
-        over = "" if self.ratio_slots is None else " in slots {} to {}".format(*self.ratio_slots)
+        if self.trials == 1 and self.relative is Claim.UNDECIDED:  # one trial decides no window
+            return f"{self.eavesdropper}: {promise}"
         where = f" in slots {self.windows}" if self.windows else ""
         run = {
-            Claim.HELD: "relative secrecy held in every window of this run",
-            Claim.FAILED: f"relative secrecy failed in this run{where}",
-            Claim.UNDECIDED: f"{self.trials:,} trials are too few to decide{where}{self.missing}"
-            if self.trials > 1
-            else "one trial is not enough for a verdict (try --trials 200)",
+            Claim.HELD: "its error was larger in every window of the run",
+            Claim.FAILED: f"its error was not larger{where}",
+            Claim.UNDECIDED: f"{self.trials:,} trials are too few to decide{where}{self.missing}",
         }[self.relative]
         if self.perfect is Claim.HELD:
-            legitimate = "stayed bounded" if self.has_bound else "did not"
-            run = f"perfect secrecy held in this run: its error grew while the legitimate one {legitimate}"
+            run = f"its error grew while the legitimate one {'stayed bounded' if self.has_bound else 'did not'}"
         if self.judged_by == "median" and self.trials > 1:
             run += " (judged by medians, because the variance is infinite)"
-        return f"{self.eavesdropper}: {times} × the legitimate error{over}; {run}; {promise}"
+        return f"{self.eavesdropper}: {run}; {promise}"
 
 
 @dataclass(frozen=True)

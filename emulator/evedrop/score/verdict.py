@@ -42,6 +42,13 @@ _GLYPHS = {
     SecrecyOutcome.BROKEN: "✗",
 }
 _ORDER = (SecrecyOutcome.BROKEN, SecrecyOutcome.OPEN, SecrecyOutcome.RELATIVE, SecrecyOutcome.PERFECT)
+
+
+def weakest(outcomes: Iterable[SecrecyOutcome]) -> SecrecyOutcome:
+    """The outcome that decides among several eavesdroppers, since one can break secrecy. Raises ValueError if there is none."""
+    return min(outcomes, key=_ORDER.index)
+
+
 _SMALLER = 0.8  # times the legitimate error: less is "more than the estimator", and the rest "as much"
 
 

@@ -148,7 +148,9 @@ def test_rounding_has_no_z() -> None:
     assert 0.0 < legitimate.metrics["mean_squared_error"] < 1e-25  # type: ignore[operator]
     assert legitimate.z == {"mean_squared_error": None}
     assert summary.secrecy["naive"].ratio is None
-    assert summary.secrecy["naive"].sentence.startswith("naive: ∞ × the legitimate error in slots 51 to 99;")
+    verdict = summary.secrecy["naive"].verdict
+    assert verdict is not None
+    assert verdict.times == "∞ ×"
 
 
 def test_infinite_variance_leaves_only_counts_a_standard_error() -> None:
@@ -353,9 +355,9 @@ def test_the_ratio_of_a_verdict_has_a_standard_error(recorded: Results, tmp_path
         for name in ("legitimate", "smart")
     )
     ratio, error = other.mean() / legitimate.mean(), ratio_error(other, legitimate)
-    sentence = recorded.summary["secrecy"]["smart"]["sentence"]
-    assert sentence.startswith(f"smart: {estimate(ratio, error)} × the legitimate error in slots 151 to 299;")
-    assert " ± " in sentence
+    secrecy = recorded.summary["secrecy"]["smart"]
+    assert secrecy["ratio_from"] == 151
+    assert (secrecy["ratio"], secrecy["ratio_standard_error"]) == (pytest.approx(ratio), pytest.approx(error))
     for scenario, trials in (("eavesdroppers", 1), ("numerical", 5)):
         alone = montecarlo(scenario, slots=50, trials=trials, out=tmp_path / scenario, plan=ALONE, expect=[])
         assert " ± " not in alone.summary["secrecy"]["smart"]["sentence"]

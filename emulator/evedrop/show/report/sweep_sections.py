@@ -25,7 +25,7 @@ from evedrop.model.metrics import all_metrics, error_column, shown_metric
 from evedrop.model.process import Floats
 from evedrop.results.tables import swept_strategies
 from evedrop.scenario.loading import value_of
-from evedrop.score.verdict import SecrecyOutcome
+from evedrop.score.verdict import SecrecyOutcome, weakest
 from evedrop.show.report.chart import Curve, LogChart
 from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.page import facts_table, made
@@ -55,7 +55,7 @@ class SweepSource:
     amount: str
     """How much was run."""
     outcome: str
-    """How many points were done, as a sentence."""
+    """At how many points the state is secret, as a sentence, or how many points were done."""
     inks: Mapping[str, str]
     """Receiver → its colour."""
 
@@ -70,11 +70,31 @@ class SweepSource:
             done, planned = len({tuple(row[key] for key in grid) for row in rows}), math.prod(map(len, grid.values()))
             sizes = (_size([row[name] for row in rows], name) for name in ("slots", "trials"))
             amount = " · ".join((f"{done:,} points of {', '.join(grid)}", *sizes))
-            outcome = f"All {planned:,} points were done" if done == planned else f"{done:,} of {planned:,} points"
+            outcome = "; ".join(_outcome(table.to_pylist(), list(grid), done, planned))
             changes, mode = entries["changes"], entries["mode"]
             return cls(folder, rows, entries["scenario"], changes, grid, mode, amount, outcome, inks)
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{folder} cannot be read as a sweep ({error}); run the sweep again") from error
+
+
+def _outcome(rows: Sequence[Mapping[str, Any]], keys: Sequence[str], done: int, planned: int) -> Iterator[str]:
+    """The verdict at each point, where there are eavesdroppers, then how many points were done if that is not said."""
+    at: dict[tuple[Any, ...], list[SecrecyOutcome]] = {}
+    for row in rows:
+        if row["verdict"] is not None:
+            at.setdefault(tuple(row[key] for key in keys), []).append(SecrecyOutcome(row["verdict"]))
+    counts = Counter(map(weakest, at.values()))
+    if list(counts.values()) == [planned]:
+        yield f"{next(iter(counts)).headline} at all {planned:,} points"
+        return
+    if counts:
+        yield ", ".join(
+            f"{outcome.headline} at {counts[outcome]:,}" for outcome in reversed(SecrecyOutcome) if counts[outcome]
+        )
+    if done < planned:
+        yield f"{done:,} of {planned:,} points were done"
+    elif not counts:
+        yield f"All {planned:,} points were done"
 
 
 def _size(counts: Sequence[int], of: str) -> str:
