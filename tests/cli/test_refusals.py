@@ -87,6 +87,7 @@ REFUSED = {
         view done --video done.mp3
         view done --slots 1:2
         view done --picture a.png --times 1:2
+        view done --panel scene
         """,
     "diff": """
         diff done

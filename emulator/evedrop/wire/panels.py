@@ -126,7 +126,7 @@ class WirePanels:
             ),
             row_shares=[1.1, 0.4 + 0.13 * min(links, 10), 1.0],
         )
-        return laid_out(rrb.Horizontal(left, right, column_shares=[1.25, 1.0]), ELAPSED)
+        return laid_out(rrb.Horizontal(left, right, column_shares=[1.25, 1.0], name="Wire"), ELAPSED)
 
     def style(self, to: rr.RecordingStream) -> None:
         """Record names and colours, once."""

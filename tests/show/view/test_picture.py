@@ -1,3 +1,4 @@
+import io
 import os
 import subprocess
 import sys
@@ -10,8 +11,10 @@ from typing import Any, cast
 import matplotlib.image
 import numpy as np
 import pytest
+from PIL import Image
 
 from evedrop.errors import UsageError
+from evedrop.show.view.palette import GROUND
 from evedrop.show.view.picture import HeadlessViewer, check_picture_name, picture_apart
 from evedrop.show.view.recording import ViewRecording
 from evedrop.show.view.viewer import guarded
@@ -73,24 +76,17 @@ def test_nobody_can_connect_to_who_draws(simulated: Callable[..., Simulated], tm
 
 
 @pytest.mark.pictures
-@pytest.mark.parametrize(("tab", "panels"), [(0, 8), (1, 9)], ids=["scene", "numbers"])
+@pytest.mark.parametrize(("tab", "panels"), [("scene", 8), ("numbers", 9)])
 @pytest.mark.parametrize(
     ("n", "growth"),
     [pytest.param(1, 1.0, marks=pytest.mark.long), (2, 1.12), pytest.param(4, 1.0, marks=pytest.mark.long)],
 )
 def test_every_panel_is_filled(
-    n: int,
-    growth: float,
-    tab: int,
-    panels: int,
-    simulated: Callable[..., Simulated],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    n: int, growth: float, tab: str, panels: int, simulated: Callable[..., Simulated], tmp_path: Path
 ) -> None:
     """For every process, each panel of both tabs draws something, in more than one colour, without a warning."""
-    monkeypatch.setattr("evedrop.show.view.recording.FIRST_TAB", tab)
     rrd = recorded(simulated(120, n=n, growth=growth), tmp_path / "r.rrd")
-    panels_are_filled(rrd, panels)
+    panels_are_filled(rrd, tab, panels)
 
 
 @pytest.mark.pictures
@@ -100,6 +96,33 @@ def test_picture_is_a_png_of_that_size(simulated: Callable[..., Simulated], tmp_
     with skipped_without_driver():
         assert picture_apart(rrd, tmp_path / "r.png", size=(1200, 800)) == []
     assert np.asarray(matplotlib.image.imread(tmp_path / "r.png")).shape[:2] == (800, 1200)
+
+
+@pytest.mark.pictures
+@pytest.mark.parametrize("panel", ["smart", "scene"])
+def test_a_picture_of_a_panel_has_no_frame(panel: str, simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """Neither the window's bars nor its border: at the left, the right and the bottom is the ground of the panel."""
+    rrd = recorded(simulated(60), tmp_path / "r.rrd")
+    with skipped_without_driver():
+        assert picture_apart(rrd, tmp_path / "r.png", 30, (640, 400), panel) == []
+    pixels = np.round(255 * np.asarray(matplotlib.image.imread(tmp_path / "r.png")))[..., :3]
+    assert pixels.shape == (400, 640, 3)
+    if panel == "scene":  # the verdict is at the top, and the strip of packets at the bottom
+        assert pixels[0, 0].tolist() == pixels[20, 0].tolist()
+        assert len(np.unique(pixels[-1, :300], axis=0)) > 1
+    else:
+        for edge in (pixels[40:, 0], pixels[40:, -1], pixels[-1]):
+            assert np.unique(edge, axis=0).tolist() == [list(GROUND)]
+
+
+@pytest.mark.pictures
+def test_a_panel_that_the_recording_lacks_is_refused(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """With the panels that it has, and a hint; no file appears."""
+    rrd = recorded(simulated(60), tmp_path / "r.rrd")
+    with skipped_without_driver(), pytest.raises(UsageError, match="did you mean smart") as told:
+        picture_apart(rrd, tmp_path / "r.png", panel="smurt")
+    assert "give scene, numbers, verdict, what-happens, estimator, " in str(told.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["r.rrd"]
 
 
 def test_missing_driver_is_named(
@@ -138,9 +161,11 @@ class SlowClient:
         self.opened = urls
 
     def take_screenshot(self, *_: object) -> bytes:
-        """A picture."""
+        """A picture of a window."""
         self._refuse()
-        return b"picture"
+        file = io.BytesIO()
+        Image.new("RGB", (102, 117), (200, 0, 0)).save(file, "PNG")
+        return file.getvalue()
 
     def set_time(self, *_: object, **__: object) -> None:
         """Show another moment."""
@@ -159,7 +184,8 @@ def test_a_busy_machine_does_not_end_a_picture() -> None:
     viewer.show(4)
     with pytest.raises(UsageError, match="slot 10 is not in the run; give one from 0 to 9"):
         viewer.show(10)
-    assert viewer.settle() == b"picture"
+    with Image.open(io.BytesIO(viewer.settle())) as picture:
+        assert picture.size == (100, 50)
 
 
 def test_a_viewer_that_has_ended_is_not_asked_again() -> None:

@@ -32,7 +32,7 @@ def pictures(moments: Sequence[float]) -> list[bytes]:
 def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of one colour in place of those of a viewer."""
 
-    def frames(_rrd: Path, moments: Sequence[float], _size: object, complaints: list[str]) -> object:
+    def frames(_rrd: Path, moments: Sequence[float], _size: object, _panel: None, complaints: list[str]) -> object:
         yield from pictures(moments)
         complaints.append("a complaint")
 
@@ -110,7 +110,7 @@ def test_a_full_disk_is_said_and_leaves_no_file(name: str, tmp_path: Path) -> No
     kind = VIDEO_FILES[Path(name).suffix]
     files = {Path(name).suffix: lambda _, rate: kind(Path("/dev/full"), rate)}
     with pytest.raises(UsageError, match=r"cannot be written \(.*No space left on device"):
-        video_apart(tmp_path / "r.rrd", tmp_path / name, range(9), SIZE, 15.0, lambda _: None, files)
+        video_apart(tmp_path / "r.rrd", tmp_path / name, range(9), SIZE, 15.0, lambda _: None, files=files)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -158,6 +158,7 @@ def test_a_missing_ffmpeg_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         (("--video", "v.gif", "--slots", "0:2.5"), "whole numbers"),
         (("--picture", "v.png", "--slots", "0:9"), "--video"),
         (("--picture", "v.svg"), "pixels"),
+        (("--panel", "scene"), "--picture or --video"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(

@@ -66,13 +66,15 @@ def view(options: argparse.Namespace) -> int:
         from evedrop.show.view.picture import SIZE, picture_apart
 
         slot = _chosen_slot(options.run) if options.slot is None else options.slot
-        for complaint in picture_apart(recording, options.picture, slot, options.size or SIZE):
+        for complaint in picture_apart(recording, options.picture, slot, options.size or SIZE, options.panel):
             print(complaint, file=sys.stderr)
     return 0
 
 
 def _check_names(options: argparse.Namespace) -> None:
     """Raise UsageError for a picture or a video that cannot be made, before anything is drawn."""
+    if options.panel is not None and options.picture is None and options.video is None:
+        raise UsageError("--panel is for a picture or a video; give --picture or --video, too")
     if options.picture is not None:
         from evedrop.show.view.picture import check_picture_name
 
@@ -134,7 +136,7 @@ def _film(recording: Path, options: argparse.Namespace, moments: Sequence[float]
             line.on_event(RunProgress(done, done / (time.monotonic() - start), "frames/s", {}))
 
         size, rate = options.size or VIDEO_SIZE, options.fps or FRAME_RATE
-        complaints = video_apart(recording, options.video, moments, size, rate, on_event)
+        complaints = video_apart(recording, options.video, moments, size, rate, on_event, options.panel)
     frames = f"{len(moments)} frames are" if len(moments) > 1 else "1 frame is"
     print("\n".join([*complaints, f"{frames} in {options.video}"]))
     return 0
@@ -178,7 +180,8 @@ def _view_wire(options: argparse.Namespace) -> int:
         if options.picture is None:
             _hold("wire", open_run(options.run, options.view, web_address, recording))
             return 0
-        for complaint in picture_apart(recording, options.picture, options.time, options.size or PICTURE_SIZE):
+        size = options.size or PICTURE_SIZE
+        for complaint in picture_apart(recording, options.picture, options.time, size, options.panel):
             print(complaint, file=sys.stderr)
     return 0
 
@@ -241,6 +244,11 @@ def _shown(parser: argparse.ArgumentParser) -> None:
     )
     moment.add_argument(
         "--times", type=_moments, metavar="A:B[:STEP]", help="for a wire: the times of a video, in seconds"
+    )
+    parser.add_argument(
+        "--panel",
+        metavar="NAME",
+        help="the tab or panel to draw, such as numbers or squared-error; default the first tab",
     )
     rate = number_type(1, _MOST_RATE, f"a number of frames per second from 1 to {_MOST_RATE}")
     parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of a video; default 15")

@@ -1,8 +1,8 @@
 """Draws a finished recording without a screen: pictures of some moments, or a video of many, as MP4 or GIF.
 
-A process of its own draws, with Rerun's viewer. Its pipes are read and written with a limit: a process that hangs must not hang
-the command. Of a video, only a few pictures are in memory at any time. The viewer needs a Vulkan driver; a software driver is
-enough, such as Debian's mesa-vulkan-drivers.
+A picture shows a tab or a panel, without the frame of the viewer's window. A process of its own draws, with Rerun's viewer. Its
+pipes are read and written with a limit: a process that hangs must not hang the command. Of a video, only a few pictures are in
+memory at any time. The viewer needs a Vulkan driver; a software driver is enough, such as Debian's mesa-vulkan-drivers.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from rerun.experimental import ViewerClient, ViewerState
 
 from evedrop.errors import RunError, UsageError
 from evedrop.show.view.column import ELAPSED, TIMELINE
+from evedrop.show.view.layout import Layout
 from evedrop.show.view.viewer import PortTaken, end, guarded, spawn, without_driver
 from evedrop.system.environment import viewer_environment
 from evedrop.system.files import whole_file
@@ -90,6 +91,8 @@ _FILE_HEADER_BYTES = 12
 _MESSAGE_HEADER = struct.Struct("<QQ")  # the kind of the message, and the number of its bytes
 _END = 0
 _FOOTER_BYTES, _FOOTER_WORD = 32, b"RRF2FOOT"
+_FRAME = (1, 37, 1, 30)
+"""Pixels of the viewer's window around the layout: left, top with its bar, right, and bottom with the collapsed time panel."""
 _TINY = 16  # pixels: even the smallest picture makes the viewer draw everything once, and it is sent quickly
 
 T = TypeVar("T")
@@ -131,9 +134,15 @@ class HeadlessViewer:
             slot = self._last if moment is None else int(moment)
             self._answer(lambda: self._client.set_time(TIMELINE, sequence=slot, play_state="paused"))
 
+    def choose(self, panel: str | None) -> None:
+        """Show only a panel or a tab, by default the first tab. Raises UsageError if the recording has no such panel."""
+        layout = Layout(self._answer(self._client.get_blueprint).blueprint).alone(panel)
+        self._answer(lambda: self._client.set_blueprint(layout, of="recording"))
+
     def take(self, view_id: str | None = None) -> bytes:
         """What is shown, or one of its views, as PNG. The first picture after `show` may still show the previous moment."""
-        return self._answer(lambda: self._client.take_screenshot(view_id))
+        png = self._answer(lambda: self._client.take_screenshot(view_id))
+        return png if view_id is not None else _without_frame(png)
 
     def frame(self, moment: float) -> bytes:
         """A picture of a moment after another one, as PNG. Raises UsageError as `show` does."""
@@ -172,11 +181,23 @@ class HeadlessViewer:
                     raise RuntimeError(f"no answer within {_PATIENCE:.0f} s") from error
 
 
-@contextmanager
-def opened(rrd: Path, size: tuple[int, int], moment: float | None = None) -> Iterator[HeadlessViewer]:
-    """A viewer that has loaded a recording and shows a moment of it, by default the last, ready to be drawn.
+def _without_frame(png: bytes) -> bytes:
+    """The picture of a window without its frame."""
+    left, top, right, bottom = _FRAME
+    with Image.open(BytesIO(png)) as window, BytesIO() as file:
+        window.crop((left, top, window.width - right, window.height - bottom)).save(file, "PNG")
+        return file.getvalue()
 
-    Raises UsageError if there is no Vulkan driver, the recording cannot be loaded, or the viewer fails.
+
+@contextmanager
+def opened(
+    rrd: Path, size: tuple[int, int], moment: float | None = None, panel: str | None = None
+) -> Iterator[HeadlessViewer]:
+    """A viewer that has loaded a recording, ready to draw pictures of this size.
+
+    moment: that it shows, by default the last. panel: the panel or tab that it shows, by default the first tab.
+
+    Raises UsageError if there is no Vulkan driver, the recording cannot be loaded or has no such panel, or the viewer fails.
     """
     check(rrd)
     with tempfile.TemporaryDirectory() as folder:
@@ -184,6 +205,7 @@ def opened(rrd: Path, size: tuple[int, int], moment: float | None = None) -> Ite
         process, port = _started(size, logs)
         try:
             viewer = HeadlessViewer(ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy"), process, rrd)
+            viewer.choose(panel)
             viewer.show(moment)
             viewer.settle()
             yield viewer
@@ -233,10 +255,12 @@ def _check_end(rrd: Path) -> None:
 
 
 def _started(size: tuple[int, int], logs: Path) -> tuple[subprocess.Popen[bytes], int]:
-    """A viewer's process, and the port on which it listens."""
+    """A viewer's process, and the port on which it listens; size: of its pictures."""
+    left, top, right, bottom = _FRAME
+    window = f"{size[0] + left + right}x{size[1] + top + bottom}"
     for attempt in range(1, _ATTEMPTS + 1):
         port = free_port()
-        shown = ["--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
+        shown = ["--window-size", window, "--hide-welcome-screen"]
         try:
             # Otherwise the viewer would write into the picture that it is drawing without a graphics card.
             quiet = {"RUST_LOG": "error"}
@@ -273,23 +297,26 @@ def check_picture_name(path: Path) -> None:
         raise UsageError(f"--picture {path} is not the name of a PNG file; give one that ends in .png")
 
 
-def picture_apart(rrd: Path, png: Path, moment: float | None = None, size: tuple[int, int] = SIZE) -> list[str]:
+def picture_apart(
+    rrd: Path, png: Path, moment: float | None = None, size: tuple[int, int] = SIZE, panel: str | None = None
+) -> list[str]:
     """Draw a moment of a recording, by default its last, to a PNG file; returns the panels' complaints.
 
-    moment: a slot of a run, or seconds since the start of a wire. The file appears when it is complete.
+    moment: a slot of a run, or seconds since the start of a wire. panel: the panel or tab, by default the first tab. The file
+    appears when it is complete.
 
-    Raises UsageError if there is no Vulkan driver, the recording cannot be loaded, or the file cannot be written, and RunError if
-    the process that draws hangs.
+    Raises UsageError if there is no Vulkan driver, the recording cannot be loaded or has no such panel, or the file cannot be
+    written, and RunError if the process that draws hangs.
     """
     complaints: list[str] = []
     with whole_file(png) as temporary:
-        for frame in frames_apart(rrd, None if moment is None else [moment], size, complaints):
+        for frame in frames_apart(rrd, None if moment is None else [moment], size, panel, complaints):
             temporary.write_bytes(frame)
     return complaints
 
 
 def frames_apart(
-    rrd: Path, moments: Iterable[float] | None, size: tuple[int, int], complaints: list[str]
+    rrd: Path, moments: Iterable[float] | None, size: tuple[int, int], panel: str | None, complaints: list[str]
 ) -> Generator[bytes, None, None]:
     """Pictures of some moments, or of the last one, as PNG; the panels' complaints about the last are added to `complaints`.
 
@@ -299,7 +326,8 @@ def frames_apart(
     Raises UsageError as `picture_apart` does, and RunError if the process hangs.
     """
     check(rrd)
-    command = [sys.executable, "-P", "-m", "evedrop.show.view.picture", str(rrd), *map(str, size)]
+    chosen = [] if panel is None else [panel]
+    command = [sys.executable, "-P", "-m", "evedrop.show.view.picture", str(rrd), *map(str, size), *chosen]
     with tempfile.TemporaryFile() as told:
         process = subprocess.Popen(
             guarded(command, apart=True),
@@ -344,12 +372,13 @@ def _why(process: subprocess.Popen[bytes], told: IO[bytes]) -> str:
 
 def main(words: Sequence[str]) -> int:
     """Draw what `frames_apart` asks for; returns the exit status."""
-    rrd, width, height = words
+    rrd, width, height, *chosen = words
+    panel = chosen[0] if chosen else None
     out = sys.stdout.buffer
     try:
         with raise_on_signals():
             first = sys.stdin.readline().strip()
-            with opened(Path(rrd), (int(width), int(height)), _moment(first)) as viewer:
+            with opened(Path(rrd), (int(width), int(height)), _moment(first), panel) as viewer:
                 later = (viewer.frame(float(line)) for line in sys.stdin)
                 for frame in itertools.chain([viewer.take()], later):
                     out.write(len(frame).to_bytes(_LENGTH_BYTES) + frame)
@@ -532,19 +561,20 @@ def video_apart(
     size: tuple[int, int],
     rate: float,
     on_progress: Callable[[int], None],
+    panel: str | None = None,
     files: Mapping[str, Callable[[Path, float], VideoFile]] = VIDEO_FILES,
 ) -> list[str]:
     """Draw some moments of a recording as a video; returns the panels' complaints. The file appears when it is complete.
 
-    rate: frames per second. on_progress: is called with the number of frames so far. files: the end of a name → what writes the
-    video.
+    rate: frames per second. on_progress: is called with the number of frames so far. panel: as in `picture_apart`. files: the end
+    of a name → what writes the video.
 
     Raises UsageError as `picture_apart` does, and if such a video cannot be made here.
     """
     check_video(path, size, rate)
     complaints: list[str] = []
     # The last moment first: if it is not in the recording, nothing is drawn in vain.
-    pictures = frames_apart(rrd, chain([moments[-1]], moments), size, complaints)
+    pictures = frames_apart(rrd, chain([moments[-1]], moments), size, panel, complaints)
     with whole_file(path) as temporary, closing(pictures), _opened(files[path.suffix.lower()](temporary, rate)) as file:
         next(pictures)
         for done, picture in enumerate(pictures, 1):

@@ -41,7 +41,8 @@ class VerdictLine(ViewPanel):
 
     def views(self) -> Iterator[PlacedView]:
         """One view without a title bar, above both tabs."""
-        yield PlacedView(rrb.TextDocumentView(origin=_TITLE_PATH, titlebar=False), "verdict", height=VERDICT_HEIGHT)
+        view = rrb.TextDocumentView(name="Verdict", origin=_TITLE_PATH, titlebar=False)
+        yield PlacedView(view, "verdict", height=VERDICT_HEIGHT)
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The verdict on the slots so far, about once a second, if it has changed."""
