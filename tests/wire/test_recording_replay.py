@@ -17,10 +17,11 @@ from PIL import Image
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WIRE_FILE
+from evedrop.show.view import picture
 from evedrop.wire import recording
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.recording import PICTURE_SIZE, replay_wire
+from evedrop.wire.recording import PICTURE_SIZE, replay_wire, wire_seconds
 from evedrop.wire.records import UNLINKED, Kind, WireFate
 from evedrop.wire.time_steps import LaneState
 from tests.conftest import LIMIT
@@ -131,16 +132,32 @@ def test_a_video_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) -> N
         assert (gif.size, getattr(gif, "n_frames", 1)) == ((400, 320), 3)
 
 
+def test_a_video_shows_the_whole_wire_in_ten_seconds(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If no times are given: from its start to its last message."""
+    asked = list[list[float]]()
+
+    def video(*values: Any) -> list[str]:
+        asked.append(values[2])
+        return []
+
+    monkeypatch.setattr(picture, "video_apart", video)
+    assert main(["view", str(folder), "--video", str(folder / "w.gif"), "--fps", "3"]) == 0
+    (times,) = asked
+    assert len(times) == 30
+    assert times[0] == 0.0
+    assert times[-1] == wire_seconds(folder) > 11.5
+    assert np.allclose(np.diff(times), times[-1] / 29)
+
+
 @pytest.mark.parametrize(
     ("words", "advice"),
     [
-        ((), "--times FIRST:LAST"),
         (("--slots", "0:3"), "give --times"),
         (("--times", "0:1e12"), "more than 1,000,000 frames"),
         (("--times", "0:1000000:1"), "more than 1,000,000 frames"),
     ],
 )
-def test_a_video_of_a_wire_needs_times(
+def test_a_video_of_a_wire_refuses_such_times(
     words: tuple[str, ...], advice: str, folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """A wire has no slots, so `--slots` is refused."""

@@ -146,10 +146,7 @@ def replay_wire(folder: Path, path: Path) -> Path:
     Rerun never returns from a disk that is full.
     """
     plan, history = load_wire(folder / WIRE_FILE), WireHistory.read(folder / JOURNAL_FOLDER)
-    ends = [pc.max(table["time"]).as_py() for table in journal_tables(folder, history.start) if table.num_rows]
-    if not ends:
-        raise UsageError(f"{folder} shows nothing: no message came to the wire since its latest start")
-    pace = Pace.of_length(max(0.0, max(ends) - history.began))
+    pace = Pace.of_length(_seconds(folder, history))
     panels, counter = WirePanels(plan, pace), StepCounter(len(plan.links), pace.step, history.began)
     links = {link.name: link.number for link in plan.links}
     recording = _Replay(path, folder.resolve().name, panels, [*_notices(plan, history)])
@@ -163,6 +160,20 @@ def replay_wire(folder: Path, path: Path) -> Path:
         path.unlink(missing_ok=True)
         raise UsageError(f"{path} cannot be written ({recording.failure})")
     return path
+
+
+def wire_seconds(folder: Path) -> float:
+    """The time from the latest start of a wire to its last message. Raises UsageError as `replay_wire` does."""
+    return _seconds(folder, WireHistory.read(folder / JOURNAL_FOLDER))
+
+
+def _seconds(folder: Path, history: WireHistory) -> float:
+    ends: list[float] = [
+        pc.max(table["time"]).as_py() for table in journal_tables(folder, history.start) if table.num_rows
+    ]
+    if not ends:
+        raise UsageError(f"{folder} shows nothing: no message came to the wire since its latest start")
+    return max(0.0, max(ends) - history.began)
 
 
 @final

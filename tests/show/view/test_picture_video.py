@@ -3,13 +3,16 @@ from collections.abc import Iterable, Sequence
 from io import BytesIO
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from evedrop import montecarlo
+from evedrop.cli.main import main
 from evedrop.errors import UsageError
-from evedrop.show.view import picture
+from evedrop.show.view import picture, telling_slot
 from evedrop.show.view.picture import VIDEO_FILES, check_video, video_apart
 from tests.conftest import Evedrop
 from tests.privileged import CannotRun, skip
@@ -68,6 +71,65 @@ def test_a_gif_has_all_frames_in_order_and_the_length_that_was_asked_for(tmp_pat
     assert length == 1000
     assert told == list(range(1, 16))
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_gif_has_the_pixels_that_changed_and_shows_them_exactly(tmp_path: Path) -> None:
+    """A square of many colours moves over a coloured ground, and rests: the frames after the first are small."""
+    generator, path = np.random.default_rng(7), tmp_path / "v.gif"
+    ground = generator.choice(np.arange(0, 250, 50, dtype=np.uint8), (240, 320, 3))
+    square = generator.choice(np.array([1, 126, 251], np.uint8), (12, 12, 3))
+    shown = []
+    for number in (0, 1, 2, 2, 3, 150):
+        frame = ground.copy()
+        frame[number : number + 12, 2 * number : 2 * number + 12] = square
+        shown.append(frame)
+    file = VIDEO_FILES[".gif"](path, 15.0)
+    for frame in shown:
+        png = BytesIO()
+        Image.fromarray(frame).save(png, "PNG")
+        file.add(png.getvalue())
+    file.finish()
+    with Image.open(path) as gif:
+        for number, frame in enumerate(shown):
+            gif.seek(number)
+            assert np.array_equal(np.asarray(gif.convert("RGB")), frame)
+    assert path.stat().st_size < 2 * ground.nbytes / 3
+
+
+def defaults(
+    run: Path, words: Sequence[str], chosen: int | None, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Sequence[float], float]:
+    """The moments and frames per second of a video whose slots nobody gives; chosen: the most telling slot, if any."""
+    asked = list[tuple[Sequence[float], float]]()
+
+    def video(*values: Any) -> list[str]:
+        asked.append((values[2], values[4]))
+        return []
+
+    monkeypatch.setattr(telling_slot, "telling_slot", lambda _: chosen)
+    monkeypatch.setattr(picture, "video_apart", video)
+    assert main(["view", str(run), "--video", str(run / "v.gif"), *words]) == 0
+    return asked[0]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "slots"), [(30, range(15, 35)), (3, range(20)), (59, range(40, 60))], ids=["middle", "start", "end"]
+)
+def test_a_video_takes_ten_seconds_around_the_most_telling_slot(
+    chosen: int, slots: range, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three quarters of the slots are before it, where the run has as many; --fps changes the number, not the time."""
+    assert defaults(finished, ["--fps", "2"], chosen, monkeypatch) == (slots, 2.0)
+
+
+@pytest.mark.parametrize(("rate", "count"), [("4", 40), ("15", 60)])
+def test_a_video_of_a_run_that_each_picture_shows_whole_takes_ten_seconds(
+    rate: str, count: int, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the first slot to the last, each at most once: a run of fewer slots takes less time."""
+    moments, _ = defaults(finished, ["--fps", rate], None, monkeypatch)
+    assert (len(moments), moments[0], moments[-1]) == (count, 0, 59)
+    assert list(moments) == sorted({*moments})
 
 
 @pytest.mark.usefixtures("drawn")

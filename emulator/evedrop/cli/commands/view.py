@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from evedrop.show.view.viewer import Viewer
 
 _MOST_RATE = 60
-_BEFORE, _AFTER = 60, 20  # slots of a video around the most telling one
+_SECONDS = 10.0  # of a video
+_BEFORE = 0.75  # of the slots of a video, before the most telling one
 _MOST_TIMES = 1_000_000  # frames of a video of a wire: eighteen hours at 15 a second
 _LEAST, _MOST = 320, 3840  # pixels; the viewer takes more than its time limit for larger pictures
 
@@ -90,30 +91,42 @@ def _check_names(options: argparse.Namespace) -> None:
 
 
 def _slots_of(options: argparse.Namespace) -> Sequence[int]:
-    """The slots of a video."""
+    """The slots of a video: some that are given, or those of ten seconds."""
     if options.times is not None:
         raise UsageError("--times is for wires; a run has slots, so give --slots")
     if options.slots is None:
         from evedrop.results.reading import Results
 
-        last = int(Results.read(options.run).summary["slots"]) - 1
+        slots, frames = int(Results.read(options.run).summary["slots"]), _frames_of(options)
         slot = _chosen_slot(options.run)
-        middle = last if slot is None else slot
-        return range(max(0, middle - _BEFORE), min(last, middle + _AFTER) + 1)
+        if slot is None:  # every picture shows the whole run
+            count = min(slots, frames)
+            return [(slots - 1) * i // max(1, count - 1) for i in range(count)]
+        first = max(0, min(slots - frames, slot - int(_BEFORE * frames)))
+        return range(first, min(slots, first + frames))
     first, last, step = options.slots
     if not all(float(part).is_integer() for part in options.slots if part is not None):
         raise UsageError("--slots has a fraction of a slot; give whole numbers")
     return range(int(first), int(last) + 1, int(step or 1))
 
 
-def _times_of(options: argparse.Namespace) -> Sequence[float]:
-    """The times of a video of a wire: by default in real time."""
+def _frames_of(options: argparse.Namespace) -> int:
+    """The frames of a video of ten seconds."""
     from evedrop.show.view.picture import FRAME_RATE
+
+    return round(_SECONDS * (options.fps or FRAME_RATE))
+
+
+def _times_of(options: argparse.Namespace) -> Sequence[float]:
+    """The times of a video of a wire: some that are given, in real time, or the whole wire in ten seconds."""
+    from evedrop.show.view.picture import FRAME_RATE
+    from evedrop.wire.recording import wire_seconds
 
     if options.slots is not None:
         raise UsageError(f"--slots is for runs, and {options.run} is the folder of a wire; give --times")
     if options.times is None:
-        raise UsageError("a video of a wire needs --times FIRST:LAST, in seconds, such as --times 0:10")
+        seconds, frames = wire_seconds(options.run), _frames_of(options)
+        return [seconds * i / (frames - 1) for i in range(frames)]
     first, last, step = options.times
     step = 1.0 / (options.fps or FRAME_RATE) if step is None else step
     if (last - first) / step >= _MOST_TIMES:
@@ -240,10 +253,10 @@ def _shown(parser: argparse.ArgumentParser) -> None:
         "--slots",
         type=_moments,
         metavar="A:B[:STEP]",
-        help="the slots of a video; default 81 around the most telling one",
+        help="the slots of a video; default ten seconds around the most telling one",
     )
     moment.add_argument(
-        "--times", type=_moments, metavar="A:B[:STEP]", help="for a wire: the times of a video, in seconds"
+        "--times", type=_moments, metavar="A:B[:STEP]", help="for a wire: the times of a video, in seconds; default all"
     )
     parser.add_argument(
         "--panel",
@@ -253,7 +266,7 @@ def _shown(parser: argparse.ArgumentParser) -> None:
     rate = number_type(1, _MOST_RATE, f"a number of frames per second from 1 to {_MOST_RATE}")
     parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of a video; default 15")
     parser.add_argument(
-        "--size", type=_size, metavar="WxH", help="in pixels; default 1600x950 for a picture, 1200x720 for a video"
+        "--size", type=_size, metavar="WxH", help="in pixels; default 1600x950 for a picture, 880x660 for a video"
     )
 
 

@@ -25,6 +25,8 @@ from itertools import chain
 from pathlib import Path
 from typing import IO, Final, TypeVar, final
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import GifImagePlugin, Image
 from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient, ViewerState
@@ -397,12 +399,14 @@ def _moment(line: str) -> float | None:
     return None if line == _LAST else float(line)
 
 
-VIDEO_SIZE = (1200, 720)
-"""Width and height of a video in pixels."""
+VIDEO_SIZE = (880, 660)
+"""Width and height of a video in pixels: its words can be read where a page shows it in full."""
 FRAME_RATE = 15.0
 """Frames per second."""
 _MOST_GIF_RATE = 50.0  # browsers show faster ones slowly
-_COLOURS = 256
+_TRANSPARENT = 255
+"""The last of the colours of a frame of a GIF, in which the pixel of the frame before it is seen."""
+_KEEP = 1  # the next frame is drawn over this one
 _HUNDREDTH = 10  # milliseconds, the unit of a GIF
 
 
@@ -490,22 +494,42 @@ class Mp4File(VideoFile):
 
 @final
 class GifFile(VideoFile):
-    """A GIF that repeats; each frame has colours of its own. Pillow's own writer of several frames would keep all in memory."""
+    """A GIF that repeats. Each frame has only the pixels that are not as in the frame before it, in colours of its own.
+
+    Pillow's own writer of several frames would keep all in memory.
+    """
 
     def __init__(self, path: Path, rate: float) -> None:
         self._file = path.open("wb")
         self._rate = rate
         self._frames = 0
+        self._shown: NDArray[np.uint8] | None = None
 
     def add(self, png: bytes) -> None:
         """See `VideoFile`."""
-        frame = Image.open(BytesIO(png)).convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
-        if not self._frames:
+        with Image.open(BytesIO(png)) as picture:
+            pixels = np.asarray(picture.convert("RGB"))
+        changed = np.ones(pixels.shape[:2], np.bool_) if self._shown is None else (pixels != self._shown).any(axis=2)
+        changed[0, 0] |= not changed.any()  # a frame has at least one pixel
+        rows, columns = (np.flatnonzero(changed.any(axis=axis)) for axis in (1, 0))
+        part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        frame = _quantized(pixels[part], changed[part])
+        if self._shown is None:
             header, _ = GifImagePlugin.getheader(frame, info={"loop": 0})
             self._file.writelines(header)
+        self._shown = pixels
         self._frames += 1
         duration = self._hundredths(self._frames) - self._hundredths(self._frames - 1)
-        self._file.writelines(GifImagePlugin.getdata(frame, duration=duration * _HUNDREDTH, include_color_table=True))
+        self._file.writelines(
+            GifImagePlugin.getdata(
+                frame,
+                (int(columns[0]), int(rows[0])),
+                duration=duration * _HUNDREDTH,
+                include_color_table=True,
+                transparency=_TRANSPARENT,
+                disposal=_KEEP,
+            )
+        )
 
     def finish(self) -> None:
         """See `VideoFile`."""
@@ -520,6 +544,17 @@ class GifFile(VideoFile):
     def _hundredths(self, frames: int) -> int:
         """When a frame ends, in hundredths of a second."""
         return round(100.0 * frames / self._rate)
+
+
+def _quantized(pixels: NDArray[np.uint8], changed: NDArray[np.bool_]) -> Image.Image:
+    """The changed ones of some pixels (h, w, 3), at least one, in the 255 colours that suit them; the others are transparent."""
+    drawn = Image.fromarray(pixels[changed][None]).quantize(_TRANSPARENT, dither=Image.Dither.NONE)
+    indices = np.full(changed.shape, _TRANSPARENT, np.uint8)
+    indices[changed] = np.asarray(drawn)[0]
+    frame = Image.frombytes("P", changed.shape[::-1], indices.tobytes())
+    palette = drawn.getpalette() or []
+    frame.putpalette(palette + [0] * (3 * (_TRANSPARENT + 1) - len(palette)))
+    return frame
 
 
 VIDEO_FILES: Mapping[str, Callable[[Path, float], VideoFile]] = {".mp4": Mp4File, ".gif": GifFile}

@@ -102,7 +102,7 @@ def _tabbed(placed: Sequence[PlacedView]) -> rrb.Container:
     tabs: list[rrb.Container] = [_arranged([view for view in placed if view.side not in {"verdict", *SCENE}])]
     if any(view.side == "worlds" for view in placed):
         tabs.insert(0, _scene([view for view in placed if view.side in SCENE]))
-    body = tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=FIRST_TAB)
+    body = tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0)
     if not above:
         return body
     height = max(view.height for view in above)
@@ -130,8 +130,6 @@ def _rows(worlds: Sequence[PlacedView]) -> list[Sequence[PlacedView]]:
 
 
 SCENE_TAB, NUMBERS_TAB = "Scene", "Numbers"
-FIRST_TAB = 0
-"""The tab that is open at first. Public, because a viewer without a screen draws no views of another one, and tests draw them."""
 MOST_WORLDS = 9
 """Receivers that have a world in the scene; the numbers show all."""
 _GRID = 1.25  # times as wide as what happens
