@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
 from evedrop.show.view.column import laid_out
-from evedrop.show.view.panels.curves import SquaredError
+from evedrop.show.view.panels.curves import SquaredError, TraceOfP
 from evedrop.show.view.panels.plane import frames, stride
 from evedrop.show.view.recording import ViewRecording
 from evedrop.show.view.scene import Scene
@@ -55,10 +55,10 @@ def test_curves_are_logarithms_at_full_rate(run: Simulated, rrd: Path) -> None:
             shown = rows(rrd, f"{kind}/{name}", "Scalars:scalars")
             curve = np.array([shown[k][0] for k in range(SLOTS)])
             above = curve > curve.min()
-            np.testing.assert_allclose(curve[above], np.log10(values[above]), rtol=1e-12)
+            np.testing.assert_allclose(curve[above], np.log10(np.sqrt(values[above])), rtol=1e-12)
             if kind == "error":
                 lowest.append(curve.min())
-                assert (np.log10(np.maximum(values[~above], 1e-300)) <= curve.min()).all()
+                assert (np.sqrt(values[~above]) <= 1.001 * 10.0 ** curve.min()).all()
     assert max(lowest) == min(lowest)
 
 
@@ -71,22 +71,55 @@ def test_styles_come_before_the_first_slot(rrd: Path) -> None:
 
 
 def test_bands_of_several_trials(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
-    """Their edges are 1.96 standard errors from the mean, in every slot; a single trial has none."""
+    """Their edges are 1.96 standard errors of the logarithm from the mean, in every slot; a single trial has none."""
     several, alone = simulated(30, trials=12), simulated(30)
     record(several, tmp_path / "several.rrd")
     for name, peer in several.slots.peers.items():
         for side, sign in (("low", -1), ("high", 1)):
             shown = rows(tmp_path / "several.rrd", f"band/{name}/{side}", "Scalars:scalars")
-            edge = peer.squared_error + sign * 1.96 * peer.standard_error
+            edge = peer.squared_error * np.exp(sign * 1.96 * peer.standard_error / peer.squared_error)
             assert sorted(shown) == list(range(30))
             # A tenth of tr Q / trials = 0.04 / 12, rounded down to a power of ten, is the least that is shown.
             heights = [shown[k][0] for k in range(30)]
-            np.testing.assert_allclose(heights, np.log10(np.maximum(edge, 1e-4)), rtol=1e-9)
+            np.testing.assert_allclose(heights, np.log10(np.sqrt(np.maximum(edge, 1e-4))), rtol=1e-9)
         assert (peer.standard_error > 0.0).any()
     assert any("band" in path for path in SquaredError(several.scene).styles())
     assert not any("band" in path for path in SquaredError(alone.scene).styles())
     assert {column.path for column in SquaredError(alone.scene).columns(alone.slots)} == {
         f"error/{name}" for name in alone.slots.peers
+    }
+
+
+def test_bands_do_not_fall_to_the_floor(simulated: Callable[..., Simulated]) -> None:
+    """A band around a mean above the floor stays within a factor of ten of it, although the mean minus 1.96 errors is below 0."""
+    run = simulated(3, trials=20)
+    mean, error = np.array([1.0, 0.05, 0.0]), np.array([0.9, 0.04, 0.0])
+    peers = {name: peer.changed(squared_error=mean, standard_error=error) for name, peer in run.slots.peers.items()}
+    drawn = {
+        column.path: next(iter(column.values)).as_arrow_array().flatten().to_numpy()
+        for column in SquaredError(run.scene).columns(run.slots.changed(peers=peers))
+    }
+    curve, low, high = drawn["error/smart"], drawn["band/smart/low"], drawn["band/smart/high"]
+    assert (curve[:2] - low[:2] < 0.5).all()
+    np.testing.assert_allclose(curve - low, high - curve, atol=1e-12)
+    assert low[2] == curve[2] == curve.min()
+
+
+def test_numbers_of_a_logarithmic_axis_are_explained(simulated: Callable[..., Simulated]) -> None:
+    """In the panels' titles, with the unit of the states if they have a common one."""
+    scene = simulated(20).scene
+    titles = {
+        units: [
+            str(placed.view.name)
+            for panel in (SquaredError, TraceOfP)
+            for placed in panel(replace(scene, units=units)).views()
+        ]
+        for units in ((), ("m", "m"), ("m", "m/s"))
+    }
+    assert titles == {
+        (): ["Error   −1: 0.1 · 1: 10", "Root of tr P   dim: theory   −1: 0.1 · 1: 10"],
+        ("m", "m"): ["Error   −1: 0.1 m · 1: 10 m", "Root of tr P   dim: theory   −1: 0.1 m · 1: 10 m"],
+        ("m", "m/s"): ["Error   −1: 0.1 · 1: 10   (m, m/s)", "Root of tr P   dim: theory   −1: 0.1 · 1: 10   (m, m/s)"],
     }
 
 

@@ -35,7 +35,7 @@ from evedrop.show.report.chart import POINTS, Curve, GroupCounts, GroupMeans, Lo
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.travel import SCENARIO, circumstances, download, input_files
-from evedrop.show.view.error_floor import error_floor
+from evedrop.show.view.error_floor import error_floor, mean_band
 from evedrop.show.view.lanes import EAVESDROPPER, KNOWLEDGE, SPIED, Lane, knowledge_lane
 from evedrop.show.view.palette import paper_inks
 from evedrop.system.files import Unreadable, text_of
@@ -99,7 +99,6 @@ MOST_SPANS = 12
 """The most spans without synchronisation that a report lists for a receiver."""
 PIXELS = 2000
 """The most pixels of a lane. Each of a long run stands for several slots: for their most frequent code, or the highest."""
-_INTERVAL = 1.96  # standard errors on either side: 95 %
 
 
 class SlotMeans(NamedTuple):
@@ -225,12 +224,9 @@ def _means(rows: pa.Table) -> Floats:
     error = _numbers(rows["mean_squared_error"])
     actual = _numbers(rows["mean_actual_trace_covariance"])
     error = np.where(np.isnan(error), actual, error)
-    with np.errstate(all="ignore"):
-        factor = np.exp(
-            _INTERVAL * _numbers(rows["standard_error"]) / error
-        )  # of its logarithm, so that it stays above 0
+    low, high = mean_band(error, _numbers(rows["standard_error"]))
     theory = _numbers(rows["theoretical_trace_covariance"])
-    return np.stack([_numbers(rows["slot"]), error, error / factor, error * factor, theory])
+    return np.stack([_numbers(rows["slot"]), error, low, high, theory])
 
 
 def _numbers(column: pa.ChunkedArray) -> Floats:

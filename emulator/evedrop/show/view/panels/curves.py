@@ -19,9 +19,9 @@ from rerun.blueprint.archetypes import PlotBackground
 
 from evedrop.model.process import Floats
 from evedrop.show.view.column import Column, scalars
-from evedrop.show.view.error_floor import error_floor
+from evedrop.show.view.error_floor import error_floor, mean_band
 from evedrop.show.view.palette import GROUND, PLANT, TRUTH_CURVE, Colour, dim
-from evedrop.show.view.panels.panel import PlacedView, ViewPanel
+from evedrop.show.view.panels.panel import PlacedView, ViewPanel, crowded
 from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots
 
 _WINDOW = 105  # slots; below four pixels a slot, Rerun merges neighbouring slots into grey
@@ -91,34 +91,43 @@ def thinned(scene: Scene, slots: NDArray[np.int64]) -> NDArray[np.intp]:
 
 
 def logarithms(scene: Scene, path: str, slots: NDArray[np.int64], values: Floats) -> Iterator[Column]:
-    """log10 of squared errors or traces (c,), without NaNs.
+    """log10 of the roots of squared errors or traces (c,), without NaNs: roots have a unit, and half as many powers of ten.
 
     Smaller values are raised to the floor of `error_floor`: after a state was received, the error is 0.
     """
     covered = ~np.isnan(values)  # no theory covers some links
     if covered.any():
         floor = error_floor(scene.noise, scene.trials)
-        yield scalars(path, slots[covered], np.log10(np.maximum(values[covered], floor)))
+        yield scalars(path, slots[covered], 0.5 * np.log10(np.maximum(values[covered], floor)))
+
+
+def powers_of_ten(scene: Scene) -> str:
+    """What the numbers of a logarithmic axis stand for, such as "−1: 0.1 m · 1: 10 m", for the title of its view.
+
+    Rerun writes only numbers on an axis.
+    """
+    units = [*dict.fromkeys(scene.units)]
+    unit = f" {units[0]}" if len(units) == 1 else ""
+    mixed = f"   ({', '.join(units)})" if len(units) > 1 else ""
+    return f"−1: 0.1{unit} · 1: 10{unit}{mixed}"
 
 
 _ERROR_PATH, _BAND = "error", "band"
 _NO_NAME = " "
 """The name of curves in the legend, which the receivers' own curves explain."""
-_SIDES = {"low": -1.96, "high": 1.96}
-"""The edges of the band, in standard errors from the mean: 19 of 20 bands contain the expectation."""
+_SIDES = ("low", "high")
 
 
 @final
 class SquaredError(ViewPanel):
-    """|x − x̂|² on a logarithmic scale: in recent slots, or in the whole run of a closed loop."""
+    """The root of |x − x̂|² on a logarithmic scale: in recent slots, or in the whole run of a closed loop."""
 
     def views(self) -> Iterator[PlacedView]:
         """One view: of the whole run for a closed loop, otherwise of the recent slots."""
-        title = "Squared error   log10"
+        title = f"Error   {'dim: 95 %   ' if self._with_bands else ''}{powers_of_ten(self.scene)}"
         if self.scene.moving:
             yield PlacedView(receivers_view(title, self._paths, whole_run(self.scene)), "right")
         else:
-            title += ", dim: 95 % bands" if self._with_bands else ""
             yield PlacedView(receivers_view(title, self._paths, recent_slots(self.scene)), "middle")
 
     @property
@@ -148,8 +157,8 @@ class SquaredError(ViewPanel):
         for shown in self.scene.receivers:
             peer = slots.peers[shown.name]
             yield from logarithms(self.scene, f"{_ERROR_PATH}/{shown.name}", slots.numbers, peer.squared_error)
-            for side, distance in _SIDES.items() if self._with_bands else ():
-                edge = peer.squared_error + distance * peer.standard_error
+            edges = zip(_SIDES, mean_band(peer.squared_error, peer.standard_error), strict=True)
+            for side, edge in edges if self._with_bands else ():
                 yield from logarithms(self.scene, f"{_BAND}/{shown.name}/{side}", slots.numbers, edge)
 
 
@@ -158,13 +167,14 @@ _REPORTED, _THEORY = "trace", "theory"
 
 @final
 class TraceOfP(ViewPanel):
-    """tr P on a logarithmic scale. Recorded but not shown for a closed loop."""
+    """The root of tr P on a logarithmic scale. Recorded but not shown for a closed loop."""
 
     def views(self) -> Iterator[PlacedView]:
-        """One view, below the squared error."""
+        """One view, below the errors, or beside them where lanes leave little height."""
         if not self.scene.moving:
-            title = "tr P   log10, dim: theoretical"
-            yield PlacedView(receivers_view(title, [_REPORTED, _THEORY], recent_slots(self.scene)), "middle")
+            title = f"Root of tr P   dim: theory   {powers_of_ten(self.scene)}"
+            view = receivers_view(title, [_REPORTED, _THEORY], recent_slots(self.scene))
+            yield PlacedView(view, "left" if crowded(self.scene) else "middle")
 
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each receiver's colour: bright for its belief, dim for theory."""
