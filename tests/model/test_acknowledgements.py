@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.stats import binomtest
 
-from evedrop.model.acknowledgements import ATTACKS, AckChannel, rates_of
+from evedrop.model.acknowledgements import ACTS, ATTACKS, AckChannel, AckFate, rates_of
 from evedrop.model.detection import Chart, CusumBatch, chart_for
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
@@ -57,6 +57,32 @@ def test_rates_are_those_of_the_arrivals(attack: str) -> None:
         (arrived & ~gamma_e, rates.eavesdropper[1]),
     ):
         assert binomtest(int(flags.sum()), flags.size, rate).pvalue > 1e-6
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+@pytest.mark.parametrize("spans", [None, [(10, 20)]])
+def test_a_fate_says_why_an_acknowledgement_came_or_not(attack: str, spans: list[tuple[int, int]] | None) -> None:
+    """The sensor gets those that arrived or were forged; the attacker's acts are those of its attack, while that lasts."""
+    slots, trials, quality = 40, 500, 0.7
+    channels = [AckChannel(attack, quality, KEY, Batch(slots, trials), spans, 0.2, 0.6) for _ in range(2)]
+    gamma, gamma_e, sent = (coins(0.7, slots, trials, seed) for seed in (1, 2, 3))
+    seen = set()
+    for k in range(slots):
+        with_gaps = sent[k] if k % 2 else None
+        arrived = channels[0].arrived(k, with_gaps, gamma[k], gamma_e[k])
+        fates = channels[1].fates(k, with_gaps, gamma[k], gamma_e[k])
+        np.testing.assert_array_equal(np.isin(fates, (AckFate.ARRIVED, AckFate.FORGED)), arrived)
+        was_sent = np.ones(trials, bool) if with_gaps is None else with_gaps
+        assert (fates[~was_sent] == AckFate.NONE).all()
+        assert not gamma[k][fates == AckFate.FORGED].any()
+        assert gamma[k][np.isin(fates, (AckFate.ARRIVED, AckFate.LOST, AckFate.BLOCKED, AckFate.IGNORED))].all()
+        if attack == "critical":
+            assert not gamma_e[k][fates == AckFate.BLOCKED].any()
+        now = spans is None or 10 <= k < 20
+        acts = {AckFate.BLOCKED, AckFate.FORGED, AckFate.IGNORED} & {AckFate(fate) for fate in fates.tolist()}
+        assert acts <= (set(ACTS[attack]) if now else set())
+        seen |= acts
+    assert seen == set(ACTS[attack])
 
 
 def test_what_was_not_sent_is_not_acknowledged() -> None:

@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.checks import expect_slots
-from evedrop.model.receiver import Flags
+from evedrop.model.receiver import Codes, Flags
 from evedrop.model.streams import Ahead, Batch, BlockReader
 
 Attack = Callable[[Flags, Flags, Flags], Flags]
@@ -57,6 +58,34 @@ OVERHEARING = frozenset({"critical", "hijack"})
 """The attacks that depend on what a jammer hears."""
 FORGING = frozenset({"forge", "flip"})
 """The attacks that make a reference of a packet that the legitimate estimator has not heard."""
+
+
+class AckFate(IntEnum):
+    """What became of the acknowledgement of a packet."""
+
+    NONE = 0
+    """The legitimate estimator acknowledged nothing."""
+    ARRIVED = 1
+    """It reached the sensor, which heeded it."""
+    LOST = 2
+    """It was lost on the way."""
+    BLOCKED = 3
+    """The attacker blocked it."""
+    FORGED = 4
+    """The attacker sent it in the name of the legitimate estimator, which had not received the packet."""
+    IGNORED = 5
+    """It came, and the hijacked sensor did not heed it."""
+
+
+ACTS: Mapping[str, tuple[AckFate, ...]] = {
+    "none": (),
+    "all": (AckFate.BLOCKED,),
+    "critical": (AckFate.BLOCKED,),
+    "forge": (AckFate.FORGED,),
+    "flip": (AckFate.BLOCKED, AckFate.FORGED),
+    "hijack": (AckFate.IGNORED,),
+}
+"""Attack → the fates that are the attacker's doing."""
 
 
 class HeedRule(NamedTuple):
@@ -170,16 +199,31 @@ class AckChannel:
         sent: `Packet.sent`; a packet that was not sent is never acknowledged, even if forged. gamma: what the estimator received;
         gamma_e: what the jammer received.
         """
+        on_the_air, heeded, _ = self._passed(k, sent, gamma, gamma_e)
+        arrived: Flags = on_the_air & heeded
+        return arrived if sent is None else arrived & sent
+
+    def fates(self, k: int, sent: Flags | None, gamma: Flags, gamma_e: Flags) -> Codes:
+        """What becomes of the acknowledgements of slot k, `AckFate`, (R,); in place of `arrived`, with the same arguments."""
+        on_the_air, heeded, chosen = self._passed(k, sent, gamma, gamma_e)
+        kept = AckFate.IGNORED if chosen else AckFate.LOST
+        heard = np.where(on_the_air, np.where(heeded, AckFate.ARRIVED, kept), AckFate.BLOCKED)
+        missed = np.where(on_the_air & heeded, AckFate.FORGED, AckFate.NONE)
+        fates = np.where(gamma, heard, missed)
+        return (fates if sent is None else np.where(sent, fates, AckFate.NONE)).astype(np.uint8)
+
+    def _passed(self, k: int, sent: Flags | None, gamma: Flags, gamma_e: Flags) -> tuple[Flags, Flags, bool]:
+        """The acknowledgements on the air, those that the sensor heeds if they are, (R,), and whether it is hijacked."""
         attacked = self._spans is None or any(start <= k < stop for start, stop in self._spans)
         through, flips, shared = self._drawn.at(k)
         on_the_air = self._attack(gamma, gamma_e, flips) if attacked else gamma
-        arrived: Flags = on_the_air & through
-        if self._heed_rule is not None:
-            self.count(k, sent, gamma_e)
-            if attacked:
-                few, as_many = self._missed < self._heed_rule.patience, self._missed == self._heed_rule.patience
-                arrived = on_the_air & (few | (as_many & shared))
-        return arrived if sent is None else arrived & sent
+        if self._heed_rule is None:
+            return on_the_air, through, False
+        self.count(k, sent, gamma_e)
+        if not attacked:
+            return on_the_air, through, False
+        few, as_many = self._missed < self._heed_rule.patience, self._missed == self._heed_rule.patience
+        return on_the_air, few | (as_many & shared), True
 
     def count(self, k: int, sent: Flags | None, gamma_e: Flags) -> None:
         """Count the packets in a row that the jammer has missed; arguments as for `arrived`, which counts, too.

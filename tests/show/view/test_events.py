@@ -4,9 +4,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evedrop.model.acknowledgements import AckFate
 from evedrop.model.receiver import Codes
-from evedrop.show.view.events import Event, Watcher
-from evedrop.show.view.scene import Scene, Shown
+from evedrop.show.view.events import AckWatcher, Event, Watcher
+from evedrop.show.view.scene import AckScene, Scene, Shown
 
 LOST, STATE, SILENT, MISLED = 0, 1, 4, 5
 
@@ -76,3 +77,37 @@ def test_long_run_has_few_lines() -> None:
     lengths = np.random.default_rng(1).geometric(0.1, 10_000)
     codes = [code for length in lengths.tolist() for code in (*[LOST] * length, STATE)]
     assert 50 < len(watch(codes, [], len(codes))) < 1000
+
+
+def watched_acks(fates: list[int], cuts: list[int], scene: Scene) -> list[Event]:
+    """The events of acknowledgements, in pieces cut at these slots."""
+    watcher, bounds = AckWatcher(scene), [0, *sorted(cuts), len(fates)]
+    return [
+        event
+        for first, stop in pairwise(bounds)
+        for event in watcher.watch(first, np.array(fates[first:stop], np.uint8))
+    ]
+
+
+def test_the_first_act_of_each_kind_and_long_waits_are_told() -> None:
+    """Blocked acknowledgements are counted in the stretch; a forged one ends it, because the sensor got it."""
+    eve = Shown("eve", "eavesdropper", "reference", 0.5)
+    scene = Scene("", "r", 20, 1, 2, 0.0, (eve,), 1.0, acknowledgements=AckScene("flip", None))
+    nothing, came, _, blocked, forged = (int(fate) for fate in list(AckFate)[:5])
+    fates = [came, blocked, nothing, blocked, blocked, forged, came, forged, nothing, nothing, came]
+    expected = [
+        Event(1, "WARN", "an acknowledgement was blocked, for the first time"),
+        Event(3, "WARN", "the sensor got no acknowledgement for 3 slots, 2 by the attack"),
+        Event(5, "WARN", "an acknowledgement was forged, for the first time"),
+        Event(5, "INFO", "the sensor got an acknowledgement again after 4 slots"),
+    ]
+    for cuts in ([], [3], [1, 2, 5, 6]):
+        assert watched_acks(fates, cuts, scene) == expected
+
+
+def test_a_long_run_has_few_lines_about_acknowledgements() -> None:
+    """Long stretches over and over become everyday life."""
+    eve = Shown("eve", "eavesdropper", "reference", 0.5)
+    fates = [fate for length in np.random.default_rng(1).geometric(0.1, 10_000).tolist() for fate in (*[2] * length, 1)]
+    scene = Scene("", "r", len(fates), 1, 2, 0.0, (eve,), 1.0, acknowledgements=AckScene("none", None))
+    assert 50 < len(watched_acks(fates, [], scene)) < 1000

@@ -10,7 +10,9 @@ from typing import NamedTuple, final
 
 import numpy as np
 
+from evedrop.model.acknowledgements import AckFate
 from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.show.view.attacks import Attacks
 from evedrop.show.view.lanes import MISLED_CODE, SILENT_CODE
 from evedrop.show.view.scene import Scene, Shown
 
@@ -113,6 +115,51 @@ class Watcher:
             line = f"{self._name} had no packet for {self._long} slots"
         line = f"{line}, {unsent} of them silent" if unsent else line
         return f"{line}, {deceived} misled" if deceived else line
+
+
+@final
+class AckWatcher:
+    """Finds the first act of each kind on acknowledgements, and long stretches in which none reached the sensor.
+
+    As for `Watcher`, a stretch is reported when it has become long, and when it ends.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._new = dict(Attacks(scene).possible)
+        self._spacing = max(_SLOTS_PER_LINE, scene.slots // _LINES)
+        self._long, self._reported = _SHORTEST, 0
+        self._missing, self._acted = 0, 0  # slots of the stretch so far, and how many acts were among them
+
+    def watch(self, first: int, fates: Codes) -> list[Event]:
+        """Events of the chunk that starts at slot `first`, in order of slot; fates: `AckFate`, (c,)."""
+        events: list[Event] = []
+        for k, fate in enumerate(fates.tolist(), first):
+            if fate in self._new:
+                events.append(
+                    Event(k, "WARN", f"an acknowledgement was {self._new.pop(AckFate(fate))}, for the first time")
+                )
+            if fate in _REACHED:
+                self._end(k, events)
+                continue
+            self._missing += 1
+            self._acted += fate in (AckFate.BLOCKED, AckFate.IGNORED)
+            if self._missing == self._long:
+                attacked = f", {self._acted} by the attack" if self._acted else ""
+                events.append(
+                    Event(k, "WARN", f"the sensor got no acknowledgement for {self._missing} slots{attacked}")
+                )
+        return events
+
+    def _end(self, k: int, events: list[Event]) -> None:
+        if self._missing >= self._long:
+            events.append(Event(k, "INFO", f"the sensor got an acknowledgement again after {self._missing} slots"))
+            self._reported += 1
+            if self._reported > 3 + k // self._spacing:
+                self._long += 1
+        self._missing = self._acted = 0
+
+
+_REACHED = frozenset({AckFate.ARRIVED, AckFate.FORGED})
 
 
 def _numbers_before(flags: Flags) -> list[int]:

@@ -43,6 +43,29 @@ class Shown:
 
 
 @dataclass(frozen=True)
+class AckScene:
+    """The acknowledgements of a run, and the attack on them."""
+
+    attack: str
+    """The name of the attack, or "none"."""
+    attacker: str | None
+    """The eavesdropper that the attack serves; None if the scenario names none."""
+
+
+@dataclass(frozen=True)
+class AttackSpan:
+    """An attack that lasts."""
+
+    text: str
+    """Such as "legitimate is cut off"."""
+    first: int
+    stop: int
+    """The slot after the last one."""
+    receiver: str | None = None
+    """The receiver whose link is cut; None for another attack."""
+
+
+@dataclass(frozen=True)
 class Scene:
     """Everything that the view needs before the first slot."""
 
@@ -69,6 +92,10 @@ class Scene:
     """Receiver → the ways of sender and receiver on the ground, for links whose losses depend on them."""
     panels: tuple[Panel, ...] = ()
     """The panels of applications."""
+    acknowledgements: AckScene | None = None
+    """None without acknowledgements."""
+    spans: tuple[AttackSpan, ...] = ()
+    """The attacks that last, in order of their first slots."""
 
     @property
     def unit(self) -> str:
@@ -122,6 +149,9 @@ class SceneSlots(Record):
     """None without a closed loop."""
     sent: Flags | None = column(
         "c", "whether the sensor sent a packet in the first recorded trial; None: in every slot", "?", default=None
+    )
+    acknowledged: Codes | None = column(
+        "c", "`AckFate` in the first recorded trial; None without acknowledgements", "u1", default=None
     )
 
     @property

@@ -21,18 +21,23 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from evedrop.errors import UsageError
+from evedrop.model.acknowledgements import AckChannel
 from evedrop.model.process import Floats
-from evedrop.model.receiver import ACTION_OF, INNOVATION, NOTHING
+from evedrop.model.receiver import ACTION_OF, INNOVATION, NOTHING, Action, Codes, Flags
+from evedrop.model.slot.link import Change
 from evedrop.model.slot.records import ReceiverSlots, SensorSlots
+from evedrop.model.streams import Batch, root_of_seed
 from evedrop.names import LEGITIMATE
 from evedrop.results.reading import Results
 from evedrop.scenario.application import APPLICATIONS, ControlledPlant
-from evedrop.scenario.closed_loop import controlled_plant, labels
+from evedrop.scenario.closed_loop import controlled_plant, labels, monitor_of
 from evedrop.scenario.recorded import recorded
+from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
+from evedrop.score.links import ack_channel_of
 from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
-from evedrop.show.view.scene import Moved, PeerSlots, Scene, SceneSlots, Shown
+from evedrop.show.view.scene import AckScene, AttackSpan, Moved, PeerSlots, Scene, SceneSlots, Shown
 from evedrop.system.output import warn
 
 if TYPE_CHECKING:
@@ -82,6 +87,53 @@ class LoopValues:
                 curves |= feed.take_monitored(first, sensor)
             curves |= feed.take(first, limited, estimates)
         return Moved(values, curves)
+
+
+@final
+class AckFates:
+    """Follows the acknowledgements of one trial, whose slots come in order.
+
+    They follow from who received which packet, and from the channel's random numbers, which the seed gives.
+    """
+
+    def __init__(self, scenario: Scenario, trial: int) -> None:
+        spec = ack_channel_of(scenario)
+        key = StreamKeys(root_of_seed(scenario.seed), b"").acknowledgements
+        self._channel = None if spec is None else AckChannel.from_spec(spec, key, Batch(scenario.slots, 1, trial))
+        self._jammer = LEGITIMATE if spec is None or spec.jammer is None else spec.jammer
+
+    def take(self, first: int, sent: Flags | None, actions: Mapping[str, Codes]) -> Codes | None:
+        """`AckFate` of the next slots, (c,); None without acknowledgements. sent (c,); actions: receiver → `Action`, (c,)."""
+        if self._channel is None:
+            return None
+        gamma, gamma_e = (actions[name][:, None] != Action.LOST for name in (LEGITIMATE, self._jammer))
+        fates = [
+            self._channel.fates(first + row, None if sent is None else sent[row : row + 1], gamma[row], gamma_e[row])
+            for row in range(len(gamma))
+        ]
+        return np.concatenate(fates)
+
+
+def attacked_scene(scenario: Scenario) -> dict[str, Any]:
+    """The entries of `Scene` for attacks; empty without."""
+    entries: dict[str, Any] = {}
+    if scenario.acknowledgements is not None:
+        entries["acknowledgements"] = AckScene(scenario.acknowledgements.attack, scenario.acknowledgements.jammer)
+    plan, last = monitor_of(scenario), scenario.slots
+    spans = []
+    if plan is not None and plan.attack is not None:
+        words = {"replay": "measurements are a recording", "replace": "measurements are replaced"}
+        text = words.get(plan.attack, "measurements are attacked")
+        spans += [AttackSpan(text, first, min(stop, last)) for first, stop in plan.spans]
+    for name, changes in scenario.timeline.changes.items():
+        began = None
+        for change in (*changes, Change(last, cut=False)):
+            if change.cut and began is None:
+                began = change.at
+            elif change.cut is False and began is not None:
+                spans.append(AttackSpan(f"{name} is cut off", began, min(change.at, last), name))
+                began = None
+    return {**entries, "spans": tuple(sorted(spans, key=lambda span: span.first))}
 
 
 def driven_scene(scenario: Scenario) -> dict[str, Any]:
@@ -147,16 +199,22 @@ def open_recording(
         units=tuple(map(drawable, scenario.process.units or ())),
         ways={name: ways for name, ways in ways.items() if ways is not None},
         **driven_scene(scenario),
+        **attacked_scene(scenario),
     )
     return ViewRecording(path, scene, warn, live=live)
 
 
 def shown(
-    slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], loop_values: LoopValues | None = None
+    slots: Slots,
+    scored: Mapping[str, Scored],
+    around: Sequence[float],
+    loop_values: LoopValues | None = None,
+    ack_fates: AckFates | None = None,
 ) -> Any:
     """Some slots as `SceneSlots`: the first recorded trial, in absolute values, and means over all trials.
 
-    around: the reference from which states are deviations, (n,); loop_values: follows the same trial of a closed loop.
+    around: the reference from which states are deviations, (n,); loop_values: follows the same trial of a closed loop;
+    ack_fates: follows its acknowledgements.
     """
     peers = {
         name: PeerSlots(
@@ -176,7 +234,9 @@ def shown(
         estimates = {name: receiver.x_hat[:, :, 0] for name, receiver in slots.receivers.items()}
         moved = loop_values.take(sensor.part(slice(0, 1)), estimates)
     sent = None if sensor.sent is None else sensor.sent[:, 0]
-    return SceneSlots(slots.first, sensor.x[:, :, 0] + around, sensor.nu[:, 0], peers, moved, sent)
+    actions = {name: peer.action for name, peer in peers.items()}
+    acknowledged = None if ack_fates is None else ack_fates.take(slots.first, sent, actions)
+    return SceneSlots(slots.first, sensor.x[:, :, 0] + around, sensor.nu[:, 0], peers, moved, sent, acknowledged)
 
 
 _CHUNK = 1000  # slots recorded at once
@@ -200,7 +260,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     loop_values = loop_values_of(scenario)
     if loop_values is not None and (sensor.u is None or len(sensor.u) != len(x)):
         raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
-    around = np.array(scenario.process.around)
+    around, ack_fates = np.array(scenario.process.around), AckFates(scenario, _first_trial_of(results))
     recording = open_recording(
         scenario, folder.name, path, words=looked_at.words, unknown_links=looked_at.unknown_links
     )
@@ -212,7 +272,8 @@ def replay(folder: Path, path: Path | None = None) -> Path:
             moved = None if loop_values is None else loop_values.take(some, deviations)
             shown = {name: peer.rows(rows) for name, peer in peers.items()}
             sent = None if some.sent is None else some.sent[:, 0]
-            recording.add(SceneSlots(first, some.x[:, :, 0], some.nu[:, 0], shown, moved, sent))
+            acknowledged = ack_fates.take(first, sent, {name: peer.action for name, peer in shown.items()})
+            recording.add(SceneSlots(first, some.x[:, :, 0], some.nu[:, 0], shown, moved, sent, acknowledged))
         for event in results.events:
             recording.note(event.slot, "INFO", event.line)
         if results.remark is None:
@@ -232,6 +293,11 @@ def _check_shapes(folder: Path, n: int, x: Floats, peers: Mapping[str, PeerSlots
     for name, peer in peers.items():
         if {len(x)} != {len(column) for column in (peer.x_hat, peer.squared_error)}:
             raise UsageError(f"{folder}: its tables do not have the same slots of {name}; run the scenario again")
+
+
+def _first_trial_of(results: Results) -> int:
+    """The number of the first recorded trial; there is one."""
+    return int(pc.min(results.trials["trial"]).as_py())
 
 
 def _first_trial(results: Results, name: str) -> pa.Table:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rerun.blueprint.archetypes import PlotBackground
 
 from evedrop.model.process import Floats
+from evedrop.show.view.attacks import Attacks, lane_count
 from evedrop.show.view.column import Column, scalars
 from evedrop.show.view.error_floor import error_floor, mean_band
 from evedrop.show.view.palette import GROUND, PLANT, TRUTH_CURVE, Colour, dim
@@ -198,17 +199,45 @@ class TraceOfP(ViewPanel):
 
 
 def worlds_over_time(scene: Scene, path: str, axis: rrb.TimeAxis) -> Iterator[PlacedView]:
-    """The first state as it is, and as each receiver believes it: curves below a path, named as truth and receivers."""
+    """The first state as it is, and as each receiver believes it: curves below a path, named as truth and receivers.
+
+    What happens has marks where the state was attacked, which its legend explains.
+    """
     label = scene.states[0] if scene.states else "the state"
-    legend = rrb.PlotLegend(visible=False)
 
-    def view(title: str, *names: str) -> rrb.TimeSeriesView:
-        contents = [f"{path}/{name}" for name in names]
-        return rrb.TimeSeriesView(name=title, origin=path, contents=contents, axis_x=axis, plot_legend=legend)
+    def view(title: str, *names: str, legend: bool = False) -> rrb.TimeSeriesView:
+        contents, corner = [f"{path}/{name}" for name in names], rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
+        return rrb.TimeSeriesView(name=title, origin=path, contents=contents, axis_x=axis, plot_legend=corner)
 
-    yield PlacedView(view(f"What happens: {label}", TRUTH_NAME), "truth")
+    attacked = bool(lane_count(scene))
+    yield PlacedView(view(f"What happens: {label}", TRUTH_NAME, f"{_ATTACKS}/**", legend=attacked), "truth")
     for shown in scene.receivers:
         yield PlacedView(view(f"{shown.world_title}   grey: truth", TRUTH_NAME, shown.name), "worlds")
+
+
+_ATTACKS = "attacks"
+
+
+@final
+class AttackedCurve:
+    """Marks on the curve of the first state where it is attacked, below a path."""
+
+    def __init__(self, scene: Scene, path: str) -> None:
+        self._attacks, self._path = Attacks(scene), f"{path}/{_ATTACKS}"
+
+    def styles(self) -> dict[str, rr.SeriesPoints]:
+        """A diamond in the colour of the attack."""
+        return {
+            f"{self._path}/{i}": rr.SeriesPoints(names=words, colors=bright, markers="diamond", marker_sizes=4.5)
+            for i, (words, bright) in enumerate(self._attacks.kinds)
+        }
+
+    def columns(self, slots: SceneSlots, at: NDArray[np.intp]) -> Iterator[Column]:
+        """The marks at some offsets of the slots."""
+        for i, flags in enumerate(self._attacks.flags(slots)):
+            attacked = at[flags[at]]
+            if len(attacked):
+                yield scalars(f"{self._path}/{i}", slots.numbers[attacked], slots.x[attacked, 0])
 
 
 _STATE_PATH = "plane"
@@ -217,6 +246,10 @@ _STATE_PATH = "plane"
 @final
 class StateOverTime(ViewPanel):
     """The state and every estimate, in place of the state plane. Recorded but not shown for a closed loop."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self._marks = AttackedCurve(scene, _STATE_PATH)
 
     @classmethod
     def applies(cls, scene: Scene) -> bool:
@@ -229,6 +262,7 @@ class StateOverTime(ViewPanel):
             view = rrb.TimeSeriesView(
                 name="State and estimates",
                 origin=_STATE_PATH,
+                contents=["$origin/**", f"- /{_STATE_PATH}/{_ATTACKS}/**"],
                 axis_x=recent_slots(self.scene),
                 plot_legend=rrb.PlotLegend(visible=False),
                 background=dark_ground(),
@@ -236,15 +270,17 @@ class StateOverTime(ViewPanel):
             yield PlacedView(view, "right")
             yield from worlds_over_time(self.scene, _STATE_PATH, recent_slots(self.scene))
 
-    def styles(self) -> dict[str, rr.SeriesLines]:
+    def styles(self) -> dict[str, rr.AsComponents]:
         """Each estimate in its receiver's colour; the truth grey and wide."""
-        styles = {f"{_STATE_PATH}/{TRUTH_NAME}": rr.SeriesLines(names="truth", colors=TRUTH_CURVE, widths=2.5)}
+        styles: dict[str, rr.AsComponents] = {**self._marks.styles()}
+        styles[f"{_STATE_PATH}/{TRUTH_NAME}"] = rr.SeriesLines(names="truth", colors=TRUTH_CURVE, widths=2.5)
         for name, bright in self.scene.colours.items():
             styles[f"{_STATE_PATH}/{name}"] = rr.SeriesLines(names=name, colors=bright, widths=1.5)
         return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
-        """The truth, and every estimate."""
+        """The truth, every estimate, and the attacks."""
+        yield from self._marks.columns(slots, np.arange(slots.count))
         yield scalars(f"{_STATE_PATH}/{TRUTH_NAME}", slots.numbers, slots.x[:, 0])
         for shown in self.scene.receivers:
             yield scalars(f"{_STATE_PATH}/{shown.name}", slots.numbers, slots.peers[shown.name].x_hat[:, 0])
@@ -257,6 +293,10 @@ _VIEWS = 2  # the first states have views; the others are recorded, but not show
 @final
 class Levels(ViewPanel):
     """A view for each of the first states, over the whole run."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self._marks = AttackedCurve(scene, f"{_LEVELS_PATH}/0")
 
     @classmethod
     def applies(cls, scene: Scene) -> bool:
@@ -271,9 +311,9 @@ class Levels(ViewPanel):
             yield PlacedView(curves_view(title, f"{_LEVELS_PATH}/{i}", whole_run(self.scene), legend=False), "left")
         yield from worlds_over_time(self.scene, f"{_LEVELS_PATH}/0", whole_run(self.scene))
 
-    def styles(self) -> dict[str, rr.SeriesLines]:
+    def styles(self) -> dict[str, rr.AsComponents]:
         """Each estimate in its receiver's colour; the truth grey and wide."""
-        styles = {}
+        styles: dict[str, rr.AsComponents] = {**self._marks.styles()}
         for i in range(self.scene.n):
             styles[f"{_LEVELS_PATH}/{i}/{TRUTH_NAME}"] = line_style("truth", TRUTH_CURVE, 1.8)
             for name, bright in self.scene.colours.items():
@@ -281,10 +321,11 @@ class Levels(ViewPanel):
         return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
-        """Every state, true and estimated."""
+        """Every state, true and estimated, and the attacks."""
         at = thinned(self.scene, slots.numbers)
         if not len(at):
             return
+        yield from self._marks.columns(slots, at)
         k = slots.numbers[at]
         for i in range(self.scene.n):
             yield scalars(f"{_LEVELS_PATH}/{i}/{TRUTH_NAME}", k, slots.x[at, i])

@@ -21,6 +21,7 @@ from evedrop.model import receiver
 from evedrop.model.schemes import SCHEMES
 from evedrop.score.synchronisation import Synchronisation
 from evedrop.show.view import lanes
+from evedrop.show.view.attacks import LASTING, Attacks, lane_count
 from evedrop.show.view.column import Column
 from evedrop.show.view.lanes import ErrorDistance, KnowledgeLane, Lane, knowledge
 from evedrop.show.view.palette import ALARM, MISLED, STEEL, TRUTH, Colour, letters
@@ -122,20 +123,23 @@ class Packets(ViewPanel):
         super().__init__(scene)
         names = ["sent", *(shown.name for shown in scene.receivers)]
         shown_lanes = [lanes.SENT, *(lanes.lane_of(shown) for shown in scene.receivers)]
-        self._lanes = StateLanes(_PACKETS_PATH, zip(names, shown_lanes, strict=True), first=0)
+        self._attacks = Attacks(scene)
+        named = [*zip(names, shown_lanes, strict=True), *self._attacks.lanes()]
+        labels = [lane.words if name == LASTING else [" "] * len(lane.words) for name, lane in named]
+        self._lanes = StateLanes(_PACKETS_PATH, named, first=0, labels=labels)
 
     def views(self) -> Iterator[PlacedView]:
         """One view, as high as the lanes need: above the events, or, with many receivers or a closed loop, at the top."""
         view = rrb.StateTimelineView(name="Packets", origin=_PACKETS_PATH, time_view=recent_slots(self.scene))
+        receivers, attacks = len(self.scene.receivers), lane_count(self.scene)
         strip = rrb.StateTimelineView(
-            name=f"Packets sent   bright: a state{self._other}",
+            name=f"Packets sent   bright: a state{self._other}{self._attacks.title}",
             origin=_PACKETS_PATH,
-            contents=[self._lanes.paths[0]],
+            contents=[self._lanes.paths[0], *self._lanes.paths[1 + receivers :]],
             time_view=recent_slots(self.scene),
         )
-        yield PlacedView(strip, "strip", 1.5, lanes_height(1))
-        receivers = len(self.scene.receivers)
-        height = lanes_height(receivers + 1)
+        yield PlacedView(strip, "strip", 1.5, lanes_height(1 + attacks))
+        height = lanes_height(receivers + 1 + attacks)
         if self.scene.moving or crowded(self.scene):
             yield PlacedView(view, "top", height=height)
         else:
@@ -156,7 +160,7 @@ class Packets(ViewPanel):
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The lanes' changes."""
         lanes_of = [lanes.sent(slots), *(lanes.received(shown, slots) for shown in self.scene.receivers)]
-        for path, at, words in self._lanes.changes(lanes_of):
+        for path, at, words in self._lanes.changes([*lanes_of, *self._attacks.codes(slots)]):
             yield Column(path, slots.numbers[at], words)
 
 

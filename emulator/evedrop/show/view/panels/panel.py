@@ -16,6 +16,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from evedrop.score.verdict import Verdict
+from evedrop.show.view.attacks import lane_count
 from evedrop.show.view.column import Column
 from evedrop.show.view.events import Event
 from evedrop.show.view.scene import Scene, SceneSlots
@@ -99,4 +100,5 @@ def lanes_height(count: int) -> float:
 
 def crowded(scene: Scene) -> bool:
     """Whether two views of lanes do not fit below each other, so that both are in the row at the top."""
-    return 1.0 - FIXED_HEIGHT - lanes_height(len(scene.receivers)) - lanes_height(len(scene.receivers) + 1) < 0.05
+    known, packets = len(scene.receivers), len(scene.receivers) + 1 + lane_count(scene)
+    return 1.0 - FIXED_HEIGHT - lanes_height(known) - lanes_height(packets) < 0.05

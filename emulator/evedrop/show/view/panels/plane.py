@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 from evedrop.model.links.way import Way
 from evedrop.model.process import Floats
+from evedrop.model.receiver import Flags
+from evedrop.show.view.attacks import Attacks, cut_off, lane_count
 from evedrop.show.view.column import TIMELINE, Column
 from evedrop.show.view.lanes import ErrorDistance
 from evedrop.show.view.palette import GROUND, TRUTH, Colour, dim
@@ -29,6 +31,7 @@ from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots, Shown
 _PLANE_PATH = "plane"
 _FRAME = f"{_PLANE_PATH}/frame"
 _HEADING, _SCALE = f"{_PLANE_PATH}/{TRUTH_NAME}/heading", f"{_PLANE_PATH}/scale"
+_ATTACKS, _ATTACKED = f"{_PLANE_PATH}/{TRUTH_NAME}/attacks", f"{_PLANE_PATH}/{TRUTH_NAME}/attacked"
 _TRAIL = 30
 _TRUTH_TRAIL = 130
 
@@ -42,6 +45,7 @@ class StatePlane(ViewPanel):
         self._frame, every = Frame(), stride(scene)
         self._moves = TruthDirection()
         self._distance = ErrorDistance(scene)
+        self._attacks, self._marks = Attacks(scene), AttackMarks()
         self._trails = {name: Trail(every) for name in (TRUTH_NAME, *(shown.name for shown in scene.receivers))}
 
     @classmethod
@@ -60,12 +64,12 @@ class StatePlane(ViewPanel):
         view = rrb.Spatial2DView(
             name="State plane   ellipses: 2σ reported",
             origin=_PLANE_PATH,
-            contents=["$origin/**", *(f"- /{path}" for path in (_HEADING, _SCALE, *map(_off, self._trails)))],
+            contents=["$origin/**", *(f"- /{path}" for path in self._of_the_scene())],
             background=list(GROUND),
             overrides=trails,  # type: ignore[arg-type]
         )
         yield PlacedView(view, "right")
-        past = {_trail(TRUTH_NAME): trails[_trail(TRUTH_NAME)]}
+        past = dict.fromkeys((_trail(TRUTH_NAME), _ATTACKS), trails[_trail(TRUTH_NAME)])
         yield PlacedView(
             rrb.Spatial2DView(
                 name="What happens",
@@ -79,10 +83,14 @@ class StatePlane(ViewPanel):
         for shown in self.scene.receivers:
             yield PlacedView(self._world(shown, trails), "worlds")
 
+    def _of_the_scene(self) -> list[str]:
+        """The paths that only the scene shows."""
+        return [_HEADING, _SCALE, _ATTACKS, _ATTACKED, *map(_off, self._trails), *map(_cut, self._trails)]
+
     def _world(self, shown: Shown, trails: Mapping[str, rrb.VisibleTimeRanges]) -> rrb.Spatial2DView:
         """The world as a receiver believes it: its estimate, path and ellipse, over the faded truth."""
         name, faded = shown.name, [dim(TRUTH)]
-        shown_paths = [_trail(name), _ellipse(name), _point(name), _off(name)]
+        shown_paths = [_trail(name), _ellipse(name), _point(name), _off(name), _cut(name)]
         overrides = {
             _trail(TRUTH_NAME): [rr.LineStrips2D.from_fields(colors=faded), trails[_trail(TRUTH_NAME)]],
             _point(TRUTH_NAME): [rr.Points2D.from_fields(colors=faded)],
@@ -116,19 +124,19 @@ class StatePlane(ViewPanel):
         styles[_SCALE] = rr.LineStrips2D.from_fields(
             colors=[dim(TRUTH)], radii=rr.Radius.ui_points(1.5), show_labels=True
         )
+        styles[_ATTACKS] = rr.Points2D.from_fields(radii=rr.Radius.ui_points(4.5), draw_order=39.0)
+        words = rr.Points2D.from_fields(colors=[TRUTH], radii=rr.Radius.ui_points(0.0), show_labels=True)
+        styles[_ATTACKED] = words
         for i, shown in enumerate(self.scene.receivers):
             bright = self.scene.colours[shown.name]
+            styles[_cut(shown.name)] = words
             styles |= _point_styles(shown.name, bright, radius=5.0, order=30.0 - i)
-            styles[_off(shown.name)] = rr.Points2D.from_fields(
-                colors=[TRUTH], radii=rr.Radius.ui_points(0.0), show_labels=True
-            )
+            styles[_off(shown.name)] = words
             if i > 0:
                 styles[_arrow(shown.name)] = rr.LineStrips2D.from_fields(
                     colors=[bright], radii=rr.Radius.ui_points(1.5)
                 )
-                styles[_away(shown.name)] = rr.Points2D.from_fields(
-                    colors=[TRUTH], radii=rr.Radius.ui_points(0.0), show_labels=True
-                )
+                styles[_away(shown.name)] = words
         # Invisible: the view fits its range to it.
         styles[_FRAME] = rr.LineStrips2D.from_fields(colors=[GROUND], radii=rr.Radius.ui_points(0.1))
         return styles
@@ -142,8 +150,10 @@ class StatePlane(ViewPanel):
         pieces = {name: self._trails[name].pieces(points, at) for name, points in positions.items()}
         followed = np.stack([positions[TRUTH_NAME], positions[self.scene.receivers[0].name]])
         boxes = self._frame.boxes(followed.min(axis=0), followed.max(axis=0), at)
+        marks = self._marks.marks(positions[TRUTH_NAME], self._attacks.acts(slots), at)
         if not len(at):
             return
+        yield from self._attacked(slots, at, boxes, marks)
         border = _BORDER * (boxes[:, 2] - boxes[:, 0])
         low, high = boxes[:, 0] + border, boxes[:, 2] - border
         truth = positions[TRUTH_NAME][at]
@@ -172,6 +182,23 @@ class StatePlane(ViewPanel):
                 seen = truth, positions[shown.name][at], low, high
                 yield from self._far(shown.name, k[at], seen, distances, labels)
 
+    def _attacked(
+        self, slots: SceneSlots, at: NDArray[np.intp], boxes: Points, marks: list[list[tuple[Points, Colour]]]
+    ) -> Iterator[Column]:
+        """The words at the upper border about attacks, marks where the truth was during them, and which links are cut."""
+        k, places = slots.numbers[at], title_places(boxes)
+        if lane_count(self.scene):
+            yield _labels(_ATTACKED, k, places, self._attacks.texts(slots, at))
+        if self.scene.acknowledgements is not None:
+            points = [point for some in marks for point, _ in some]
+            colours = [colour for some in marks for _, colour in some]
+            columns = rr.Points2D.columns(positions=np.array(points).reshape(-1, 2), colors=colours)
+            yield Column(_ATTACKS, k, columns.partition([len(some) for some in marks]))
+        for shown in self.scene.receivers:
+            if any(span.receiver == shown.name for span in self.scene.spans):
+                cut = cut_off(self.scene, shown.name, k).tolist()
+                yield _labels(_cut(shown.name), k, places, ["cut off" if now else "" for now in cut])
+
     def _far(
         self,
         name: str,
@@ -196,6 +223,13 @@ class StatePlane(ViewPanel):
         labels.append(centres)
         columns = rr.Points2D.columns(positions=centres[far], labels=texts)
         yield Column(_away(name), k, columns.partition(lengths))
+
+
+def _labels(path: str, k: NDArray[np.int64], places: Points, texts: list[str]) -> Column:
+    """Labels at places, (f, 2), in slots k, (f,); none where a text is empty."""
+    shown = np.array([bool(text) for text in texts])
+    columns = rr.Points2D.columns(positions=places[shown], labels=[text for text in texts if text])
+    return Column(path, k, columns.partition(shown.astype(np.int64)))
 
 
 def _point_styles(name: str, bright: Colour, *, radius: float, order: float) -> dict[str, rr.AsComponents]:
@@ -227,6 +261,10 @@ def _away(name: str) -> str:
     return f"{_PLANE_PATH}/{name}/away"
 
 
+def _cut(name: str) -> str:
+    return f"{_PLANE_PATH}/{name}/cut"
+
+
 def _off(name: str) -> str:
     return f"{_PLANE_PATH}/{name}/off"
 
@@ -246,6 +284,7 @@ _LABEL = 0.18  # the same for the labels: half the width of one
 _LINE = 0.11  # of a frame's height: what a label needs
 _VEHICLE = 0.09  # length of the vehicle, compared with the longer side
 _SCALE_BAR = 0.25  # of a frame's width: the longest scale
+_HEADLINE = 0.04  # of a frame's height, from its upper border: where words about the whole frame are
 _ARROW = 0.08  # length of an arrow, compared with the longer side
 _FRAME_ROOM = 0.3  # around what the frame follows, compared with its longer side
 
@@ -343,6 +382,12 @@ def scale_bars(low: Points, high: Points) -> tuple[Points, Floats]:
     return _shown(np.stack([left, right], axis=1)), lengths
 
 
+def title_places(boxes: Points) -> Points:
+    """Where words are drawn at the upper border of frames, (f, 2)."""
+    low, high = boxes[:, 0], boxes[:, 2]
+    return _shown(np.stack([(low + high)[:, 0] / 2, low[:, 1] + _HEADLINE * (high - low)[:, 1]], axis=1))
+
+
 def labels_below(points: Points, low: Points, high: Points) -> Points:
     """Where the labels of points, (f, 2), are drawn: below them, or above them near the lower border."""
     size = high - low
@@ -433,6 +478,30 @@ class TruthDirection:
 
 
 _HEADED_SLOTS = 8
+
+
+@final
+@dataclass
+class AttackMarks:
+    """Where the truth was when an attacker acted, for the frame that follows."""
+
+    _waiting: list[tuple[Points, Colour]] = field(default_factory=list)
+
+    def marks(
+        self, truth: Points, acts: Sequence[tuple[Colour, Flags]], offsets: NDArray[np.intp]
+    ) -> list[list[tuple[Points, Colour]]]:
+        """The places, (2,), and colours of the acts since the frame before, for each frame at offsets of the next slots.
+
+        truth: (c, 2); acts: the colour of each kind, and in which slots it was, (c,).
+        """
+        acted = sorted((int(at), colour) for colour, flags in acts for at in np.flatnonzero(flags))
+        frames_of = np.searchsorted(offsets, [at for at, _ in acted])
+        marks: list[list[tuple[Points, Colour]]] = [[] for _ in range(len(offsets) + 1)]
+        marks[0] = self._waiting
+        for frame, (at, colour) in zip(frames_of.tolist(), acted, strict=True):
+            marks[frame] = [*marks[frame], (truth[at], colour)]
+        *marks, self._waiting = marks
+        return marks
 
 
 @final

@@ -18,7 +18,7 @@ from evedrop.score.after_start import BatchMeans, leading_states
 from evedrop.score.verdict import Verdict, verdict_so_far
 from evedrop.show.view import lanes
 from evedrop.show.view.column import Column
-from evedrop.show.view.events import Event, Watcher
+from evedrop.show.view.events import AckWatcher, Event, Watcher
 from evedrop.show.view.lanes import received
 from evedrop.show.view.palette import GROUND, TRUTH, Colour
 from evedrop.show.view.panels.panel import LEGEND_HEIGHT, VERDICT_HEIGHT, PlacedView, ViewPanel, lanes_height
@@ -147,6 +147,7 @@ class Events(ViewPanel):
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
+        self._acks = AckWatcher(scene)
         self._watchers = [(shown, Watcher(shown, scene)) for shown in scene.receivers]
         self._events: list[Event] = []  # in order of slot
 
@@ -163,10 +164,13 @@ class Events(ViewPanel):
         return rrb.TextDocumentView(name="Events", origin=_EVENTS_PATH)
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
-        """The events that the watcher of each receiver noticed."""
-        yield from self._lines(
-            [event for shown, watcher in self._watchers for event in watcher.watch(slots.first, received(shown, slots))]
-        )
+        """The events that the watchers of receivers and of acknowledgements noticed."""
+        events = [
+            event for shown, watcher in self._watchers for event in watcher.watch(slots.first, received(shown, slots))
+        ]
+        if slots.acknowledged is not None:
+            events += self._acks.watch(slots.first, slots.acknowledged)
+        yield from self._lines(events)
 
     def notes(self, notes: Sequence[Event]) -> Iterator[Column]:
         """A line for each note."""
