@@ -7,14 +7,18 @@ import gc
 import json
 import os
 import pickle
+import re
 import shlex
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
+from urllib.request import urlopen
 
 import numpy as np
 import pyarrow as pa
@@ -29,13 +33,14 @@ from evedrop.errors import RunError, ScenarioError, UsageError
 from evedrop.model.metrics import all_metrics
 from evedrop.results.reading import ByName
 from evedrop.scenario.loading import load
-from evedrop.scenario.progress_events import ProgressEvent, RunProgress
+from evedrop.scenario.progress_events import ProgressEvent, RunProgress, ViewOpened
 from evedrop.score.summary import BuiltInMetrics, PeerSummary
 from evedrop.show.report import closing
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.studies.sweep import grid_of
 from tests.builders import GOOD, digests_of
+from tests.conftest import LIMIT
 from tests.pages import checked
 
 SMALL = Scenario(GOOD).replace(slots=12)
@@ -269,28 +274,83 @@ def test_a_comparison_takes_a_scenario_of_python() -> None:
     assert result.cell("innovation", "naive").eavesdropper is not None
 
 
-def test_a_notebook_shows_progress_and_takes_it_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only the kernel of a notebook shows a bar, and only if no function takes the events; the kernel is a stand-in."""
+@pytest.fixture
+def cells(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What a notebook shows in its cells, of which this program is the kernel."""
     shown: list[str] = []
-    handle = SimpleNamespace(update=shown.append)
 
-    def display(text: str, display_id: bool) -> SimpleNamespace:
-        assert display_id
+    def display(text: str, display_id: bool = False) -> SimpleNamespace:
         shown.append(text)
-        return handle
+        return SimpleNamespace(update=shown.append)
 
     monkeypatch.setitem(sys.modules, "IPython", _module(get_ipython=lambda: SimpleNamespace(kernel=None)))
     monkeypatch.setitem(sys.modules, "IPython.display", _module(HTML=str, display=display))
+    return shown
+
+
+def test_a_notebook_shows_progress_and_takes_it_away(cells: list[str]) -> None:
+    """Only the kernel of a notebook shows a bar, and only if no function takes the events; the kernel is a stand-in."""
     event: list[ProgressEvent] = []
     montecarlo(SMALL, trials=1, on_event=event.append)
-    assert shown == []
+    assert cells == []
     montecarlo(SMALL, trials=1)
-    assert (shown[0], shown[-1]) == ('<progress max="1" value="0.0000"></progress> 0% · starting', "")
+    assert (cells[0], cells[-1]) == ('<progress max="1" value="0.0000"></progress> 0% · starting', "")
     from evedrop.cli.api.notebook import progress
 
     with progress(None, 50) as on_event:
         on_event(RunProgress(25, 1000.0, "slots/s", {}))
-    assert shown[-2] == '<progress max="1" value="0.5000"></progress> 50% · 1,000 slots/s'
+    assert cells[-2] == '<progress max="1" value="0.5000"></progress> 50% · 1,000 slots/s'
+
+
+@pytest.mark.parametrize("mode", ["auto", "web", "notebook"])
+def test_a_live_run_is_shown_in_the_cell(mode: str, cells: list[str]) -> None:
+    """While it goes on; its page stays when it has ended."""
+    kept = run(SMALL, view=mode)
+    (frame,) = (text for text in cells if text.startswith("<iframe"))
+    assert data_at(address_in(frame)) == (kept.folder / "recording.rrd").read_bytes()
+
+
+def test_without_a_notebook_the_address_of_a_live_run_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    """With a function that takes events, it is for that function; and there is no cell to show a view in."""
+    events: list[ProgressEvent] = []
+    run(SMALL, view="web", on_event=events.append)
+    assert capsys.readouterr().out == ""
+    (address,) = (event.address for event in events if isinstance(event, ViewOpened))
+    assert str(address).startswith("http://127.0.0.1:")
+    run(SMALL, view="web")
+    words, address, _ = capsys.readouterr().out.split("\n")
+    assert words == "the view is open to anybody who has this address:"
+    assert address.startswith("http://127.0.0.1:")
+    with pytest.raises(UsageError, match="view='notebook': expected \"web\" in a program that is not a notebook"):
+        run(SMALL, view="notebook")
+
+
+def test_results_have_a_view(results: RunResults, tmp_path: Path) -> None:
+    """A frame in a notebook, elsewhere an address; it outlives the results, and ends when it is closed."""
+    shutil.copytree(results.folder, tmp_path / "copy")
+    view = load_results(tmp_path / "copy").view()
+    shutil.rmtree(tmp_path / "copy")
+    assert repr(view).split("\n") == ["the view is open to anybody who has this address:", view.address]
+    assert address_in(view._repr_html_()) == view.address
+    assert data_at(view.address).startswith(b"RRF2")
+    view.close()
+    assert repr(view) == view._repr_html_() == "a closed view"
+    with pytest.raises(OSError, match="refused"):
+        data_at(view.address)
+    assert not (results.folder / "recording.rrd").exists()
+
+
+def address_in(frame: str) -> str:
+    """The address of the page in a frame."""
+    (address,) = set(re.findall(r'(?:src|href)="([^"]+)"', frame))
+    return unescape(address)
+
+
+def data_at(address: str) -> bytes:
+    """The recording that a page shows."""
+    (data,) = parse_qs(urlsplit(address).query)["url"]
+    with urlopen(data, timeout=LIMIT) as reply:  # noqa: S310 - our own address
+        return bytes(reply.read())
 
 
 def _module(**names: Any) -> ModuleType:

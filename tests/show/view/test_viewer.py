@@ -103,7 +103,7 @@ def test_the_page_can_ask_no_other_host(viewer: Viewer) -> None:
     assert "wasm_bindgen.WebHandle" in page
     assert "//" not in re.sub(r"(?<!:)//.*", "", page), "no address, with or without a scheme"
     assert "fonts" not in page
-    assert rules["default-src"] == "'none'"
+    assert rules["default-src"] == rules["frame-ancestors"] == "'none'"
     assert rules["connect-src"].split() == [
         "'self'",
         f"http://{data}",
@@ -160,6 +160,28 @@ def test_the_recording_is_at_a_secret_address_alone(viewer: Viewer, tmp_path: Pa
     for guess in ("", "/", "/recording.rrd", f"/{token[:-1]}/recording.rrd", f"/{token}", f"/{token}/recording.rrd/"):
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(f"http://{urlsplit(data).netloc}{guess}", timeout=LIMIT)
+
+
+def test_a_page_for_a_notebook_is_for_this_machine_and_this_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only pages of this machine may frame it. The address is in the notebook's file, so no other user gets the recording."""
+    (tmp_path / "r.rrd").write_bytes(b"all")
+    started = Viewer.start("notebook", tmp_path, tmp_path / "r.rrd", complete=True)
+    assert started is not None
+    assert started.address is not None
+    try:
+        with urllib.request.urlopen(started.address, timeout=LIMIT) as reply:  # noqa: S310 - our own address
+            rules = reply.headers["Content-Security-Policy"].split("; ")
+        assert "frame-ancestors http://127.0.0.1:* http://localhost:*" in rules
+        with urllib.request.urlopen(data_of(started), timeout=LIMIT) as reply:  # noqa: S310 - the same
+            assert reply.read() == b"all"
+        for user in (os.getuid() + 1, -1):
+            monkeypatch.setattr("evedrop.show.view.serving.other_user", lambda _, user=user: user)
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                urllib.request.urlopen(data_of(started), timeout=LIMIT)  # noqa: S310 - the same
+    finally:
+        started.stop()
 
 
 @pytest.fixture

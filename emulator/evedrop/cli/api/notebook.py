@@ -1,4 +1,4 @@
-"""What Evedrop shows in a notebook: a progress bar, and tables in HTML. Needs no notebook to be imported."""
+"""What Evedrop shows in a notebook: a progress bar, tables in HTML, and the view. Needs no notebook to be imported."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from importlib import import_module
+from pathlib import Path
+from typing import final
 
 from evedrop.scenario.arguments import refuse_unless
-from evedrop.scenario.progress_events import OnEvent, ProgressEvent, RunProgress, silent
+from evedrop.scenario.progress_events import OnEvent, ProgressEvent, RunProgress, ViewOpened, silent
 from evedrop.show.report.text_table import TextTable
+from evedrop.show.view.viewer import NOTEBOOK, Viewer, open_run
 
 _TELL_SECONDS = 0.2
+_SHARED = "the view is open to anybody who has this address:"
 
 
 def in_notebook() -> bool:
@@ -46,6 +50,68 @@ def progress(on_event: OnEvent | None, total: int) -> Iterator[OnEvent]:
         yield take
     finally:
         handle.update(shown.HTML(""))
+
+
+def view_in(mode: str) -> str:
+    """The way to view a live run: in a notebook, "auto" and "web" are "notebook". Raises UsageError for "notebook" elsewhere."""
+    inside = in_notebook()
+    refuse_unless(mode != NOTEBOOK or inside, "view", mode, '"web" in a program that is not a notebook')
+    return NOTEBOOK if inside and mode in {"auto", "web"} else mode
+
+
+def shown_when_open(mode: str, emit: OnEvent) -> OnEvent:
+    """The function `emit`, but the view is shown when it opens: in the cell of a notebook, or by its printed address."""
+
+    def take(event: ProgressEvent) -> None:
+        if isinstance(event, ViewOpened) and event.address is not None:
+            if mode == NOTEBOOK:
+                shown = import_module("IPython.display")
+                shown.display(shown.HTML(view_text(event.address)))
+            elif emit is silent:
+                print(_SHARED, event.address, sep="\n", flush=True)
+        emit(event)
+
+    return take
+
+
+@final
+class OpenView:
+    """A view of results, at an address for browsers of this machine; a notebook shows it in the cell.
+
+    It is open until `close`, or until the program or the notebook's kernel ends; no other process is started for it.
+    """
+
+    def __init__(self, viewer: Viewer) -> None:
+        self._viewer = viewer
+
+    @classmethod
+    def of(cls, folder: Path, recording: Path) -> OpenView:
+        """The view of a results folder whose recording will not grow, and may be removed. Raises UsageError as `open_run`."""
+        viewer = open_run(folder, NOTEBOOK, recording=recording)
+        viewer.complete()
+        return cls(viewer)
+
+    @property
+    def address(self) -> str:
+        """The address to open in a browser of this machine. Anybody who has it sees the truth."""
+        return str(self._viewer.address)
+
+    def close(self) -> None:
+        """Accept no more browsers. Harmless if it is closed."""
+        self._viewer.stop()
+
+    def __repr__(self) -> str:
+        return f"{_SHARED}\n{self.address}" if self._viewer.alive() else "a closed view"
+
+    def _repr_html_(self) -> str:
+        return view_text(self.address) if self._viewer.alive() else "a closed view"
+
+
+def view_text(address: str) -> str:
+    """The view at an address in HTML: in a frame, with a link to it."""
+    from evedrop.show.report.page import made, printable
+
+    return printable(made("view", address))
 
 
 def bar_text(done: int, total: int, label: str) -> str:

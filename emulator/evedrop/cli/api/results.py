@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, Self
 
 import pyarrow as pa
 
-from evedrop.cli.api.notebook import table_text
+from evedrop.cli.api.notebook import OpenView, table_text
 from evedrop.model.metrics import shown_metric
 from evedrop.model.metrics.text import number_text
 from evedrop.results.comparison import COMPARISON, Comparison, read_comparison
@@ -145,6 +146,19 @@ class RunResults(Results, ReportedResults):
         from evedrop.show.view.result_pictures import run_figure  # matplotlib takes half a second
 
         return run_figure(self, panels, slots, trial, width)
+
+    def view(self) -> OpenView:
+        """The view of the run: in a notebook in the cell, elsewhere an address for a browser. Source: docs/view.md.
+
+        Raises UsageError if the results cannot be read, or have no recorded trial.
+        """
+        from evedrop.show.view.scene_slots import replay  # Rerun takes a third of a second
+
+        recording = self.folder / "recording.rrd"
+        if self.remark is None and recording.is_file():
+            return OpenView.of(self.folder, recording)
+        with tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
+            return OpenView.of(self.folder, replay(self.folder, Path(temporary) / "recording.rrd"))
 
     def __repr__(self) -> str:
         error = ("mean_squared_error", "mean_actual_trace_covariance")

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
-from evedrop.cli.api.notebook import progress
+from evedrop.cli.api.notebook import progress, shown_when_open, view_in
 from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults
 from evedrop.errors import EvedropError, UsageError
 from evedrop.results.crash_proof_tables import goes_on
@@ -22,6 +22,7 @@ from evedrop.scenario.loading import plain_tables, prepared
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import dotted
+from evedrop.show.view.viewer import NOTEBOOK
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.studies.parts import StudyPlace
@@ -157,7 +158,8 @@ def run(
     """Run a scenario live, with sensor, router, estimators and recorder in separate processes.
 
     scenario: a built-in name, a file, or a `Scenario`; out: the results folder, new or empty, by default a temporary one that is
-    removed with the results; overwrite: replace the results in `out`; view: auto, native, web or off; listen: the router's
+    removed with the results; overwrite: replace the results in `out`; view: notebook (in the cell, where it stays until the
+    kernel ends), native (a window), web (a page, whose address is printed), auto (one of these) or off; listen: the router's
     loopback endpoint, tls/127.0.0.1:PORT, by default a socket; on_event: called with each event, by default a progress bar
     in a notebook; changes: entries of the scenario by dotted key, with `__` for the dot, such as `slots=500` or
     `legitimate__link__quality=0.5`.
@@ -171,13 +173,13 @@ def run(
     """
     from evedrop.live.launch.launcher import launch  # Monte Carlo does not need it
 
-    made = scenario_of(scenario, changes)
+    made, view = scenario_of(scenario, changes), view_in(view)
     refuse_unless(
         listen is None or isinstance(listen, str), "listen", listen, "an endpoint such as tls/127.0.0.1:17460"
     )
     with place_for(out, overwrite) as place, progress(on_event, made.slots) as emit:
-        ended = launch(made, place.folder, view, listen, emit)
-        if ended.viewer is not None:
+        ended = launch(made, place.folder, view, listen, shown_when_open(view, emit))
+        if ended.viewer is not None and view != NOTEBOOK:
             ended.viewer.stop()
         results = RunResults.read(ended.folder)
         place.keep_for(results)

@@ -33,6 +33,7 @@ from typing import IO, final
 from evedrop.errors import UsageError
 from evedrop.show.view.bounded_http import BoundedServer, QuietHandler
 from evedrop.show.view.live_files import LiveFiles
+from evedrop.system.ports import other_user
 
 _POLL_SECONDS = 0.05  # between two checks of whether the file has grown
 _PIECE = 2**18
@@ -123,9 +124,10 @@ class Served:
     Raises UsageError if the port is not available.
     """
 
-    def __init__(self, followed: Followed, host: str, port: int) -> None:
+    def __init__(self, followed: Followed, host: str, port: int, private: bool = False) -> None:
+        """private: only programs of this user get the recording, because its address is written to a file."""
         self.path = f"/{secrets.token_urlsafe(24)}/recording.rrd"
-        self._server = _listening(partial(_RecordingServer, followed, self.path), host, port)
+        self._server = _listening(partial(_RecordingServer, followed, self.path, private), host, port)
         self.port = int(self._server.server_address[1])
 
     def stop(self) -> None:
@@ -134,8 +136,9 @@ class Served:
 
 
 class _RecordingServer(BoundedServer):
-    def __init__(self, followed: Followed, path: str, host: str, port: int) -> None:
+    def __init__(self, followed: Followed, path: str, private: bool, host: str, port: int) -> None:
         self.followed = followed
+        self.private = private
         self.path = path.encode()
         super().__init__((host, port), _RecordingHandler)
 
@@ -146,7 +149,8 @@ class _RecordingHandler(QuietHandler):
     def do_GET(self) -> None:
         """Send the recording to a reader that knows its address."""
         self.close_connection = True
-        if not hmac.compare_digest(self.path.encode(), self.server.path):
+        unknown = not hmac.compare_digest(self.path.encode(), self.server.path)
+        if unknown or (self.server.private and other_user(self.connection) not in {os.getuid(), None}):
             self.refuse(404)
             return
         self.connection.settimeout(None)  # a browser whose user has paused it may wait indefinitely
@@ -263,6 +267,10 @@ _ADDRESS = re.compile(r"""https?://[^\s"'`<>]+""")
 _INLINE = re.compile(r"<script>(.*?)</script>", re.DOTALL)
 
 
+_LOOPBACK, _NOWHERE = "http://127.0.0.1:* http://localhost:*", "'none'"
+"""Where a page may be shown in a frame; `http:` stands for `https:`, too."""
+
+
 @final
 class WebPage:
     """The page at an address; it can load recordings from one port of the same host, and nothing from elsewhere.
@@ -270,12 +278,14 @@ class WebPage:
     Raises UsageError if the port is not available.
     """
 
-    def __init__(self, rerun: RerunPage, host: str, port: int, seen: str, recordings: int) -> None:
+    def __init__(
+        self, rerun: RerunPage, host: str, port: int, seen: str, recordings: int, framed: bool = False
+    ) -> None:
         """host, port: where to listen; port 0: any free one. seen: the host's name for a browser.
 
-        recordings: the port of the recording.
+        recordings: the port of the recording; framed: whether pages of this machine may show the page in a frame.
         """
-        self._server = _listening(partial(_PageServer, rerun, (seen, recordings)), host, port)
+        self._server = _listening(partial(_PageServer, rerun, (seen, recordings), framed), host, port)
         self.port = int(self._server.server_address[1])
 
     def stop(self) -> None:
@@ -288,8 +298,11 @@ def own_page(html: str) -> str:
     return _ADDRESS.sub("#", _LINK.sub("", html))
 
 
-def policy(html: str, recordings: list[str]) -> str:
-    """The Content-Security-Policy of a page: its own scripts, files of its own address, and recordings from these addresses."""
+def policy(html: str, recordings: list[str], framed: bool = False) -> str:
+    """The Content-Security-Policy of a page: its own scripts, files of its own address, and recordings from these addresses.
+
+    framed: whether pages of this machine, such as a notebook, may show it in a frame.
+    """
     digests = [hashlib.sha256(script.encode()).digest() for script in _INLINE.findall(html)]
     scripts = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     return "; ".join(
@@ -302,14 +315,15 @@ def policy(html: str, recordings: list[str]) -> str:
             "worker-src 'self' blob:",
             "base-uri 'none'",
             "form-action 'none'",
-            "frame-ancestors 'none'",
+            f"frame-ancestors {_LOOPBACK if framed else _NOWHERE}",
         ]
     )
 
 
 class _PageServer(BoundedServer):
-    def __init__(self, rerun: RerunPage, recordings: tuple[str, int], host: str, port: int) -> None:
+    def __init__(self, rerun: RerunPage, recordings: tuple[str, int], framed: bool, host: str, port: int) -> None:
         self.rerun = rerun
+        self.framed = framed
         self.html = own_page(rerun.html)
         self.recordings = recordings
         super().__init__((host, port), _PageHandler)
@@ -338,7 +352,7 @@ class _PageHandler(QuietHandler):
         self.send_response(200)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(length))
-        self.send_header("Content-Security-Policy", policy(self.server.html, self._recordings()))
+        self.send_header("Content-Security-Policy", policy(self.server.html, self._recordings(), self.server.framed))
         self.send_header("Referrer-Policy", "no-referrer")  # the page's address contains that of the recording
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Cache-Control", "no-store")

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 
 HOST = "127.0.0.1"
+NOTEBOOK = "notebook"
+"""The view as a page that notebooks of this machine can show in a frame."""
 _LSOF = "/usr/sbin/lsof"
 _START_SECONDS = 120.0
 _STOP_SECONDS = 3.0
@@ -253,13 +255,13 @@ def has_screen() -> bool:
 
 
 def choose(mode: str) -> str:
-    """One of "native", "web" and "off", from these or "auto": native with a screen, otherwise web.
+    """One of "native", "web", "notebook" and "off", from these or "auto": native with a screen, otherwise web.
 
     Raises UsageError for any other word, and for "native" without a screen.
     """
     if mode == "auto":
         return "native" if has_screen() else "web"
-    if mode not in {"native", "web", "off"}:
+    if mode not in {"native", "web", NOTEBOOK, "off"}:
         raise UsageError(f"{mode} is not a way to view a run; give auto, native, web or off")
     if mode == "native" and not has_screen():
         raise UsageError(
@@ -336,8 +338,8 @@ class Viewer:
     ) -> Viewer | None:
         """Start a viewer and wait until it is ready; None for "off". A window's output goes to viewer.log in the folder `logs`.
 
-        mode: "native", "web", "off", or "auto". recording: the file to show, from its beginning on and as it grows; it need not
-        exist yet. complete: whether the file no longer grows. options: those that a window is started with.
+        mode: "native", "web", "notebook", "off", or "auto". recording: the file to show, from its beginning on and as it grows;
+        it need not exist yet. complete: whether the file no longer grows. options: those that a window is started with.
 
         Raises UsageError if it cannot be started.
         """
@@ -347,8 +349,8 @@ class Viewer:
         from evedrop.show.view.serving import Followed  # noqa: PLC0415 - only with a view
 
         followed = Followed(recording, complete)
-        if mode == "web":
-            return cls._page(followed, HOST, HOST, 0, 0)
+        if mode in {"web", NOTEBOOK}:
+            return cls._page(followed, HOST, HOST, 0, 0, framed=mode == NOTEBOOK)
         for _ in range(_ATTEMPTS - 1):
             with contextlib.suppress(PortTaken):
                 return cls._window(followed, free_port(), logs, options)
@@ -370,14 +372,16 @@ class Viewer:
             raise UsageError(f"--serve {host}:{port}: {error}") from error
 
     @classmethod
-    def _page(cls, followed: Followed, host: str, seen: str, port: int, data_port: int) -> Viewer:
-        """A page at a port of ours, and the recording at another; 0: any free one."""
+    def _page(
+        cls, followed: Followed, host: str, seen: str, port: int, data_port: int, *, framed: bool = False
+    ) -> Viewer:
+        """A page at a port of ours, and the recording at another; 0: any free one. framed: for a notebook, which saves it."""
         from evedrop.show.view.serving import RerunPage, Served, WebPage  # noqa: PLC0415 - only with a view
 
         rerun = RerunPage(executable())
-        served = Served(followed, host, data_port)
+        served = Served(followed, host, data_port, private=framed)
         try:
-            page = WebPage(rerun, host, port, seen, served.port)
+            page = WebPage(rerun, host, port, seen, served.port, framed)
         except BaseException:
             served.stop()
             raise
