@@ -46,7 +46,7 @@ EXCEPTIONS = {
     "peers/sensor.py wait self._subscription.recv": PROCESS,
 }
 """File, function and call → why it needs no limit."""
-CONTEXT = {"TAKEN", "_NO_MODULES"}
+CONTEXT = {"TAKEN", "_NO_MODULES", "_OF_COMMAND"}
 """Variables of a context, whose `get` does not wait."""
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from evedrop.cli.commands import GROUP, MODULES, ROLES
 from evedrop.cli.parser import Parser
 from evedrop.cli.tables import written_tables
+from evedrop.cli.words import words_of_commands
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.system.files import shown
 from evedrop.system.lacks import lack_of, refuse_scipy_without_room
@@ -67,7 +68,7 @@ def _status_of(given: list[str]) -> int:
     command: Callable[[argparse.Namespace], int] = options.command
     try:
         _check_names(options)
-        with written_tables(options):
+        with written_tables(options), words_of_commands():
             return command(options)
     except EvedropError as error:
         sys.stdout.flush()

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evedrop.cli.api.running import scenario_of
+from evedrop.cli.words import for_programs, speaks_python
 from evedrop.errors import UsageError
 from evedrop.model.checks import toml_of
 from evedrop.model.eavesdroppers import STRATEGIES
@@ -31,13 +32,18 @@ if TYPE_CHECKING:
 
 
 def measuring_command(given: str | Path | Scenario, changes: Mapping[str, Any], made: Scenario) -> str:
-    """A command that simulates the scenario: over a grid of μ_d if it has one μ_d, otherwise as it is.
+    """A command, or for programs a call, that simulates the scenario: over a grid of μ_d if it has one μ_d, otherwise as it is.
 
     given: the scenario as the caller named it; a Scenario, which has no name, is called SCENARIO; changes: those of the call;
     made: the scenario with these changes.
     """
     mu_d = made.encoding.parameters.get("state_probability")
     constant = isinstance(mu_d, (int, float))
+    if for_programs():
+        grid = [f"{{'encoding.state_probability': {[i / 10 for i in range(1, 10)]}}}"] if constant else []
+        words = ["SCENARIO" if isinstance(given, Scenario) else repr(str(given)), *grid]
+        words += [f"{key.replace('.', '__')}={value!r}" for key, value in dotted(changes).items()]
+        return f"{'sweep' if constant else 'montecarlo'}({', '.join(words)})"
     words = [
         "evedrop",
         "sweep" if constant else "montecarlo",
@@ -54,6 +60,7 @@ _LONGEST_SCHEDULE = 100  # designed in a minute
 _TWENTIETHS = tuple(float(i) / 20 for i in range(21))
 
 
+@speaks_python
 def design(
     scenario: str | Path | Scenario,
     *,
@@ -127,6 +134,7 @@ def _adversaries(made: Scenario, measured: str) -> tuple[float, list[Adversary],
     return quality[LEGITIMATE], adversaries, left_out
 
 
+@speaks_python
 def design_schedule(
     scenario: str | Path | Scenario,
     slots: int,
@@ -181,6 +189,7 @@ def design_schedule(
     return ScheduleDesign(schedules, left_out)
 
 
+@speaks_python
 def design_policy(
     scenario: str | Path | Scenario,
     *,
@@ -209,6 +218,7 @@ def design_policy(
     return policies_of(scenario_of(scenario, changes or {}, beyond_horizon=True), weights, prices, states)
 
 
+@speaks_python
 def design_budget(
     scenario: str | Path | Scenario, budget: float, *, changes: Mapping[str, Any] | None = None
 ) -> BudgetDesign:

@@ -7,7 +7,7 @@ import math
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol, Self
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, Self
 import pyarrow as pa
 
 from evedrop.cli.api.notebook import OpenView, table_text
+from evedrop.cli.words import in_python
 from evedrop.model.metrics import shown_metric
 from evedrop.model.metrics.text import number_text
 from evedrop.results.comparison import COMPARISON, Comparison, read_comparison
@@ -103,7 +104,8 @@ class RunResults(Results, ReportedResults):
     @cached_property
     def secrecy(self) -> Mapping[str, SecrecySummary]:
         """Eavesdropper → the verdict."""
-        return ByName("verdict on", self._typed.secrecy)
+        found = {name: replace(kept, sentence=in_python(kept.sentence)) for name, kept in self._typed.secrecy.items()}
+        return ByName("verdict on", found)
 
     @property
     def verdict(self) -> Verdict | None:
@@ -128,7 +130,7 @@ class RunResults(Results, ReportedResults):
             yield self.remark
         yield from (line for _, line in closing.verdict_lines(self._typed))
         for lines in (closing.remarks, closing.details, closing.doubts, closing.application_lines):
-            yield from lines(self._typed)
+            yield from map(in_python, lines(self._typed))
         yield from (expectation.sentence for expectation in self.expectations)
 
     def plot(

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, final
 
 from evedrop.cli.api.notebook import progress, shown_when_open, view_in
 from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults
+from evedrop.cli.words import speaks_python
 from evedrop.errors import EvedropError, UsageError
 from evedrop.results.crash_proof_tables import goes_on
 from evedrop.scenario.arguments import CHANGES, path_argument, refuse_unless, table_argument
@@ -145,6 +146,7 @@ def _clear(folder: Path, overwrite: bool) -> None:
             inside.unlink()
 
 
+@speaks_python
 def run(
     scenario: str | Path | Scenario,
     *,
@@ -186,6 +188,7 @@ def run(
         return results
 
 
+@speaks_python
 def montecarlo(
     scenario: str | Path | Scenario,
     *,
@@ -217,6 +220,7 @@ def montecarlo(
         return results
 
 
+@speaks_python
 def sweep(
     scenario: str | Path | Scenario,
     over: Mapping[str, Any],
@@ -259,6 +263,7 @@ def sweep(
         return results
 
 
+@speaks_python
 def compare(
     scenario: str | Path | Scenario,
     *,
@@ -305,6 +310,7 @@ def compare(
         return results
 
 
+@speaks_python
 def cost(
     scenario: str | Path | Scenario,
     *,
@@ -332,6 +338,7 @@ def cost(
         return secrecy_cost(made, progress_counter(emit, total), plan_of(None, workers, scheduler), place)
 
 
+@speaks_python
 def learned(
     scenario: str | Path | Scenario,
     *,
