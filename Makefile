@@ -8,7 +8,7 @@ READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs-ready
 NOTEBOOKS_READY := $(VENV)/.notebooks-ready
 
-.PHONY: demo test test-wheel test-pictures notebooks bench bench-against coverage test-long test-hosts test-compose test-fresh test-faults test-mutants docs lint lint-types lint-rest setup clean
+.PHONY: demo test test-wheel test-pictures pictures notebooks bench bench-against coverage test-long test-hosts test-compose test-fresh test-faults test-mutants docs lint lint-types lint-rest setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
@@ -24,6 +24,12 @@ test-wheel: $(READY)
 # Pictures and videos, drawn by Rerun's viewer without a screen. Without a Vulkan driver they are skipped.
 test-pictures: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "pictures and not long" tests/show/view
+
+# The pictures of README and docs/, drawn again by the commands that the pages name: some minutes. They need a Vulkan driver.
+# NAMES=vehicle.gif: only that file.
+NAMES ?=
+pictures: $(READY)
+	$(BIN)/python -m tests.docs.pictures $(NAMES)
 
 COVERING := $(addprefix tests/,model live/protocol)
 

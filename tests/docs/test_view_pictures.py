@@ -3,54 +3,21 @@
 from __future__ import annotations
 
 import re
-import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import numpy.typing as npt
 import pytest
+from PIL import Image
 
-from tests.privileged import CannotRun, skip
+from evedrop.cli import main as cli
+from tests.docs.pictures import DOCS, PICTURES, ROOT, drawn, quoted, run_of
 
-ROOT = Path(__file__).parents[2]
-DOCS = ROOT / "docs"
 SQUARE = 10
 """Pixels along a side of the squares whose mean colours are compared, so that the edges of letters matter little."""
 TOLERANCE = 0.002
 """Of the mean difference, from 0 to 1: the same slot, drawn again, differed by 0.0002, and one a second later by 0.005."""
-
-
-def evedrop(*words: str | Path) -> None:
-    """Run a command, and fail if it fails. Skips the test where nothing can draw."""
-    done = subprocess.run(
-        [sys.executable, "-m", "evedrop", *words], check=False, timeout=300, capture_output=True, text=True
-    )
-    if "no Vulkan driver" in done.stderr:
-        skip(CannotRun(done.stderr))
-    assert done.returncode == 0, done.stderr
-
-
-def run_of(scenario: str, folder: Path) -> Path:
-    """A run of a built-in scenario, as fast as possible."""
-    evedrop("run", scenario, "--pace", "0", "--view", "off", "--out", folder / "run")
-    return folder / "run"
-
-
-def quoted(page: Path, picture: str) -> list[str]:
-    """The words of the command with which a page says that one of its pictures is made."""
-    text = page.read_text(encoding="utf-8")
-    match = re.search(r"`evedrop (view RUN --picture FILE\.png[^`]*)`", text[text.index(f"{picture})") :])
-    assert match is not None
-    return shlex.split(match[1])
-
-
-def drawn(words: list[str], run: Path, picture: Path) -> Path:
-    """The picture that a quoted command makes of a run."""
-    evedrop(*({"RUN": run, "FILE.png": picture}.get(word, word) for word in words))
-    return picture
 
 
 def coarse(picture: Path) -> npt.NDArray[np.float64]:
@@ -75,7 +42,8 @@ def test_the_picture_of_the_readme_is_what_its_command_draws(tmp_path: Path) -> 
     words = quoted(ROOT / "README.md", "live_view.png")
     run = run_of("vehicle", tmp_path)
     assert difference(drawn(words, run, tmp_path / "same.png"), DOCS / "live_view.png") < TOLERANCE
-    words[-1] = str(int(words[-1]) + 50)
+    at = words.index("--slot") + 1
+    words[at] = str(int(words[at]) + 50)
     assert difference(drawn(words, run, tmp_path / "later.png"), DOCS / "live_view.png") > 2 * TOLERANCE
 
 
@@ -87,6 +55,31 @@ def test_the_picture_of_a_day_is_what_its_command_draws(tmp_path: Path) -> None:
     assert difference(drawn(words, run, tmp_path / "same.png"), DOCS / "microgrid_view.png") < TOLERANCE
     noon = drawn([*words, "--slot", "43200"], run, tmp_path / "noon.png")
     assert difference(noon, DOCS / "microgrid_view.png") > 2 * TOLERANCE
+
+
+def test_every_picture_has_a_command_that_draws_it() -> None:
+    """So that `make pictures` draws all of them again."""
+    assert {path.name for path in DOCS.iterdir() if path.suffix in {".png", ".gif"}} == PICTURES.keys()
+    for page, picture in (
+        (ROOT / "README.md", "live_view.png"),
+        (DOCS / "view.md", "vehicle.gif"),
+        (DOCS / "view.md", "microgrid_view.png"),
+        (DOCS / "wire.md", "wire_view.png"),
+    ):
+        assert cli.parser_of().parse_args(quoted(page, picture)).command is not None
+
+
+def test_the_video_of_the_vehicle_is_a_small_loop_of_ten_seconds() -> None:
+    """As wide as a page, so that its words are sharp, and below 3 MB."""
+    path = DOCS / "vehicle.gif"
+    assert path.stat().st_size < 3_000_000
+    with Image.open(path) as gif:
+        assert gif.width == 880
+        length = 0
+        for number in range(getattr(gif, "n_frames", 1)):
+            gif.seek(number)
+            length += gif.info["duration"]
+    assert length == 10_000
 
 
 def test_a_picture_is_described_alike_wherever_it_is_shown() -> None:

@@ -28,8 +28,8 @@ def view_section() -> str:
     """The section of the gallery in Markdown."""
     parts = [
         "## The view\n",
-        f"A run of `{SCENARIO}` in [the view](view.md), at the same slot while the run is paused there and when it has ended, in",
-        "windows of two sizes.\n",
+        f"The scene of a run of `{SCENARIO}` in [the view](view.md), at the same slot while the run is paused there and",
+        "when it has ended, in two sizes.\n",
     ]
     for name in _names():
         state, size = name.split("-")

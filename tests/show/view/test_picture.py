@@ -1,5 +1,6 @@
 import io
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -117,11 +118,17 @@ def test_a_picture_of_a_panel_has_no_frame(panel: str, simulated: Callable[..., 
 
 @pytest.mark.pictures
 def test_a_panel_that_the_recording_lacks_is_refused(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
-    """With the panels that it has, and a hint; no file appears."""
+    """With the panels that it has, which docs/view.md lists, and a hint; no file appears."""
     rrd = recorded(simulated(60), tmp_path / "r.rrd")
     with skipped_without_driver(), pytest.raises(UsageError, match="did you mean smart") as told:
         picture_apart(rrd, tmp_path / "r.png", panel="smurt")
-    assert "give scene, numbers, verdict, what-happens, estimator, " in str(told.value)
+    names = str(told.value).partition("; give ")[2].partition(";")[0].replace(" or ", ", ").split(", ")
+    page = (Path(__file__).parents[3] / "docs" / "view.md").read_text(encoding="utf-8")
+    named = re.findall(
+        r"`([a-z-]+)`", page.partition("a list of those that it has:")[2].partition(" for the scenario")[0]
+    )
+    assert names[:2] == ["scene", "numbers"]
+    assert {*names[2:]} == {*named, "naive", "suspicious", "smart"}
     assert [path.name for path in tmp_path.iterdir()] == ["r.rrd"]
 
 
