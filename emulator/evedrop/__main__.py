@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _WITH_VALUES = ("--seed", "--set", "--over")
 _HIDDEN = "..."
-_COLLECT_AFTER = 20_000
+_COLLECT_AFTER = 50_000
 """New objects, before cycles among them are searched for: almost all that a command makes are its modules, and stay."""
 
 

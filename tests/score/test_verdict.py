@@ -205,10 +205,11 @@ def test_a_distance_counts_the_first_states_of_one_unit() -> None:
     assert [leading_states(units, 4) for units in (("m", "m", "m/s", "m/s"), ("m",) * 4, ())] == [2, 4, 4]
     tally, x, x_hat = DistanceTally(2, 4, 1), np.zeros((4, 4, 1)), np.zeros((4, 4, 1))
     x_hat[:2], x_hat[2:, :, 0] = 100.0, [3.0, 4.0, 50.0, 60.0]
-    tally.add_slots(0, np.sum((x - x_hat) ** 2, axis=1), x, x_hat)
+    errors = np.sum((x - x_hat) ** 2, axis=1)
+    tally.add_slots(0, errors, errors[:, 0], x, x_hat)
     assert tally.distance == 5.0
     unknown = DistanceTally(2, 4, 1)
-    unknown.add_slots(0, np.ones((4, 1)))
+    unknown.add_slots(0, np.ones((4, 1)), np.ones(4))
     assert unknown.distance is None
 
 

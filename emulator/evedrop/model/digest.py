@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from array import array
 from bisect import bisect_left, bisect_right
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from hashlib import sha256
 from typing import final
@@ -117,9 +118,8 @@ class PartialDigests:
             self._count = 0
 
     def _hash(self, beliefs: Beliefs) -> None:
-        for first, records in _records(beliefs.action != Action.LOST, beliefs.x_hat, beliefs.P):
-            for digest, record in zip(self._hashes[first : first + len(records)], records, strict=True):
-                digest.update(record)
+        for first, records in _records(beliefs.action != int(Action.LOST), beliefs.x_hat, beliefs.P):
+            deque(map(xxh3_128.update, self._hashes[first : first + len(records)], records), maxlen=0)
 
 
 def _room(n: int, trials: int) -> Beliefs:

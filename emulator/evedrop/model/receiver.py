@@ -59,7 +59,10 @@ _SMALLEST = 1e-145  # the square of a smaller number has fewer digits
 
 
 class Action(IntEnum):
-    """What a receiver did in a slot, as far as the receiver knows."""
+    """What a receiver did in a slot, as far as the receiver knows.
+
+    Compare arrays with `int(Action.LOST)`, not with `Action.LOST`, before which numpy makes them eight times as wide.
+    """
 
     LOST = 0
     """Nothing was received: γ = 0."""

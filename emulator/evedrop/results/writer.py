@@ -321,7 +321,7 @@ class ResultsWriter:
 
 def seen_actions(action: Codes, nu: Flags) -> Codes:
     """Indices into `ACTIONS`: the actions, with the truth about each packet's type."""
-    misled = (action == Action.STATE) & nu
+    misled = (action == int(Action.STATE)) & nu
     return np.where(misled, np.uint8(ACTIONS.index(MISLED)), action)
 
 

@@ -138,16 +138,20 @@ class DistanceTally:
         self._held: list[tuple[Floats, Floats]] = []
         self._held_slots = self._done = 0
 
-    def add_slots(self, first: int, errors: Floats, x: Floats | None = None, x_hat: Floats | None = None) -> None:
-        """Add the slots from `first` on: squared errors (c, R), states and estimates (c, n, R), None in modes without states."""
-        squares = errors
+    def add_slots(
+        self, first: int, errors: Floats, sums: Floats, x: Floats | None = None, x_hat: Floats | None = None
+    ) -> None:
+        """Add the slots from `first` on.
+
+        Squared errors (c, R) and their sums (c,), states and estimates (c, n, R), None in modes without states.
+        """
         if self._states is not None:
             if x is None or x_hat is None:
-                squares = np.full_like(errors, np.nan)
+                sums = np.full(len(errors), np.nan)
             else:
-                squares = kernels.squared_errors(x[:, : self._states], x_hat[:, : self._states])
-        self._counted += squares[max(0, self._first - first) :].size
-        self._held.append((errors[:, 0].copy(), squares.sum(axis=1)))
+                sums = kernels.sums(kernels.squared_errors(x[:, : self._states], x_hat[:, : self._states]))[:, 0]
+        self._counted += errors[max(0, self._first - first) :].size
+        self._held.append((errors[:, 0].copy(), sums))
         self._held_slots += len(errors)
         if self._held_slots >= _HELD:
             self._add_held()

@@ -58,7 +58,7 @@ class LeakTally:
     def add_slots(self, action: Codes, nu: Flags, revealed: HeardBits) -> None:
         """Add the next slots: the receiver's actions, and the packets' types, (c, R) each."""
         self.slots += len(action)
-        kernels.add_leaked(self._sums, action != Action.LOST, nu, revealed.by_type)
+        kernels.add_leaked(self._sums, action != int(Action.LOST), nu, revealed.by_type)
         expected = np.full(len(action), math.nan) if revealed.expected is None else revealed.expected
         self._expected = added_in_order(self._expected, expected[:, None])
 

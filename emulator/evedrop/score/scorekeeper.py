@@ -86,7 +86,7 @@ class Scorekeeper:
             tally = self.run_tally.tallies[name]
             tally.add_slots(slots.first, *values)
             if tally.distance is not None:
-                tally.distance.add_slots(slots.first, errors, sensor.x, receiver.x_hat)
+                tally.distance.add_slots(slots.first, errors, values.sums.error, sensor.x, receiver.x_hat)
             if tally.conditional is not None:
                 tally.conditional.add_actions(receiver.action)
             if tally.leak is not None:

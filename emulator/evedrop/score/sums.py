@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from itertools import pairwise
 from typing import Any, final
 
 import numpy as np
@@ -79,15 +80,18 @@ class SlotHistograms:
         """`LEVELS` of every slot, (slots, levels); NaN in slots that were left out or have no values."""
         edges = self._edges()
         quantiles = np.full((self._slots, len(LEVELS)), np.nan)
-        totals = self.counts.sum(axis=1)
-        cumulative = np.cumsum(self.counts, axis=1)
-        rows = np.flatnonzero(totals)
+        filled = np.flatnonzero(self.counts.any(axis=0))
+        low, high = (filled[0], filled[-1] + 1) if filled.size else (0, 1)
+        counts = self.counts[:, low:high]
+        cumulative = np.cumsum(counts, axis=1)
+        rows = np.flatnonzero(cumulative[:, -1])
         for column, level in enumerate(LEVELS):
-            wanted = level * totals[rows]
-            bins = np.minimum((cumulative[rows] < wanted[:, None]).sum(axis=1), _BINS - 1)
-            count = self.counts[rows, bins]
+            wanted = level * cumulative[rows, -1]
+            bins = (cumulative[rows] < wanted[:, None]).sum(axis=1)
+            count = counts[rows, bins]
             before = cumulative[rows, bins] - count
             part = np.clip((wanted - before) / np.maximum(count, 1), 0.0, 1.0)
+            bins += low
             values = edges[bins] + part * (edges[bins + 1] - edges[bins])
             # In the first and the last bin, values are known only to be too small or too large.
             quantiles[rows * self._stride, column] = np.select([bins == 0, bins == _BINS - 1], [0.0, np.inf], values)
@@ -157,7 +161,7 @@ def slot_sums(error: Floats, action: Codes, trace: Floats | None = None) -> Slot
     trace: if None, the error is tr P itself.
     """
     count, trials = error.shape
-    errors, squares = error.sum(axis=1), (error * error).sum(axis=1)
+    errors, squares = kernels.sums(error).T
     counts = kernels.count_codes(action, len(Action))
     received = trials - counts[:, Action.LOST].astype(np.float64)
     discarded = counts[:, Action.DISCARDED]
@@ -246,6 +250,7 @@ class Tally(ReceiverTally):
 
     def __post_init__(self) -> None:
         self.window_errors = np.zeros((WINDOWS + 1, self.trials))
+        self._bounds = [0, *window_bounds(self.slots).tolist()]
         self.bursts = np.zeros(COUNTED_BURSTS, np.int64)
         self.delays = np.zeros(0, np.int64)
         self._finished: Floats | None = np.zeros(self.trials)
@@ -262,11 +267,10 @@ class Tally(ReceiverTally):
         self.theoretical_trace += float(expected.sum()) * self.trials
         self.received += int(sums.received.sum())
         self.used += int(sums.used.sum())
-        windows = window_of(np.arange(first, first + count), self.slots)
-        for window in range(windows[0], windows[-1] + 1):
-            inside = np.flatnonzero(windows == window)
-            if inside.size:
-                self.window_errors[window] += error[inside[0] : inside[-1] + 1].sum(axis=0)
+        for window, bounds in enumerate(pairwise(self._bounds), -1):
+            start, stop = (max(bound - first, 0) for bound in bounds)
+            if start < min(stop, count):
+                self.window_errors[window] += error[start:stop].sum(axis=0)
 
     def add_traces(self, first: int, traces: Floats | None) -> None:
         """Add tr P of the slots from `first` on and of every trial, (c, R); None if it is not known."""
@@ -287,10 +291,10 @@ class Tally(ReceiverTally):
 
     def account(self, link: LinkSlots, action: Codes) -> None:
         """Compare the journal of the link with the receiver's action, (c, R)."""
-        received, delivered = action != Action.LOST, link.delivered
+        received, delivered = action != int(Action.LOST), link.delivered
         self.unexplained += int(np.count_nonzero(delivered != received))
         self.packets[0] += _counts_of_trials(received)
-        self.packets[1] += _counts_of_trials(received & (action != Action.DISCARDED))
+        self.packets[1] += _counts_of_trials(received & (action != int(Action.DISCARDED)))
         count = delivered.size - int(np.count_nonzero(delivered))
         for reason, lost in zip(REASONS, link.lost.sum(axis=0, dtype=np.int64).tolist(), strict=True):
             self.lost[reason] = self.lost.get(reason, 0) + lost

@@ -152,7 +152,7 @@ class FirstState(MetricTally):
 
     def add(self, slots: ScoredSlots) -> None:
         """Add the next slots."""
-        states = slots.action == Action.STATE
+        states = slots.action == int(Action.STATE)
         new = states.any(axis=0) & (self._first == _NEVER)
         self._first[new] = slots.first + states.argmax(axis=0)[new]
 

@@ -14,6 +14,7 @@ from typing import final
 import numpy as np
 
 from evedrop.model.digest import Digests
+from evedrop.model.kernels.current import kernels
 from evedrop.model.metrics.metric import ScoredSlots
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import Account, Accountant
@@ -197,7 +198,7 @@ def _score(block: TrialBlock, keeper: Scorekeeper, rows: slice, chunk: Chunk, sl
     for name, values in part.receivers.items():
         account = _account(block, name, rows, chunk)
         trace = chunk.receivers[name].trace[:, rows]
-        receivers[name] = replace(values, trace=np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1))
+        receivers[name] = replace(values, trace=kernels.sums(trace))
         links[name] = account.slots
         keeper.run_tally.tallies[name].count(account)
     errors_and_traces = {
@@ -214,13 +215,13 @@ def _add(block: TrialBlock, mode: Mode, rows: slice, chunk: Chunk, expected: Map
         error, trace, action = values.error[:, rows], values.trace[:, rows], values.action[:, rows]
         sums = slot_sums(error, action)
         if values.error is not values.trace:
-            sums = slot_sums(error, action, np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1))
+            sums = slot_sums(error, action, kernels.sums(trace))
         block.sums[name].add_trials(chunk.first, sums)
         tally = block.run_tally.tallies[name]
         tally.watched.add_slots(ScoredSlots(chunk.first, error, action, sums.trace, expected[name]))
         tally.add_slots(chunk.first, error, sums, expected[name])
         if tally.distance is not None:
-            tally.distance.add_slots(chunk.first, error)
+            tally.distance.add_slots(chunk.first, error, sums.error)
         if (
             tally.conditional is not None and mode is not Mode.COVARIANCE_ONLY
         ):  # there, the error is its own expectation

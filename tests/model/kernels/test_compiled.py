@@ -209,6 +209,7 @@ def test_counts_are_the_same(random: np.random.Generator, slots: int, trials: in
     same(compiled.count_bursts(result, 1, runs[0], most), reference.count_bursts(result, 1, runs[1], most))
     same(*runs)
     values, bins = np.abs(numbers(random, slots, trials)), int(random.integers(1, 300))
+    twins("sums", values)
     counts = [np.full((slots, bins), 3, np.uint32) for _ in range(2)]
     base = int(np.float64(1e-3).view(np.int64)) >> 50
     compiled.add_to_histograms(counts[0], values, 50, base)
@@ -222,6 +223,17 @@ def test_counts_are_the_same(random: np.random.Generator, slots: int, trials: in
         kernels.add_leaked(sums[1], flags, types, by_type)
     same(*between)
     same(*leaked)
+
+
+@pytest.mark.parametrize("trials", [7, 8, 129, 500, 999, 2000, 8193])
+def test_sums_of_many_trials_are_those_of_numpy(trials: int) -> None:
+    """To the bit, of numbers that differ by many powers of ten; of some columns of a larger array, too."""
+    random = np.random.default_rng(trials)
+    values = random.standard_normal((3, trials + 5)) * np.exp(20.0 * random.standard_normal((3, trials + 5)))
+    for some in (values, values[:, 2:-3]):
+        expected = np.stack([some.sum(axis=1), (some * some).sum(axis=1)], axis=1)
+        same(compiled.sums(some), expected)
+        same(reference.sums(some), expected)
 
 
 @QUICK

@@ -49,6 +49,7 @@ FIT: dict[str, tuple[Any, ...]] = {
     "records": (flags(SLOTS, TRIALS), ones(*PACKETS), ones(*COVARIANCES), codes(TRIALS, SLOTS, 41)),
     "squared_errors": (ones(*PACKETS), ones(*PACKETS)),
     "traces": (ones(*COVARIANCES),),
+    "sums": (ones(SLOTS, TRIALS),),
     "count_codes": (codes(SLOTS, TRIALS), 3),
     "count_bursts": (codes(SLOTS, TRIALS), 1, np.zeros(TRIALS, np.int64), 4),
     "add_between": (ones(3, TRIALS), flags(SLOTS, TRIALS), ones(SLOTS, TRIALS)),

@@ -126,7 +126,7 @@ class BeliefReporter:
         self._digests.update(self._log.add(slots.slots, slots.beliefs))
         if self._sums is not None:
             self._trace_sums.update(self._sums.add(slots.slots, trace))
-        sums = np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1)
+        sums = kernels.sums(trace)
         P, recorded = slots.P, self._brief.recorded
         if recorded < self._brief.trials:
             P = P[..., :recorded].copy()  # a view would keep the covariances of all trials until the report

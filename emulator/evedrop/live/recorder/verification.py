@@ -107,7 +107,7 @@ class Verifier:
         trials, claimed = slots.x_hat.shape[2], _sums_of(slots)
         others = trials - traces.shape[1]
         with np.errstate(over="ignore", invalid="ignore"):  # a receiver may have made these numbers up
-            sums_ = np.stack([traces.sum(axis=1), (traces * traces).sum(axis=1)], axis=1)
+            sums_ = kernels.sums(traces)
             size = np.stack([np.sqrt(trials * np.abs(claimed[:, 1])), np.abs(claimed[:, 1])], axis=1)
             left = claimed - sums_
             if others == 0:
@@ -155,7 +155,7 @@ class Verifier:
                 self._check_sent(slots.sensor.sent, slots.links[name])
 
     def _check_received(self, name: str, receiver: ReceiverSlots, link: LinkSlots) -> None:
-        received = receiver.action != Action.LOST
+        received = receiver.action != int(Action.LOST)
         wrong = received != link.delivered
         if wrong.any():
             row, r = (int(i) for i in np.argwhere(wrong)[0])

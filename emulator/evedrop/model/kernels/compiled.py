@@ -199,6 +199,14 @@ def traces(P: Floats) -> Floats:
     return out
 
 
+def sums(values: Floats) -> Floats:
+    """As `reference.sums`."""
+    slots, trials = values.shape
+    out = np.empty((slots, 2))
+    _lib.kernels_sums(slots, trials, _doubles(values, (slots, trials)), _buffer("double[]", out))
+    return out
+
+
 def add_between(sums: Floats, used: Flags, traces: Floats) -> None:
     """As `reference.add_between`."""
     slots, trials = used.shape
@@ -228,7 +236,7 @@ def count_bursts(codes: Codes, lost: int, run: NDArray[np.int64], most: int) -> 
     """As `reference.count_bursts`."""
     slots, trials = codes.shape
     expect_runs(run, trials)
-    counts = np.zeros(most + 1, np.uint32)
+    counts = np.zeros(most, np.uint32)
     _lib.kernels_bursts(
         slots,
         trials,
@@ -238,7 +246,7 @@ def count_bursts(codes: Codes, lost: int, run: NDArray[np.int64], most: int) -> 
         most,
         _buffer("uint32_t[]", counts),
     )
-    return counts[1:]
+    return counts
 
 
 def add_to_histograms(counts: NDArray[np.uint32], values: Floats, shift: int, base: int) -> None:

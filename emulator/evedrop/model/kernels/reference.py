@@ -262,6 +262,16 @@ def traces(P: Floats) -> Floats:
 
 
 @np.errstate(over="ignore", invalid="ignore")
+@np.errstate(over="ignore", invalid="ignore")  # as in C: the square of a large error is infinite
+def sums(values: Floats) -> Floats:
+    """Sums over trials of values (c, R), and of their squares, (c, 2), in the order of `numpy.sum`."""
+    slots, trials = values.shape
+    expect(values, (slots, trials))
+    values = np.ascontiguousarray(values)
+    return np.stack([values.sum(axis=1), (values * values).sum(axis=1)], axis=1)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # as in C: covariances may exceed double precision
 def add_between(sums: Floats, used: Flags, traces: Floats) -> None:
     """Add slots to three sums of each trial, (3, R): of tr P, of tr P up to the last used state, and the squares between states.
 

@@ -243,7 +243,7 @@ def pooled(fates: Sequence[Codes]) -> Codes:
     """`Fate` of the packets of several links, (slots, R) each: delivered if any delivers, otherwise lost as on the first."""
     result = fates[0].copy()
     for other in fates[1:]:
-        result[other == Fate.DELIVERED] = Fate.DELIVERED
+        result[other == int(Fate.DELIVERED)] = Fate.DELIVERED
     return result
 
 

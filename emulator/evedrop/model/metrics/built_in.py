@@ -38,7 +38,7 @@ class ReceivedFraction(MeanMetric, TallyMetric):
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
         """Counts of packets received, (c, R)."""
-        received: Floats = (slots.action != Action.LOST).astype(np.float64)
+        received: Floats = (slots.action != int(Action.LOST)).astype(np.float64)
         return received if slots.late is None else np.add(received, slots.late, out=received)
 
 
@@ -54,7 +54,7 @@ class UsedFraction(MeanMetric, TallyMetric):
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
         """Counts of packets received and used, (c, R)."""
-        used: Floats = ((slots.action != Action.LOST) & (slots.action != Action.DISCARDED)).astype(np.float64)
+        used: Floats = ((slots.action != int(Action.LOST)) & (slots.action != int(Action.DISCARDED))).astype(np.float64)
         return used if slots.late_used is None else np.add(used, slots.late_used, out=used)
 
 

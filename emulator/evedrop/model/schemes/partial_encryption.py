@@ -63,7 +63,7 @@ class PartialEncryptionEstimator(Receiver):
         action = self.act(k, heard.gamma)
         z = heard.z
         if self._hidden.any():
-            masked = self._hidden[:, None] & (action == Action.STATE)
+            masked = self._hidden[:, None] & (action == int(Action.STATE))
             z = np.where(masked, self._mask.reveal(k, np.where(masked, z, 0.0)), z)
         return update.belief(self.process, k, belief, action, z, np.zeros_like(z))
 

@@ -292,7 +292,7 @@ class ReceiverCore:
         for slot in slots:
             slot.before = belief
             belief = self._receiver.step(slot.k, belief, slot.heard)
-            self._late[1] += slot.fresh & (belief.action != Action.DISCARDED)
+            self._late[1] += slot.fresh & (belief.action != int(Action.DISCARDED))
             slot.fresh = np.zeros_like(slot.fresh)
         self.belief = belief
 

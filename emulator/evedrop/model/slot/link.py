@@ -43,7 +43,7 @@ class Fates(NamedTuple):
     @property
     def in_time(self) -> Flags:
         """γ: delivered in its own slot, (c, R)."""
-        delivered: Flags = self.codes == Fate.DELIVERED
+        delivered: Flags = self.codes == int(Fate.DELIVERED)
         return delivered if self.delays is None else delivered & (self.delays == 0)
 
     def copied(self) -> Fates:
@@ -211,12 +211,12 @@ class Link:
             codes = np.where(full[:, None], np.uint8(Fate.OVERFLOW), codes)
             delays = waits[:, None] + (np.zeros(shape) if delays is None else delays)
         if self._state.cut:
-            codes = np.where(codes == Fate.OVERFLOW, codes, np.uint8(Fate.CUT))
+            codes = np.where(codes == int(Fate.OVERFLOW), codes, np.uint8(Fate.CUT))
         whole = None if delays is None else delays.astype(np.uint32)
         codes = self._received(slots, codes, whole)
         again = None
         if chances is not None and settings.get("duplicate"):
-            again = (codes == Fate.DELIVERED) & (chances[:, 2] < settings["duplicate"])
+            again = (codes == int(Fate.DELIVERED)) & (chances[:, 2] < settings["duplicate"])
         rests = None if delays is None or whole is None else delays[:, 0] - whole[:, 0]
         return Fates(codes, whole, again, rests)
 
@@ -349,7 +349,7 @@ class Accountant:
         for k in [k for k in self._due if k < slots.stop]:
             counts[k - slots.start] += self._due.pop(k)
         if fates.delays is not None:
-            waits = np.where(fates.codes == Fate.DELIVERED, fates.delays, 0)
+            waits = np.where(fates.codes == int(Fate.DELIVERED), fates.delays, 0)
             for row, trial in zip(*np.nonzero(waits), strict=True):
                 k = slots.start + int(row) + int(waits[row, trial])
                 if k < slots.stop:
@@ -364,7 +364,7 @@ class Accountant:
             delays = np.zeros(bins, np.uint32)
             delays[0] = counts[:, [Fate.DELIVERED, Fate.LATE]].sum()
             return delays
-        through = (fates.codes == Fate.DELIVERED) | (fates.codes == Fate.LATE)
+        through = (fates.codes == int(Fate.DELIVERED)) | (fates.codes == int(Fate.LATE))
         return np.bincount(np.minimum(fates.delays[through], bins - 1), minlength=bins).astype(np.uint32)
 
 

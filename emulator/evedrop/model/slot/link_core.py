@@ -78,7 +78,7 @@ class Transit:
     def arrival(self, k: int, fates: Fates, row: int, z: Floats, header: NDArray[np.int64] | None = None) -> Arrival:
         """The packets that arrive in slot k, whose own packets z (n, R) and header (h, R) have the fates of one row."""
         codes, delays, again = fates.codes[row], fates.delays, fates.again
-        delivered: Flags = codes == Fate.DELIVERED
+        delivered: Flags = codes == int(Fate.DELIVERED)
         due = self._due.pop(k, [])
         if delays is not None:
             waits = delays[row]

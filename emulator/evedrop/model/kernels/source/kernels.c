@@ -132,6 +132,10 @@ void kernels_traces(int64_t slots, int64_t n, int64_t trials, const double *P, d
   CHOOSE(traces, (slots, n, trials, P, out));
 }
 
+void kernels_sums(int64_t slots, int64_t trials, const double *values, double *out) {
+  CHOOSE(sums, (slots, trials, values, out));
+}
+
 void kernels_add_between(int64_t slots, int64_t trials, const uint8_t *state, const double *traces, double *total,
                          double *mark, double *squares) {
   CHOOSE(add_between, (slots, trials, state, traces, total, mark, squares));

@@ -40,6 +40,9 @@ void kernels_squared_errors(int64_t slots, int64_t n, int64_t trials, const doub
 /* tr P, (slots, trials), from (slots, n, n, trials). */
 void kernels_traces(int64_t slots, int64_t n, int64_t trials, const double *P, double *out);
 
+/* Sums over trials of values (slots, trials), and of their squares, (slots, 2). */
+void kernels_sums(int64_t slots, int64_t trials, const double *values, double *out);
+
 /* Slot by slot: what total (trials,) grew by since mark (trials,) is added to mark, and its square to squares (trials,), where
    state (slots, trials) is 1; then traces (slots, trials) is added to total. */
 void kernels_add_between(int64_t slots, int64_t trials, const uint8_t *state, const double *traces, double *total,
@@ -50,11 +53,11 @@ void kernels_add_between(int64_t slots, int64_t trials, const uint8_t *state, co
 void kernels_add_leaked(int64_t slots, int64_t trials, const uint8_t *heard, const uint8_t *nu, const double *by_type,
                         double *bits, double *clear);
 
-/* How often each code below `kinds` occurs in each slot, (slots, kinds), from codes (slots, trials). */
+/* Adds to counts (slots, kinds) how often each code below `kinds` occurs in each slot, from codes (slots, trials). */
 void kernels_count_codes(int64_t slots, int64_t trials, const uint8_t *codes, int64_t kinds, uint32_t *counts);
 
-/* Lengths of runs of `lost` that another code ends, added to counts (most + 1,), those of `most` and more together, and the
-   packets that end no run as length 0; run (trials,): the length of each trial's current run, before and after. */
+/* Lengths of runs of `lost` that another code ends, 1, 2, ..., added to counts (most,), those of `most` and more together;
+   run (trials,): the length of each trial's current run, before and after. */
 void kernels_bursts(int64_t slots, int64_t trials, const uint8_t *codes, uint8_t lost, int64_t *run, int64_t most,
                     uint32_t *counts);
 

@@ -186,13 +186,53 @@ static void NAME(traces, SET)(int64_t slots, int64_t n, int64_t trials, const do
     }
 }
 
-static void NAME(count_codes, SET)(int64_t slots, int64_t trials, const uint8_t *codes, int64_t kinds, uint32_t *counts) {
-  for (int64_t s = 0; s < slots; s++) {
-    uint32_t all[256] = {0};
-    for (int64_t r = 0; r < trials; r++) all[codes[s * trials + r]]++;
-    memcpy(counts + s * kinds, all, (size_t)(kinds < 256 ? kinds : 256) * sizeof *counts);
+/* The sums of numbers and of their squares, in numpy's order: eight sums of up to 128 numbers, halves of more. */
+static void NAME(sums_of, SET)(int64_t count, const double *values, double *sums) {
+  if (count > 128) {
+    int64_t half = count / 2 - count / 2 % 8;
+    double more[2];
+    NAME(sums_of, SET)(half, values, sums);
+    NAME(sums_of, SET)(count - half, values + half, more);
+    sums[0] += more[0];
+    sums[1] += more[1];
+    return;
+  }
+  int64_t i = 0;
+  sums[0] = sums[1] = 0.0;
+  if (count >= 8) {
+    double of[8] = {0.0}, squares[8] = {0.0};
+    for (; i < count - count % 8; i += 8)
+      for (int64_t j = 0; j < 8; j++) {
+        of[j] += values[i + j];
+        squares[j] += values[i + j] * values[i + j];
+      }
+    sums[0] = ((of[0] + of[1]) + (of[2] + of[3])) + ((of[4] + of[5]) + (of[6] + of[7]));
+    sums[1] = ((squares[0] + squares[1]) + (squares[2] + squares[3])) + ((squares[4] + squares[5]) + (squares[6] + squares[7]));
+  }
+  for (; i < count; i++) {
+    sums[0] += values[i];
+    sums[1] += values[i] * values[i];
   }
 }
+
+static void NAME(sums, SET)(int64_t slots, int64_t trials, const double *values, double *out) {
+  for (int64_t s = 0; s < slots; s++) NAME(sums_of, SET)(trials, values + s * trials, out + 2 * s);
+}
+
+#define TILE 192 /* below 256: a byte counts the codes of a tile */
+
+static void NAME(count_codes, SET)(int64_t slots, int64_t trials, const uint8_t *codes, int64_t kinds, uint32_t *counts) {
+  for (int64_t s = 0; s < slots; s++, codes += trials, counts += kinds)
+    for (int64_t start = 0; start < trials; start += TILE) {
+      int64_t count = trials - start < TILE ? trials - start : TILE;
+      for (int64_t i = 0; i < kinds && i < 256; i++) {
+        uint8_t found = 0;
+        for (int64_t r = 0; r < count; r++) found += codes[start + r] == (uint8_t)i;
+        counts[i] += found;
+      }
+    }
+}
+#undef TILE
 
 static void NAME(add_between, SET)(int64_t slots, int64_t trials, const uint8_t *state, const double *traces, double *total,
                                    double *mark, double *squares) {
@@ -220,26 +260,61 @@ static void NAME(add_leaked, SET)(int64_t slots, int64_t trials, const uint8_t *
   }
 }
 
+#define TILE 256
+
 static void NAME(bursts, SET)(int64_t slots, int64_t trials, const uint8_t *codes, uint8_t lost, int64_t *run, int64_t most,
                               uint32_t *counts) {
-  for (int64_t s = 0; s < slots; s++)
-    for (int64_t r = 0; r < trials; r++) {
-      int64_t goes_on = codes[s * trials + r] == lost;
-      counts[run[r] < most ? run[r] : most] += !goes_on;
-      run[r] = (run[r] + 1) & -goes_on;
+  for (int64_t s = 0; s < slots; s++, codes += trials)
+    for (int64_t start = 0; start < trials; start += TILE) {
+      int64_t count = trials - start < TILE ? trials - start : TILE, ends = 0;
+      int64_t ended[TILE], length[TILE];
+      for (int64_t r = 0; r < count; r++) {
+        int64_t goes_on = codes[start + r] == lost, now = run[start + r];
+        ended[r] = goes_on ? 0 : now;
+        run[start + r] = (now + 1) & -goes_on;
+      }
+      for (int64_t r = 0; r < count; r++) {
+        length[ends] = ended[r];
+        ends += ended[r] > 0;
+      }
+      for (int64_t i = 0; i < ends; i++) counts[(length[i] < most ? length[i] : most) - 1]++;
     }
 }
 
+/* Counts go to several tables in turns: an increment waits for the last one, which is often of the same bin. */
+#define TABLES 4
+#define MOST_BINS 512
+
 static void NAME(histogram, SET)(int64_t rows, int64_t trials, const double *values, int shift, int64_t base, int64_t bins,
                                  uint32_t *counts) {
-  for (int64_t s = 0; s < rows; s++, counts += bins)
-    for (int64_t r = 0; r < trials; r++) {
-      int64_t bits;
-      memcpy(&bits, values + s * trials + r, sizeof bits);
-      int64_t bin = (bits >> shift) - base;
-      counts[bin < 0 ? 0 : bin < bins ? bin : bins - 1]++;
+  uint32_t all[MOST_BINS][TABLES];
+  int64_t tables = bins <= MOST_BINS && bins <= trials ? TABLES : 1;
+  for (int64_t s = 0; s < rows; s++, counts += bins) {
+    if (tables > 1) memset(all, 0, (size_t)bins * sizeof *all);
+    for (int64_t start = 0; start < trials; start += TILE, values += TILE) {
+      int64_t count = trials - start < TILE ? trials - start : TILE;
+      int64_t place[TILE];
+      for (int64_t r = 0; r < count; r++) {
+        int64_t bits;
+        memcpy(&bits, values + r, sizeof bits);
+        bits = (bits >> shift) - base;
+        bits = bits < bins ? bits : bins - 1;
+        place[r] = bits < 0 ? 0 : bits;
+      }
+      if (tables > 1)
+        for (int64_t r = 0; r < count; r++) all[place[r]][r % TABLES]++;
+      else
+        for (int64_t r = 0; r < count; r++) counts[place[r]]++;
     }
+    values += trials - (trials + TILE - 1) / TILE * TILE;
+    if (tables > 1)
+      for (int64_t i = 0; i < bins; i++)
+        for (int64_t t = 0; t < TABLES; t++) counts[i] += all[i][t];
+  }
 }
+#undef MOST_BINS
+#undef TABLES
+#undef TILE
 
 static void NAME(scatter, SET)(int64_t slots, int64_t n, int64_t trials, const uint8_t *flags, const double *packed,
                                double *z) {
