@@ -16,11 +16,13 @@ SMALL = Scenario(GOOD).replace(slots=12)
 
 def test_results_of_python_advise_arguments() -> None:
     """The file keeps the words of the command."""
-    results = montecarlo(SMALL, trials=1)
+    lost = SMALL.replace(legitimate__link={"quality": 0.999}, eavesdroppers__smart__link={"quality": 1.0})
+    rare = lost.replace(process={"A": [[1.0]], "Q": [[1.0]], "initial_covariance": [[1e6]]})
+    results = montecarlo(rare.replace(encoding__state_probability=0.02), trials=100)
     sentence = results.secrecy["smart"].sentence
-    assert "(try trials=200)" in sentence
+    assert " montecarlo(…, plan=Plan(rare=True)) estimates its mean;" in sentence
     assert sentence in results._repr_html_().replace("&#34;", '"')
-    assert "(try --trials 200)" in results.summary["secrecy"]["smart"]["sentence"]
+    assert " montecarlo --rare estimates its mean;" in results.summary["secrecy"]["smart"]["sentence"]
     assert Plan(rare=True).rare
     assert in_python("2 trials would do; montecarlo --rare estimates it") == (
         "2 trials would do; montecarlo(…, plan=Plan(rare=True)) estimates it"
