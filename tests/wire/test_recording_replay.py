@@ -17,7 +17,7 @@ from PIL import Image
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WIRE_FILE
-from evedrop.show.view import picture
+from evedrop.show.view import video
 from evedrop.wire import recording
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.journal import WireJournal
@@ -136,11 +136,11 @@ def test_a_video_shows_the_whole_wire_in_ten_seconds(folder: Path, monkeypatch: 
     """If no times are given: from its start to its last message."""
     asked = list[list[float]]()
 
-    def video(*values: Any) -> list[str]:
+    def asked_for(*values: Any) -> list[str]:
         asked.append(values[2])
         return []
 
-    monkeypatch.setattr(picture, "video_apart", video)
+    monkeypatch.setattr(video, "video_apart", asked_for)
     assert main(["view", str(folder), "--video", str(folder / "w.gif"), "--fps", "3"]) == 0
     (times,) = asked
     assert len(times) == 30

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.errors import RunError
-from evedrop.show.view import picture
+from evedrop.show.view import picture, video
 from evedrop.show.view.picture import ended, give, received
 
 HANGS = [sys.executable, "-c", "import time; time.sleep(3600)"]
@@ -28,7 +28,8 @@ def process() -> Iterator[subprocess.Popen[bytes]]:
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """The limit is over soon, and what draws a recording hangs."""
     monkeypatch.setattr(picture, "DRAWING_SECONDS", 0.1)
-    monkeypatch.setattr(picture, "guarded", lambda *_, **__: HANGS)
+    for module in (picture, video):
+        monkeypatch.setattr(module, "guarded", lambda *_, **__: HANGS)
     monkeypatch.setattr(picture, "check", lambda _: None)
 
 
@@ -54,8 +55,8 @@ def test_a_picture_whose_process_hangs_ends(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("short")
 def test_a_video_whose_encoder_hangs_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """While it gets pictures, and at its end."""
-    monkeypatch.setattr(picture, "ffmpeg", lambda: "ffmpeg")
-    file = picture.Mp4File(tmp_path / "r.mp4", 15.0)
+    monkeypatch.setattr(video, "ffmpeg", lambda: "ffmpeg")
+    file = video.Mp4File(tmp_path / "r.mp4", 15.0)
     try:
         with pytest.raises(RunError, match="took no further picture"):
             file.add(bytes(10**6))

@@ -81,7 +81,7 @@ def _check_names(options: argparse.Namespace) -> None:
 
         check_picture_name(options.picture)
     if options.video is not None:
-        from evedrop.show.view.picture import FRAME_RATE, VIDEO_SIZE, check_video
+        from evedrop.show.view.video import FRAME_RATE, VIDEO_SIZE, check_video
 
         check_video(options.video, options.size or VIDEO_SIZE, options.fps or FRAME_RATE)
         if options.slot is not None or options.time is not None:
@@ -112,14 +112,14 @@ def _slots_of(options: argparse.Namespace) -> Sequence[int]:
 
 def _frames_of(options: argparse.Namespace) -> int:
     """The frames of a video of ten seconds."""
-    from evedrop.show.view.picture import FRAME_RATE
+    from evedrop.show.view.video import FRAME_RATE
 
     return round(_SECONDS * (options.fps or FRAME_RATE))
 
 
 def _times_of(options: argparse.Namespace) -> Sequence[float]:
     """The times of a video of a wire: some that are given, in real time, or the whole wire in ten seconds."""
-    from evedrop.show.view.picture import FRAME_RATE
+    from evedrop.show.view.video import FRAME_RATE
     from evedrop.wire.recording import wire_seconds
 
     if options.slots is not None:
@@ -140,7 +140,7 @@ def _film(recording: Path, options: argparse.Namespace, moments: Sequence[float]
     """Draw some moments as a video."""
     from evedrop.cli.console import ProgressLine
     from evedrop.scenario.progress_events import RunProgress
-    from evedrop.show.view.picture import FRAME_RATE, VIDEO_SIZE, video_apart
+    from evedrop.show.view.video import FRAME_RATE, VIDEO_SIZE, video_apart
 
     start = time.monotonic()
     with ProgressLine(len(moments), "frames") as line:
@@ -148,7 +148,9 @@ def _film(recording: Path, options: argparse.Namespace, moments: Sequence[float]
         def on_event(done: int) -> None:
             line.on_event(RunProgress(done, done / (time.monotonic() - start), "frames/s", {}))
 
-        size, rate = options.size or VIDEO_SIZE, options.fps or FRAME_RATE
+        given = options.slots is not None or options.times is not None
+        rate = options.fps or (FRAME_RATE if given else min(FRAME_RATE, max(1.0, len(moments) / _SECONDS)))
+        size = options.size or VIDEO_SIZE
         complaints = video_apart(recording, options.video, moments, size, rate, on_event, options.panel)
     frames = f"{len(moments)} frames are" if len(moments) > 1 else "1 frame is"
     print("\n".join([*complaints, f"{frames} in {options.video}"]))

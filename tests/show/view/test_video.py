@@ -12,8 +12,8 @@ from PIL import Image
 from evedrop import montecarlo
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
-from evedrop.show.view import picture, telling_slot
-from evedrop.show.view.picture import VIDEO_FILES, check_video, video_apart
+from evedrop.show.view import telling_slot, video
+from evedrop.show.view.video import VIDEO_FILES, check_video, video_apart
 from tests.conftest import Evedrop
 from tests.privileged import CannotRun, skip
 
@@ -39,7 +39,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
         yield from pictures(moments)
         complaints.append("a complaint")
 
-    monkeypatch.setattr(picture, "frames_apart", frames)
+    monkeypatch.setattr(video, "frames_apart", frames)
 
 
 @pytest.fixture(scope="module")
@@ -102,12 +102,12 @@ def defaults(
     """The moments and frames per second of a video whose slots nobody gives; chosen: the most telling slot, if any."""
     asked = list[tuple[Sequence[float], float]]()
 
-    def video(*values: Any) -> list[str]:
+    def asked_for(*values: Any) -> list[str]:
         asked.append((values[2], values[4]))
         return []
 
     monkeypatch.setattr(telling_slot, "telling_slot", lambda _: chosen)
-    monkeypatch.setattr(picture, "video_apart", video)
+    monkeypatch.setattr(video, "video_apart", asked_for)
     assert main(["view", str(run), "--video", str(run / "v.gif"), *words]) == 0
     return asked[0]
 
@@ -122,14 +122,19 @@ def test_a_video_takes_ten_seconds_around_the_most_telling_slot(
     assert defaults(finished, ["--fps", "2"], chosen, monkeypatch) == (slots, 2.0)
 
 
-@pytest.mark.parametrize(("rate", "count"), [("4", 40), ("15", 60)])
+@pytest.mark.parametrize(("words", "count", "rate"), [(["--fps", "4"], 40, 4.0), ([], 60, 6.0)])
 def test_a_video_of_a_run_that_each_picture_shows_whole_takes_ten_seconds(
-    rate: str, count: int, finished: Path, monkeypatch: pytest.MonkeyPatch
+    words: list[str], count: int, rate: float, finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the first slot to the last, each at most once: a run of fewer slots takes less time."""
-    moments, _ = defaults(finished, ["--fps", rate], None, monkeypatch)
-    assert (len(moments), moments[0], moments[-1]) == (count, 0, 59)
+    """From the first slot to the last, each at most once: a short run is shown more slowly."""
+    moments, shown = defaults(finished, words, None, monkeypatch)
+    assert (len(moments), moments[0], moments[-1], shown) == (count, 0, 59, rate)
     assert list(moments) == sorted({*moments})
+
+
+def test_slots_that_are_given_are_shown_at_the_usual_rate(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However few they are."""
+    assert defaults(finished, ["--slots", "20:23"], None, monkeypatch) == (range(20, 24), 15.0)
 
 
 @pytest.mark.usefixtures("drawn")
@@ -157,7 +162,7 @@ def test_an_interrupt_leaves_no_file(name: str, tmp_path: Path, monkeypatch: pyt
         yield from pictures(range(3))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(picture, "frames_apart", frames)
+    monkeypatch.setattr(video, "frames_apart", frames)
     with pytest.raises(KeyboardInterrupt):
         video_apart(tmp_path / "r.rrd", tmp_path / name, range(9), SIZE, 15.0, lambda _: None)
     assert list(tmp_path.iterdir()) == []
@@ -183,7 +188,7 @@ def test_slots_that_the_run_does_not_have_are_refused_at_once(tmp_path: Path, mo
         raise UsageError(f"slot {next(iter(moments))} is not in the run")
         yield
 
-    monkeypatch.setattr(picture, "frames_apart", frames)
+    monkeypatch.setattr(video, "frames_apart", frames)
     with pytest.raises(UsageError, match="slot 999999999999 is not in the run"):
         video_apart(tmp_path / "r.rrd", tmp_path / "v.gif", range(10**12), SIZE, 15.0, lambda _: None)
     assert list(tmp_path.iterdir()) == []
