@@ -15,9 +15,68 @@ from numpy.typing import NDArray
 from evedrop.model.process import Floats
 
 TIMELINE = "slot_number"
-"""Rerun makes the events' first column as wide as this name, and "slot" is too narrow for a number."""
 ELAPSED = "elapsed"
-"""The time line of a wire, which has no slots: seconds since its start."""
+"""The time line of a wire, which has no slots, and of a run whose slots have seconds: time since its start."""
+CLOCK = "clock"
+"""That of a run of hours or days: the time of day, from midnight on. Rerun calls the first day 1970-01-01."""
+_HOUR = 3600.0
+_SHORTEST, _LONGEST = 1e-6, 9e9  # seconds of a slot, and of a run
+
+
+@final
+@dataclass(frozen=True)
+class SlotTimes:
+    """The time lines of a run: the slots' numbers; and where slots have seconds, the times at which they begin."""
+
+    slots: int
+    seconds: float | None
+    """Of a slot."""
+
+    @classmethod
+    def of(cls, slots: int, seconds: float | None) -> SlotTimes:
+        """For slots of some seconds; without times if Rerun's nanoseconds are too coarse for them or end too early."""
+        countable = seconds is not None and seconds >= _SHORTEST and slots * seconds < _LONGEST
+        return cls(slots, seconds if countable else None)
+
+    @property
+    def line(self) -> str:
+        """The time line that the axes show."""
+        if self.seconds is None:
+            return TIMELINE
+        return ELAPSED if self.seconds * self.slots < _HOUR else CLOCK
+
+    def columns(self, slots: NDArray[np.int64]) -> list[rr.TimeColumn]:
+        """The times of slots on all lines, (c,)."""
+        numbers = rr.TimeColumn(TIMELINE, sequence=slots)
+        if self.seconds is None:
+            return [numbers]
+        nanoseconds = np.round(slots * (self.seconds * 1e9)).astype(np.int64)
+        if self.line == CLOCK:
+            return [numbers, rr.TimeColumn(CLOCK, timestamp=nanoseconds.astype("datetime64[ns]"))]
+        return [numbers, rr.TimeColumn(ELAPSED, duration=nanoseconds.astype("timedelta64[ns]"))]
+
+    def at(self, slot: int) -> rrb.TimeRangeBoundary:
+        """The time of a slot, as an end of an axis."""
+        if self.seconds is None:
+            return rrb.TimeRangeBoundary.absolute(seq=slot)
+        return rrb.TimeRangeBoundary.absolute(seconds=slot * self.seconds)
+
+    def after_cursor(self, slots: int) -> rrb.TimeRangeBoundary:
+        """The time some slots after that shown, as an end of an axis; a negative number: before it."""
+        if self.seconds is None:
+            return rrb.TimeRangeBoundary.cursor_relative(seq=slots)
+        return rrb.TimeRangeBoundary.cursor_relative(seconds=slots * self.seconds)
+
+    def text(self, slot: int) -> str:
+        """Such as "#1848"; "14:30:05  #52205" or "12.30 s  #615" where slots have seconds."""
+        if self.seconds is None:
+            return f"#{slot}"
+        time = slot * self.seconds
+        if self.line == ELAPSED:
+            return f"{time:.2f} s  #{slot}"
+        day, rest = divmod(int(time), 86_400)
+        clock = f"{rest // 3600:02}:{rest % 3600 // 60:02}:{rest % 60:02}"
+        return f"{f'day {day + 1}, ' if day else ''}{clock}  #{slot}"
 
 
 @dataclass(frozen=True)
@@ -28,10 +87,9 @@ class Column:
     slots: NDArray[np.int64]
     values: rr.ComponentColumnList
 
-    def send(self, to: rr.RecordingStream) -> None:
+    def send(self, to: rr.RecordingStream, times: SlotTimes) -> None:
         """Add it to a recording. Raises an error from Rerun if slots and values do not have the same length."""
-        slots = rr.TimeColumn(TIMELINE, sequence=self.slots)
-        to.send_columns(self.path, indexes=[slots], columns=self.values, strict=True)
+        to.send_columns(self.path, indexes=times.columns(self.slots), columns=self.values, strict=True)
 
 
 def joined(columns: Sequence[Column]) -> list[Column]:

@@ -27,7 +27,7 @@ from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient, ViewerState
 
 from evedrop.errors import RunError, UsageError
-from evedrop.show.view.column import ELAPSED, TIMELINE
+from evedrop.show.view.column import CLOCK, ELAPSED, TIMELINE
 from evedrop.show.view.layout import Layout
 from evedrop.show.view.viewer import PortTaken, end, guarded, spawn, without_driver
 from evedrop.system.environment import viewer_environment
@@ -103,7 +103,7 @@ class HeadlessViewer:
         """process: known to be the one that the client is connected to. rrd: the recording to load."""
         self._client, self._process = client, process
         self._answer(lambda: self._client.open([str(rrd.resolve())]))
-        self._timeline, self._last = self._loaded()
+        self._lines = self._loaded()
 
     def state(self) -> ViewerState:
         """What the viewer shows."""
@@ -119,17 +119,30 @@ class HeadlessViewer:
 
         Raises UsageError if the recording has no such moment.
         """
-        if self._timeline == ELAPSED:
-            end = self._last / 1e9
-            if moment is not None and not 0.0 <= moment <= end:
-                raise UsageError(f"{moment:g} s is not a time of the wire; give one from 0 to {end:g}, in seconds")
-            seconds = end if moment is None else moment
-            self._answer(lambda: self._client.set_time(ELAPSED, duration=seconds, play_state="paused"))
+        line, end = next((line, end) for line, end in self._lines.items() if line != TIMELINE or len(self._lines) == 1)
+        last = self._lines.get(TIMELINE)
+        if last is None:
+            if moment is not None and not 0.0 <= moment <= end / 1e9:
+                raise UsageError(
+                    f"{moment:g} s is not a time of the wire; give one from 0 to {end / 1e9:g}, in seconds"
+                )
+            at = end if moment is None else round(moment * 1e9)
         else:
-            if moment is not None and not 0 <= moment <= self._last:
-                raise UsageError(f"slot {moment:.0f} is not in the run; give one from 0 to {self._last}")
-            slot = self._last if moment is None else int(moment)
-            self._answer(lambda: self._client.set_time(TIMELINE, sequence=slot, play_state="paused"))
+            if moment is not None and not 0 <= moment <= last:
+                raise UsageError(f"slot {moment:.0f} is not in the run; give one from 0 to {last}")
+            slot = last if moment is None else int(moment)
+            # Rounded up, because a nanosecond before a slot begins the one before it is shown.
+            at = slot if line == TIMELINE else -(-slot * end // max(1, last))
+        self._answer(lambda: self._set(line, at))
+
+    def _set(self, line: str, at: int) -> None:
+        """Show a slot, or a nanosecond since the start, of a time line."""
+        if line == TIMELINE:
+            self._client.set_time(line, sequence=at, play_state="paused")
+        elif line == ELAPSED:
+            self._client.set_time(line, duration=np.timedelta64(at, "ns"), play_state="paused")
+        else:
+            self._client.set_time(line, timestamp=np.datetime64(at, "ns"), play_state="paused")
 
     def choose(self, panel: str | None) -> None:
         """Show only a panel or a tab, by default the first tab. Raises UsageError if the recording has no such panel."""
@@ -156,14 +169,14 @@ class HeadlessViewer:
             before, now = now, self.take()
         return now
 
-    def _loaded(self) -> tuple[str, int]:
-        """The recording's time line and its last slot, or its last nanosecond, once recording and layout are loaded."""
+    def _loaded(self) -> dict[str, int]:
+        """The recording's time lines with their last slot, or last nanosecond, once recording and layout are loaded."""
         deadline = time.monotonic() + _PATIENCE
-        while (end := _end(self.state())) is None:
+        while not (ends := _ends(self.state())):
             if time.monotonic() > deadline:
                 raise RuntimeError(f"the recording was not loaded within {_PATIENCE:.0f} s")
             time.sleep(_PAUSE)
-        return end
+        return ends
 
     def _answer(self, ask: Callable[[], T]) -> T:
         """The viewer's answer. It refuses a question after 15 seconds, which is too early on a busy machine, so ask again."""
@@ -269,13 +282,14 @@ def _started(size: tuple[int, int], logs: Path) -> tuple[subprocess.Popen[bytes]
     raise AssertionError
 
 
-def _end(state: ViewerState) -> tuple[str, int] | None:
+def _ends(state: ViewerState) -> dict[str, int]:
     if state.loading or not state.views:
-        return None
-    lines = [line for recording in state.recordings for line in recording.timelines if line.name in {TIMELINE, ELAPSED}]
-    return (lines[0].name, int(lines[0].end)) if lines and lines[0].end is not None else None
+        return {}
+    lines = [line for recording in state.recordings for line in recording.timelines if line.name in _LINES]
+    return {line.name: int(line.end) for line in lines if line.end is not None}
 
 
+_LINES = {TIMELINE, ELAPSED, CLOCK}
 SIZE = (1600, 950)
 """Width and height of a picture in pixels."""
 _LENGTH_BYTES = 8

@@ -25,9 +25,10 @@ from evedrop.model.registry import place_of
 from evedrop.results.folder import private_file
 from evedrop.scenario.words import listed
 from evedrop.score.verdict import Verdict
-from evedrop.show.view.column import TIMELINE, Column, laid_out
+from evedrop.show.view.column import Column, laid_out
 from evedrop.show.view.events import Event, introduction
 from evedrop.show.view.panels import PANELS
+from evedrop.show.view.panels.curves import times_of
 from evedrop.show.view.panels.panel import COLUMNS, ROWS_ABOVE, ROWS_BELOW, SCENE, PlacedView, ViewPanel
 from evedrop.show.view.scene import Scene, SceneSlots
 from evedrop.show.view.staged import StagedChunks, chunk_sizes
@@ -62,7 +63,7 @@ class PanelSet:
             for name, panel in [*self._panels.items()]
             for view in self._tried(name, partial(_views, panel, _drawable if PANELS.foreign(name) else _placed))
         ]
-        return laid_out(_tabbed(placed), TIMELINE)
+        return laid_out(_tabbed(placed), times_of(self._scene).line)
 
     def send_styles(self, to: rr.RecordingStream) -> None:
         """Record every panel's styles."""
@@ -389,13 +390,14 @@ class ViewRecording(RecordingThread[SceneSlots, Event]):
         if not self._sizes:
             super()._begin(path)
             return
-        staged = StagedChunks(path, self._file, self._sizes, lambda: self._stream(send_properties=False))
+        times = times_of(self._scene)
+        staged = StagedChunks(path, self._file, self._sizes, lambda: self._stream(send_properties=False), times)
         super()._begin(path)
         staged.begin(self._patience)
         self._staged = staged
 
     def _send(self, chunks: list[SceneSlots], notes: list[Event], to: rr.RecordingStream) -> bool:
-        put = self._staged.put if self._staged is not None else partial(Column.send, to=to)
+        put = self._staged.put if self._staged is not None else partial(Column.send, to=to, times=times_of(self._scene))
         if chunks:
             slots = SceneSlots.joined(chunks)
             self._recorded = slots.first + slots.count

@@ -96,6 +96,8 @@ class Scene:
     """None without acknowledgements."""
     spans: tuple[AttackSpan, ...] = ()
     """The attacks that last, in order of their first slots."""
+    slot_seconds: float | None = None
+    """What a slot lasts in the scenario; None if it is a number only."""
 
     @property
     def unit(self) -> str:

@@ -198,6 +198,7 @@ def open_recording(
         noise=float(np.trace(scenario.process.process.Q)),
         units=tuple(map(drawable, scenario.process.units or ())),
         ways={name: ways for name, ways in ways.items() if ways is not None},
+        slot_seconds=scenario.slot_seconds,
         **driven_scene(scenario),
         **attacked_scene(scenario),
     )

@@ -13,7 +13,7 @@ from typing import final
 import rerun as rr
 
 from evedrop.results.folder import private_file
-from evedrop.show.view.column import Column, joined
+from evedrop.show.view.column import Column, SlotTimes, joined
 from evedrop.show.view.live_files import Span, WrittenPositions, chunk_file
 
 _FACTOR = 10  # between the slots in the chunks of one file and the next
@@ -42,12 +42,18 @@ class StagedChunks:
     """The files beside a recording that is being written. Any method may raise OSError, or RuntimeError from Rerun."""
 
     def __init__(
-        self, path: Path, recording: rr.RecordingStream, sizes: list[int], stream: Callable[[], rr.RecordingStream]
+        self,
+        path: Path,
+        recording: rr.RecordingStream,
+        sizes: list[int],
+        stream: Callable[[], rr.RecordingStream],
+        times: SlotTimes,
     ) -> None:
         """Create the files, before the recording itself; recording: written to `path`. sizes: as by `chunk_sizes`.
 
-        stream: makes another stream of the same recording.
+        stream: makes another stream of the same recording. times: of its slots.
         """
+        self._times = times
         self._path, self._sizes = path, sizes
         self._positions = WrittenPositions(path, len(sizes) + 1)
         self._streams = [recording]
@@ -71,7 +77,7 @@ class StagedChunks:
 
     def put(self, column: Column) -> None:
         """Record a column in the smallest chunks."""
-        column.send(self._streams[-1])
+        column.send(self._streams[-1], self._times)
         self._waiting[-1].append(column)
 
     def pass_on(self, slots: int, patience: float, last: bool) -> None:
@@ -81,7 +87,7 @@ class StagedChunks:
             if last or slots - self._reached[number] >= self._sizes[number]:
                 merged = joined(self._waiting[number])
                 for column in merged:
-                    column.send(self._streams[number])
+                    column.send(self._streams[number], self._times)
                 self._streams[number].flush(timeout_sec=patience)
                 if number:
                     self._waiting[number - 1] += merged

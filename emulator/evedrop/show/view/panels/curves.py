@@ -19,7 +19,7 @@ from rerun.blueprint.archetypes import PlotBackground
 
 from evedrop.model.process import Floats
 from evedrop.show.view.attacks import Attacks, lane_count
-from evedrop.show.view.column import Column, scalars
+from evedrop.show.view.column import CLOCK, Column, SlotTimes, scalars
 from evedrop.show.view.error_floor import error_floor, mean_band
 from evedrop.show.view.palette import GROUND, PLANT, TRUTH_CURVE, Colour, dim
 from evedrop.show.view.panels.panel import PlacedView, ViewPanel, crowded
@@ -27,27 +27,34 @@ from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots
 
 _WINDOW = 105  # slots; below four pixels a slot, Rerun merges neighbouring slots into grey
 _ROOM = 3  # slots to the right of the present, so that the newest slot is not at the border
+_ROOM_FOR_DATE, _HIDDEN = 25, 500  # parts of a run: half of a date, and a pixel
 _MOST_POINTS = 20_000  # of a curve over a run: a day of one-second slots is drawn every five seconds
 
 # For slots that share a pixel: the mean of their logarithms would be far below the logarithm of their mean.
 LARGEST = rr.components.AggregationPolicy.Max
 
 
+def times_of(scene: Scene) -> SlotTimes:
+    """The time lines of a run."""
+    return SlotTimes.of(scene.slots, scene.slot_seconds)
+
+
 def recent_slots(scene: Scene) -> rrb.TimeAxis:
     """An axis that follows the newest slot."""
-    recent = rrb.TimeRange(
-        start=rrb.TimeRangeBoundary.cursor_relative(seq=-min(_WINDOW, scene.slots)),
-        end=rrb.TimeRangeBoundary.cursor_relative(seq=_ROOM),
-    )
+    times = times_of(scene)
+    recent = rrb.TimeRange(start=times.after_cursor(-min(_WINDOW, scene.slots)), end=times.after_cursor(_ROOM))
     return rrb.TimeAxis(view_range=recent, zoom_lock=True)
 
 
 def whole_run(scene: Scene) -> rrb.TimeAxis:
     """An axis from slot 0 to the last."""
-    whole = rrb.TimeRange(
-        start=rrb.TimeRangeBoundary.absolute(seq=0), end=rrb.TimeRangeBoundary.absolute(seq=scene.slots)
-    )
-    return rrb.TimeAxis(view_range=whole, zoom_lock=True)
+    times = times_of(scene)
+    first, last = 0, scene.slots
+    if (
+        times.line == CLOCK
+    ):  # Rerun writes a date at each midnight: the first is not cut at the border, and the last is left out
+        first, last = -scene.slots // _ROOM_FOR_DATE, scene.slots - scene.slots // _HIDDEN
+    return rrb.TimeAxis(view_range=rrb.TimeRange(start=times.at(first), end=times.at(last)), zoom_lock=True)
 
 
 def dark_ground() -> PlotBackground:
@@ -127,7 +134,7 @@ class SquaredError(ViewPanel):
         """One view: of the whole run for a closed loop, otherwise of the recent slots."""
         title = f"Error   {'dim: 95 %   ' if self._with_bands else ''}{powers_of_ten(self.scene)}"
         if self.scene.moving:
-            yield PlacedView(receivers_view(title, self._paths, whole_run(self.scene)), "right")
+            yield PlacedView(receivers_view(title, self._paths, whole_run(self.scene)), "right", 1.2)
         else:
             yield PlacedView(receivers_view(title, self._paths, recent_slots(self.scene)), "middle")
 
@@ -304,11 +311,11 @@ class Levels(ViewPanel):
         return bool(scene.moving)
 
     def views(self) -> Iterator[PlacedView]:
-        """A view for each of the first two states, on the left side."""
+        """A view for each of the first two states, in the middle."""
         for i in range(min(self.scene.n, _VIEWS)):
             label = self.scene.states[i] if self.scene.states else f"state {i}"
             title = f"{label}   grey: truth"
-            yield PlacedView(curves_view(title, f"{_LEVELS_PATH}/{i}", whole_run(self.scene), legend=False), "left")
+            yield PlacedView(curves_view(title, f"{_LEVELS_PATH}/{i}", whole_run(self.scene), legend=False), "middle")
         yield from worlds_over_time(self.scene, f"{_LEVELS_PATH}/0", whole_run(self.scene))
 
     def styles(self) -> dict[str, rr.AsComponents]:
@@ -383,7 +390,7 @@ class ApplicationPanels(ViewPanel):
         for panel in self.scene.panels:
             span = None if panel.span is None else rrb.ScalarAxis(range=panel.span, zoom_lock=True)
             view = curves_view(panel.title, panel.path, whole_run(self.scene), span, legend=not panel.with_beliefs)
-            yield PlacedView(view, "right", 1.2) if panel.with_beliefs else PlacedView(view, "left")
+            yield PlacedView(view, "right", 0.9) if panel.with_beliefs else PlacedView(view, "left")
 
     def styles(self) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:
         """The styles that the application describes; a receiver's own colour if it gives none."""

@@ -22,9 +22,10 @@ from evedrop.model.links.way import Way
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.show.view.attacks import Attacks, cut_off, lane_count
-from evedrop.show.view.column import TIMELINE, Column
+from evedrop.show.view.column import Column
 from evedrop.show.view.lanes import ErrorDistance
 from evedrop.show.view.palette import GROUND, TRUTH, Colour, dim
+from evedrop.show.view.panels.curves import times_of
 from evedrop.show.view.panels.panel import PlacedView, ViewPanel
 from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots, Shown
 
@@ -107,15 +108,9 @@ class StatePlane(ViewPanel):
     def _past(self, slots: int) -> rrb.VisibleTimeRanges:
         # A piece of a trail is recorded at its end, so the oldest piece shown begins a frame earlier.
         reach = max(slots, 4 * stride(self.scene))
-        return rrb.VisibleTimeRanges(
-            [
-                rrb.VisibleTimeRange(
-                    TIMELINE,
-                    start=rrb.TimeRangeBoundary.cursor_relative(seq=-reach),
-                    end=rrb.TimeRangeBoundary.cursor_relative(seq=0),
-                )
-            ]
-        )
+        times = times_of(self.scene)
+        ends = times.after_cursor(-reach), times.after_cursor(0)
+        return rrb.VisibleTimeRanges([rrb.VisibleTimeRange(times.line, start=ends[0], end=ends[1])])
 
     def styles(self) -> dict[str, rr.AsComponents]:
         """Each estimate in its receiver's colour; the truth white, on top of the others."""

@@ -21,6 +21,7 @@ from evedrop.show.view.column import Column
 from evedrop.show.view.events import AckWatcher, Event, Watcher
 from evedrop.show.view.lanes import received
 from evedrop.show.view.palette import GROUND, TRUTH, Colour
+from evedrop.show.view.panels.curves import times_of
 from evedrop.show.view.panels.panel import LEGEND_HEIGHT, VERDICT_HEIGHT, PlacedView, ViewPanel, lanes_height
 from evedrop.show.view.scene import Scene, SceneSlots
 
@@ -150,12 +151,13 @@ class Events(ViewPanel):
         self._acks = AckWatcher(scene)
         self._watchers = [(shown, Watcher(shown, scene)) for shown in scene.receivers]
         self._events: list[Event] = []  # in order of slot
+        self._times = times_of(scene)
 
     def views(self) -> Iterator[PlacedView]:
         """Two views: beside the strip of the scene, and at the bottom right of the numbers."""
         yield PlacedView(self._view(), "strip", 1.0, lanes_height(1))
         if self.scene.moving:
-            yield PlacedView(self._view(), "right", 0.7)
+            yield PlacedView(self._view(), "right", 0.55)
         else:
             yield PlacedView(self._view(), "right", 0.45)
 
@@ -184,13 +186,14 @@ class Events(ViewPanel):
         slots = [event.k for event in self._events]
         changed = range(bisect_left(slots, min(event.k for event in events)), len(slots))
         ends = [i + 1 for i in changed if i + 1 == len(slots) or slots[i + 1] > slots[i]]
-        texts = ["\n".join(map(_line, reversed(self._events[max(0, end - _MOST_LINES) : end]))) for end in ends]
+        lines = [self._line(event) for event in self._events[max(0, changed[0] + 1 - _MOST_LINES) :]]
+        before = len(self._events) - len(lines)
+        texts = ["\n".join(reversed(lines[max(0, end - before - _MOST_LINES) : end - before])) for end in ends]
         k = np.array([slots[end - 1] for end in ends], np.int64)
         documents = rr.TextDocument.columns(text=texts, media_type=["text/plain"] * len(texts))
         yield Column(_EVENTS_PATH, k, documents)
 
-
-def _line(event: Event) -> str:
-    """Such as "#1848   WARN   smart lost 3 packets in a row"; information has no level."""
-    level = "" if event.level == "INFO" else f"{event.level}   "
-    return f"#{event.k}   {level}{event.text}"
+    def _line(self, event: Event) -> str:
+        """Such as "#1848   WARN   smart lost 3 packets in a row"; information has no level."""
+        level = "" if event.level == "INFO" else f"{event.level}   "
+        return f"{self._times.text(event.k)}   {level}{event.text}"
