@@ -199,7 +199,7 @@ def test_receivers_can_be_seen(name: str) -> None:
 def test_letters_can_be_read() -> None:
     """Those of graphs, on both grounds, those of the legend on its own; those in lanes, and of verdicts, are black or white."""
     inks = {
-        *FATES.values(),
+        *FATES,
         *(state.colour for state in LaneState),
         *STRATEGIES.values(),
         *RESERVE,

@@ -54,6 +54,7 @@ class AcknowledgedEncoder(Encoder):
 class _AcknowledgedReferences(Scheme):
     """Subtracts a reference that the legitimate estimator has, as its acknowledgements show."""
 
+    sent_words = ("coded state",)
     best_reader = "reference"
     needs_acknowledgements = True
     reads_packets = True

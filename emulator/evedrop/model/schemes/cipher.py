@@ -58,6 +58,7 @@ class Cipher(Scheme):
     Source: docs/mathematics.md, stream cipher.
     """
 
+    sent_words = ("encrypted state",)
     best_reader = "constant"
     secret_streams = ("mask",)
     estimator_streams = ("mask",)

@@ -79,6 +79,7 @@ class EncryptedSchedule(Scheme):
     Source: after Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics.md, schedules by holding time.
     """
 
+    sent_words = ("state",)
     best_reader = "selective"
     closed_forms = MappingProxyType({"selective": _selective_form})
     parameters = MappingProxyType({"threshold": 2})
@@ -194,6 +195,7 @@ class QuantisedSchedule(Scheme):
     Source: Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics.md, quantised packets.
     """
 
+    sent_words = ("state",)
     best_reader = "selective"
     closed_forms = MappingProxyType({"legitimate": _always_read, "selective": _quantised_selective_form})
     meets_energy_budget = True

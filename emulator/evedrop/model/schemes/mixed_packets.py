@@ -72,6 +72,7 @@ class RandomCode(Scheme):
 
     parameters = MappingProxyType({"plain_probability": 0.3})
     secret_streams = ("schedule",)
+    sent_words = ("packet",)
     best_reader = "reference"
     needs_acknowledgements = True
     reads_packets = True
@@ -161,6 +162,7 @@ class ThresholdCode(Scheme):
     """
 
     parameters = MappingProxyType({"lost_belief": 0.1, "assumed_quality": 0.8, "assumed_flip": 0.1})
+    sent_words = ("packet",)
     best_reader = "reference"
     needs_acknowledgements = True
     reads_packets = True

@@ -97,6 +97,7 @@ class Noise(Scheme):
     Source: Crimson, Kennedy, Quevedo (2023); docs/mathematics.md, noise packets.
     """
 
+    sent_words = ("state", "noise")
     best_reader = "bayesian"
     closed_forms = MappingProxyType(dict.fromkeys(("naive", "suspicious"), _takes_noise))
     parameters = MappingProxyType({"state_probability": 0.6, "noise_covariance": PACKETS})

@@ -35,6 +35,7 @@ class PlainEstimator(PacketUser):
 class Plain(Scheme):
     """Every packet is the state, μ_d = 1; there is no secret."""
 
+    sent_words = ("state",)
     sends_states_and_innovations = True
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:  # noqa: ARG002 - there is no secret

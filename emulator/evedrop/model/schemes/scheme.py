@@ -176,6 +176,8 @@ class Scheme(ABC):
     reads_packets: ClassVar[bool] = False
     """Whether the estimator's action depends on more than γ and the secret, so that `Receiver.act` cannot know it and only a
     simulation of packets can follow it."""
+    sent_words: ClassVar[tuple[str, ...]] = ("state", "innovation")
+    """What pictures call its packets with ν = 0 and those with ν = 1; the first alone if ν is never 1."""
     may_be_silent: ClassVar[bool] = False
     """Whether it sends nothing in some slots, so that its packets have `Packet.sent`."""
     header: ClassVar[tuple[str, ...]] = ()

@@ -48,6 +48,7 @@ class Withholding(Scheme):
 
     parameters = MappingProxyType({"state_probability": 0.6})
     secret_streams = ("schedule",)
+    sent_words = ("state",)
     may_be_silent = True
 
     def __init__(self, process: Process, state_probability: float) -> None:
@@ -130,6 +131,7 @@ class Scheduled(Scheme):
     sends_by_holding_time = True
     parameters = MappingProxyType({"threshold": 4})
     needs_acknowledgements = True
+    sent_words = ("state",)
     may_be_silent = True
 
     def __init__(self, process: Process, threshold: int) -> None:

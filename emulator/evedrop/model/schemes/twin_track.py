@@ -98,6 +98,7 @@ class TwinTrack(Scheme):
     Source: docs/mathematics.md, twin track.
     """
 
+    sent_words = ("track",)
     best_reader = "tracker"
     secret_streams = ("start", "track")
     estimator_streams = ("start", "track")

@@ -11,9 +11,9 @@ from typing import NamedTuple, final
 import numpy as np
 
 from evedrop.model.acknowledgements import AckFate
-from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.model.receiver import INNOVATION, Action, Codes, Flags
 from evedrop.show.view.attacks import Attacks
-from evedrop.show.view.lanes import MISLED_CODE, SILENT_CODE
+from evedrop.show.view.lanes import MISLED_CODE, SILENT_CODE, scheme_of
 from evedrop.show.view.scene import Scene, Shown
 
 _SHORTEST = 3  # packets in a row; missing fewer is normal
@@ -51,6 +51,8 @@ class Watcher:
 
     def __init__(self, shown: Shown, scene: Scene) -> None:
         self._name = shown.name
+        other = scheme_of(scene).sent_words[-1]
+        self._other = f"an {other}" if other == INNOVATION else other
         self._legitimate = shown.role == "legitimate"
         self._spacing = max(_SLOTS_PER_LINE, scene.slots // _LINES)
         self._long = _SHORTEST
@@ -69,7 +71,7 @@ class Watcher:
         if not self._ever_misled and misled.any():
             self._ever_misled = True
             k = first + int(misled.argmax())
-            events.append(Event(k, "WARN", f"{self._name} took an innovation for the state, for the first time"))
+            events.append(Event(k, "WARN", f"{self._name} took {self._other} for the state, for the first time"))
         places = np.flatnonzero(good)
         starts, ends = np.concatenate([[0], places + 1]), np.append(places, len(codes))
         looked_at = ends > starts  # a good slot after a good slot changes nothing

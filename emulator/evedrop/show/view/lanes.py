@@ -18,21 +18,14 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
 from evedrop.model.receiver import DISCARDED, DROPPED, INNOVATION, MISLED, SILENT, STATE, Action, Codes
+from evedrop.model.schemes import SCHEMES
+from evedrop.model.schemes.scheme import Scheme
 from evedrop.score.after_start import leading_states
 from evedrop.score.synchronisation import FACTOR, Synchronisation, synchronisation_of
 from evedrop.score.verdict import distance_text
 from evedrop.show.view import palette
 from evedrop.show.view.palette import Colour
 from evedrop.show.view.scene import PeerSlots, Scene, SceneSlots, Shown
-
-_LEGEND = (
-    ("state", palette.STATE),
-    ("innovation decoded", palette.DECODED),
-    ("misled by innovation", palette.MISLED),
-    ("innovation sent, or discarded", palette.DISCARDED),
-    ("dropped", palette.DROPPED),
-    ("silence", palette.SILENT),
-)
 
 
 @dataclass(frozen=True)
@@ -68,14 +61,57 @@ MISLED_CODE = np.uint8(EAVESDROPPER.words.index(MISLED))
 """Code of the only outcome that an eavesdropper does not know itself."""
 
 
-def legend() -> list[tuple[str, Colour]]:
-    """What the colours of all lanes stand for."""
-    return [*_LEGEND]
+READ = "read"
+"""What an eavesdropper did with a packet that it did not use as the state, where the scheme sends no innovations."""
 
 
-def lane_of(shown: Shown) -> Lane:
-    """The lane of a receiver."""
-    return LEGITIMATE if shown.role == "legitimate" else EAVESDROPPER
+def scheme_of(scene: Scene) -> type[Scheme]:
+    """The scheme of a run, or the base class of all if it is not built in."""
+    name = scene.receivers[0].strategy
+    return SCHEMES[name] if name in SCHEMES.names else Scheme
+
+
+def legend(scene: Scene) -> list[tuple[str, Colour]]:
+    """What the colours of the run's lanes stand for, in the words of its scheme, and without what cannot happen in it."""
+    scheme, spied = scheme_of(scene), len(scene.receivers) > 1
+    state, *others = scheme.sent_words
+    entries = [(state, palette.STATE)]
+    if INNOVATION in others:
+        entries.append((f"{INNOVATION} decoded", palette.DECODED))
+    elif spied:
+        entries.append((READ, palette.DECODED))
+    for other in others:
+        if spied:
+            entries.append((f"misled by {other}", palette.MISLED))
+        entries.append((f"{other} sent, or discarded", palette.DISCARDED))
+    if spied and not others:
+        entries.append((DISCARDED, palette.DISCARDED))
+    entries.append((DROPPED, palette.DROPPED))
+    if scheme.may_be_silent or scheme is Scheme:
+        entries.append(("silence", palette.SILENT))
+    return entries
+
+
+def sent_lane(scene: Scene) -> Lane:
+    """The sensor's lane, in the words of the run's scheme."""
+    words = scheme_of(scene).sent_words
+    return Lane((words[0], words[1] if len(words) > 1 else INNOVATION, SILENT), SENT.colours)
+
+
+def lane_of(shown: Shown, scene: Scene) -> Lane:
+    """The lane of a receiver, in the words of the run's scheme.
+
+    Without innovations, whatever the legitimate estimator could use is what the sensor sent.
+    """
+    words = scheme_of(scene).sent_words
+    legitimate = shown.role == "legitimate"
+    lane = LEGITIMATE if legitimate else EAVESDROPPER
+    names, colours = [*lane.words], [*lane.colours]
+    if INNOVATION not in words:
+        names[Action.INNOVATION] = words[0] if legitimate else READ
+        if legitimate:
+            names[Action.STATE], colours[Action.INNOVATION] = words[0], palette.STATE
+    return Lane(tuple(names), tuple(colours))
 
 
 def knowledge_lane(role: str) -> Lane:

@@ -7,7 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from evedrop.model.process import Trajectory
+from evedrop.model.receiver import Action
+from evedrop.model.schemes import SCHEMES
+from evedrop.model.streams import Batch
 from evedrop.score.synchronisation import Synchronisation
 from evedrop.show.view import lanes
 from evedrop.show.view.lanes import knowledge
@@ -21,8 +26,9 @@ from evedrop.show.view.palette import (
 )
 from evedrop.show.view.panels.fates import FATES, LastPacket, Packets
 from evedrop.show.view.recording import ViewRecording
+from tests.builders import stream_keys
 from tests.show.view.read_back import rows
-from tests.show.view.simulated_run import Simulated
+from tests.show.view.simulated_run import Simulated, orbit
 
 COLOURS = {
     "state": TRUTH,
@@ -55,7 +61,7 @@ def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], t
         assert [coloured(code) for code in colours[k][:2]] == [letters(TRUTH)] * 2
         for i, receiver in enumerate(receivers):
             peer = run.slots.peers[receiver.name]
-            word = lanes.lane_of(receiver).words[int(lanes.received(receiver, run.slots)[k])]
+            word = lanes.lane_of(receiver, run.scene).words[int(lanes.received(receiver, run.slots)[k])]
             assert shown[2 + i] == word
             status = Synchronisation(knowledge(run.scene, run.slots.x, peer)[k])
             name, _, rest = shown[2 + len(receivers) + i].partition(": ")
@@ -70,7 +76,46 @@ def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], t
 
 def test_every_fate_has_a_colour() -> None:
     """The graph can show everything that a lane shows."""
-    assert {*lanes.LEGITIMATE.words, *lanes.EAVESDROPPER.words} == set(FATES)
+    assert [COLOURS[word] for word in lanes.EAVESDROPPER.words] == list(FATES)
+
+
+@pytest.mark.parametrize("name", [*SCHEMES.names, "mine:Masked"])
+def test_words_are_those_of_the_scheme(name: str, simulated: Callable[..., Simulated]) -> None:
+    """Sensor, links and legend agree; only a scheme that sends innovations, or may be silent, has words for them."""
+    scene = simulated(20).scene
+    scene = replace(scene, receivers=(replace(scene.receivers[0], strategy=name), *scene.receivers[1:]))
+    listed = dict(lanes.legend(scene))
+    sent, ours, theirs = lanes.sent_lane(scene), *(lanes.lane_of(shown, scene) for shown in scene.receivers[:2])
+    words = ("state", "innovation") if name == "mine:Masked" else SCHEMES[name].sent_words
+    assert sent.words[: len(words)] == words
+    assert listed[words[0]] == sent.colours[0] == ours.colours[Action.STATE]
+    assert ("silence" in listed) == (name in {"scheduled", "withholding", "mine:Masked"})
+    told = " ".join(
+        [*listed, *ours.words, *theirs.words, *(str(placed.view.name) for placed in Packets(scene).views())]
+    )
+    assert ("innovation" in told) == ("innovation" in words)
+    used = ours.words[Action.INNOVATION], ours.colours[Action.INNOVATION]
+    if "innovation" in words:
+        assert used == ("innovation", listed["innovation decoded"])
+    else:
+        assert used == (words[0], listed[words[0]])
+        assert (theirs.words[Action.INNOVATION], theirs.colours[Action.INNOVATION]) == ("read", listed["read"])
+    alone = replace(scene, receivers=scene.receivers[:1])
+    assert not {"read", "misled by innovation", "misled by noise"} & dict(lanes.legend(alone)).keys()
+
+
+@pytest.mark.parametrize("name", [name for name in SCHEMES.names if len(SCHEMES[name].sent_words) == 1])
+def test_a_scheme_with_one_word_sends_one_type(name: str) -> None:
+    """No packet has ν = 1."""
+    n, slots = 2, 60
+    process = orbit(n)
+    scheme = SCHEMES[name](process, **SCHEMES[name].parameters)
+    batch = Batch(slots, 3)
+    streams = ("process", *SCHEMES[name].secret_streams)
+    keys = stream_keys(5, streams)
+    encoder, trajectory = scheme.encoder(keys, batch), Trajectory(process, keys["process"], batch)
+    for k in range(slots):
+        assert not encoder.encode(k, trajectory.advance(), trajectory.predicted).nu.any()
 
 
 def test_a_closed_loop_has_no_graph(simulated: Callable[..., Simulated]) -> None:

@@ -17,8 +17,6 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from rerun import AsComponents
 
-from evedrop.model import receiver
-from evedrop.model.schemes import SCHEMES
 from evedrop.score.synchronisation import Synchronisation
 from evedrop.show.view import lanes
 from evedrop.show.view.attacks import LASTING, Attacks, lane_count
@@ -122,7 +120,7 @@ class Packets(ViewPanel):
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
         names = ["sent", *(shown.name for shown in scene.receivers)]
-        shown_lanes = [lanes.SENT, *(lanes.lane_of(shown) for shown in scene.receivers)]
+        shown_lanes = [lanes.sent_lane(scene), *(lanes.lane_of(shown, scene) for shown in scene.receivers)]
         self._attacks = Attacks(scene)
         named = [*zip(names, shown_lanes, strict=True), *self._attacks.lanes()]
         labels = [lane.words if name == LASTING else [" "] * len(lane.words) for name, lane in named]
@@ -133,7 +131,7 @@ class Packets(ViewPanel):
         view = rrb.StateTimelineView(name="Packets", origin=_PACKETS_PATH, time_view=recent_slots(self.scene))
         receivers, attacks = len(self.scene.receivers), lane_count(self.scene)
         strip = rrb.StateTimelineView(
-            name=f"Packets sent   bright: a state{self._other}{self._attacks.title}",
+            name=f"Packets sent   {self._brightness}{self._attacks.title}",
             origin=_PACKETS_PATH,
             contents=[self._lanes.paths[0], *self._lanes.paths[1 + receivers :]],
             time_view=recent_slots(self.scene),
@@ -147,11 +145,12 @@ class Packets(ViewPanel):
             yield PlacedView(view, "left", height / (column - height))
 
     @property
-    def _other(self) -> str:
-        """The part of the title about the scheme's innovations; empty if it sends none."""
-        scheme = self.scene.receivers[0].strategy
-        sends = scheme in SCHEMES.names and SCHEMES[scheme].sends_states_and_innovations
-        return ", dark: an innovation" if sends else ""
+    def _brightness(self) -> str:
+        """What the strip's brightness stands for, in the words of the scheme."""
+        scheme = lanes.scheme_of(self.scene)
+        tones = zip(("bright", "dark"), scheme.sent_words, strict=False)
+        silent = ["black: silence"] if scheme.may_be_silent else []
+        return ", ".join([*(f"{tone}: {word}" for tone, word in tones), *silent])
 
     def styles(self) -> dict[str, rr.StateConfiguration]:
         """Colours; the legend says what they mean."""
@@ -215,15 +214,8 @@ class _Together:
 _GRAPH_PATH = "graph"
 _SENSOR, _ROUTER = "the sensor", "the router"
 _LINKS, _RECEIVERS = 150.0, 320.0  # where their columns are, right of sensor and router
-FATES = {
-    receiver.STATE: TRUTH,
-    receiver.INNOVATION: TRUTH,
-    receiver.MISLED: MISLED,
-    receiver.DISCARDED: STEEL,
-    receiver.DROPPED: STEEL,
-    receiver.SILENT: STEEL,
-}
-"""The colour of each word of a lane: bright where the packet was used, sand where it misled, steel where it was not used."""
+FATES: tuple[Colour, ...] = (STEEL, TRUTH, TRUTH, STEEL, STEEL, MISLED)
+"""The colour of each code of a lane: bright where the packet was used, sand where it misled, steel where it was not used."""
 
 
 @final
@@ -265,7 +257,8 @@ class LastPacket(ViewPanel):
         at = frames(self.scene, slots.first, slots.count)
         if not len(at):
             return
-        sent = [lanes.SENT.words[code] for code in lanes.sent(slots)[at].tolist()]
+        words_sent = lanes.sent_lane(self.scene).words
+        sent = [words_sent[code] for code in lanes.sent(slots)[at].tolist()]
         links = [self._fates(shown, slots, at.tolist()) for shown in self.scene.receivers]
         words = [self._known(shown, slots, at.tolist()) for shown in self.scene.receivers]
         labels, colours = [], []
@@ -280,10 +273,9 @@ class LastPacket(ViewPanel):
             colours += [colour for _, colour in nodes]
         yield Column(_GRAPH_PATH, slots.numbers[at], self._drawn.columns(labels, colours))
 
-    @staticmethod
-    def _fates(shown: Shown, slots: SceneSlots, at: list[int]) -> list[tuple[str, Colour]]:
-        words, codes = lanes.lane_of(shown).words, lanes.received(shown, slots)[at]
-        return [(words[code], FATES[words[code]]) for code in codes.tolist()]
+    def _fates(self, shown: Shown, slots: SceneSlots, at: list[int]) -> list[tuple[str, Colour]]:
+        words, codes = lanes.lane_of(shown, self.scene).words, lanes.received(shown, slots)[at]
+        return [(words[code], FATES[code]) for code in codes.tolist()]
 
     def _known(self, shown: Shown, slots: SceneSlots, at: list[int]) -> list[tuple[str, Colour]]:
         peer = slots.peers[shown.name]
