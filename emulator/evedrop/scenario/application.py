@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
+import numpy as np
+
 from evedrop.model.controllers import Assignment, Controller
 from evedrop.model.integrity.monitor import MonitorPlan
 from evedrop.model.metrics import error_column
@@ -59,6 +61,18 @@ class ControlledPlant:
     """Whether the controller acts on the true state."""
     spoofed: tuple[tuple[int, int], ...] = ()
     """The slots [from, to) of events in which the measurements are attacked; without such events an attack lasts all run."""
+
+    def flow(self, inputs: Mapping[str, float], disturbances: Mapping[str, float]) -> tuple[float, ...]:
+        """Factors of the disturbances, then of the inputs; those that are not named have 0."""
+        given = [disturbances.get(name, 0.0) for name in self.disturbance_names]
+        return (*given, *(inputs.get(name, 0.0) for name in self.inputs))
+
+    @property
+    def largest_flow(self) -> float:
+        """The largest disturbance of the run, or limit of an input, if any is above 0; otherwise 1."""
+        limits = np.abs(np.concatenate([self.plant.input_lower, self.plant.input_upper]))
+        values = np.concatenate([limits[np.isfinite(limits)], np.abs(self.disturbances).ravel()])
+        return float(values.max(initial=0.0)) or 1.0
 
     @property
     def process(self) -> Process:
@@ -163,6 +177,57 @@ class Panel:
     """Whether it is placed with the panels of the receivers' beliefs, rather than with those of the plant."""
 
 
+Spot = tuple[float, float]
+"""A place in a drawing: to the right, and downwards."""
+
+
+@dataclass(frozen=True)
+class DrawnLevel:
+    """A state in a drawing: an upright bar, filled up to it, with its name and value below."""
+
+    name: str
+    state: int
+    low: float
+    """The value of an empty bar."""
+    high: float
+    """The value of a full one."""
+    foot: Spot
+    """The middle of its lower end."""
+    top: float
+    """How far down its upper end is."""
+    marks: tuple[float, ...] = ()
+    """Values with a mark beside the bar, such as limits."""
+
+
+@dataclass(frozen=True)
+class DrawnFlow:
+    """A power in a drawing: an arrow as wide as it is large."""
+
+    positive: str
+    """The words before its value where it is positive; with no words there is no value."""
+    negative: str
+    weights: tuple[float, ...]
+    """It is the sum of disturbances, then inputs, with these factors."""
+    start: Spot
+    """The other end where it is negative."""
+    end: Spot
+    label: Spot
+    signed: bool = False
+    """Whether the value has a sign."""
+
+
+@dataclass(frozen=True)
+class Sketch:
+    """A drawing of a plant: what never changes, its states, and the powers that move it."""
+
+    size: Spot
+    lines: tuple[tuple[Spot, ...], ...]
+    levels: tuple[DrawnLevel, ...]
+    flows: tuple[DrawnFlow, ...]
+    most: float
+    """The power in kW whose arrow is the widest."""
+
+
 class PanelFeed(ABC):
     """The values of an application's panels in one trial, whose slots come in order."""
 
@@ -247,6 +312,12 @@ class Application(ABC):
         """Its panels in the view; by default none."""
         del loop, table
         return ()
+
+    @classmethod
+    def drawing(cls, loop: ControlledPlant, table: Table) -> Sketch | None:
+        """A drawing of its plant, which the view shows as what happens; by default none, so that curves take its place."""
+        del loop, table
+        return None
 
     @classmethod
     def feed(cls, loop: ControlledPlant, table: Table) -> PanelFeed | None:

@@ -57,6 +57,23 @@ def test_the_recording_holds_what_moves_the_plant(day: Path) -> None:
         assert shown[SLOTS - 1][0] == pytest.approx(house[f"{name}_energy"])
 
 
+def test_the_house_is_drawn_as_the_tables_have_it(day: Path) -> None:
+    """The words and the heights of the bars in every slot, from the true state and the powers."""
+    path, results = replay(day), load_results(day)
+    assert results.inputs is not None
+    inputs = results.inputs.to_pydict()
+    states = [row["x"] for row in results.trials.to_pylist() if row["peer"] == "smart"]
+    words, bars = rows(path, "drawing/words", "Points2D:labels"), rows(path, "drawing/bars", "LineStrips2D:strips")
+    for k, ((battery, hydrogen), (_, grid), (sun, drawn)) in enumerate(
+        zip(states, inputs["u"], inputs["d"], strict=True)
+    ):
+        assert words[k][:3] == [f"battery {battery:.1f} %", f"hydrogen {hydrogen:.1f} %", f"load {drawn:.2f} kW"]
+        assert words[k][3] == (f"to grid {-grid:.2f} kW" if grid < -0.005 else f"from grid {max(0.0, grid):.2f} kW")
+        assert words[k][4] == f"sun {sun:.2f} kW"
+        tops = [min(y for _, y in strip) - 0.07 for strip in bars[k]]
+        assert tops == pytest.approx([5.7 - 2.3 * level / 100.0 for level in (battery, hydrogen)], abs=1e-4)
+
+
 def test_guesses_are_shown_from_where_their_minute_began(day: Path) -> None:
     """One for each minute that is over, and the legitimate estimator's is near the load."""
     path = replay(day)

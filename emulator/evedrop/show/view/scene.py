@@ -14,7 +14,7 @@ from evedrop.model.links.way import Way
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 from evedrop.model.record import Record, RecordColumn, column
-from evedrop.scenario.application import Panel
+from evedrop.scenario.application import Panel, Sketch
 from evedrop.show.view.palette import Colour, identities
 
 TRUTH_NAME = "truth"
@@ -92,6 +92,8 @@ class Scene:
     """Receiver → the ways of sender and receiver on the ground, for links whose losses depend on them."""
     panels: tuple[Panel, ...] = ()
     """The panels of applications."""
+    drawing: Sketch | None = None
+    """What an application draws in place of the curve of what happens."""
     acknowledgements: AckScene | None = None
     """None without acknowledgements."""
     spans: tuple[AttackSpan, ...] = ()

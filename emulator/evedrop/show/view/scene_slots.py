@@ -141,12 +141,14 @@ def driven_scene(scenario: Scenario) -> dict[str, Any]:
     plant, process, loop = scenario.plant, scenario.process, controlled_plant(scenario)
     if plant is None or loop is None:
         return {}
+    drawings = (APPLICATIONS[name].drawing(loop, table) for name, table in scenario.applications.items())
     return {
         "states": labels(process.states, process.units),
         "moving": (*loop.disturbance_labels, *labels(plant.inputs, plant.input_units)),
         "panels": tuple(
             panel for name, table in scenario.applications.items() for panel in APPLICATIONS[name].panels(loop, table)
         ),
+        "drawing": next(filter(None, drawings), None),
     }
 
 

@@ -18,14 +18,18 @@ from evedrop.scenario.application import (
     Application,
     ApplicationTally,
     ControlledPlant,
+    DrawnFlow,
+    DrawnLevel,
     Kind,
     Panel,
     PanelCurve,
     PanelFeed,
+    Sketch,
     Summary,
 )
 from evedrop.scenario.table import Mistake, Number, Table
 from evedrop.show.view.palette import PLANT
+from evedrop.studies.applications.house_outline import HEIGHT, OUTLINE, RADIATOR, WIDTH
 
 _HOUR = 3600.0
 _ENERGY, _DISCOMFORT = "heating", "discomfort"
@@ -186,6 +190,20 @@ class Comfort(Application):
                 with_beliefs=True,
             ),
         )
+
+    @classmethod
+    def drawing(cls, loop: ControlledPlant, table: Table) -> Sketch:
+        """The room with the heater, and beside it the first other state, such as the temperature of the wall."""
+        comfort = _room(table)
+        room, wanted = loop.state(comfort.temperature), (comfort.lowest, comfort.highest)
+        margin = 2.0 * (comfort.highest - comfort.lowest)
+        ends = comfort.lowest - margin, comfort.highest + margin
+        levels = [DrawnLevel("room", room, *ends, (6.9, 6.0), 3.5, wanted)]
+        for state in [i for i in range(len(loop.states)) if i != room][:1]:
+            levels.append(DrawnLevel(loop.states[state].removeprefix("T_"), state, *ends, (10.8, 6.0), 3.5))
+        heat = loop.flow({comfort.heater: 1.0}, {})
+        flow = DrawnFlow("heating", "heating", heat, (4.2, 4.9), (6.2, 4.9), (4.5, 5.6), signed=True)
+        return Sketch((WIDTH, HEIGHT), (*OUTLINE, *RADIATOR), tuple(levels), (flow,), loop.largest_flow)
 
     @classmethod
     def feed(cls, loop: ControlledPlant, table: Table) -> ComfortFeed:

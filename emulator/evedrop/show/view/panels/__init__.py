@@ -11,6 +11,7 @@ from evedrop.show.view.panels.curves import (
     TraceOfP,
     WhatMovesThePlant,
 )
+from evedrop.show.view.panels.drawing import DrawnPlant
 from evedrop.show.view.panels.fates import LastPacket, Packets, WhoKnowsWhat
 from evedrop.show.view.panels.panel import ViewPanel
 from evedrop.show.view.panels.plane import GroundMap, StatePlane
@@ -25,6 +26,7 @@ PANELS: Registry[ViewPanel] = Registry(
         "knowledge": WhoKnowsWhat,
         "fates": LastPacket,
         "plant": WhatMovesThePlant,
+        "drawing": DrawnPlant,
         "levels": Levels,
         "applications": ApplicationPanels,
         "error": SquaredError,

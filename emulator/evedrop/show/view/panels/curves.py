@@ -208,7 +208,7 @@ class TraceOfP(ViewPanel):
 def worlds_over_time(scene: Scene, path: str, axis: rrb.TimeAxis) -> Iterator[PlacedView]:
     """The first state as it is, and as each receiver believes it: curves below a path, named as truth and receivers.
 
-    What happens has marks where the state was attacked, which its legend explains.
+    What happens has marks where the state was attacked, which its legend explains. A drawing takes its place.
     """
     label = scene.states[0] if scene.states else "the state"
 
@@ -217,7 +217,8 @@ def worlds_over_time(scene: Scene, path: str, axis: rrb.TimeAxis) -> Iterator[Pl
         return rrb.TimeSeriesView(name=title, origin=path, contents=contents, axis_x=axis, plot_legend=corner)
 
     attacked = bool(lane_count(scene))
-    yield PlacedView(view(f"What happens: {label}", TRUTH_NAME, f"{_ATTACKS}/**", legend=attacked), "truth")
+    if scene.drawing is None:
+        yield PlacedView(view(f"What happens: {label}", TRUTH_NAME, f"{_ATTACKS}/**", legend=attacked), "truth")
     for shown in scene.receivers:
         yield PlacedView(view(f"{shown.world_title}   grey: truth", TRUTH_NAME, shown.name), "worlds")
 

@@ -31,16 +31,21 @@ from evedrop.scenario.application import (
     Application,
     ApplicationTally,
     ControlledPlant,
+    DrawnFlow,
+    DrawnLevel,
     Kind,
     Panel,
     PanelCurve,
     PanelFeed,
     PowerFeed,
+    Sketch,
+    Spot,
     Summary,
 )
 from evedrop.scenario.table import Table
 from evedrop.score.energy import Meter, energy
 from evedrop.show.view.palette import PLANT, TRUTH_CURVE
+from evedrop.studies.applications.house_outline import GRID, HEIGHT, OUTLINE, SUN, WIDTH
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -406,6 +411,34 @@ class Household(Application):
         )
 
     @classmethod
+    def drawing(cls, loop: ControlledPlant, table: Table) -> Sketch:
+        """Sun, load and grid with the power that each gives or takes, the battery, and the first other store."""
+        house, plant = _house(table), loop.plant
+        battery = loop.state(house.battery)
+        levels = [_store(loop, "battery", battery, (4.0, 5.7))]
+        load = DrawnFlow("load", "load", loop.flow({}, {house.load: 1.0}), (6.0, 5.0), (6.0, 6.4), (6.0, 6.5))
+        grid = loop.flow({house.grid: 1.0}, {})
+        flows = [load, DrawnFlow("from grid", "to grid", grid, (11.0, 4.6), (8.9, 4.6), (10.5, 3.5))]
+        lines = (*OUTLINE, *GRID)
+        if house.sun is not None:
+            flows.append(DrawnFlow("sun", "sun", loop.flow({}, {house.sun: 1.0}), (1.6, 0.8), (3.7, 1.85), (1.2, 1.3)))
+            lines += SUN
+        rows = np.hstack([plant.disturbance_matrix, plant.input_matrix])
+        moved = rows[:, len(loop.disturbance_names) + loop.input(house.grid)]
+        if moved[battery]:
+            charge = tuple((rows[battery] / moved[battery]).tolist())
+            flows.append(DrawnFlow("", "", charge, (5.8, 4.6), (4.6, 4.6), (5.2, 4.2)))
+        for state in [i for i in range(len(loop.states)) if i != battery][:1]:
+            name = loop.states[state]
+            levels.append(_store(loop, _STORES.get(name, name), state, (8.0, 5.7)))
+            movers = [i for i, name in enumerate(loop.inputs) if name != house.grid and plant.input_matrix[state, i]]
+            for i in movers[:1]:
+                words = _CONVERTERS.get(loop.states[state], (loop.inputs[i],) * 2)
+                own = loop.flow({loop.inputs[i]: 1.0}, {})
+                flows.append(DrawnFlow(*words, own, (7.4, 4.6), (6.2, 4.6), (6.9, 2.7)))
+        return Sketch((WIDTH, HEIGHT), lines, tuple(levels), tuple(flows), loop.largest_flow)
+
+    @classmethod
     def feed(cls, loop: ControlledPlant, table: Table) -> PanelFeed:
         """What fills its panels."""
         return HouseholdFeed(loop, _house(table))
@@ -451,6 +484,17 @@ class HouseholdFeed(PanelFeed):
             if load is not None:
                 pairs.append((float(first + row - self._period), float(load[0])))
         return np.array(pairs).reshape(-1, 2).T
+
+
+_STORES = {"LOH": "hydrogen"}
+_CONVERTERS = {"LOH": ("fuel cell", "electrolyser")}
+"""The paper's names of a store, and of what takes power from it and gives power to it."""
+
+
+def _store(loop: ControlledPlant, name: str, state: int, foot: Spot) -> DrawnLevel:
+    """A store in per cent, with marks at its limits."""
+    limits = (float(limit[state]) for limit in (loop.plant.state_lower, loop.plant.state_upper))
+    return DrawnLevel(name, state, 0.0, 100.0, foot, 3.4, tuple(limit for limit in limits if np.isfinite(limit)))
 
 
 def _house(table: Table) -> HouseholdTable:
