@@ -22,6 +22,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import IO, Final, TypeVar, final
 
+import numpy as np
 from PIL import Image
 from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient, ViewerState
