@@ -23,7 +23,7 @@ _MOST_RATE = 60
 _SECONDS = 10.0  # of a video
 _BEFORE = 0.75  # of the slots of a video, before the most telling one
 _MOST_TIMES = 1_000_000  # frames of a video of a wire: eighteen hours at 15 a second
-_LEAST, _MOST = 320, 3840  # pixels; the viewer takes more than its time limit for larger pictures
+_LEAST, _MOST = 200, 3840  # pixels; the viewer takes more than its time limit for larger pictures
 
 
 def view(options: argparse.Namespace) -> int:
@@ -263,7 +263,7 @@ def _shown(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--panel",
         metavar="NAME",
-        help="the tab or panel to draw, such as numbers or squared-error; default the first tab",
+        help="the tab or panel to draw, such as numbers or packets; default the first tab",
     )
     rate = number_type(1, _MOST_RATE, f"a number of frames per second from 1 to {_MOST_RATE}")
     parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of a video; default 15")
