@@ -123,6 +123,23 @@ def test_numbers_of_a_logarithmic_axis_are_explained(simulated: Callable[..., Si
     }
 
 
+@pytest.mark.parametrize(
+    ("growth", "title", "unit"),
+    [(0.0, "−1: 0.1 m · 1: 10 m", 1), (5.84, "−1: 0.01 m · 1: 100 m", 2), (40.0, "−1: 1e-10 m · 1: 1e10 m", 10)],
+)
+def test_an_unstable_process_has_larger_units(
+    growth: float, title: str, unit: int, simulated: Callable[..., Simulated]
+) -> None:
+    """So that its axis has a few of them, and a number at each, however small the panel."""
+    run = simulated(20)
+    panel = SquaredError(replace(run.scene, units=("m", "m"), growth=growth))
+    assert str(next(iter(panel.views())).view.name) == f"Error   {title}"
+    drawn = next(column for column in panel.columns(run.slots) if column.path == "error/naive")
+    heights = next(iter(drawn.values)).as_arrow_array().flatten().to_numpy()
+    errors = np.maximum(run.slots.peers["naive"].squared_error, 1e-3)
+    np.testing.assert_allclose(10.0 ** (2 * unit * heights), errors, rtol=1e-9)
+
+
 def test_lanes_tell_what_happened(run: Simulated, rrd: Path) -> None:
     """Each lane says in every slot what became of the packet, and an innovation used as the state misled."""
     nu = run.slots.nu

@@ -98,6 +98,8 @@ class Scene:
     """None without acknowledgements."""
     spans: tuple[AttackSpan, ...] = ()
     """The attacks that last, in order of their first slots."""
+    growth: float = 0.0
+    """Powers of ten by which the error of an estimate without packets grows over the run, of an unstable process."""
     slot_seconds: float | None = None
     """What a slot lasts in the scenario; None if it is a number only."""
 

@@ -10,6 +10,7 @@ Source: docs/view.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -200,11 +201,18 @@ def open_recording(
         noise=float(np.trace(scenario.process.process.Q)),
         units=tuple(map(drawable, scenario.process.units or ())),
         ways={name: ways for name, ways in ways.items() if ways is not None},
+        growth=_growth(scenario),
         slot_seconds=scenario.slot_seconds,
         **driven_scene(scenario),
         **attacked_scene(scenario),
     )
     return ViewRecording(path, scene, warn, live=live)
+
+
+def _growth(scenario: Scenario) -> float:
+    """As in `Scene`, by the largest eigenvalue."""
+    largest = float(np.abs(np.linalg.eigvals(np.array(scenario.process.A))).max())
+    return scenario.slots * max(0.0, math.log10(max(largest, 1.0)))
 
 
 def shown(

@@ -28,6 +28,8 @@ from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots
 _WINDOW = 105  # slots; below four pixels a slot, Rerun merges neighbouring slots into grey
 _ROOM = 3  # slots to the right of the present, so that the newest slot is not at the border
 _ROOM_FOR_DATE, _HIDDEN = 25, 500  # parts of a run: half of a date, and a pixel
+_USUAL, _UNITS = 2.5, 4.5  # powers of ten over which errors extend without growth; units of an axis
+_LONG = 5  # powers of ten that are not written out
 _MOST_POINTS = 20_000  # of a curve over a run: a day of one-second slots is drawn every five seconds
 
 # For slots that share a pixel: the mean of their logarithms would be far below the logarithm of their mean.
@@ -99,14 +101,24 @@ def thinned(scene: Scene, slots: NDArray[np.int64]) -> NDArray[np.intp]:
 
 
 def logarithms(scene: Scene, path: str, slots: NDArray[np.int64], values: Floats) -> Iterator[Column]:
-    """log10 of the roots of squared errors or traces (c,), without NaNs: roots have a unit, and half as many powers of ten.
+    """The roots of squared errors or traces (c,) as units of a logarithmic axis, without NaNs.
 
-    Smaller values are raised to the floor of `error_floor`: after a state was received, the error is 0.
+    Roots have a unit, and half as many powers of ten. Smaller values are raised to the floor of `error_floor`: after a state was
+    received, the error is 0.
     """
     covered = ~np.isnan(values)  # no theory covers some links
     if covered.any():
         floor = error_floor(scene.noise, scene.trials)
-        yield scalars(path, slots[covered], 0.5 * np.log10(np.maximum(values[covered], floor)))
+        yield scalars(path, slots[covered], np.log10(np.maximum(values[covered], floor)) / (2 * decades(scene)))
+
+
+def decades(scene: Scene) -> int:
+    """Powers of ten of a unit of a logarithmic axis.
+
+    Rerun writes a number at each unit if it has 20 pixels, so a small panel has numbers for five units at most. Errors extend
+    over two or three powers of ten, and those of an unstable process over as many more as an estimate without packets diverges.
+    """
+    return math.ceil((_USUAL + scene.growth) / _UNITS)
 
 
 def powers_of_ten(scene: Scene) -> str:
@@ -117,7 +129,9 @@ def powers_of_ten(scene: Scene) -> str:
     units = [*dict.fromkeys(scene.units)]
     unit = f" {units[0]}" if len(units) == 1 else ""
     mixed = f"   ({', '.join(units)})" if len(units) > 1 else ""
-    return f"−1: 0.1{unit} · 1: 10{unit}{mixed}"
+    power = decades(scene)
+    less, more = (f"{10.0**-power:.{power}f}", f"{10**power:,}") if power < _LONG else (f"1e-{power}", f"1e{power}")
+    return f"−1: {less}{unit} · 1: {more}{unit}{mixed}"
 
 
 _ERROR_PATH, _BAND = "error", "band"
