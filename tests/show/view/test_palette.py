@@ -48,6 +48,8 @@ _VISIONS = (None, "deutan", "protan", "tritan")
 _WHITE = (255, 255, 255)
 _BLACK, _DARK = (0, 0, 0), (13, 13, 13)
 """The second is the ground of nodes in the dark theme."""
+_LABEL_GROUNDS = (30, 31, 33), (120, 121, 123)
+"""The grounds of labels on `GROUND`, in the dark theme and in the light one."""
 _BOTH = 4.35  # 4.4 is the greatest contrast with white and `_DARK` that any colour has
 _TEXT, _LARGE = 4.5, 3.0  # WCAG 2.1, 1.4.3 and 1.4.11: contrasts of letters, and of curves
 
@@ -208,6 +210,7 @@ def test_letters_can_be_read() -> None:
         ALARM,
     }
     assert min(_contrast(letters(ink), ground) for ink in inks for ground in (_DARK, _WHITE)) >= _BOTH
+    assert min(_contrast(palette.LABEL, ground) for ground in _LABEL_GROUNDS) >= _BOTH
     assert min(_contrast(ink, GROUND) for ink in (TRUTH, ALARM)) >= _TEXT
     for ground in (*palette.KNOWLEDGE, *palette.SPIED, *VERDICTS):
         assert max(_contrast(ink, ground) for ink in (_BLACK, _WHITE)) >= _TEXT

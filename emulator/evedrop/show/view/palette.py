@@ -22,6 +22,11 @@ GROUND: Colour = (16, 18, 22)
 """The background of the panels whose colours would be illegible on white: it is dark in both themes."""
 TRUTH: Colour = (226, 228, 234)
 """The truth on `GROUND`."""
+LABEL: Colour = (255, 255, 255)
+"""Letters in labels of two-dimensional panels, whose ground is nearly black, or (120, 121, 123) in the viewer's light theme.
+
+White has the greatest contrast with the latter, 4.36, of all colours that can be read on the former.
+"""
 TRUTH_CURVE: Colour = (151, 154, 159)
 """The truth on the background of a page: no curve is white or black."""
 

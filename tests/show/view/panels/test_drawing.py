@@ -114,6 +114,13 @@ def test_a_drawing_takes_the_place_of_the_curve() -> None:
     assert sides([*Levels(replace(scene, drawing=None)).views()]) == ["truth", "worlds"]
 
 
+def test_the_curves_beside_it_are_dark_in_both_themes() -> None:
+    """A yellow or a light green curve cannot be seen on the white ground of a light window."""
+    scene = replace(SCENE, moving=("P_heat (kW)",))
+    for placed in Levels(scene).views():
+        assert "PlotBackground" in placed.view.properties
+
+
 def test_every_frame_has_all_parts() -> None:
     """Bars, arrows and words, of the slots that are frames."""
     drawing = drawing_of("heated-room")

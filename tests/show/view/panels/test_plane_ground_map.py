@@ -38,7 +38,7 @@ def test_the_map_shows_both_ends_and_their_distance(tmp_path: Path) -> None:
         recording.add(replace(slots, peers=some))
     assert recording.close()
     places = rows(tmp_path / "r.rrd", "map/parked/at", "Points2D:positions")
-    labels = rows(tmp_path / "r.rrd", "map/parked/at", "Points2D:labels")
+    labels = rows(tmp_path / "r.rrd", "map/parked/words", "Points2D:labels")
     for k, distance in ((0, 25.0), (300, 25.0), (750, 212.5), (1499, 400.0)):
         np.testing.assert_allclose(places[k], [[distance, 0.0], [0.0, 0.0]], rtol=1e-6)
         assert labels[k] == ["sensor", f"parked: {distance:,.0f} m away"]
@@ -57,7 +57,7 @@ def test_both_ends_may_move(tmp_path: Path) -> None:
     places = rows(tmp_path / "r.rrd", "map/smart/at", "Points2D:positions")
     np.testing.assert_allclose(places[0], [[0.0, -10.0], [30.0, 10.0]])
     np.testing.assert_allclose(places[59], [[39.0, -30.0], [30.0, 10.0]])
-    labels = rows(tmp_path / "r.rrd", "map/smart/at", "Points2D:labels")
+    labels = rows(tmp_path / "r.rrd", "map/smart/words", "Points2D:labels")
     assert [labels[k][1] for k in (0, 20)] == ["smart: 36 m away", "smart: 50 m away"]
     ways = GroundMap(scene).styles()["map/smart/ways"]
     assert isinstance(ways, rr.LineStrips2D)

@@ -228,7 +228,14 @@ def worlds_over_time(scene: Scene, path: str, axis: rrb.TimeAxis) -> Iterator[Pl
 
     def view(title: str, *names: str, legend: bool = False) -> rrb.TimeSeriesView:
         contents, corner = [f"{path}/{name}" for name in names], rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
-        return rrb.TimeSeriesView(name=title, origin=path, contents=contents, axis_x=axis, plot_legend=corner)
+        return rrb.TimeSeriesView(
+            name=title,
+            origin=path,
+            contents=contents,
+            axis_x=axis,
+            plot_legend=corner,
+            background=dark_ground(),
+        )
 
     attacked = bool(lane_count(scene))
     if scene.drawing is None:

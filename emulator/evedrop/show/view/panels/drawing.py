@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from evedrop.model.process import Floats
 from evedrop.scenario.application import DrawnFlow, DrawnLevel
 from evedrop.show.view.column import Column
-from evedrop.show.view.palette import GROUND, PLANT, TRUTH, TRUTH_CURVE, Colour, dim
+from evedrop.show.view.palette import GROUND, LABEL, PLANT, TRUTH, TRUTH_CURVE, Colour, dim
 from evedrop.show.view.panels.panel import PlacedView, ViewPanel
 from evedrop.show.view.panels.plane import frames
 from evedrop.show.view.scene import Scene, SceneSlots
@@ -76,7 +76,7 @@ class DrawnPlant(ViewPanel):
             ),
             _BARS: rr.LineStrips2D.from_fields(colors=[TRUTH_CURVE], radii=[_STROKE]),
             _ARROWS: rr.LineStrips2D.from_fields(colors=[ink(flow) for flow in flows]),
-            _WORDS: rr.Points2D(places, colors=[TRUTH], radii=rr.Radius.ui_points(0.0), show_labels=True),
+            _WORDS: rr.Points2D(places, colors=[LABEL], radii=rr.Radius.ui_points(0.0), show_labels=True),
         }
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:

@@ -24,7 +24,7 @@ from evedrop.model.receiver import Flags
 from evedrop.show.view.attacks import Attacks, cut_off, lane_count
 from evedrop.show.view.column import Column
 from evedrop.show.view.lanes import ErrorDistance
-from evedrop.show.view.palette import GROUND, TRUTH, Colour, dim
+from evedrop.show.view.palette import GROUND, LABEL, TRUTH, Colour, dim
 from evedrop.show.view.panels.curves import times_of
 from evedrop.show.view.panels.panel import PlacedView, ViewPanel
 from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots, Shown
@@ -116,11 +116,9 @@ class StatePlane(ViewPanel):
         """Each estimate in its receiver's colour; the truth white, on top of the others."""
         styles = _point_styles(TRUTH_NAME, TRUTH, radius=3.5, order=40.0)
         styles[_HEADING] = rr.LineStrips2D.from_fields(colors=[TRUTH], radii=rr.Radius.ui_points(2.0), draw_order=41.0)
-        styles[_SCALE] = rr.LineStrips2D.from_fields(
-            colors=[dim(TRUTH)], radii=rr.Radius.ui_points(1.5), show_labels=True
-        )
+        styles[_SCALE] = rr.LineStrips2D.from_fields(colors=[LABEL], radii=rr.Radius.ui_points(1.0), show_labels=True)
         styles[_ATTACKS] = rr.Points2D.from_fields(radii=rr.Radius.ui_points(4.5), draw_order=39.0)
-        words = rr.Points2D.from_fields(colors=[TRUTH], radii=rr.Radius.ui_points(0.0), show_labels=True)
+        words = rr.Points2D.from_fields(colors=[LABEL], radii=rr.Radius.ui_points(0.0), show_labels=True)
         styles[_ATTACKED] = words
         for i, shown in enumerate(self.scene.receivers):
             bright = self.scene.colours[shown.name]
@@ -561,7 +559,10 @@ class GroundMap(ViewPanel):
                 styles[f"{_MAP_PATH}/{shown.name}/ways"] = lines
                 styles[f"{_MAP_PATH}/{shown.name}/link"] = rr.LineStrips2D.from_fields(colors=[bright], radii=size(0.7))
                 styles[f"{_MAP_PATH}/{shown.name}/at"] = rr.Points2D.from_fields(
-                    colors=[TRUTH, bright], radii=size(5.0), show_labels=True
+                    colors=[TRUTH, bright], radii=size(5.0)
+                )
+                styles[f"{_MAP_PATH}/{shown.name}/words"] = rr.Points2D.from_fields(
+                    colors=[LABEL], radii=size(0.0), show_labels=True
                 )
         return styles
 
@@ -576,8 +577,10 @@ class GroundMap(ViewPanel):
             distances = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
             labels = [text for distance in distances.tolist() for text in ("sensor", f"{name}: {distance:,.0f} m away")]
             yield Column(f"{_MAP_PATH}/{name}/link", k, rr.LineStrips2D.columns(strips=ends))
-            points = rr.Points2D.columns(positions=ends.reshape(-1, 2), labels=labels)
+            both = ends.reshape(-1, 2)
+            points, words = rr.Points2D.columns(positions=both), rr.Points2D.columns(positions=both, labels=labels)
             yield Column(f"{_MAP_PATH}/{name}/at", k, points.partition([2] * len(k)))
+            yield Column(f"{_MAP_PATH}/{name}/words", k, words.partition([2] * len(k)))
 
     def _corners(self, way: Way) -> NDArray[np.float32]:
         """The places of a run at which a way may change its direction, its first and its last one, (corners, 2)."""

@@ -20,7 +20,7 @@ from evedrop.show.view import lanes
 from evedrop.show.view.column import Column
 from evedrop.show.view.events import AckWatcher, Event, Watcher
 from evedrop.show.view.lanes import received
-from evedrop.show.view.palette import GROUND, TRUTH, Colour
+from evedrop.show.view.palette import GROUND, LABEL, TRUTH, Colour
 from evedrop.show.view.panels.curves import times_of
 from evedrop.show.view.panels.panel import LEGEND_HEIGHT, VERDICT_HEIGHT, PlacedView, ViewPanel, lanes_height
 from evedrop.show.view.scene import Scene, SceneSlots
@@ -111,7 +111,7 @@ class Legend(ViewPanel):
         return {
             f"{_LEGEND_PATH}/dots": rr.Points2D(places, colors=colours, radii=size(6.0)),
             f"{_LEGEND_PATH}/words": rr.Points2D(
-                places, colors=[TRUTH], radii=size(0.0), labels=words, show_labels=True
+                places, colors=[LABEL], radii=size(0.0), labels=words, show_labels=True
             ),
         }
 
