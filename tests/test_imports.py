@@ -115,18 +115,18 @@ def model() -> list[str]:
 
 
 def test_model_is_mathematics(loaded: dict[str, set[str]]) -> None:
-    """The model loads numpy, cryptography for streams, xxhash for digests: no network, no view, no scipy outside theory."""
+    """The model loads numpy, and xxhash for digests: no network, no view, no scipy outside theory."""
     assert len(model()) > 15
     for module in model():
         names = loaded[module]
-        assert packages(names) <= {"numpy", "cryptography", "xxhash", "_cffi_backend"}, module
+        assert packages(names) <= {"numpy", "xxhash", "_cffi_backend"}, module
         assert ours(names) <= MATHEMATICS, module
 
 
 def test_theory_may_use_scipy_and_no_more() -> None:
     """Theory loads scipy besides, and still neither network nor view nor results."""
     for module, names in loaded_by(*modules_of("model.theory")).items():
-        assert packages(names) <= {"numpy", "scipy", "cryptography", "_cffi_backend"}, module
+        assert packages(names) <= {"numpy", "scipy", "_cffi_backend"}, module
         assert ours(names) <= MATHEMATICS, module
 
 
@@ -139,7 +139,7 @@ def test_launcher_and_memory_load_neither_zenoh_nor_rerun(
 
 
 STARTS = {
-    "evedrop.live.launch.launcher": {"msgspec", "numpy", "xxhash", "pydantic", "cryptography", "tomli_w"},
+    "evedrop.live.launch.launcher": {"msgspec", "numpy", "xxhash", "pydantic", "tomli_w"},
     "evedrop.live.recorder.recorder": {
         "numpy",
         "xxhash",

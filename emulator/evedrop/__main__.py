@@ -21,6 +21,9 @@ _HIDDEN = "..."
 _COLLECT_AFTER = 50_000
 """New objects, before cycles among them are searched for: almost all that a command makes are its modules, and stay."""
 
+_LIGHT = {"ARROW_DEFAULT_MEMORY_POOL": "system", "PYDANTIC_DISABLE_PLUGINS": "__all__"}
+"""For this process alone: Arrow's own pool keeps 5 MB, and plugins of pydantic, which we do not use, are searched for."""
+
 
 def without_values(words: Sequence[str]) -> list[str]:
     """A command line for all users to read: without the values of options that may be a seed or a password."""
@@ -66,6 +69,8 @@ def program() -> NoReturn:
         # Threads may still be in Zenoh, or in Rerun: an interpreter that exits meanwhile aborts (Python 3.11), or hangs.
         os._exit(main())
     gc.set_threshold(_COLLECT_AFTER)
+    for name, value in _LIGHT.items():
+        os.environ.setdefault(name, value)
     status = main()
     for number in heeded():  # the command is over: ignore signals while it exits
         signal.signal(number, signal.SIG_IGN)

@@ -15,10 +15,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import blake2b
-from typing import Generic, Protocol, TypeVar, final
+from typing import Any, Generic, Protocol, TypeVar, final
 
 import numpy as np
-from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from numpy.typing import NDArray
 
 from evedrop.model.kernels import reference
@@ -32,7 +31,6 @@ MOST_SLOTS = 100_000_000
 """The most slots of a run."""
 KEY_BYTES = 32
 _AES_BLOCK = 16
-_ECB = modes.ECB()  # noqa: S305 - counter mode, see `Stream`
 _WORD = np.dtype("<u8")
 _BLOCK_WORDS = 16_384  # words drawn ahead at once: large enough to hide the cost of a call, small enough for the cache
 
@@ -59,6 +57,13 @@ def stream_keys(root: bytes) -> Callable[[str], bytes]:
     return key_of
 
 
+def _encryptor(key: bytes) -> Any:
+    """AES-256 of single blocks."""
+    from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes  # noqa: PLC0415 - 6 MB; a launcher draws nothing
+
+    return Cipher(algorithms.AES(key), modes.ECB()).encryptor()  # noqa: S305 - counter mode, see `Stream`
+
+
 class Stream:
     """A stream over a range of trials (step 1), `per_trial` words for each in every slot.
 
@@ -66,7 +71,7 @@ class Stream:
     """
 
     def __init__(self, key: bytes, trials: range, per_trial: int) -> None:
-        self._encryptor = Cipher(algorithms.AES(key), _ECB).encryptor()
+        self._encryptor = _encryptor(key)
         self._blocks = (per_trial + 1) // 2
         self._trials = trials
         self._per_trial = per_trial
@@ -173,7 +178,7 @@ class SingleTrialReader:
         """Raises ValueError unless the batch is trial 0 alone."""
         if batch.trial_range != range(1):
             raise ValueError(batch)
-        self._encryptor = Cipher(algorithms.AES(key), _ECB).encryptor()
+        self._encryptor = _encryptor(key)
         self._per_trial = per_trial
 
     def uniforms(self, slots: range) -> Floats:

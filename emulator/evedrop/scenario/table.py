@@ -94,7 +94,7 @@ Mistake = tuple[str, str]
 class Table(BaseModel):
     """A table of a scenario file."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, serialize_by_alias=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, serialize_by_alias=True, defer_build=True)
 
     @classmethod
     def entries(cls) -> list[str]:

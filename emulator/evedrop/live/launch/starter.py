@@ -172,6 +172,7 @@ _START_SECONDS = 120.0
 _GONE = (errno.ESRCH, "its fork server has ended")
 _SILENT = (errno.ETIMEDOUT, f"its fork server did not respond within {_START_SECONDS:.0f} s")
 _EVERY_ROLE = (
+    "cryptography.hazmat.primitives.ciphers",
     "evedrop.cli.commands.process",
     "evedrop.cli.main",
     "evedrop.live.protocol.brief",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
@@ -17,14 +17,12 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
 from evedrop.model.metrics.text import number_text
 from evedrop.model.process import Floats
-from evedrop.model.receiver import NOTHING, SILENT, Codes
+from evedrop.model.receiver import NOTHING, SILENT, Codes, Flags
 from evedrop.results.reading import Results
 from evedrop.scenario.recorded import recorded_noise, recorded_strategies
 from evedrop.score.expectations_held import repeating
@@ -60,14 +58,14 @@ class SlotRows:
         """Of the receivers that have rows."""
         self._in_order = True
         for name, rows in self._by_receiver(results.pieces(table, self._with_keys([]))):
-            slots = rows["slot"].to_numpy()
+            slots = rows["slot"]
             first, last, before = int(slots.min()), int(slots.max()), self.extents.get(name)
             self._in_order &= bool((np.diff(slots) > 0).all()) and (before is None or before.last < first)
             if before is not None:
                 first, last = min(first, before.first), max(last, before.last)
             self.extents[name] = RowExtent(len(slots) + (0 if before is None else before.rows), first, last)
 
-    def pieces(self, columns: Sequence[str]) -> Iterator[tuple[str, pa.Table]]:
+    def pieces(self, columns: Sequence[str]) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Some columns, as pieces: the receiver, and its next rows. All rows at once if the slots of the table are not in order.
 
         Raises UsageError as the constructor does.
@@ -75,23 +73,41 @@ class SlotRows:
         if self._in_order:
             yield from self._by_receiver(self._results.pieces(self._table, self._with_keys(columns)))
         else:  # somebody has written the table again
-            where = None if self._trial is None else pc.field("trial") == self._trial
-            whole = self._results.part(self._table, self._with_keys(columns), where).sort_by("slot")
-            yield from self._by_receiver(iter([whole]))
+            yield from self._by_receiver([self._results.part(self._table, self._with_keys(columns)).sort_by("slot")])
 
     def _with_keys(self, columns: Sequence[str]) -> list[str]:
         keys = ["slot", "peer", *([] if self._trial is None else ["trial"])]
         return list(dict.fromkeys([*keys, *columns]))
 
-    def _by_receiver(self, tables: Iterator[pa.Table]) -> Iterator[tuple[str, pa.Table]]:
-        for table in tables:
-            of_trial = table if self._trial is None else table.filter(pc.equal(table["trial"], self._trial))
+    def _by_receiver(self, tables: Iterable[pa.Table]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        for table in tables:  # without Arrow's own functions, whose import takes 9 MB
+            columns = {name: _column(name, table[name]) for name in table.column_names}
+            peers, names = columns["peer"]
             for name in self._receivers:
-                rows = of_trial.filter(pc.equal(of_trial["peer"], name))
-                if rows.num_rows:
-                    yield name, rows
+                some = np.array([peer == name for peer in names], np.bool_)[peers]
+                if self._trial is not None:
+                    some &= columns["trial"] == self._trial
+                if some.any():
+                    yield name, {key: _rows(column, some) for key, column in columns.items()}
 
 
+def _column(name: str, column: pa.ChunkedArray) -> Any:
+    """A column of numbers, (c,); one of words as indices, (c,), into the words that follow."""
+    if name not in _OF_WORDS:
+        return column.to_numpy()
+    whole = column.combine_chunks()
+    if isinstance(whole, pa.DictionaryArray) and not whole.null_count:
+        return whole.indices.to_numpy().astype(np.intp), whole.dictionary.to_pylist()
+    words: dict[str, int] = {}
+    return np.array([words.setdefault(str(word), len(words)) for word in column.to_pylist()], np.intp), list(words)
+
+
+def _rows(column: Any, some: Flags) -> Any:
+    """Some rows of a column as `_column` returns it."""
+    return (column[0][some], column[1]) if isinstance(column, tuple) else column[some]
+
+
+_OF_WORDS = ("peer", "sent", "action")
 _MOST_BYTES = 2**24
 OUTCOMES = EAVESDROPPER.words
 """The fates of a packet; the index of a word is its code."""
@@ -130,13 +146,13 @@ class RecordedTrial:
         self.lost = LongestSpans(MOST_SPANS, extent.first)
         """The spans in which it lost synchronisation."""
 
-    def add(self, rows: pa.Table) -> None:
+    def add(self, rows: Mapping[str, Any]) -> None:
         """The rows of the next slots. Raises UsageError if one has an unknown action."""
-        sent, actions = (_listed(rows[name]) for name in ("sent", "action"))
-        unknown = sorted(set(actions[1]) - set(OUTCOMES))
+        sent, actions = rows["sent"], rows["action"]
+        unknown = sorted({actions[1][place] for place in np.unique(actions[0])} - set(OUTCOMES))
         if unknown:
             raise UsageError(f"trials.parquet has the unknown action {unknown[0]}; run the scenario again")
-        codes = np.array([OUTCOMES.index(word) for word in actions[1]], np.uint8)[actions[0]]
+        codes = np.array([OUTCOMES.index(word) if word in OUTCOMES else 0 for word in actions[1]], np.uint8)[actions[0]]
         silent = np.array([word == NOTHING for word in sent[1]], np.bool_)[sent[0]]
         self.outcome.add(np.where(silent, np.uint8(OUTCOMES.index(SILENT)), codes))
         codes = synchronisation_of(_numbers(rows["squared_error"]), _numbers(rows["trace_covariance"]), self._noise)
@@ -219,7 +235,7 @@ class RunSource:
         return recorded_noise(self.folder)
 
 
-def _means(rows: pa.Table) -> Floats:
+def _means(rows: Mapping[str, Any]) -> Floats:
     """Slot, error, the ends of its interval, and what theory expects, (5, c)."""
     error = _numbers(rows["mean_squared_error"])
     actual = _numbers(rows["mean_actual_trace_covariance"])
@@ -229,16 +245,8 @@ def _means(rows: pa.Table) -> Floats:
     return np.stack([_numbers(rows["slot"]), error, low, high, theory])
 
 
-def _numbers(column: pa.ChunkedArray) -> Floats:
-    return np.asarray(column.to_numpy(), np.float64)
-
-
-def _listed(column: pa.ChunkedArray) -> tuple[NDArray[np.intp], list[str]]:
-    """A column of words as indices, (c,), into the words that follow."""
-    whole = pc.dictionary_encode(column.cast(pa.string())).combine_chunks()
-    if isinstance(whole, pa.ChunkedArray):  # without rows
-        whole = whole.chunk(0) if whole.num_chunks else pa.array([], pa.string()).dictionary_encode()
-    return whole.indices.to_numpy(zero_copy_only=False).astype(np.intp), whole.dictionary.to_pylist()
+def _numbers(column: Any) -> Floats:
+    return np.asarray(column, np.float64)
 
 
 _MOST_TEXT = 40_000

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from evedrop.errors import UsageError
 from evedrop.results.comparison import COMPARISON
@@ -21,8 +22,10 @@ from evedrop.show.report.comparison_sections import COMPARISON_SECTIONS, Compari
 from evedrop.show.report.page import Page, parts_of
 from evedrop.show.report.run_sections import RUN_SECTIONS, RunSource
 from evedrop.show.report.sweep_sections import SWEEP_SECTIONS, SWEEP_TABLE, SweepSource
-from evedrop.show.report.wire_sections import WIRE_SECTIONS, WireSource
 from evedrop.system.output import warn
+
+if TYPE_CHECKING:
+    from evedrop.show.report.wire_sections import WireSource
 
 
 def run_page(folder: Path) -> Page:
@@ -47,13 +50,21 @@ def comparison_page(folder: Path) -> Page:
 
 def wire_page(source: WireSource) -> Page:
     """The report of a wire."""
+    from evedrop.show.report.wire_sections import WIRE_SECTIONS  # noqa: PLC0415 - its import takes 9 MB more
+
     return Page(source.title, source.about, *source.outcome, parts_of(WIRE_SECTIONS, source))
+
+
+def _wire_page_of(folder: Path) -> Page:
+    from evedrop.show.report.wire_sections import WireSource  # noqa: PLC0415 - the same
+
+    return wire_page(WireSource.read(folder))
 
 
 KINDS: Mapping[str, Callable[[Path], Page]] = {
     SWEEP_TABLE: sweep_page,
     COMPARISON: comparison_page,
-    WIRE_FILE: lambda folder: wire_page(WireSource.read(folder)),
+    WIRE_FILE: _wire_page_of,
 }
 """A file that only such a folder has → the function that makes its page. Any other folder is that of a run."""
 
