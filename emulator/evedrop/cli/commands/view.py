@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _MOST_RATE = 60
 _SECONDS = 10.0  # of a video
 _BEFORE = 0.75  # of the slots of a video, before the most telling one
+_WIRE_RATE = 8.0  # frames per second of a whole wire: all its curves move, so that 15 would be a GIF of more than 3 MB
 _MOST_TIMES = 1_000_000  # frames of a video of a wire: eighteen hours at 15 a second
 _LEAST, _MOST = 200, 3840  # pixels; the viewer takes more than its time limit for larger pictures
 
@@ -96,8 +97,10 @@ def _slots_of(options: argparse.Namespace) -> Sequence[int]:
         raise UsageError("--times is for wires; a run has slots, so give --slots")
     if options.slots is None:
         from evedrop.results.reading import Results
+        from evedrop.show.view.video import FRAME_RATE
 
-        slots, frames = int(Results.read(options.run).summary["slots"]), _frames_of(options)
+        slots = int(Results.read(options.run).summary["slots"])
+        frames = round(_SECONDS * (options.fps or FRAME_RATE))
         slot = _chosen_slot(options.run)
         if slot is None:  # every picture shows the whole run
             count = min(slots, frames)
@@ -110,13 +113,6 @@ def _slots_of(options: argparse.Namespace) -> Sequence[int]:
     return range(int(first), int(last) + 1, int(step or 1))
 
 
-def _frames_of(options: argparse.Namespace) -> int:
-    """The frames of a video of ten seconds."""
-    from evedrop.show.view.video import FRAME_RATE
-
-    return round(_SECONDS * (options.fps or FRAME_RATE))
-
-
 def _times_of(options: argparse.Namespace) -> Sequence[float]:
     """The times of a video of a wire: some that are given, in real time, or the whole wire in ten seconds."""
     from evedrop.show.view.video import FRAME_RATE
@@ -125,7 +121,7 @@ def _times_of(options: argparse.Namespace) -> Sequence[float]:
     if options.slots is not None:
         raise UsageError(f"--slots is for runs, and {options.run} is the folder of a wire; give --times")
     if options.times is None:
-        seconds, frames = wire_seconds(options.run), _frames_of(options)
+        seconds, frames = wire_seconds(options.run), round(_SECONDS * (options.fps or _WIRE_RATE))
         return [seconds * i / (frames - 1) for i in range(frames)]
     first, last, step = options.times
     step = 1.0 / (options.fps or FRAME_RATE) if step is None else step
