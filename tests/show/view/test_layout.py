@@ -47,6 +47,7 @@ def tabbed() -> Blueprint:
     ("title", "name"),
     [
         ("Squared error   log10, dim: 95 % bands", "squared-error"),
+        ("Root of tr P   dim: theory   −1: 0.1 m · 1: 10 m", "root-of-tr-p"),
         ("What happens: SOC (%)", "what-happens"),
         ("The last packet, and what each knows", "last-packet"),
         ("Evidence of an attack; watermark", "evidence-of-an-attack"),

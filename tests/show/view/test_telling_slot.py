@@ -29,6 +29,14 @@ def test_the_slot_in_which_most_are_overconfident_is_chosen() -> None:
     assert most_telling(errors, reported(errors), 0.1) == 700
 
 
+def test_the_slots_before_it_count_first() -> None:
+    """They are what the panels show: a single slot, however far the eavesdropper is, is not chosen before a long stretch."""
+    errors = errors_of(1000, naive=(700, 1e6))
+    errors["naive"][300:400] = 50.0
+    errors["naive"][396] = 80.0
+    assert most_telling(errors, reported(errors), 0.1) == 396
+
+
 def test_where_the_legitimate_estimator_errs_as_well_there_is_nothing_to_see() -> None:
     """The separation is a ratio."""
     errors = errors_of(1000, naive=(400, 50.0))

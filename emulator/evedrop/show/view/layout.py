@@ -1,8 +1,8 @@
 """The layout of a recording: the names of its tabs and panels, and the same layout with only one of them.
 
 A layout is a blueprint as Rerun's viewer gives it and takes it back: path → archetype → field. A name is the beginning of the
-title that the view shows, in the form in which somebody types it: `squared-error` for "Squared error   log10", and the name of
-the receiver for the world as it believes it.
+title that the view shows, in the form in which somebody types it: `state-plane` for "State plane   ellipses: 2σ reported", and
+the name of the receiver for the world as it believes it.
 
 Source: docs/view.md, pictures.
 """

@@ -17,6 +17,8 @@ from evedrop.scenario.recorded import recorded
 from evedrop.score.synchronisation import is_overconfident
 
 _BEFORE, _AFTER = 105, 25  # slots that the panels show on either side, so that the picture is filled
+_ABOUT = 0.9  # of the largest mean
+_MOST = 1e3  # powers of ten: a separation that is not a number counts as such
 
 
 def telling_slot(results: Results) -> int | None:
@@ -40,23 +42,33 @@ def telling_slot(results: Results) -> int | None:
 
 
 def most_telling(errors: Mapping[str, Floats], traces: Mapping[str, Floats], noise: float) -> int:
-    """The slot with the largest separation between the eavesdroppers that are overconfident and the legitimate estimator.
+    """The slot with the largest separation of the eavesdroppers that are overconfident from the legitimate estimator.
+
+    It is one of those with the slots before them, which the panels show, in which the mean separation is about the largest.
 
     errors, traces: receiver → its squared error, and the trace of the covariance that it reports, (slots,). noise: trace of Q.
     """
     legitimate = errors[LEGITIMATE]
     others = [name for name in errors if name != LEGITIMATE]
+    candidates = _candidates(len(legitimate))
+    separation = legitimate
     if others:
         overconfident = {name: is_overconfident(errors[name], traces[name], noise) for name in others}
-        some = any(flags[_candidates(len(flags))].any() for flags in overconfident.values())
-        separation = sum(
-            np.log10((errors[name] + noise) / (legitimate + noise)) * (overconfident[name] if some else 1.0)
-            for name in others
-        )
-    else:
-        separation = legitimate
-    candidates = _candidates(len(legitimate))
-    return int(candidates.start) + int(np.argmax(np.nan_to_num(separation, nan=-np.inf)[candidates]))
+        some = any(flags[candidates].any() for flags in overconfident.values())
+        with np.errstate(all="ignore"):
+            separation = np.sum(
+                [
+                    np.log10((errors[name] + noise) / (legitimate + noise)) * (overconfident[name] if some else 1.0)
+                    for name in others
+                ],
+                axis=0,
+            )
+    separation = np.nan_to_num(separation, nan=-_MOST, posinf=_MOST, neginf=-_MOST)
+    sums = np.concatenate([[0.0], np.cumsum(np.where(np.arange(len(separation)) < candidates.start, 0.0, separation))])
+    ends = np.arange(len(separation)) + 1
+    means = ((sums[ends] - sums[np.maximum(ends - _BEFORE, 0)]) / _BEFORE)[candidates]
+    about_largest = means >= means.max() - (1.0 - _ABOUT) * abs(means.max())
+    return int(candidates.start) + int(np.argmax(np.where(about_largest, separation[candidates], -np.inf)))
 
 
 def _candidates(slots: int) -> slice:
