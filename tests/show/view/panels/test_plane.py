@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evedrop.show.view.panels.plane import apart, arrows, borders, inside, labels_of, within
+from evedrop.show.view.panels.plane import apart, arrows, borders, inside, labels_of, side_by_side, within
 from evedrop.show.view.recording import ViewRecording
 from tests.show.view.read_back import rows
 from tests.show.view.simulated_run import Simulated
@@ -21,14 +21,15 @@ LOW, HIGH, TRUTH = (np.array([one], np.float32) for one in ([-10.0, -5.0], [10.0
 def test_arrows_end_at_the_border_and_point_at_the_estimate(where: tuple[float, float]) -> None:
     """Wherever it is, up to the largest number; their tip lies on the line from the truth."""
     point = np.array([where], np.float32)
-    tip = borders(TRUTH, point, LOW, HIGH)[0].astype(float)
+    tips = borders(TRUTH, point, LOW, HIGH)
+    tip = tips[0].astype(float)
     edge = np.array([2.0, 1.0])
     assert (tip >= LOW[0] + edge - 1e-5).all()
     assert (tip <= HIGH[0] - edge + 1e-5).all()
     assert np.isclose(np.abs(tip), np.array([8.0, 4.0]), atol=1e-5).any()
     towards, moved = point[0].astype(float) - TRUTH[0], tip - TRUTH[0]
     assert np.isclose(towards @ moved, np.hypot(*towards) * np.hypot(*moved), rtol=1e-5)
-    shaft = arrows(TRUTH, point, LOW, HIGH)[0]
+    shaft = arrows(TRUTH, point, tips, LOW, HIGH)[0]
     np.testing.assert_array_equal(shaft[1], shaft[3])
     np.testing.assert_allclose(shaft[1], tip, rtol=1e-6)
     assert (shaft[1] - shaft[0]) @ towards > 0.0
@@ -76,6 +77,19 @@ def test_labels_of_estimates_at_one_place_are_below_each_other(tip: tuple[float,
     np.testing.assert_array_equal(apart(beside, placed, LOW, HIGH), beside)
     nowhere = np.full((1, 2), np.nan, np.float32)
     np.testing.assert_array_equal(apart(first, [nowhere], LOW, HIGH), first)
+
+
+def test_each_that_is_far_has_an_arrow_of_its_own() -> None:
+    """Estimates at one place outside the frame are drawn side by side, inside it; those inside the frame stay where they are."""
+    places: list[np.ndarray] = []
+    for where in ((50.0, 1.0), (50.0, 1.0), (51.0, 1.0), (0.0, 0.0), (0.0, 0.0)):
+        point = np.array([where], np.float32)
+        places.append(side_by_side(TRUTH, point, places, LOW, HIGH))
+    far = np.concatenate(places[:3])
+    gaps = [np.abs(far[i] - far[j]).max() for i in range(3) for j in range(i)]
+    assert min(gaps) > 0.05 * 20.0
+    assert inside(far, LOW, HIGH).all()
+    np.testing.assert_array_equal(places[3], places[4])
 
 
 def test_two_that_are_far_have_labels_apart(simulated: Callable[..., Simulated], tmp_path: Path) -> None:

@@ -157,10 +157,12 @@ class StatePlane(ViewPanel):
         bars, lengths = scale_bars(boxes[:, 0], boxes[:, 2])
         texts = [self._distance.text(length) for length in lengths.tolist()]
         yield Column(_SCALE, k[at], rr.LineStrips2D.columns(strips=bars, labels=texts))
+        places: dict[str, Points] = {}
         for name, points in positions.items():
             trail = within(pieces[name], low, high, truth)
             yield Column(_trail(name), k[at], rr.LineStrips2D.columns(strips=trail))
-            yield Column(_point(name), k[at], rr.Points2D.columns(positions=borders(truth, points[at], low, high)))
+            places[name] = side_by_side(truth, points[at], [*places.values()], low, high)
+            yield Column(_point(name), k[at], rr.Points2D.columns(positions=places[name]))
         for i, shown in enumerate(self.scene.receivers):
             peer = slots.peers[shown.name]
             outlines = np.clip(ellipses(peer.x_hat[at], peer.P[at]), low[:, None], high[:, None])
@@ -168,12 +170,11 @@ class StatePlane(ViewPanel):
             yield Column(_ellipse(shown.name), k[at], rr.LineStrips2D.columns(strips=outlines))
             distances = self._distance.of(slots.x[at], peer.x_hat[at])
             offs = [f"{self._distance.text(distance)} off" for distance in distances.tolist()]
-            seen_at = borders(truth, positions[shown.name][at], low, high)
-            below = rr.Points2D.columns(positions=labels_below(seen_at, low, high), labels=offs)
+            below = rr.Points2D.columns(positions=labels_below(places[shown.name], low, high), labels=offs)
             yield Column(_off(shown.name), k[at], below)
             if i > 0:
                 seen = truth, positions[shown.name][at], low, high
-                yield from self._far(shown.name, k[at], seen, distances, labels)
+                yield from self._far(shown.name, k[at], seen, places[shown.name], distances, labels)
 
     def _attacked(
         self, slots: SceneSlots, at: NDArray[np.intp], boxes: Points, marks: list[list[tuple[Points, Colour]]]
@@ -197,16 +198,18 @@ class StatePlane(ViewPanel):
         name: str,
         k: NDArray[np.int64],
         seen: tuple[Points, Points, Points, Points],
+        tips: Points,
         distances: Floats,
         labels: list[Points],
     ) -> Iterator[Column]:
         """Arrows with distances where an estimate is outside the frame.
 
-        seen: truth, estimates, lows and highs; labels: those of other receivers, as in `apart`, to which its own are added.
+        seen: truth, estimates, lows and highs; tips: of the arrows; labels: those of other receivers, as in `apart`, to which
+        its own are added.
         """
         truth, points, low, high = seen
         far = ~inside(points, low, high)
-        drawn = arrows(truth[far], points[far], low[far], high[far])
+        drawn = arrows(truth[far], points[far], tips[far], low[far], high[far])
         texts = [f"{name}: {self._distance.text(distance)}" for distance in distances[far].tolist()]
         lengths = far.astype(np.int64)
         yield Column(_arrow(name), k, rr.LineStrips2D.columns(strips=drawn).partition(lengths))
@@ -278,6 +281,10 @@ _LINE = 0.11  # of a frame's height: what a label needs
 _VEHICLE = 0.09  # length of the vehicle, compared with the longer side
 _SCALE_BAR = 0.25  # of a frame's width: the longest scale
 _HEADLINE = 0.04  # of a frame's height, from its upper border: where words about the whole frame are
+_BESIDE, _MOST_BESIDE = (
+    0.06,
+    8,
+)  # from one tip to the next, compared with the longer side; and tips that stand side by side
 _ARROW = 0.08  # length of an arrow, compared with the longer side
 _FRAME_ROOM = 0.3  # around what the frame follows, compared with its longer side
 
@@ -345,9 +352,23 @@ def borders(truth: Points, points: Points, low: Points, high: Points) -> Points:
     return _shown(np.where(inside(points, low, high)[:, None], points, moved))
 
 
-def arrows(truth: Points, points: Points, low: Points, high: Points) -> Points:
-    """Arrows, (f, 5, 2), from within the frame to the border, towards points outside: a shaft, and both sides of its head."""
-    tips = borders(truth, points, low, high).astype(np.float64)
+def side_by_side(truth: Points, points: Points, others: Sequence[Points], low: Points, high: Points) -> Points:
+    """Where points, (f, 2), are drawn: as by `borders`; those outside the frame are beside the `others`, not on them."""
+    placed, size = borders(truth, points, low, high).astype(np.float64), (high - low).astype(np.float64)
+    far, towards = ~inside(points, low, high), placed - truth
+    across = np.stack([-towards[:, 1], towards[:, 0]], axis=1)
+    step = _BESIDE * size.max(axis=1, initial=0.0) / np.maximum(np.hypot(towards[:, 0], towards[:, 1]), 1e-300)
+    for _ in others[:_MOST_BESIDE]:
+        covered = far & np.any(np.all(np.abs(placed - np.stack(others)) < 0.9 * _BESIDE * size, axis=2), axis=0)
+        if not covered.any():
+            break
+        placed += np.where(covered[:, None], step[:, None] * across, 0.0)
+    return _shown(np.clip(placed, low, high))
+
+
+def arrows(truth: Points, points: Points, ends: Points, low: Points, high: Points) -> Points:
+    """Arrows, (f, 5, 2), with their tips at `ends`, towards points outside: a shaft, and both sides of its head."""
+    tips = ends.astype(np.float64)
     towards = points.astype(np.float64) - truth
     direction = towards / np.maximum(np.hypot(towards[:, 0], towards[:, 1]), 1e-300)[:, None]
     across = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
