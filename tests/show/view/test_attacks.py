@@ -40,9 +40,9 @@ def all_of(results: Any, column: str, peer: str) -> list[Any]:
     return [row[column] for row in sorted(table, key=lambda row: row["slot"]) if row["trial"] == first]
 
 
-@pytest.mark.parametrize("attack", mostly_long(sorted(ATTACKS), ["critical", "hijack"]))
-def test_the_lane_is_what_the_sensor_got(attack: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the first of the trials, which is not trial 0; blocked where the estimator received and the air was silent."""
+@pytest.fixture
+def arrivals(monkeypatch: pytest.MonkeyPatch) -> dict[int, Flags]:
+    """Slot → the acknowledgements that reach the sensor of a run in this process, (R,)."""
     arrivals: dict[int, Flags] = {}
     arrived = AckChannel.arrived
 
@@ -51,6 +51,12 @@ def test_the_lane_is_what_the_sensor_got(attack: str, tmp_path: Path, monkeypatc
         return arrivals[k]
 
     monkeypatch.setattr(AckChannel, "arrived", spied)
+    return arrivals
+
+
+@pytest.mark.parametrize("attack", mostly_long(sorted(ATTACKS), ["critical", "hijack"]))
+def test_the_lane_is_what_the_sensor_got(attack: str, tmp_path: Path, arrivals: dict[int, Flags]) -> None:
+    """Of the first of the trials, which is not trial 0; blocked where the estimator received and the air was silent."""
     acks: dict[str, Any] = {"link": {"quality": 0.8}, "attack": attack}
     acks |= {"jammer": "jammer"} if attack in ("critical", "hijack") else {"flip": 0.3} if attack == "flip" else {}
     changes: dict[str, Any] = {"first_trial": 3, "acknowledgements": acks, "expect": []}
@@ -68,6 +74,30 @@ def test_the_lane_is_what_the_sensor_got(attack: str, tmp_path: Path, monkeypatc
     done = set(seen) - {"nothing", "acknowledged", "lost"}
     assert done <= acts
     assert bool(done) == bool(acts)
+
+
+@pytest.mark.parametrize("attack", mostly_long(["critical", "hijack"], ["hijack"]))
+def test_the_lane_is_right_where_receivers_are_away_and_packets_late(
+    attack: str, tmp_path: Path, arrivals: dict[int, Flags]
+) -> None:
+    """Who is away acknowledges and overhears nothing, nor is a late packet acknowledged; an attack may last for a while."""
+    events = [
+        {"from": 5, "to": 12, "pause": "legitimate"},
+        {"from": 10, "to": 20, "kill": "jammer"},
+        {"from": 22, "to": 26, "cut": "jammer"},
+        {"from": 8, "to": 38, "jam": "acknowledgements"},
+    ]
+    delay = {"model": "normal", "mean": 0.6, "standard_deviation": 0.7}
+    changes: dict[str, Any] = {
+        "acknowledgements": {"link": {"quality": 0.7}, "attack": attack, "jammer": "jammer"},
+        "legitimate": {"link": {"quality": 0.9, "delay": delay}, "window": 3},
+        "event": events,
+        "expect": [],
+    }
+    montecarlo("acknowledged", trials=2, out=tmp_path / "run", workers=1, **changes)
+    seen = lane(replay(tmp_path / "run"), "packets/4_acknowledged", 41)
+    assert [word == "acknowledged" for word in seen] == [bool(arrivals[k][0]) for k in range(41)]
+    assert {"acknowledged", "nothing", {"critical": "blocked", "hijack": "ignored"}[attack]} <= set(seen)
 
 
 def test_a_live_run_shows_what_its_replay_shows(tmp_path: Path) -> None:
@@ -102,8 +132,8 @@ def test_a_link_that_is_cut_is_named(tmp_path: Path) -> None:
     events = [{"from": 20, "to": 30, "cut": "smart"}, {"from": 25, "to": 40, "cut": "legitimate"}]
     folder = montecarlo("cut", trials=1, slots=50, out=tmp_path / "run", event=events, expect=[]).folder
     path = replay(folder)
-    both = "smart is cut off, legitimate is cut off"
-    words = [" "] * 20 + ["smart is cut off"] * 5 + [both] * 5 + ["legitimate is cut off"] * 10 + [" "] * 10
+    both = "cut off: smart, legitimate"
+    words = [" "] * 20 + ["cut off: smart"] * 5 + [both] * 5 + ["cut off: legitimate"] * 10 + [" "] * 10
     assert lane(path, "packets/3_attack", 50) == words
     shown = rows(path, "plane/truth/attacked", "Points2D:labels")
     assert [(shown[k] or [" "])[0] for k in range(50)] == words
@@ -132,6 +162,27 @@ def test_a_run_without_attack_shows_none(tmp_path: Path) -> None:
     assert not any("acknowledgement" in text[0] for text in rows(path, "events", "TextDocument:text").values())
 
 
+def test_many_attacks_that_overlap_are_named_together() -> None:
+    """Also more kinds than a byte has codes, in the order in which they began."""
+    spans = tuple(AttackSpan("", i, i + 2, f"e{i}") for i in range(600))
+    attacks = Attacks(a_scene(spans=spans))
+    texts = attacks.texts(some_slots(0, 602), np.arange(602))
+    assert texts[0] == "cut off: e0"
+    assert texts[1:600] == [f"cut off: e{i}, e{i + 1}" for i in range(599)]
+    assert texts[600:] == ["cut off: e599", ""]
+    ((_, named),) = attacks.lanes()
+    (codes,) = attacks.codes(some_slots(0, 602))
+    assert [named.words[code].strip() for code in codes.tolist()] == texts
+
+
+def test_a_cut_during_another_attack_is_named_after_it() -> None:
+    """Where one attack ends as another one begins, only the latter is named."""
+    spans = AttackSpan("measurements are replaced", 1, 4), AttackSpan("", 2, 3, "eve"), AttackSpan("", 4, 5, "eve")
+    texts = Attacks(a_scene(spans=spans)).texts(some_slots(0, 6), np.arange(6))
+    replaced = "measurements are replaced"
+    assert texts == ["", replaced, f"{replaced}, cut off: eve", replaced, "cut off: eve", ""]
+
+
 def test_words_count_across_pieces_and_name_the_attacker() -> None:
     """However the slots are cut; a slot with an act says so."""
     fates = [AckFate.BLOCKED, AckFate.ARRIVED, AckFate.FORGED, AckFate.BLOCKED, AckFate.LOST]
@@ -154,7 +205,7 @@ def test_words_count_across_pieces_and_name_the_attacker() -> None:
 
 def test_the_colour_of_an_attack_is_the_attackers() -> None:
     """Or a tone where the scenario names none: never vermilion, which is broken secrecy, nor a receiver's."""
-    scene = a_scene(acknowledgements=AckScene("critical", "eve"), spans=(AttackSpan("eve is cut off", 2, 5, "eve"),))
+    scene = a_scene(acknowledgements=AckScene("critical", "eve"), spans=(AttackSpan("", 2, 5, "eve"),))
     (_, acks), (_, attack) = Attacks(scene).lanes()
     assert acks.colours[AckFate.BLOCKED] == scene.colours["eve"]
     assert set(attack.colours) <= set(palette.LANES)

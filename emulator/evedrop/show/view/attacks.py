@@ -7,17 +7,18 @@ Source: docs/view.md, attacks.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.acknowledgements import ACTS, AckFate
-from evedrop.model.receiver import Codes, Flags
+from evedrop.model.receiver import Flags
 from evedrop.show.view import palette
 from evedrop.show.view.lanes import Lane
 from evedrop.show.view.palette import Colour
-from evedrop.show.view.scene import Scene, SceneSlots
+from evedrop.show.view.scene import AttackSpan, Scene, SceneSlots
 
 _ACKS = Lane(
     ("nothing", "acknowledged", "lost", "blocked", "forged", "ignored"),
@@ -41,11 +42,14 @@ class Attacks:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        bounds = sorted({0, *(k for span in scene.spans for k in (span.first, span.stop))})
-        texts = [", ".join(span.text for span in scene.spans if span.first <= k < span.stop) for k in bounds]
+        ends = [(k, begins, span) for span in scene.spans for k, begins in ((span.first, True), (span.stop, False))]
+        words, bounds, parts, now = {NO_ATTACK: 0}, [0], [0], list[AttackSpan]()
+        for k, begins, span in sorted(ends, key=lambda end: end[:2]):
+            now.append(span) if begins else now.remove(span)
+            bounds.append(k)
+            parts.append(words.setdefault(_together(now), len(words)))
         self._bounds: NDArray[np.int64] = np.array(bounds, np.int64)
-        self._words = (NO_ATTACK, *dict.fromkeys(text for text in texts if text))
-        self._of_part = np.array([self._words.index(text or NO_ATTACK) for text in texts], np.uint8)
+        self._words, self._of_part = tuple(words), np.array(parts, np.int64)
         acks = scene.acknowledgements
         self._attacker = None if acks is None else acks.attacker
         self._attack = None if acks is None or acks.attacker is None else acks.attack
@@ -85,13 +89,13 @@ class Attacks:
             lanes.append((LASTING, Lane(self._words, tuple(tones))))
         return lanes
 
-    def codes(self, slots: SceneSlots) -> list[Codes]:
+    def codes(self, slots: SceneSlots) -> list[NDArray[np.integer]]:
         """The codes of the lanes, (c,) each."""
-        codes = [] if slots.acknowledged is None else [slots.acknowledged]
+        codes: list[NDArray[np.integer]] = [] if slots.acknowledged is None else [slots.acknowledged]
         return [*codes, self._lasting(slots.numbers)] if self._scene.spans else codes
 
-    def _lasting(self, k: NDArray[np.int64]) -> Codes:
-        codes: Codes = self._of_part[np.searchsorted(self._bounds, k, side="right") - 1]
+    def _lasting(self, k: NDArray[np.int64]) -> NDArray[np.int64]:
+        codes: NDArray[np.int64] = self._of_part[np.searchsorted(self._bounds, k, side="right") - 1]
         return codes
 
     def acts(self, slots: SceneSlots) -> list[tuple[Colour, Flags]]:
@@ -135,6 +139,12 @@ class Attacks:
                 elif count:
                     text.append(f"{count} acknowledgement{'s' * (count > 1)} {words} so far")
         return [" · ".join(text) for text in texts]
+
+
+def _together(spans: Sequence[AttackSpan]) -> str:
+    """Attacks at the same time in words, such as "cut off: legitimate, smart"."""
+    texts, cut = [span.text for span in spans if span.text], [span.receiver for span in spans if span.receiver]
+    return ", ".join([*texts, f"cut off: {', '.join(cut)}"] if cut else texts) or NO_ATTACK
 
 
 def cut_off(scene: Scene, receiver: str, k: NDArray[np.int64]) -> Flags:

@@ -57,7 +57,7 @@ class AttackSpan:
     """An attack that lasts."""
 
     text: str
-    """Such as "legitimate is cut off"."""
+    """Such as "measurements are replaced"; empty for a cut."""
     first: int
     stop: int
     """The slot after the last one."""

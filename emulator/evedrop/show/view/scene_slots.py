@@ -97,8 +97,9 @@ class AckFates:
     They follow from who received which packet, and from the channel's random numbers, which the seed gives.
     """
 
-    def __init__(self, scenario: Scenario, trial: int) -> None:
-        spec = ack_channel_of(scenario)
+    def __init__(self, scenario: Scenario, trial: int, unknown_links: Collection[str] = ()) -> None:
+        """unknown_links: as in `open_recording`."""
+        spec = ack_channel_of(scenario) if _acknowledges(scenario, unknown_links) else None
         key = StreamKeys(root_of_seed(scenario.seed), b"").acknowledgements
         self._channel = None if spec is None else AckChannel.from_spec(spec, key, Batch(scenario.slots, 1, trial))
         self._jammer = LEGITIMATE if spec is None or spec.jammer is None else spec.jammer
@@ -115,10 +116,16 @@ class AckFates:
         return np.concatenate(fates)
 
 
-def attacked_scene(scenario: Scenario) -> dict[str, Any]:
-    """The entries of `Scene` for attacks; empty without."""
+def _acknowledges(scenario: Scenario, unknown_links: Collection[str]) -> bool:
+    """Whether there are acknowledgements whose fates can be known: a hijacked sensor heeds them by the quality of a link."""
+    acks = scenario.acknowledgements
+    return acks is not None and not (acks.attack == "hijack" and acks.jammer in unknown_links)
+
+
+def attacked_scene(scenario: Scenario, unknown_links: Collection[str] = ()) -> dict[str, Any]:
+    """The entries of `Scene` for attacks; empty without. unknown_links: as in `open_recording`."""
     entries: dict[str, Any] = {}
-    if scenario.acknowledgements is not None:
+    if scenario.acknowledgements is not None and _acknowledges(scenario, unknown_links):
         entries["acknowledgements"] = AckScene(scenario.acknowledgements.attack, scenario.acknowledgements.jammer)
     plan, last = monitor_of(scenario), scenario.slots
     spans = []
@@ -132,7 +139,7 @@ def attacked_scene(scenario: Scenario) -> dict[str, Any]:
             if change.cut and began is None:
                 began = change.at
             elif change.cut is False and began is not None:
-                spans.append(AttackSpan(f"{name} is cut off", began, min(change.at, last), name))
+                spans.append(AttackSpan("", began, min(change.at, last), name))
                 began = None
     return {**entries, "spans": tuple(sorted(spans, key=lambda span: span.first))}
 
@@ -204,7 +211,7 @@ def open_recording(
         growth=_growth(scenario),
         slot_seconds=scenario.slot_seconds,
         **driven_scene(scenario),
-        **attacked_scene(scenario),
+        **attacked_scene(scenario, unknown_links),
     )
     return ViewRecording(path, scene, warn, live=live)
 
@@ -271,7 +278,10 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     loop_values = loop_values_of(scenario)
     if loop_values is not None and (sensor.u is None or len(sensor.u) != len(x)):
         raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
-    around, ack_fates = np.array(scenario.process.around), AckFates(scenario, _first_trial_of(results))
+    around, ack_fates = (
+        np.array(scenario.process.around),
+        AckFates(scenario, _first_trial_of(results), looked_at.unknown_links),
+    )
     recording = open_recording(
         scenario, folder.name, path, words=looked_at.words, unknown_links=looked_at.unknown_links
     )
