@@ -18,7 +18,7 @@ from evedrop import Scenario, montecarlo, sweep
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.model.schemes.innovation import Innovation
-from evedrop.scenario.loading import load, parse, tables_in, with_event
+from evedrop.scenario.loading import load, parse, prepared, tables_in, with_event
 from evedrop.scenario.tables import ScenarioEntries
 from evedrop.scenarios import shipped
 from evedrop.simulate.montecarlo import Plan
@@ -163,6 +163,10 @@ def test_none_removes_an_entry() -> None:
     made = vehicle(energy={"packet": 2.0, "bit": 1.0})
     assert made.replace(energy=None, plant=None, network__routers=None) == vehicle()
     assert made.replace(energy__bit=None) == vehicle(energy={"packet": 2.0})
+    loaded = Scenario.load("vehicle", {"expect": None}, eavesdroppers=None, process__units=None)
+    assert loaded == Scenario.load("vehicle").replace(expect=None, eavesdroppers=None, process__units=None)
+    assert [*loaded.receivers] == ["legitimate"]
+    assert [*prepared("vehicle", {"eavesdroppers.naive": None}).eavesdroppers] == ["suspicious", "smart"]
 
 
 def test_a_class_of_a_module_is_named_and_its_folder_known(own: Any, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -56,17 +56,25 @@ _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
 _DOTTED = re.compile(rf"""(?<![A-Za-z0-9_"'.-])(?:{_PART}){{{_MOST_DOTS}}}""")
 
 
-def load(source: str | Path, changes: Mapping[str, Any] | None = None, *, beyond_horizon: bool = False) -> Scenario:
+def load(
+    source: str | Path,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    beyond_horizon: bool = False,
+    without: Collection[str] = (),
+) -> Scenario:
     """Load a built-in scenario by name, or a file, with changes by dotted key.
 
-    beyond_horizon: allow more slots than float64 can follow exactly, for commands that do not follow states.
+    beyond_horizon: allow more slots than float64 can follow exactly, for commands that do not follow states; without: entries
+    to leave out, by dotted key.
 
     Raises ScenarioError with every mistake, UsageError if there is no such scenario.
     """
     path = shipped().get(str(source), Path(source))
     # A built-in scenario names no files of its own, so the names in a change refer to the current folder.
     folder = Path() if str(source) in shipped() else path if is_folder(path) else path.parent
-    return parse(read(source), shown(source), changes, beyond_horizon=beyond_horizon, folder=folder)
+    text = read(source)
+    return parse(text, shown(source), changes, beyond_horizon=beyond_horizon, folder=folder, without=without)
 
 
 def read(source: str | Path) -> str:
@@ -94,6 +102,7 @@ def parse(
     *,
     beyond_horizon: bool = False,
     folder: Path = Path(),
+    without: Collection[str] = (),
 ) -> Scenario:
     """The scenario in a TOML text. Raises ScenarioError with every mistake.
 
@@ -102,6 +111,7 @@ def parse(
     tables = tables_in(text, source)
     if not tables and not changes:
         raise ScenarioError(source, ["has no entries; `evedrop new FILE` writes a scenario to start from"])
+    _remove(tables, without)
     locate_files(tables, folder)
     with with_line_numbers(text, changes or ()):
         return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
@@ -426,7 +436,9 @@ def loaded(source: str | Path, changes: Mapping[str, Any]) -> Scenario:
 
 
 def prepared(scenario: str | Path | Scenario, changes: Mapping[str, Any], *, beyond_horizon: bool = False) -> Scenario:
-    """The scenario that a call is about, with changes by dotted key, checked as `load` does; beyond_horizon: as there.
+    """The scenario that a call is about, with changes by dotted key, checked as `load` does; None removes an entry.
+
+    beyond_horizon: as for `load`.
 
     Raises ScenarioError with every mistake, UsageError for what is neither a Scenario nor the name of one.
     """
@@ -435,21 +447,32 @@ def prepared(scenario: str | Path | Scenario, changes: Mapping[str, Any], *, bey
     path_argument(
         "scenario", scenario, "a built-in name, a file, or a Scenario, which Scenario(entries) makes of a dict"
     )
-    return load(scenario, plain_tables(changes, str(scenario)), beyond_horizon=beyond_horizon)
+    made, without = plain_tables(changes, str(scenario)), _without_value(changes)
+    return load(scenario, made, beyond_horizon=beyond_horizon, without=without)
 
 
 def changed(scenario: Scenario, changes: Mapping[str, Any], *, beyond_horizon: bool = True) -> Scenario:
     """The scenario with changes by dotted key; None removes an entry. Raises ScenarioError with every mistake."""
     tables = scenario.as_tables()
-    for key in [key for key, value in changes.items() if value is None]:
+    _remove(tables, _without_value(changes))
+    made = plain_tables(changes, scenario.title, scenario.modules)
+    return checked(tables, scenario.title, made, beyond_horizon=beyond_horizon)
+
+
+def _without_value(changes: Mapping[str, Any]) -> list[str]:
+    """The keys of the entries that changes remove."""
+    return [key for key, value in changes.items() if value is None]
+
+
+def _remove(tables: dict[str, Any], keys: Collection[str]) -> None:
+    """Remove entries by dotted key, in place; those that are not there, too."""
+    for key in keys:
         *above, last = key.split(".")
         inner: Any = tables
         for name in above:
             inner = inner.get(name, {}) if isinstance(inner, dict) else {}
         if isinstance(inner, dict):
             inner.pop(last, None)
-    made = plain_tables(changes, scenario.title, scenario.modules)
-    return checked(tables, scenario.title, made, beyond_horizon=beyond_horizon)
 
 
 def register() -> None:

@@ -92,6 +92,14 @@ def recorded_noise(folder: Path) -> float:
         return 0.0
 
 
+def recorded_units(folder: Path) -> list[str]:
+    """The unit of each state of the scenario in a results folder; empty if it gives none, or cannot be read."""
+    try:
+        return recorded(folder).scenario.process.units or []
+    except UsageError:
+        return []
+
+
 def recorded_strategies(folder: Path) -> Mapping[str, str]:
     """Receiver → its strategy, as the scenario in a results folder names it; empty if it cannot be read."""
     try:

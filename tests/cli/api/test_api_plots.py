@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
+from matplotlib.text import Text
 
 from evedrop import Scenario, montecarlo
 from evedrop.cli.api import ComparisonResults, RunResults, SweepResults, compare, sweep
@@ -101,6 +103,27 @@ def test_the_plane_shows_the_truth_and_who_follows_it(results: RunResults) -> No
     process = {"A": [[0.9]], "Q": [[0.1]], "initial_covariance": [[1.0]]}
     (axes,) = montecarlo(SCENARIO, trials=2, process=process).plot("plane").axes
     assert axes.get_xlabel() == "slot"
+
+
+@pytest.mark.parametrize("receivers", [1, 4, 9])
+def test_receivers_are_named_beside_their_errors(receivers: int) -> None:
+    """No name covers another, and none is in a legend; the axis has the unit of what it shows."""
+    link = {"quality": 0.9}
+    eavesdroppers = {f"e{i}": {"strategy": "naive", "link": link} for i in range(receivers - 1)}
+    units = {"states": ["position", "speed"], "units": ["m", "m/s"]}
+    scenario = SCENARIO.replace(
+        eavesdroppers=eavesdroppers, expect=[], process={**SCENARIO.as_tables()["process"], **units}
+    )
+    results = montecarlo(scenario, trials=3)
+    figure = results.plot("errors")
+    (axes,) = figure.axes
+    assert axes.get_legend() is None
+    assert axes.get_ylabel() == "squared error (m² + (m/s)²)"
+    assert [text.get_text() for text in axes.texts] == list(results.peers)
+    figure.savefig(io.BytesIO(), dpi=figure.dpi)
+    boxes = sorted((Text.get_window_extent(text) for text in axes.texts), key=lambda box: float(box.y0))
+    assert all(above.y0 > below.y0 + 0.8 * below.height for below, above in pairwise(boxes))
+    assert all(box.x1 <= figure.bbox.x1 for box in boxes)
 
 
 def test_nine_receivers_look_different() -> None:

@@ -33,6 +33,7 @@ from evedrop.show.report.chart import POINTS, Curve, GroupCounts, GroupMeans, Lo
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.travel import SCENARIO, circumstances, download, input_files
+from evedrop.show.view.axis_name import squared_unit
 from evedrop.show.view.error_floor import error_floor, mean_band
 from evedrop.show.view.lanes import EAVESDROPPER, KNOWLEDGE, SPIED, Lane, knowledge_lane
 from evedrop.show.view.palette import paper_inks
@@ -222,12 +223,7 @@ class RunSource:
         """The unit of a squared error, to follow its name; empty if the states have none."""
         process = self.tables.get("process")
         units = process.get("units") if isinstance(process, dict) else None
-        distinct = list(dict.fromkeys(map(str, units))) if isinstance(units, list) else []
-        return (
-            f" ({' + '.join(f'({unit})²' if set('/ *·') & set(unit) else f'{unit}²' for unit in distinct)})"
-            if any(distinct)
-            else ""
-        )
+        return squared_unit(map(str, units) if isinstance(units, list) else ())
 
     @cached_property
     def noise(self) -> float:

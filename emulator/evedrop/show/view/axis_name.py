@@ -1,6 +1,8 @@
-"""What the axis of a scenario's entry is called in pictures."""
+"""What the axis of a scenario's entry is called in pictures, and the unit of a squared error."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 _NAMES = {
     "encoding.state_probability": "μ_d: probability of sending a state",
@@ -15,6 +17,13 @@ def axis_name(key: str) -> str:
     if table == "eavesdroppers" and entry == "link.quality":
         return f"μ of {receiver}: probability that a packet arrives"
     return _NAMES.get(key.removeprefix("legitimate."), key)
+
+
+def squared_unit(units: Iterable[str]) -> str:
+    """The unit of a squared error over all states, to follow its name; empty without any. units: those of the states."""
+    distinct = list(dict.fromkeys(units))
+    squares = [f"({unit})²" if set("/ *·") & set(unit) else f"{unit}²" for unit in distinct if unit]
+    return f" ({' + '.join(squares)})" if squares else ""
 
 
 def as_mathematics(name: str) -> str:

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 WIDTH = 3.5
 """Inches: 89 mm, as of IEEE and Elsevier."""
-_POINTS, _LINE_OF_TEXT = 8.0, 9.5
+_POINTS = 8.0
+_LINE_OF_TEXT = 1.19  # its height over that of its letters
 STYLE: Mapping[str, Any] = {
     "axes.labelsize": _POINTS,
     "axes.titlesize": _POINTS,
@@ -37,7 +38,9 @@ def fit(axes: Axes, direct: bool, height: float) -> None:
     axes.set_title("")
     legend = axes.get_legend()
     if direct:
-        _name_curves(axes, height)
+        for line in axes.get_lines():
+            line.set_linewidth(0.8)
+        name_curves(axes, height)
     elif legend is not None:
         handles = [handle for handle in legend.legend_handles if handle is not None]
         texts = [text.get_text() for text in legend.get_texts()]
@@ -45,21 +48,18 @@ def fit(axes: Axes, direct: bool, height: float) -> None:
             handles, texts, loc="upper center", bbox_to_anchor=(0.5, -0.28 / height * 1.6), ncols=3, frameon=False,
             handlelength=1.2, columnspacing=0.8, handletextpad=0.4,
         )  # fmt: skip
-        return
-    if legend is not None:
-        legend.remove()
 
 
-def _name_curves(axes: Axes, height: float) -> None:
-    """Write the name of each curve to the right of its end, with a line to it in its colour."""
+def name_curves(axes: Axes, height: float) -> None:
+    """Write the name of each curve to the right of its end, with a line to it in its colour; height: of the axes, in inches."""
+    from matplotlib import rcParams  # noqa: PLC0415 - slow to import, and needed only for figures
+
     curves = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
     ends = [end_of(axes, np.asarray(line.get_ydata(), float)) for line in curves]
-    for line in axes.get_lines():
-        line.set_linewidth(0.8)
-    for line, end, place in zip(curves, ends, label_places(ends, _LINE_OF_TEXT / (72.0 * height)), strict=True):
-        ink, style = line.get_color(), line.get_linestyle()
-        axes.plot(
-            [1.0, 1.06], [end, place], linestyle=style, color=ink, transform=axes.transAxes, clip_on=False, linewidth=1.0,
-            label="_name",
+    gap = _LINE_OF_TEXT * rcParams["font.size"] / (72.0 * height)
+    for line, end, place in zip(curves, ends, label_places(ends, gap), strict=True):
+        leader = {"arrowstyle": "-", "color": line.get_color(), "linestyle": line.get_linestyle(), "relpos": (0.0, 0.5)}
+        axes.annotate(
+            str(line.get_label()), (1.0, end), (1.075, place), axes.transAxes, axes.transAxes, va="center", annotation_clip=False,
+            arrowprops=leader | {"shrinkA": 3.0, "shrinkB": 0.0},
         )  # fmt: skip
-        axes.text(1.075, place, str(line.get_label()), transform=axes.transAxes, va="center")

@@ -28,10 +28,10 @@ from evedrop.model.receiver import NOTHING, SILENT
 from evedrop.results.reading import Results
 from evedrop.results.tables import swept_strategies
 from evedrop.scenario.arguments import refuse_unless
-from evedrop.scenario.recorded import recorded, recorded_noise, recorded_strategies
+from evedrop.scenario.recorded import recorded, recorded_noise, recorded_strategies, recorded_units
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.view import journal_column, palette
-from evedrop.show.view.axis_name import as_mathematics, axis_name
+from evedrop.show.view.axis_name import as_mathematics, axis_name, squared_unit
 from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
 from evedrop.show.view.figure_style import drawing, panels
 from evedrop.show.view.lanes import EAVESDROPPER
@@ -57,6 +57,7 @@ _HEIGHTS: Mapping[str, Callable[[int], float]] = {
     "plane": lambda _: 3.8,
 }
 """Panel → its height in inches, for a number of receivers."""
+_AROUND = 0.8  # inches above and below the axes, for its title and labels
 _WIDTHS: Mapping[str, float] = {"page": 1.0, "column": 0.72}
 """Width of a figure → the factor of these heights."""
 
@@ -77,7 +78,6 @@ def run_figure(
     if slots is not None and (not slots or slots.step != 1 or not 0 <= slots[0] <= slots[-1] <= last):
         raise UsageError(f"plot: {slots} are not slots of the run; expected some such as range(0, {last + 1})")
     receivers = rows["peer"].unique().to_pylist()
-    noise = recorded_noise(results.folder)
     inks = paper_inks(receivers, recorded_strategies(results.folder))
     recorded_trial = None if names == ["errors"] else _RecordedTrial(results, inks, trial, slots)
     heights = [_HEIGHTS[name](len(receivers)) * _WIDTHS[width] for name in names]
@@ -89,15 +89,21 @@ def run_figure(
         places = figure.subplots(len(names), 1, height_ratios=heights, squeeze=False)[:, 0]
         for name, axes in zip(names, places, strict=True):
             if name == "errors":
-                _errors(axes, rows, inks, slots, error_floor(noise, pc.max(rows["trials"]).as_py()))
+                floor = error_floor(recorded_noise(results.folder), pc.max(rows["trials"]).as_py())
+                _errors(axes, rows, inks, slots, floor, f"squared error{squared_unit(recorded_units(results.folder))}")
             elif recorded_trial is not None:
                 (recorded_trial.lanes if name == "lanes" else recorded_trial.plane)(axes)
+            height = heights[names.index(name)]
             if column:
-                journal_column.fit(axes, name == "errors", heights[names.index(name)] - 0.5)
+                journal_column.fit(axes, name == "errors", height - 0.5)
+            elif name == "errors":
+                journal_column.name_curves(axes, height - _AROUND)
     return figure
 
 
-def _errors(axes: Axes, rows: pa.Table, inks: Mapping[str, str], slots: range | None, floor: float) -> None:
+def _errors(
+    axes: Axes, rows: pa.Table, inks: Mapping[str, str], slots: range | None, floor: float, y_label: str
+) -> None:
     """The mean squared error of each slot, theory dashed, and a band of two standard errors of its logarithm.
 
     inks: of each receiver; floor: values below it are drawn at it.
@@ -129,10 +135,9 @@ def _errors(axes: Axes, rows: pa.Table, inks: Mapping[str, str], slots: range | 
         axes.set_yscale("log")
         axes.set_ylim(axis.low, axis.high)
     axes.set_xlabel("slot")
-    axes.set_ylabel("squared error")
+    axes.set_ylabel(y_label)
     title = "squared error" + (", mean ± 2 standard errors" if many else "") + "; dashed: theory"
     axes.set_title(f"{title}; {floor_words(floor)}" if axis is not None and axis.below else title)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 class _RecordedTrial:
