@@ -18,6 +18,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+from PIL import Image
+
 from evedrop.system.ports import free_port
 from tests.conftest import wait_until
 from tests.privileged import CannotRun, skip
@@ -52,21 +54,32 @@ def drawn(words: Sequence[str], results: Path, picture: Path) -> Path:
     return picture
 
 
-def run_of(scenario: str, folder: Path) -> Path:
-    """A run of a built-in scenario, as fast as possible."""
-    evedrop("run", scenario, "--pace", "0", "--view", "off", "--out", folder / scenario)
-    return folder / scenario
+def run_of(scenario: str, folder: Path, *changes: str) -> Path:
+    """A run of a built-in scenario, as fast as possible; made only once in a folder."""
+    run = folder / scenario if not changes else folder / f"{scenario}-changed"
+    if not run.exists():
+        evedrop("run", scenario, "--pace", "0", "--view", "off", "--out", run, *changes)
+    return run
+
+
+def _nine(folder: Path) -> Path:
+    """A run of `vehicle` with five more eavesdroppers: with the legitimate estimator, nine receivers."""
+    more = ("bayesian", "genie", "constant", "power-test", "likelihood")
+    changes = [f'eavesdroppers.{name}={{strategy="{name}", link={{quality=0.8}}}}' for name in more]
+    return run_of("vehicle", folder, *(word for change in changes for word in ("--set", change)))
 
 
 def _wire(folder: Path) -> Path:
     """The wire of docs/wire.md, with a robot and its base that publish for 28 s as the page says."""
+    out = folder / "wire"
+    if out.exists():
+        return out
     example = subprocess.run([*_EVEDROP, "wire", "--example"], check=True, capture_output=True).stdout
     (folder / "robot.toml").write_bytes(example)
     endpoints = {side: f"tcp/127.0.0.1:{free_port()}" for side in ("robot", "base", "listener")}
     changes = {f"side.{side}.listen": endpoint for side, endpoint in endpoints.items()}
     changes |= {"event.0.to": "16", "event.1.to": "25"}
     options = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
-    out = folder / "wire"
     command = [
         *_EVEDROP,
         "wire",
@@ -122,12 +135,49 @@ PICTURES: Mapping[str, Callable[[Path, Path], None]] = {
 """File in docs/ → what draws it: called with a folder for results, and the path of the picture."""
 
 
+def _built_in(scenario: str) -> Callable[[Path], Path]:
+    return lambda folder: run_of(scenario, folder)
+
+
+SCENES: Mapping[str, Callable[[Path], Path]] = {
+    **{name: _built_in(name) for name in ("vehicle", "acknowledged", "hijacked", "microgrid")},
+    "nine": _nine,
+    "wire": _wire,
+}
+"""Name → what makes the results whose first tab the page of screens shows, called with a folder."""
+SIZES = ("1280x720", "1920x1080")
+
+
+def scene_of(name: str, size: str, folder: Path, picture: Path) -> Path:
+    """Draw the first tab of the view of such results, in a folder for results."""
+    moment = ["--time", "18"] if name == "wire" else []
+    evedrop("view", SCENES[name](folder), "--picture", picture, "--size", size, *moment)
+    return picture
+
+
+def _scene(name: str, size: str) -> Callable[[Path, Path], None]:
+    """What draws a scene into docs/screens, in few colours, so that the file is small."""
+
+    def draw(folder: Path, picture: Path) -> None:
+        with Image.open(scene_of(name, size, folder, picture)) as drawing:
+            drawing.convert("RGB").quantize(128).save(picture, optimize=True)
+
+    return draw
+
+
+ALL_PICTURES: Mapping[str, Callable[[Path, Path], None]] = {
+    **PICTURES,
+    **{f"screens/{name}-{size}.png": _scene(name, size) for name in SCENES for size in SIZES},
+}
+"""Those of docs/screens as well."""
+
+
 def main(names: Sequence[str]) -> None:
     """Draw these pictures, or all of them."""
-    for name in names or PICTURES:
-        with tempfile.TemporaryDirectory() as folder:
-            PICTURES[name](Path(folder), DOCS / name)
-        sys.stdout.write(f"docs/{name} is drawn\n")
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names or ALL_PICTURES:
+            ALL_PICTURES[name](Path(folder), DOCS / name)
+            sys.stdout.write(f"docs/{name} is drawn\n")
 
 
 if __name__ == "__main__":

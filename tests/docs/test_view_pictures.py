@@ -12,10 +12,12 @@ import pytest
 from PIL import Image
 
 from evedrop.cli import main as cli
-from tests.docs.pictures import DOCS, PICTURES, ROOT, drawn, quoted, run_of
+from tests.docs.pictures import DOCS, PICTURES, ROOT, SCENES, SIZES, drawn, quoted, run_of, scene_of
 
 SQUARE = 10
 """Pixels along a side of the squares whose mean colours are compared, so that the edges of letters matter little."""
+FEW_COLOURS = 0.01
+"""The same for pictures in few colours."""
 TOLERANCE = 0.002
 """Of the mean difference, from 0 to 1: the same slot, drawn again, differed by 0.0002, and one a second later by 0.005."""
 
@@ -55,6 +57,23 @@ def test_the_picture_of_a_day_is_what_its_command_draws(tmp_path: Path) -> None:
     assert difference(drawn(words, run, tmp_path / "same.png"), DOCS / "microgrid_view.png") < TOLERANCE
     noon = drawn([*words, "--slot", "43200"], run, tmp_path / "noon.png")
     assert difference(noon, DOCS / "microgrid_view.png") > 2 * TOLERANCE
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "wire"])
+def test_a_scene_is_the_one_on_the_page_of_screens(name: str, tmp_path: Path) -> None:
+    """In both sizes. That of a wire depends on when its messages came, and is only drawn again."""
+    for size in SIZES:
+        picture = scene_of(name, size, tmp_path, tmp_path / f"{size}.png")
+        assert difference(picture, DOCS / "screens" / f"{name}-{size}.png") < FEW_COLOURS
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("name", SCENES)
+def test_the_page_of_screens_has_every_scene(name: str, size: str) -> None:
+    """In its size."""
+    with Image.open(DOCS / "screens" / f"{name}-{size}.png") as picture:
+        assert "x".join(map(str, picture.size)) == size
 
 
 def test_every_picture_has_a_command_that_draws_it() -> None:

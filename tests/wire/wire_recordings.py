@@ -26,4 +26,11 @@ def shown(rrd: Path, entity: str, component: str) -> list[tuple[float, Any]]:
 
 def texts(rrd: Path) -> list[tuple[float, str]]:
     """The lines of the events."""
-    return [(round(seconds, 6), text[0]) for seconds, text in shown(rrd, "events", "TextLog:text")]
+    events: list[tuple[float, str]] = []
+    for _, document in shown(rrd, "events", "TextDocument:text"):
+        for line in reversed(document[0].splitlines()):
+            when, *_, text = line.split("   ")
+            event = float(when.removesuffix(" s")), text
+            if event not in events:
+                events.append(event)
+    return events

@@ -1,4 +1,7 @@
-"""The page of screens: what commands print on terminals of six widths, as docs/screens has it."""
+"""The page of screens: the first tab of the view in two sizes, and what commands print on terminals of six widths.
+
+docs/screens has them; tests/docs/pictures.py and tests/docs/screens.py make them.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +13,33 @@ _HEAD = """# Screens
 Evedrop as it is seen on terminals and screens of different sizes. `make docs` makes all of them again,
 and fails if one has changed.
 
-## The terminal
+## The view
+"""
+_TERMINAL = """## The terminal
 
 Ten commands on terminals of six widths, without colours. Text that differs from run to run is `…`.
 """
 
 
+_SCENES = {
+    "vehicle": "A patrolling vehicle and three eavesdroppers",
+    "acknowledged": "A jammer that blocks critical acknowledgements",
+    "hijacked": "A hijacked sensor",
+    "microgrid": "A house for a day",
+    "nine": "Nine receivers",
+    "wire": "A wire between programs",
+}
+
+
 def screens_page() -> str:
     """The page in Markdown."""
     parts = [_HEAD]
+    for name, title in _SCENES.items():
+        parts.append(f"### {title}\n")
+        for path in sorted(SCREENS.glob(f"{name}-*.png")):
+            size = path.stem.removeprefix(f"{name}-").replace("x", " × ")
+            parts.append(f"![{title}, {size} pixels](screens/{path.name})\n")
+    parts.append(_TERMINAL)
     for path in sorted(SCREENS.glob("*.txt"), key=lambda path: int(path.stem)):
         _, _, text = path.read_text(encoding="utf-8").partition("\n\n")
         parts.append(f"### {path.stem} columns\n\n```text\n{text.rstrip()}\n```\n")

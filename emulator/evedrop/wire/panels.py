@@ -16,10 +16,10 @@ from typing import final
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
 from evedrop.model.process import Floats
 from evedrop.show.view.column import ELAPSED, laid_out
+from evedrop.show.view.event_log import EventLog, LogLine
 from evedrop.show.view.palette import TRUTH, dim, series
 from evedrop.show.view.panels.curves import dark_ground
 from evedrop.show.view.panels.fates import LETTER, LINE, DrawnGraph, StateLanes
@@ -89,6 +89,7 @@ class WirePanels:
         self._last_counts: Counts | None = None
         self._last_delays: Counts | None = None
         self._total: Counts | None = None
+        self._log = EventLog()
         self._recent: deque[Counts] = deque(maxlen=max(1, round(pace.window / pace.step)))
 
     def layout(self) -> rrb.Blueprint:
@@ -115,15 +116,7 @@ class WirePanels:
         right = rrb.Vertical(
             self._graph.view(f"Losses {past}   coloured as the lanes"),
             rrb.TextDocumentView(name="What became of the messages since the start", origin=_TABLE),
-            rrb.TextLogView(
-                name="Events",
-                origin=_EVENTS,
-                columns=rrb.TextLogColumns(
-                    timeline_columns=[TimelineColumn(ELAPSED)],
-                    text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
-                ),
-                format_options=rrb.TextLogFormat(monospace_body=True),
-            ),
+            rrb.TextDocumentView(name="Events", origin=_EVENTS),
             row_shares=[1.1, 0.4 + 0.13 * min(links, 10), 1.0],
         )
         return laid_out(rrb.Horizontal(left, right, column_shares=[1.25, 1.0], name="Wire"), ELAPSED)
@@ -142,14 +135,13 @@ class WirePanels:
 
     def notes(self, notices: Sequence[Notice], to: rr.RecordingStream) -> None:
         """Record lines of the events."""
-        if notices:
-            texts, levels = [notice.text for notice in notices], [notice.level for notice in notices]
-            _send(
-                to,
-                _EVENTS,
-                [round(notice.seconds, 1) for notice in notices],
-                rr.TextLog.columns(text=texts, level=levels),
-            )
+        times = [round(notice.seconds, 1) for notice in notices]
+        at, texts = self._log.add(
+            [LogLine(time, f"{time:g} s", *notice[1:]) for time, notice in zip(times, notices, strict=True)]
+        )
+        if at:
+            documents = rr.TextDocument.columns(text=texts, media_type=["text/plain"] * len(texts))
+            _send(to, _EVENTS, at, documents)
 
     def send(self, steps: WireSteps, to: rr.RecordingStream) -> None:
         """Record the next steps."""

@@ -6,7 +6,6 @@ operator, and long stretches without a usable packet.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from typing import final
 
@@ -18,6 +17,7 @@ from evedrop.score.after_start import BatchMeans, leading_states
 from evedrop.score.verdict import Verdict, verdict_so_far
 from evedrop.show.view import lanes
 from evedrop.show.view.column import Column
+from evedrop.show.view.event_log import EventLog, LogLine
 from evedrop.show.view.events import AckWatcher, Event, Watcher
 from evedrop.show.view.lanes import received
 from evedrop.show.view.palette import GROUND, LABEL, TRUTH, Colour
@@ -136,21 +136,17 @@ class Legend(ViewPanel):
 
 
 _EVENTS_PATH = "events"
-_MOST_LINES = 16  # more than fit into the panel of a window of 1080 pixels
 
 
 @final
 class Events(ViewPanel):
-    """The last events so far, the newest first, each with its slot; a warning has its level, too.
-
-    They are a document with a version for each slot that has events, because Rerun's log of texts shows those of later slots.
-    """
+    """The last events so far, the newest first, each with its slot; a warning has its level, too."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
         self._acks = AckWatcher(scene)
         self._watchers = [(shown, Watcher(shown, scene)) for shown in scene.receivers]
-        self._events: list[Event] = []  # in order of slot
+        self._log = EventLog()
         self._times = times_of(scene)
 
     def views(self) -> Iterator[PlacedView]:
@@ -180,20 +176,9 @@ class Events(ViewPanel):
 
     def _lines(self, events: Sequence[Event]) -> Iterator[Column]:
         """The document with these events, at their slots, and again at the slots of later events."""
-        if not events:
-            return
-        self._events = sorted([*self._events, *events], key=lambda event: event.k)
-        slots = [event.k for event in self._events]
-        changed = range(bisect_left(slots, min(event.k for event in events)), len(slots))
-        ends = [i + 1 for i in changed if i + 1 == len(slots) or slots[i + 1] > slots[i]]
-        lines = [self._line(event) for event in self._events[max(0, changed[0] + 1 - _MOST_LINES) :]]
-        before = len(self._events) - len(lines)
-        texts = ["\n".join(reversed(lines[max(0, end - before - _MOST_LINES) : end - before])) for end in ends]
-        k = np.array([slots[end - 1] for end in ends], np.int64)
-        documents = rr.TextDocument.columns(text=texts, media_type=["text/plain"] * len(texts))
-        yield Column(_EVENTS_PATH, k, documents)
-
-    def _line(self, event: Event) -> str:
-        """Such as "#1848   WARN   smart lost 3 packets in a row"; information has no level."""
-        level = "" if event.level == "INFO" else f"{event.level}   "
-        return f"{self._times.text(event.k)}   {level}{event.text}"
+        slots, texts = self._log.add(
+            [LogLine(event.k, self._times.text(event.k), event.level, event.text) for event in events]
+        )
+        if slots:
+            documents = rr.TextDocument.columns(text=texts, media_type=["text/plain"] * len(texts))
+            yield Column(_EVENTS_PATH, np.array(slots, np.int64), documents)
