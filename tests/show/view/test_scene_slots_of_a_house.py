@@ -71,7 +71,7 @@ def test_the_house_is_drawn_as_the_tables_have_it(day: Path) -> None:
         assert words[k][3] == (f"to grid {-grid:.2f} kW" if grid < -0.005 else f"from grid {max(0.0, grid):.2f} kW")
         assert words[k][4] == f"sun {sun:.2f} kW"
         tops = [min(y for _, y in strip) - 0.07 for strip in bars[k]]
-        assert tops == pytest.approx([5.7 - 2.3 * level / 100.0 for level in (battery, hydrogen)], abs=1e-4)
+        assert tops == pytest.approx([5.4 - 2.2 * level / 100.0 for level in (battery, hydrogen)], abs=1e-4)
 
 
 def test_guesses_are_shown_from_where_their_minute_began(day: Path) -> None:

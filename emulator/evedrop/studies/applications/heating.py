@@ -198,11 +198,11 @@ class Comfort(Application):
         room, wanted = loop.state(comfort.temperature), (comfort.lowest, comfort.highest)
         margin = 2.0 * (comfort.highest - comfort.lowest)
         ends = comfort.lowest - margin, comfort.highest + margin
-        levels = [DrawnLevel("room", room, *ends, (6.9, 6.0), 3.5, wanted)]
+        levels = [DrawnLevel("room", room, *ends, (6.9, 6.1), 3.5, wanted)]
         for state in [i for i in range(len(loop.states)) if i != room][:1]:
-            levels.append(DrawnLevel(loop.states[state].removeprefix("T_"), state, *ends, (10.8, 6.0), 3.5))
+            levels.append(DrawnLevel(loop.states[state].removeprefix("T_"), state, *ends, (10.6, 6.1), 3.5))
         heat = loop.flow({comfort.heater: 1.0}, {})
-        flow = DrawnFlow("heating", "heating", heat, (4.2, 4.9), (6.2, 4.9), (4.5, 5.6), signed=True)
+        flow = DrawnFlow("heating", "heating", heat, (4.2, 4.9), (6.2, 4.9), (4.4, 5.6), signed=True)
         return Sketch((WIDTH, HEIGHT), (*OUTLINE, *RADIATOR), tuple(levels), (flow,), loop.largest_flow)
 
     @classmethod

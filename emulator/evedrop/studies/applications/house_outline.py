@@ -23,9 +23,9 @@ SUN: Lines = (
 )
 """The sun, and solar panels on the left side of the roof."""
 GRID: Lines = (
-    ((11.5, _FLOOR), (11.5, 4.2)),
-    ((11.1, 4.4), (11.9, 4.4)),
-    ((11.2, 4.8), (11.8, 4.8)),
+    ((11.5, _FLOOR), (11.5, 4.0)),
+    ((11.1, 4.2), (11.9, 4.2)),
+    ((11.2, 4.6), (11.8, 4.6)),
 )
 """A pole of the grid."""
 RADIATOR: Lines = (

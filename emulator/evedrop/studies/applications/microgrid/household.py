@@ -415,27 +415,27 @@ class Household(Application):
         """Sun, load and grid with the power that each gives or takes, the battery, and the first other store."""
         house, plant = _house(table), loop.plant
         battery = loop.state(house.battery)
-        levels = [_store(loop, "battery", battery, (4.0, 5.7))]
-        load = DrawnFlow("load", "load", loop.flow({}, {house.load: 1.0}), (6.0, 5.0), (6.0, 6.4), (6.0, 6.5))
+        levels = [_store(loop, "battery", battery, (4.0, 5.4))]
+        load = DrawnFlow("load", "load", loop.flow({}, {house.load: 1.0}), (6.0, 4.8), (6.0, 6.3), (6.0, 6.4))
         grid = loop.flow({house.grid: 1.0}, {})
-        flows = [load, DrawnFlow("from grid", "to grid", grid, (11.0, 4.6), (8.9, 4.6), (10.5, 3.5))]
+        flows = [load, DrawnFlow("from grid", "to grid", grid, (11.0, 4.4), (8.9, 4.4), (10.2, 3.3))]
         lines = (*OUTLINE, *GRID)
         if house.sun is not None:
-            flows.append(DrawnFlow("sun", "sun", loop.flow({}, {house.sun: 1.0}), (1.6, 0.8), (3.7, 1.85), (1.2, 1.3)))
+            flows.append(DrawnFlow("sun", "sun", loop.flow({}, {house.sun: 1.0}), (1.6, 0.8), (3.7, 1.85), (1.6, 1.65)))
             lines += SUN
         rows = np.hstack([plant.disturbance_matrix, plant.input_matrix])
         moved = rows[:, len(loop.disturbance_names) + loop.input(house.grid)]
         if moved[battery]:
             charge = tuple((rows[battery] / moved[battery]).tolist())
-            flows.append(DrawnFlow("", "", charge, (5.8, 4.6), (4.6, 4.6), (5.2, 4.2)))
+            flows.append(DrawnFlow("", "", charge, (5.8, 4.4), (4.6, 4.4), (5.2, 4.0)))
         for state in [i for i in range(len(loop.states)) if i != battery][:1]:
             name = loop.states[state]
-            levels.append(_store(loop, _STORES.get(name, name), state, (8.0, 5.7)))
+            levels.append(_store(loop, _STORES.get(name, name), state, (8.0, 5.4)))
             movers = [i for i, name in enumerate(loop.inputs) if name != house.grid and plant.input_matrix[state, i]]
             for i in movers[:1]:
                 words = _CONVERTERS.get(loop.states[state], (loop.inputs[i],) * 2)
                 own = loop.flow({loop.inputs[i]: 1.0}, {})
-                flows.append(DrawnFlow(*words, own, (7.4, 4.6), (6.2, 4.6), (6.9, 2.7)))
+                flows.append(DrawnFlow(*words, own, (7.4, 4.4), (6.2, 4.4), (6.9, 2.4)))
         return Sketch((WIDTH, HEIGHT), lines, tuple(levels), tuple(flows), loop.largest_flow)
 
     @classmethod
@@ -494,7 +494,7 @@ _CONVERTERS = {"LOH": ("fuel cell", "electrolyser")}
 def _store(loop: ControlledPlant, name: str, state: int, foot: Spot) -> DrawnLevel:
     """A store in per cent, with marks at its limits."""
     limits = (float(limit[state]) for limit in (loop.plant.state_lower, loop.plant.state_upper))
-    return DrawnLevel(name, state, 0.0, 100.0, foot, 3.4, tuple(limit for limit in limits if np.isfinite(limit)))
+    return DrawnLevel(name, state, 0.0, 100.0, foot, 3.2, tuple(limit for limit in limits if np.isfinite(limit)))
 
 
 def _house(table: Table) -> HouseholdTable:
