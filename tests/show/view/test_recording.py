@@ -119,7 +119,7 @@ def test_numbers_of_a_logarithmic_axis_are_explained(simulated: Callable[..., Si
     assert titles == {
         (): ["Error   −1: 0.1 · 1: 10", "Root of tr P   dim: theory   −1: 0.1 · 1: 10"],
         ("m", "m"): ["Error   −1: 0.1 m · 1: 10 m", "Root of tr P   dim: theory   −1: 0.1 m · 1: 10 m"],
-        ("m", "m/s"): ["Error   −1: 0.1 · 1: 10   (m, m/s)", "Root of tr P   dim: theory   −1: 0.1 · 1: 10   (m, m/s)"],
+        ("m", "m/s"): ["Error   −1: 0.1 · 1: 10   (m, m/s)", "Root of tr P   dim: theory   −1: 0.1 · 1: 10"],
     }
 
 

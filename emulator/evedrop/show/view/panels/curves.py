@@ -128,10 +128,9 @@ def powers_of_ten(scene: Scene) -> str:
     """
     units = [*dict.fromkeys(scene.units)]
     unit = f" {units[0]}" if len(units) == 1 else ""
-    mixed = f"   ({', '.join(units)})" if len(units) > 1 else ""
     power = decades(scene)
     less, more = (f"{10.0**-power:.{power}f}", f"{10**power:,}") if power < _LONG else (f"1e-{power}", f"1e{power}")
-    return f"−1: {less}{unit} · 1: {more}{unit}{mixed}"
+    return f"−1: {less}{unit} · 1: {more}{unit}"
 
 
 _ERROR_PATH, _BAND = "error", "band"
@@ -146,11 +145,17 @@ class SquaredError(ViewPanel):
 
     def views(self) -> Iterator[PlacedView]:
         """One view: of the whole run for a closed loop, otherwise of the recent slots."""
-        title = f"Error   {'dim: 95 %   ' if self._with_bands else ''}{powers_of_ten(self.scene)}"
+        title = f"Error   {'dim: 95 %   ' if self._with_bands else ''}{powers_of_ten(self.scene)}{self._mixture}"
         if self.scene.moving:
             yield PlacedView(receivers_view(title, self._paths, whole_run(self.scene)), "right", 1.2)
         else:
             yield PlacedView(receivers_view(title, self._paths, recent_slots(self.scene)), "middle")
+
+    @property
+    def _mixture(self) -> str:
+        """The units of the states if they have several, such as "   (m, m/s)"."""
+        units = [*dict.fromkeys(self.scene.units)]
+        return f"   ({', '.join(units)})" if len(units) > 1 else ""
 
     @property
     def _with_bands(self) -> bool:
