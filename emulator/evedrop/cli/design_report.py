@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-from evedrop.cli.report import left_out_line, terminal
+from evedrop.cli.report import ReportConsole, left_out_line
 from evedrop.model.checks import toml_of
 from evedrop.model.metrics.text import finite_text, number_text
 from evedrop.show.report.text_table import TextTable
@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from evedrop.scenario.designs import BudgetDesign, PolicyDesign
 
 
-def print_design(design: Design) -> None:
+def print_design(design: Design, console: ReportConsole) -> None:
     """Print a design as text: bounds, intervals, optima and the price of secrecy."""
-    console = terminal()
     if (answer := _answer(design)) is not None:
         console.say(answer, "bold")
     console.say(f"spectral radius {design.rho:.6g}; legitimate link quality μ = {design.mu:g}")
@@ -127,9 +126,8 @@ def _half_open(interval: tuple[float, float], bound: float) -> str:
     return f"({low:.5f}, {high:.5f}{')' if high == bound == 1.0 else ']'}"
 
 
-def print_budget(design: BudgetDesign) -> None:
+def print_budget(design: BudgetDesign, console: ReportConsole) -> None:
     """Print the thresholds as a table, the one for the budget among them."""
-    console = terminal()
     console.say(
         f"an unencrypted packet costs {design.unencrypted:g}, an encrypted one {design.encrypted:g}; errors are traces in the "
         f"limit; the legitimate one is {finite_text(design.legitimate)}"
@@ -155,9 +153,8 @@ def print_budget(design: BudgetDesign) -> None:
 _METRICS = ("legitimate error", "its error", "sent")
 
 
-def print_policies(design: PolicyDesign) -> None:
+def print_policies(design: PolicyDesign, console: ReportConsole) -> None:
     """Print the fronts as text."""
-    console = terminal()
     console.say(
         f"legitimate link quality μ = {design.mu:g}; errors are traces in the limit; sent: the fraction of slots with a packet"
     )
@@ -212,9 +209,8 @@ def _metrics(metrics: PolicyMetrics) -> tuple[str, ...]:
     return (*map(finite_text, (metrics.legitimate, metrics.eavesdropper)), number_text(metrics.transmissions, ".4f"))
 
 
-def print_schedules(design: ScheduleDesign) -> None:
+def print_schedules(design: ScheduleDesign, console: ReportConsole) -> None:
     """Print the schedules as text."""
-    console = terminal()
     for name, schedule in design.schedules.items():
         console.say(
             f"against {name}: the sum is {schedule.best.value:.6g} with this schedule, "

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO, final
 
 from evedrop.cli.console import StyledConsole
 from evedrop.cli.tables import TAKEN
@@ -81,7 +82,7 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None, verb
     console.say(f"results: {folder}; to look at them: evedrop view {folder}")
 
 
-def _print_details(console: _Console, summary: Summary, replay: str | None) -> None:
+def _print_details(console: ReportConsole, summary: Summary, replay: str | None) -> None:
     """Print what the report page says besides: theory, leaks, directions, doubts, and the most surprising trial."""
     for line in closing.details(summary):
         console.say(line)
@@ -109,7 +110,15 @@ def left_out_line(left_out: Mapping[str, str], why: str) -> str:
     return f"left out: {who}: {why}"
 
 
-class _Console(StyledConsole):
+@final
+class ReportConsole(StyledConsole):
+    """What reports are printed on."""
+
+    def __init__(self, file: TextIO, columns: int | None) -> None:
+        """columns: in which sentences are broken into lines, and tables fit; None: whole sentences, tables in 140 columns."""
+        super().__init__(file, highlight=False, markup=False, width=columns or 140, height=_HEIGHT)
+        self._columns = columns
+
     def show(self, table: TextTable, drawn: TextTable | None = None, **how: Any) -> None:
         """Show a table as far as the terminal is wide enough; drawn: what is shown of it, if that is not all.
 
@@ -129,19 +138,26 @@ class _Console(StyledConsole):
 
     def say(self, line: str, style: str = "") -> None:
         """Print a paragraph, on a terminal in lines that are broken between words; words of failure are red."""
-        self._print_whole(wrapped(line, columns_of(sys.stdout)), style)
+        self._print_whole(wrapped(line, self._columns), style)
 
     def command(self, line: str) -> None:
         """Print a command, on a terminal in lines that a shell can still read."""
-        self._print_whole(wrapped_command(line, columns_of(sys.stdout)))
+        self._print_whole(wrapped_command(line, self._columns))
 
     def _print_whole(self, text: str, style: str = "") -> None:
         self.print(alarming(text, style), soft_wrap=True)
 
 
-def terminal() -> _Console:
-    """A console on standard output; 140 columns wide if that is not a terminal."""
-    return _Console(sys.stdout, highlight=False, markup=False, width=columns_of(sys.stdout) or 140, height=_HEIGHT)
+def terminal() -> ReportConsole:
+    """A console on standard output."""
+    return ReportConsole(sys.stdout, columns_of(sys.stdout))
+
+
+def printed(show: Callable[[ReportConsole], None], columns: int) -> str:
+    """What a function prints, as text in lines of at most this many columns."""
+    text = io.StringIO()
+    show(ReportConsole(text, columns))
+    return "\n".join(line.rstrip() for line in text.getvalue().splitlines() if line.strip())
 
 
 _HEIGHT = 25  # which nothing depends on; without it Rich makes a dumb terminal 80 columns wide

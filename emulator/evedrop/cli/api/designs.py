@@ -78,7 +78,8 @@ def design(
     the losses of a link are not independent and alike in all slots, or if Ω is infinite, or no μ_d keeps the trace below it or
     has the ratio. The error names a command that measures what cannot be designed.
     """
-    from evedrop.model.theory.design import design as design_of  # a run does not need it
+    from evedrop.cli.api.shown_designs import ShownDesign, shown_as  # a run does not need it
+    from evedrop.model.theory.design import design as design_of  # the same
 
     made = scenario_of(scenario, changes or {}, beyond_horizon=True)
     measured = measuring_command(scenario, changes or {}, made)
@@ -102,7 +103,7 @@ def design(
             f'eavesdroppers.genie={{strategy = "genie", link = {{quality = 0.9}}}}, or measure those it has: {measured}'
         )
     designed = design_of(made.process.process, mu, made.encoding.mu_d, adversaries, made.slots, max_trace, min_ratio)
-    return replace(designed, left_out=left_out, measuring=measured)
+    return shown_as(ShownDesign, replace(designed, left_out=left_out, measuring=measured))
 
 
 def _adversaries(made: Scenario, measured: str) -> tuple[float, list[Adversary], dict[str, str]]:
@@ -152,7 +153,8 @@ def design_schedule(
 
     Raises ScenarioError with every mistake of the scenario, UsageError as `design` does, and for numbers out of range.
     """
-    from evedrop.model.theory.schedules import ScheduleDesign, best_schedule  # a run does not need it
+    from evedrop.cli.api.shown_designs import ShownScheduleDesign  # a run does not need it
+    from evedrop.model.theory.schedules import best_schedule  # the same
 
     made = scenario_of(scenario, changes or {}, beyond_horizon=True)
     measured = measuring_command(scenario, changes or {}, made)
@@ -186,7 +188,7 @@ def design_schedule(
             "a schedule is designed against eavesdroppers whose error has a closed form, and the scenario has none; add one, "
             f'such as eavesdroppers.genie={{strategy = "genie", link = {{quality = 0.9}}}}, or measure those it has: {measured}'
         )
-    return ScheduleDesign(schedules, left_out)
+    return ShownScheduleDesign(schedules, left_out)
 
 
 @speaks_python
@@ -206,7 +208,8 @@ def design_policy(
     Raises ScenarioError with every mistake of the scenario, UsageError if it is not one for policies, see
     `evedrop.scenario.designs.policies_of`.
     """
-    from evedrop.scenario.designs import policies_of  # a run does not need it
+    from evedrop.cli.api.shown_designs import ShownPolicyDesign, shown_as  # a run does not need it
+    from evedrop.scenario.designs import policies_of  # the same
 
     for name, several in (("weights", weights), ("prices", prices)):
         refuse_unless(
@@ -215,7 +218,8 @@ def design_policy(
         for value in several:
             number_argument(name, value)
     number_argument("states", states, whole=True)
-    return policies_of(scenario_of(scenario, changes or {}, beyond_horizon=True), weights, prices, states)
+    made = scenario_of(scenario, changes or {}, beyond_horizon=True)
+    return shown_as(ShownPolicyDesign, policies_of(made, weights, prices, states))
 
 
 @speaks_python
@@ -229,10 +233,11 @@ def design_budget(
     Raises ScenarioError with every mistake of the scenario, UsageError if no threshold meets the budget, see
     `evedrop.scenario.designs.budget_of`.
     """
-    from evedrop.scenario.designs import budget_of  # a run does not need it
+    from evedrop.cli.api.shown_designs import ShownBudgetDesign, shown_as  # a run does not need it
+    from evedrop.scenario.designs import budget_of  # the same
 
     number_argument("budget", budget)
-    return budget_of(scenario_of(scenario, changes or {}, beyond_horizon=True), budget)
+    return shown_as(ShownBudgetDesign, budget_of(scenario_of(scenario, changes or {}, beyond_horizon=True), budget))
 
 
 def _refuse_texts(whole: bool = False, **numbers: object) -> None:

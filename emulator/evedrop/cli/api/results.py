@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import tempfile
 from abc import ABC, abstractmethod
@@ -279,14 +278,9 @@ def _in_lines(paragraphs: Iterable[str]) -> str:
 
 def _drawn(table: TextTable) -> list[str]:
     """The lines of a table, which leaves out what does not fit into 100 characters, as the terminal does."""
-    from rich.console import Console  # a live run does not need it
+    from evedrop.cli.report import printed  # a live run does not need Rich
 
-    from evedrop.show.terminal_tables import fitted  # the same
-
-    text = io.StringIO()
-    console = Console(file=text, width=_WIDTH, color_system=None)
-    console.print(fitted(table, console))
-    return [line.rstrip() for line in text.getvalue().splitlines() if line.strip()]
+    return printed(lambda console: console.show(table), _WIDTH).splitlines()
 
 
 def load_results(folder: str | Path) -> RunResults:

@@ -17,6 +17,7 @@ def design(options: argparse.Namespace) -> int:
     """Print the admissible μ_d, the cost and secrecy of each choice; or when to send or to encrypt, or a μ_d for each slot."""
     from evedrop.cli import api
     from evedrop.cli.design_report import print_budget, print_design, print_policies, print_schedules
+    from evedrop.cli.report import terminal
 
     chosen = {"--policy": options.policy, "--schedule": options.schedule, "--budget": options.budget}
     kind = next((name for name, value in chosen.items() if value is not None and value is not False), None)
@@ -25,19 +26,19 @@ def design(options: argparse.Namespace) -> int:
         raise UsageError(f"--plot is for the design of μ_d, and {kind} is another; leave it out")
     if kind == "--policy":
         policies = api.design_policy(options.scenario, changes=changed, **given)
-        return _show(options, policies, lambda: print_policies(policies))
+        return _show(options, policies, lambda: print_policies(policies, terminal()))
     if kind == "--schedule":
         schedules = api.design_schedule(options.scenario, options.schedule, changes=changed, **given)
-        return _show(options, schedules, lambda: print_schedules(schedules))
+        return _show(options, schedules, lambda: print_schedules(schedules, terminal()))
     if kind == "--budget":
         budget = api.design_budget(options.scenario, options.budget, changes=changed)
-        return _show(options, budget, lambda: print_budget(budget))
+        return _show(options, budget, lambda: print_budget(budget, terminal()))
     designed = api.design(options.scenario, changes=changed, **given)
     if options.plot is not None:
         from evedrop.show.view.design_picture import draw_design
 
         draw_design(options.plot, designed)
-    return _show(options, designed, lambda: print_design(designed))
+    return _show(options, designed, lambda: print_design(designed, terminal()))
 
 
 _OPTIONS: Mapping[str | None, Mapping[str, str]] = {
