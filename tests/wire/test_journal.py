@@ -418,13 +418,13 @@ told, heard = [], []
 with WireJournal(disk / "run", wire_plan(), tell=told.append, part_rows=1000) as journal:
     journal.listeners.append(lambda block: heard.extend(block["n"].tolist()))
     key = journal.words.key_code("scan/1")
-    for n in range(20_000):
-        journal.records.record(time.time(), n, -1, 0.0, key, 0, 64, 0, Kind.PUT, 0)
     # Otherwise parts in memory may be given up before there is room again, if the machine is busy.
     ticks = []
     journal.records.tend = ticks.append
     while not ticks:
         time.sleep(0.01)
+    for n in range(20_000):
+        journal.records.record(time.time(), n, -1, 0.0, key, 0, 64, 0, Kind.PUT, 0)
     fill("rest")
     for code in range(3000):
         journal.words.key_code(f"scan/a/long/name/of/a/key/{code}")
