@@ -90,6 +90,7 @@ test-mutants: $(READY)
 docs: $(DOCS_READY)
 	NO_MKDOCS_2_WARNING=1 PYTHONPATH=tools/site $(BIN)/python -m mkdocs build --clean
 ifndef BUILD_ONLY
+	$(BIN)/python -m tests.docs.reports build/site/screens
 	$(BIN)/python -m pytest -n 2 tests/docs/test_consoles.py tests/docs/test_view_pictures.py tests/docs/test_screens.py
 endif
 	@echo "the site is in build/site; to read it: python3 -m http.server --bind 127.0.0.1 --directory build/site"

@@ -22,6 +22,7 @@ from PIL import Image
 
 from evedrop.system.ports import free_port
 from tests.conftest import wait_until
+from tests.docs.browser import CHROMIUM, light_scene
 from tests.privileged import CannotRun, skip
 from tests.wire.wire_at_work import program
 
@@ -69,7 +70,7 @@ def _nine(folder: Path) -> Path:
     return run_of("vehicle", folder, *(word for change in changes for word in ("--set", change)))
 
 
-def _wire(folder: Path) -> Path:
+def wire_at_work(folder: Path) -> Path:
     """The wire of docs/wire.md, with a robot and its base that publish for 28 s as the page says."""
     out = folder / "wire"
     if out.exists():
@@ -129,7 +130,7 @@ PICTURES: Mapping[str, Callable[[Path, Path], None]] = {
     "live_view.png": _viewed(ROOT / "README.md", lambda folder: run_of("vehicle", folder)),
     "vehicle.gif": _viewed(DOCS / "view.md", lambda folder: run_of("vehicle", folder)),
     "microgrid_view.png": _viewed(DOCS / "view.md", lambda folder: run_of("microgrid", folder)),
-    "wire_view.png": _viewed(DOCS / "wire.md", _wire),
+    "wire_view.png": _viewed(DOCS / "wire.md", wire_at_work),
     "compare.png": _compare,
 }
 """File in docs/ → what draws it: called with a folder for results, and the path of the picture."""
@@ -142,7 +143,7 @@ def _built_in(scenario: str) -> Callable[[Path], Path]:
 SCENES: Mapping[str, Callable[[Path], Path]] = {
     **{name: _built_in(name) for name in ("vehicle", "acknowledged", "hijacked", "microgrid")},
     "nine": _nine,
-    "wire": _wire,
+    "wire": wire_at_work,
 }
 """Name → what makes the results whose first tab the page of screens shows, called with a folder."""
 SIZES = ("1280x720", "1920x1080")
@@ -159,15 +160,32 @@ def _scene(name: str, size: str) -> Callable[[Path, Path], None]:
     """What draws a scene into docs/screens, in few colours, so that the file is small."""
 
     def draw(folder: Path, picture: Path) -> None:
-        with Image.open(scene_of(name, size, folder, picture)) as drawing:
-            drawing.convert("RGB").quantize(128).save(picture, optimize=True)
+        _in_few_colours(scene_of(name, size, folder, picture))
 
     return draw
+
+
+def _light_scene(name: str, size: str) -> Callable[[Path, Path], None]:
+    """The same in the light theme, at the end of the results, as a browser shows it; the picture stays as it is without one."""
+
+    def draw(folder: Path, picture: Path) -> None:
+        if CHROMIUM is not None:
+            light_scene(SCENES[name](folder), size, picture)
+            _in_few_colours(picture)
+
+    return draw
+
+
+def _in_few_colours(picture: Path) -> None:
+    with Image.open(picture) as drawing:
+        small = drawing.convert("RGB").quantize(128)
+    small.save(picture, optimize=True)
 
 
 ALL_PICTURES: Mapping[str, Callable[[Path, Path], None]] = {
     **PICTURES,
     **{f"screens/{name}-{size}.png": _scene(name, size) for name in SCENES for size in SIZES},
+    **{f"screens/{name}-{size}-light.png": _light_scene(name, size) for name in SCENES for size in SIZES},
 }
 """Those of docs/screens as well."""
 

@@ -68,11 +68,12 @@ def test_a_scene_is_the_one_on_the_page_of_screens(name: str, tmp_path: Path) ->
         assert difference(picture, DOCS / "screens" / f"{name}-{size}.png") < FEW_COLOURS
 
 
+@pytest.mark.parametrize("theme", ["", "-light"])
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", SCENES)
-def test_the_page_of_screens_has_every_scene(name: str, size: str) -> None:
-    """In its size."""
-    with Image.open(DOCS / "screens" / f"{name}-{size}.png") as picture:
+def test_the_page_of_screens_has_every_scene(name: str, size: str, theme: str) -> None:
+    """In its size, in both themes."""
+    with Image.open(DOCS / "screens" / f"{name}-{size}{theme}.png") as picture:
         assert "x".join(map(str, picture.size)) == size
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 SCREENS = Path(__file__).parents[2] / "docs" / "screens"
 _HEAD = """# Screens
 
-Evedrop as it is seen on terminals and screens of different sizes. `make docs` makes all of them again,
-and fails if one has changed.
+Evedrop as it is seen on terminals and screens of different sizes. `make docs` makes the dark scenes and the terminals again,
+and fails if one has changed. `make pictures` draws all scenes; those of the light theme are taken from a browser.
 
 ## The view
 """
@@ -31,16 +31,25 @@ _SCENES = {
 }
 
 
+_PAPER = """## On paper
+
+The reports, printed by Chromium where `make docs` finds it: """ + ", ".join(
+    f'<a href="screens/report-{kind}.pdf">{kind}</a>'
+    for kind in ("run", "study", "sweep", "comparison", "tests", "wire")
+)
+
+
 def screens_page() -> str:
     """The page in Markdown."""
     parts = [_HEAD]
     for name, title in _SCENES.items():
         parts.append(f"### {title}\n")
         for path in sorted(SCREENS.glob(f"{name}-*.png")):
-            size = path.stem.removeprefix(f"{name}-").replace("x", " × ")
-            parts.append(f"![{title}, {size} pixels](screens/{path.name})\n")
+            size, _, theme = path.stem.removeprefix(f"{name}-").partition("-")
+            words = f"{title}, {size.replace('x', ' × ')} pixels, {theme or 'dark'}"
+            parts.append(f"![{words}](screens/{path.name})\n")
     parts.append(_TERMINAL)
     for path in sorted(SCREENS.glob("*.txt"), key=lambda path: int(path.stem)):
         _, _, text = path.read_text(encoding="utf-8").partition("\n\n")
         parts.append(f"### {path.stem} columns\n\n```text\n{text.rstrip()}\n```\n")
-    return "\n".join(parts)
+    return "\n".join([*parts, _PAPER])

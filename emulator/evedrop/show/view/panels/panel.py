@@ -87,7 +87,7 @@ _PIXELS = 544.0  # of the tab with numbers, below the verdict and between the vi
 _MOST = 0.57
 _HEAD, _LANE = 48.0, 40.0  # title bar and ruler of a view of lanes; a lane with its name
 
-VERDICT_HEIGHT = 0.15  # two lines of a verdict, and the title, in a window of 720 pixels
+VERDICT_HEIGHT = 0.165  # two lines of a verdict, and the title, in a window of 720 pixels
 LEGEND_HEIGHT = 0.085
 FIXED_HEIGHT = LEGEND_HEIGHT
 """The height of the rows that the numbers of every run have."""
