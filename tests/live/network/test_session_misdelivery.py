@@ -135,10 +135,13 @@ def test_a_question_that_names_another_key_is_not_answered(stage: Stage) -> None
             assert list(stage.router.get(key, payload=message, timeout=2.0)) == []
         assert asked.empty()
         assert session.dropped == len(foreign(stage.keys, key))
-        threading.Thread(target=lambda: list(stage.router.get(key, payload=enclosed(key, GOOD)))).start()
+        asking = threading.Thread(target=lambda: list(stage.router.get(key, payload=enclosed(key, GOOD))))
+        asking.start()
         question = asked.get(timeout=LIMIT)
         assert question.payload == GOOD
         question.answer(GOOD)
+        asking.join(LIMIT)
+        assert not asking.is_alive(), "the router cannot be closed while it is used"
 
 
 def test_an_answer_that_names_another_key_is_none(stage: Stage) -> None:
