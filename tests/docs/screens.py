@@ -62,8 +62,8 @@ class Screen(NamedTuple):
     text: str
 
     def wide(self, columns: int) -> list[str]:
-        """The lines that are wider than the terminal."""
-        return [line for line in self.text.split("\n") if Text(line).cell_len > columns]
+        """The lines that are wider than the terminal, but for a single word, which stays whole."""
+        return [line for line in self.text.split("\n") if Text(line).cell_len > columns and len(line.split()) > 1]
 
     @property
     def words(self) -> list[str]:
