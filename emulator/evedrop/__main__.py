@@ -76,10 +76,9 @@ def program() -> NoReturn:
         signal.signal(number, signal.SIG_IGN)
     if "threading" in sys.modules and sys.modules["threading"].active_count() > 1:
         sys.exit(status)  # waits for them
+    # The interpreter would free every object of every module, which takes a quarter of a second after a study.
     atexit._run_exitfuncs()
-    os._exit(
-        status
-    )  # the interpreter would free every object of every module, which takes a quarter of a second after a study
+    os._exit(status)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ def main(folder: Path) -> None:
             page = next(iter([*place.glob("tests.html"), place / "report.html"]))
             try:
                 printed(page, folder / f"report-{kind}.pdf")
-            except OSError as error:  # a browser that cannot print here is no fault of the pages
+            except OSError as error:  # the browser is at fault, not the page
                 sys.stdout.write(f"{error}\n")
 
 

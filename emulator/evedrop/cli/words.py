@@ -18,6 +18,9 @@ from evedrop.errors import EvedropError
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
+WIDTH = 100
+"""Characters of the lines that Python shows."""
+
 _OF_COMMAND: ContextVar[bool] = ContextVar("_OF_COMMAND", default=False)
 _ADVICE: Sequence[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]]] = (
     (re.compile(r"\bmontecarlo --rare\b"), "montecarlo(…, plan=Plan(rare=True))"),

@@ -276,7 +276,7 @@ def test_a_comparison_takes_a_scenario_of_python() -> None:
 
 @pytest.fixture
 def cells(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What a notebook shows in its cells, of which this program is the kernel."""
+    """Makes this program the kernel of a notebook, and collects what its cells show."""
     shown: list[str] = []
 
     def display(text: str, display_id: bool = False) -> SimpleNamespace:

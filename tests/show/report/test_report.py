@@ -47,6 +47,7 @@ from evedrop.show.report.run_sections import (
     RunSource,
     lane_picture,
 )
+from evedrop.show.report.sweep_sections import sweep_outcome
 from evedrop.show.report.text_table import TextTable, aligned, far
 from evedrop.show.report.writing import REPORT, try_report, write_report
 from evedrop.show.view.axis_name import as_mathematics, axis_name
@@ -591,3 +592,19 @@ def test_a_changed_study_is_refused_in_a_sentence(
         with suppress(UsageError):
             write_report(path.parent)
     assert evedrop("report", "study").status in {0, 2}
+
+
+def test_a_sweep_begins_with_the_verdict_at_its_points() -> None:
+    """At each point the eavesdropper that knows most decides; points that were not done are said."""
+    secret, broken, still_open = "secret", "not secret", "cannot tell yet"
+
+    def begins(points: list[list[str | None]], planned: int) -> list[str]:
+        rows = [{"mu": point, "verdict": verdict} for point, verdicts in enumerate(points) for verdict in verdicts]
+        return list(sweep_outcome(rows, ["mu"], len(points), planned))
+
+    assert begins([[None, secret], [None, secret]], 2) == ["✓ secret at all 2 points"]
+    assert begins([[None, secret, broken], [None, secret, still_open], [None, secret, secret]], 3) == [
+        "✗ not secret at 1, ? cannot tell yet at 1, ✓ secret at 1"
+    ]
+    assert begins([[None, secret]], 3) == ["✓ secret at 1", "1 of 3 points were done"]
+    assert begins([[None], [None]], 2) == ["All 2 points were done"]

@@ -25,7 +25,7 @@ def container(kind: str, *contents: str, title: str | None = None) -> dict[str, 
 
 
 def tabbed() -> Blueprint:
-    """A verdict above two tabs, of which the second is open; events are in both."""
+    """A verdict above two tabs. The second tab is open, and both have events."""
     return {
         "/viewport": {"ViewportBlueprint": {"root_container": "root"}},
         "/time_panel": {"TimePanelBlueprint": {"state": "Collapsed"}},

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, Self
 import pyarrow as pa
 
 from evedrop.cli.api.notebook import OpenView, table_text
-from evedrop.cli.words import in_python
+from evedrop.cli.words import WIDTH, in_python
 from evedrop.model.metrics import shown_metric
 from evedrop.model.metrics.text import number_text
 from evedrop.results.comparison import COMPARISON, Comparison, read_comparison
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 Panels = Literal["errors", "lanes", "plane"]
 Width = Literal["page", "column"]
 _MOST_ROWS = 40  # of a table in a notebook
-_WIDTH = 100  # characters of the lines that Python shows
 
 
 class _InFolder(Protocol):
@@ -244,7 +243,7 @@ class ComparisonResults(Comparison, ReportedResults):
         return comparison_figure(self)
 
     def __repr__(self) -> str:
-        return _in_lines([comparison_heading(self), *matrix_lines(self, _WIDTH), conclusion(self)])
+        return _in_lines([comparison_heading(self), *matrix_lines(self, WIDTH), conclusion(self)])
 
     def _tables(self) -> list[TextTable]:
         return [schemes_table(self), pairs_table(self)]
@@ -273,14 +272,14 @@ class ComparisonResults(Comparison, ReportedResults):
 
 def _in_lines(paragraphs: Iterable[str]) -> str:
     """Paragraphs, in lines of 100 characters."""
-    return "\n".join(wrapped(paragraph, _WIDTH) for paragraph in paragraphs)
+    return "\n".join(wrapped(paragraph, WIDTH) for paragraph in paragraphs)
 
 
 def _drawn(table: TextTable) -> list[str]:
     """The lines of a table, which leaves out what does not fit into 100 characters, as the terminal does."""
     from evedrop.cli.report import printed  # a live run does not need Rich
 
-    return printed(lambda console: console.show(table), _WIDTH).splitlines()
+    return printed(lambda console: console.show(table), WIDTH).splitlines()
 
 
 def load_results(folder: str | Path) -> RunResults:

@@ -6,11 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from evedrop.cli.words import WIDTH
 from evedrop.model.theory.design import Design
 from evedrop.model.theory.schedules import ScheduleDesign
 from evedrop.scenario.designs import BudgetDesign, PolicyDesign
-
-_WIDTH = 100  # characters of a line
 
 
 @dataclass(frozen=True, repr=False)
@@ -64,4 +63,4 @@ def shown_as(kind: type[_Shown], design: Any) -> _Shown:
 def _printed(show: Callable[..., None], design: object) -> str:
     from evedrop.cli.report import printed  # as above
 
-    return printed(lambda console: show(design, console), _WIDTH)
+    return printed(lambda console: show(design, console), WIDTH)

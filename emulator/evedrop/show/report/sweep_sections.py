@@ -70,14 +70,14 @@ class SweepSource:
             done, planned = len({tuple(row[key] for key in grid) for row in rows}), math.prod(map(len, grid.values()))
             sizes = (_size([row[name] for row in rows], name) for name in ("slots", "trials"))
             amount = " · ".join((f"{done:,} points of {', '.join(grid)}", *sizes))
-            outcome = "; ".join(_outcome(table.to_pylist(), list(grid), done, planned))
+            outcome = "; ".join(sweep_outcome(table.to_pylist(), list(grid), done, planned))
             changes, mode = entries["changes"], entries["mode"]
             return cls(folder, rows, entries["scenario"], changes, grid, mode, amount, outcome, inks)
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{folder} cannot be read as a sweep ({error}); run the sweep again") from error
 
 
-def _outcome(rows: Sequence[Mapping[str, Any]], keys: Sequence[str], done: int, planned: int) -> Iterator[str]:
+def sweep_outcome(rows: Sequence[Mapping[str, Any]], keys: Sequence[str], done: int, planned: int) -> Iterator[str]:
     """The verdict at each point, where there are eavesdroppers, then how many points were done if that is not said."""
     at: dict[tuple[Any, ...], list[SecrecyOutcome]] = {}
     for row in rows:
