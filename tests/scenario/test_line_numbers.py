@@ -188,3 +188,9 @@ def test_mistakes_are_illustrated_by_the_lines_of_the_file(tmp_path: Path) -> No
     with pytest.raises(ScenarioError) as caught:
         parse("slots = 10\ntrials == 3\n", "mine.toml")
     assert caught.value.illustrated.split("\n")[-2:] == ["   2 | trials == 3", "     |         ^"]
+
+
+def test_an_excerpt_marks_the_key_of_an_unknown_entry() -> None:
+    """The value of an entry that is not known is not what is wrong."""
+    shown, carets = excerpt("legitimate = {quality = 1.4}", 4, "quality", key=True).split("\n")
+    assert shown[carets.index("^") : carets.rindex("^") + 1] == "quality"

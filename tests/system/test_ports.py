@@ -24,7 +24,9 @@ def test_the_user_at_the_other_end_is_known(tmp_path: Path, monkeypatch: pytest.
                 if sys.platform == "linux":
                     assert other_user(connection) == other_user(client) == os.getuid()
                     table = tmp_path / "tcp"
-                    table.write_text("the heads\n")
+                    ends = [ports._in_table(*end) for end in (connection.getpeername(), connection.getsockname())]
+                    others = f"0: {ends[1]} {ends[0]} 01 0:0 0:0 0 4321 0 1"  # the same connection, seen from this end
+                    table.write_text(f"the heads\n{others}\n")
                     monkeypatch.setattr(ports, "_TABLE", table)
                     assert other_user(connection) == -1
                 monkeypatch.setattr(ports, "_TABLE", tmp_path / "none")

@@ -135,3 +135,10 @@ def test_every_frame_has_all_parts() -> None:
         ["room 21.0 °C", "wall 18.0 °C", "heating −0.25 kW"],
         ["room 20.0 °C", "wall 18.0 °C", "heating +0.00 kW"],
     ]
+
+
+def test_the_widest_arrow_is_that_of_the_largest_power() -> None:
+    """Of the drawing, whatever it is, and widths are in proportion."""
+    widths = half_widths(np.array([[2.0, -4.0, 8.0]]), 8.0)[0]
+    np.testing.assert_allclose(widths, np.array([0.25, 0.5, 1.0]) * widths[2])
+    assert half_widths(np.array([[80.0]]), 80.0)[0, 0] == widths[2]
