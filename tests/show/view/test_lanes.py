@@ -33,7 +33,7 @@ def known(error: float, trace: float, scene: Scene = SCENE) -> Synchronisation:
     P = np.diag([trace / 4, 3 * trace / 4])[None]
     off = np.sqrt(error / 4), -np.sqrt(3 * error / 4)
     peer = PeerSlots(0, np.array([off]), P, none.astype(np.uint8), none, none, none, none)
-    return Synchronisation(knowledge(scene, np.zeros((1, 2)), peer)[0])
+    return Synchronisation(knowledge(scene, np.zeros((1, 2)), peer.x_hat, peer.P)[0])
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_no_word_of_a_lane_is_cut(simulated: Callable[..., Simulated]) -> None:
     distance = ErrorDistance(replace(run.scene, units=("m", "m")))
     for shown in run.scene.receivers:
         knows, peer = KnowledgeLane(shown, distance), run.slots.peers[shown.name]
-        levels = knowledge(run.scene, run.slots.x, peer)
+        levels = knowledge(run.scene, run.slots.x, peer.x_hat, peer.P)
         changes = dict(knows.changes(0, levels, distance.of(run.slots.x, peer.x_hat)))
         labels = [knows.labels[code] for code in changes.values()]
         for start, end, label in zip(changes, [*[*changes][1:], 300], labels, strict=True):
@@ -136,7 +136,8 @@ def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp
         assert lanes[shown.name, 7] == lanes[shown.name, 300]
         changes = rows(tmp_path / "7.rrd", f"knows/{i}_{shown.name}", "StateChange:state")
         assert [word for _, (word,) in sorted(changes.items())] == [word for word, _ in groupby(lanes[shown.name, 7])]
-        expected = knowledge(run.scene, run.slots.x, run.slots.peers[shown.name])
+        peer = run.slots.peers[shown.name]
+        expected = knowledge(run.scene, run.slots.x, peer.x_hat, peer.P)
         assert [word.split()[0] for word in lanes[shown.name, 7]] == [KNOWLEDGE.words[code] for code in expected]
     words = {name: " ".join(words_) for (name, _), words_ in lanes.items()}
     assert "overconfident" in words["naive"]

@@ -25,7 +25,7 @@ from evedrop.score.synchronisation import FACTOR, Synchronisation, synchronisati
 from evedrop.score.verdict import distance_text
 from evedrop.show.view import palette
 from evedrop.show.view.palette import Colour
-from evedrop.show.view.scene import PeerSlots, Scene, SceneSlots, Shown
+from evedrop.show.view.scene import Scene, SceneSlots, Shown
 
 
 @dataclass(frozen=True)
@@ -138,11 +138,14 @@ def received(shown: Shown, slots: SceneSlots) -> Codes:
     return codes if slots.sent is None else np.where(slots.sent, codes, SILENT_CODE)
 
 
-def knowledge(scene: Scene, x: Floats, peer: PeerSlots) -> Codes:
-    """Codes of the lane `KNOWLEDGE`, (c,), in the first recorded trial, by `synchronisation_of`; x: true states, (c, n)."""
+def knowledge(scene: Scene, x: Floats, x_hat: Floats, P: Floats) -> Codes:
+    """Codes of the lane `KNOWLEDGE`, (c,), by `synchronisation_of`.
+
+    x, x_hat, P: true states, estimates and reported covariances of one trial, (c, n), (c, n), (c, n, n).
+    """
     with np.errstate(all="ignore"):
-        squared = np.sum((x - peer.x_hat) ** 2, axis=1)
-        trace = np.trace(peer.P, axis1=1, axis2=2)
+        squared = np.sum((x - x_hat) ** 2, axis=1)
+        trace = np.trace(P, axis1=1, axis2=2)
     return synchronisation_of(squared, trace, scene.noise)
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from functools import cache
 
 from evedrop.names import LEGITIMATE as _LEGITIMATE_NAME
 
@@ -198,6 +199,7 @@ def on_paper(of: Colour) -> Colour:
     return r, g, b
 
 
+@cache  # of a handful of colours, for each node and frame
 def letters(of: Colour) -> Colour:
     """The same colour for letters in a node of a graph, whose ground is white or nearly black with the theme.
 

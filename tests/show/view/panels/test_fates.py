@@ -63,7 +63,7 @@ def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], t
             peer = run.slots.peers[receiver.name]
             word = lanes.lane_of(receiver, run.scene).words[int(lanes.received(receiver, run.slots)[k])]
             assert shown[2 + i] == word
-            status = Synchronisation(knowledge(run.scene, run.slots.x, peer)[k])
+            status = Synchronisation(knowledge(run.scene, run.slots.x, peer.x_hat, peer.P)[k])
             name, _, rest = shown[2 + len(receivers) + i].partition(": ")
             assert name == receiver.name
             inks = [coloured(colours[k][at + i]) for at in (2, 2 + len(receivers))]

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
@@ -67,12 +68,13 @@ class StateLanes:
             at = np.flatnonzero(np.diff(steps.astype(np.int64), prepend=self._last[i]))
             self._last[i] = int(steps[-1])
             if len(at):
-                yield path, at, states(lane, steps[at].tolist())
+                yield path, at, states(lane, steps[at])
 
 
-def states(lane: Lane, codes: Iterable[int]) -> rr.ComponentColumnList:
+def states(lane: Lane, codes: Sequence[int] | NDArray[np.integer]) -> rr.ComponentColumnList:
     """The words of codes of a lane, as Rerun's states."""
-    return rr.StateChange.columns(state=[lane.words[code] for code in codes])
+    words: Any = pa.array(lane.words).take(pa.array(codes))
+    return rr.StateChange.columns(state=words)
 
 
 _KNOWLEDGE_PATH = "knows"
@@ -104,7 +106,7 @@ class WhoKnowsWhat(ViewPanel):
         for shown, path, knows in zip(self.scene.receivers, self._lanes.paths, self._knowledge, strict=True):
             peer = slots.peers[shown.name]
             distances = self._distance.of(slots.x, peer.x_hat)
-            changes = [*knows.changes(slots.first, knowledge(self.scene, slots.x, peer), distances)]
+            changes = [*knows.changes(slots.first, knowledge(self.scene, slots.x, peer.x_hat, peer.P), distances)]
             if changes:
                 k, codes = zip(*changes, strict=True)
                 yield Column(path, np.array(k, np.int64), states(knows.lane, codes))
@@ -197,7 +199,9 @@ class DrawnGraph:
     def columns(self, labels: Sequence[str], colours: Sequence[Colour]) -> rr.ComponentColumnList:
         """Labels and colours of all nodes at some times: those of the first time, then those of the second, and so on."""
         lengths = [len(self.nodes)] * (len(labels) // len(self.nodes))
-        return rr.GraphNodes.columns(labels=labels, colors=[letters(colour) for colour in colours]).partition(lengths)
+        words: Any = pa.array(labels, pa.utf8())
+        inks = np.array([letters(colour) for colour in colours], np.uint8)
+        return rr.GraphNodes.columns(labels=words, colors=inks).partition(lengths)
 
 
 @dataclass(frozen=True)
@@ -257,34 +261,30 @@ class LastPacket(ViewPanel):
         at = frames(self.scene, slots.first, slots.count)
         if not len(at):
             return
-        words_sent = lanes.sent_lane(self.scene).words
-        sent = [words_sent[code] for code in lanes.sent(slots)[at].tolist()]
-        links = [self._fates(shown, slots, at.tolist()) for shown in self.scene.receivers]
-        words = [self._known(shown, slots, at.tolist()) for shown in self.scene.receivers]
-        labels, colours = [], []
-        for k, word in enumerate(sent):
-            nodes = [
-                (f"sensor: {word}", TRUTH),
-                ("router", TRUTH),
-                *(column[k] for column in links),
-                *(column[k] for column in words),
-            ]
-            labels += [label for label, _ in nodes]
-            colours += [colour for _, colour in nodes]
+        words = lanes.sent_lane(self.scene).words
+        sent = [f"sensor: {words[code]}" for code in lanes.sent(slots)[at].tolist()]
+        nodes = [(sent, [TRUTH] * len(at)), (["router"] * len(at), [TRUTH] * len(at))]
+        nodes += [self._fates(shown, slots, at) for shown in self.scene.receivers]
+        nodes += [self._known(shown, slots, at) for shown in self.scene.receivers]
+        labels, colours = (
+            [value for frame in zip(*of, strict=True) for value in frame] for of in zip(*nodes, strict=True)
+        )
         yield Column(_GRAPH_PATH, slots.numbers[at], self._drawn.columns(labels, colours))
 
-    def _fates(self, shown: Shown, slots: SceneSlots, at: list[int]) -> list[tuple[str, Colour]]:
-        words, codes = lanes.lane_of(shown, self.scene).words, lanes.received(shown, slots)[at]
-        return [(words[code], FATES[code]) for code in codes.tolist()]
+    def _fates(self, shown: Shown, slots: SceneSlots, at: NDArray[np.intp]) -> tuple[list[str], list[Colour]]:
+        """The labels and colours of a link at frames."""
+        words, codes = lanes.lane_of(shown, self.scene).words, lanes.received(shown, slots)[at].tolist()
+        return [words[code] for code in codes], [FATES[code] for code in codes]
 
-    def _known(self, shown: Shown, slots: SceneSlots, at: list[int]) -> list[tuple[str, Colour]]:
-        peer = slots.peers[shown.name]
-        distances = self._distance.of(slots.x[at], peer.x_hat[at]).tolist()
-        statuses = [Synchronisation(code) for code in knowledge(self.scene, slots.x, peer)[at].tolist()]
-        return [
-            (f"{shown.name}: {self._distance.text(distance)} off", self._ink(shown, status))
-            for status, distance in zip(statuses, distances, strict=True)
-        ]
+    def _known(self, shown: Shown, slots: SceneSlots, at: NDArray[np.intp]) -> tuple[list[str], list[Colour]]:
+        """The labels and colours of a receiver at frames."""
+        x, x_hat, P = slots.x[at], slots.peers[shown.name].x_hat[at], slots.peers[shown.name].P[at]
+        inks = [self._ink(shown, status) for status in Synchronisation]
+        distances = self._distance.of(x, x_hat).tolist()
+        return (
+            [f"{shown.name}: {self._distance.text(distance)} off" for distance in distances],
+            [inks[status] for status in knowledge(self.scene, x, x_hat, P).tolist()],
+        )
 
     def _ink(self, shown: Shown, status: Synchronisation) -> Colour:
         """The receiver's own colour, unless it is an eavesdropper that knows the state."""

@@ -268,7 +268,7 @@ def _off(name: str) -> str:
 Points = NDArray[np.float32]
 
 _FRAMES_PER_SECOND = 30.0
-_MOST_FRAMES = 4_000
+_MOST_FRAMES = 2_000
 _MOST_FRAMES_IN_REAL_TIME = 30_000  # five a second for more than an hour
 _LARGEST = 1e30  # Rerun's points are float32
 _FRAMED_SLOTS = 130  # the length of the path of the truth
