@@ -1,4 +1,4 @@
-"""The recursions of the theory in exact fractions, from docs/mathematics.md and not from the code under test.
+"""The recursions of the theory in exact fractions, from docs/mathematics/ and not from the code under test.
 
 Values are rounded to 400 bits after each slot, which keeps them short, and is far more than any condition number needs.
 """

@@ -199,7 +199,7 @@ def test_a_large_mean_is_as_exact_as_a_small_one() -> None:
     ],
 )
 def test_delays_of_the_document(mu: float, mu_e: float, attack: str, delay: float) -> None:
-    """The table of docs/mathematics.md: packets until the alarm, with false alarms 10 000 packets apart."""
+    """The table of docs/mathematics/attacks.md: packets until the alarm, with false alarms 10 000 packets apart."""
     normal = rates_of("none", mu, mu_e).arrives
     attacked = rates_of(attack, mu, mu_e).arrives
     assert chart_for(normal, attacked, 1e4).run_length(attacked) == pytest.approx(delay, rel=1e-3)

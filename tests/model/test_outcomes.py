@@ -1,4 +1,4 @@
-"""The outcomes of a slot by scheme and strategy, against the table of docs/mathematics.md."""
+"""The outcomes of a slot by scheme and strategy, against the table of docs/mathematics/."""
 
 from __future__ import annotations
 

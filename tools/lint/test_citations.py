@@ -56,20 +56,23 @@ def test_every_cited_section_exists() -> None:
 
 
 def test_every_cited_section_of_the_mathematics_exists() -> None:
-    """Wherever code cites docs/mathematics.md, as its source or in passing."""
-    headings = re.findall(
-        r"^## (.+)$", (ROOT / "docs" / "mathematics.md").read_text(encoding="utf-8").lower(), re.MULTILINE
-    )
+    """Wherever code cites a page of docs/mathematics/, as its source or in passing."""
+    headings = {
+        path.stem: re.findall(r"^## (.+)$", path.read_text(encoding="utf-8").lower(), re.MULTILINE)
+        for path in (ROOT / "docs" / "mathematics").glob("*.md")
+    }
     cited = [
-        (name, section.lower())
+        (name, page, section.lower())
         for name in FILES
-        for section in re.findall(
-            r"docs/mathematics\.md, ([A-Za-z][\w ]*\w)", (ROOT / name).read_text(encoding="utf-8")
+        for page, section in re.findall(
+            r"docs/mathematics/(\w+)\.md, ([A-Za-z][\w -]*\w)", (ROOT / name).read_text(encoding="utf-8")
         )
     ]
-    assert len(cited) > 20
+    assert len(cited) > 100
     assert [
-        (name, section) for name, section in cited if not any(section.startswith(title) for title in headings)
+        (name, page, section)
+        for name, page, section in cited
+        if not any(section.startswith(title) for title in headings[page])
     ] == []
 
 

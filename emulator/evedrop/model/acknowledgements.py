@@ -103,7 +103,7 @@ class HeedRule(NamedTuple):
         1 − (1−μ_e)^J (1 − μ_e a) = α, with the patience J and the fraction a. None if there is no choice: where no
         acknowledgement is lost, and where nothing is overheard.
 
-        Source: after Lu, Quevedo, Gupta, Dey (2020); docs/mathematics.md, the hijacked sensor.
+        Source: after Lu, Quevedo, Gupta, Dey (2020); docs/mathematics/attacks.md, the hijacked sensor.
         """
         if quality >= 1.0 or 1.0 - overheard == 1.0:
             return None
@@ -254,7 +254,7 @@ def rates_of(attack: str, mu: float, mu_e: float, quality: float = 1.0, flip: fl
 
     flip: the probability of a flip.
 
-    Source: docs/mathematics.md, attacks on acknowledgements.
+    Source: docs/mathematics/attacks.md, attacks on acknowledgements.
     """
     gamma, gamma_e, flips = (np.arange(8) >> bit & 1 == 0 for bit in range(3))
     chances = np.where(gamma, mu, 1.0 - mu) * np.where(gamma_e, mu_e, 1.0 - mu_e) * np.where(flips, flip, 1.0 - flip)
@@ -281,7 +281,7 @@ class HoldingTime:
 
     Acknowledgements that are blocked or lost make h too large, never too small.
 
-    Source: docs/mathematics.md, schedules by holding time.
+    Source: docs/mathematics/schemes.md, schedules by holding time.
     """
 
     def __init__(self, trials: int) -> None:

@@ -4,7 +4,7 @@ Both minimise Σ xᵀW_x x + uᵀW_u u + (u − u′)ᵀW_r (u − u′) over de
 
 The linear quadratic regulator ignores limits and disturbances and clips its inputs: u = −K [x; u′]. It needs no solver and gives
 the same bits on every machine; the Riccati equation is solved by the structured doubling algorithm (Chu, Fan and Lin 2005, Linear
-Algebra and its Applications 396; docs/mathematics.md, regulator).
+Algebra and its Applications 396; docs/mathematics/plant.md, regulator).
 
 In model predictive control, every decision finds the best inputs over a horizon of decisions and applies the first. It minimises
 the sum with soft·‖s‖² added over `horizon` decisions of a period each, with disturbances constant at their current values, within

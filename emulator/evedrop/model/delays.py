@@ -61,7 +61,7 @@ class DelayModel(ABC):
 class ConstantDelay(DelayModel):
     """A delay of `value`.
 
-    Source: docs/mathematics.md, late packets.
+    Source: docs/mathematics/links.md, late packets.
     """
 
     parameters = MappingProxyType({"value": 2.0})
@@ -87,7 +87,7 @@ class ConstantDelay(DelayModel):
 class Normal(DelayModel):
     """Delays max(0, mean + standard_deviation · N(0, 1)), independent, so packets may overtake each other.
 
-    Source: docs/mathematics.md, late packets.
+    Source: docs/mathematics/links.md, late packets.
     """
 
     parameters = MappingProxyType({"mean": 2.0, "standard_deviation": 0.5})
@@ -117,7 +117,7 @@ class Normal(DelayModel):
 class Pareto(DelayModel):
     """Delays least · U^(−1/shape), independent: P(delay > d) = (least/d)^shape for d ≥ least.
 
-    Source: docs/mathematics.md, late packets.
+    Source: docs/mathematics/links.md, late packets.
     """
 
     parameters = MappingProxyType({"least": 0.5, "shape": 2.0})

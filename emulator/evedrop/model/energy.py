@@ -1,6 +1,6 @@
 """The energy that a sensor spends on its packets.
 
-Source: docs/mathematics.md, energy.
+Source: docs/mathematics/schemes.md, energy.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 It knows the plant, its inputs and its disturbances, so its innovations are white, with covariance S_k, and the transmitted
 estimate follows x̂ˢ_{k+1} = A x̂ˢ_k + B u_k + B_d d_k + K_{k+1} ν_{k+1}: for the network, process noise of covariance K S Kᵀ.
 
-Source: docs/mathematics.md, a filter at the sensor.
+Source: docs/mathematics/plant.md, a filter at the sensor.
 """
 
 from __future__ import annotations

@@ -275,7 +275,7 @@ def _limit_step(process: Process, chain: Chain, outcomes_at: OutcomesAt, states:
 def tail_outcomes(chain: Chain, outcomes_at: OutcomesAt) -> Outcomes:
     """The outcomes of an independent link whose errors last equally long; `kept`: the rate at which the chain keeps errors.
 
-    Source: docs/mathematics.md, losses in bursts.
+    Source: docs/mathematics/links.md, losses in bursts.
     """
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
     if all(outcome.predicted + outcome.leaked == 0.0 for outcome in outcomes):

@@ -20,7 +20,7 @@ from evedrop.model.streams import Ahead, Batch, BlockReader
 class StateVariances:
     """Σ_k[i, i], (n,). Slots may be asked for in any order; in order is quick.
 
-    Source: docs/mathematics.md, model.
+    Source: docs/mathematics/model.md, model.
     """
 
     def __init__(self, process: Process) -> None:
@@ -49,7 +49,7 @@ class DitheredQuantiser:
     is uniform on [−Δ/2, Δ/2). The value read differs from the state by a number that is uniform on (−Δ/2, Δ/2] and independent
     of the state, as long as state plus dither lies in the range; beyond, it is cut to the last level (overload).
 
-    Source: docs/mathematics.md, quantised packets.
+    Source: docs/mathematics/schemes.md, quantised packets.
     """
 
     def __init__(self, process: Process, bits: int, standard_deviations: float, key: bytes, batch: Batch) -> None:

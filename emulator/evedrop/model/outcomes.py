@@ -1,6 +1,6 @@
 """The outcomes of a slot at a receiver, by scheme and strategy, where one slot alone determines them.
 
-Source: docs/mathematics.md, eavesdroppers; docs/schemes.md.
+Source: docs/mathematics/eavesdroppers.md, eavesdroppers; docs/schemes.md.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ def _use_one(uses_block: Callable[..., Flags | None]) -> Callable[..., Flags | N
 class PacketUser(Receiver):
     """Its covariance is its own belief; where it used an innovation as the state, the actual covariance differs.
 
-    Source: Lemma V.1; docs/mathematics.md, eavesdroppers.
+    Source: Lemma V.1; docs/mathematics/eavesdroppers.md, eavesdroppers.
     """
 
     def __init_subclass__(cls, **options: Any) -> None:

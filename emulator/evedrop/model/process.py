@@ -3,7 +3,7 @@
 Arrays of a batch have the trials as last axis: x is (n, R), P is (n, n, R). The two products below are elementwise over
 that axis, in a fixed order, so a trial's bits do not depend on the batch or the machine.
 
-Source: docs/mathematics.md, model.
+Source: docs/mathematics/model.md, model.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ class StateFactors:
 
     Σ_k itself is never formed: in the unstable example its Cholesky factorisation fails from k = 45 on.
 
-    Source: docs/mathematics.md, encoding noise.
+    Source: docs/mathematics/numerics.md, encoding noise.
     """
 
     def __init__(self, process: Process) -> None:
@@ -218,7 +218,7 @@ def mistakes_of(
 
     singular_noise: Q may be singular.
 
-    Source: docs/mathematics.md, model (assumptions).
+    Source: docs/mathematics/model.md, model (assumptions).
     """
     mistakes: list[tuple[str, str]] = []
     if max(map(len, (A, Q, initial_covariance))) > MOST_STATES:

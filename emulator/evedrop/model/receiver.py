@@ -177,7 +177,7 @@ def asymmetry(P: Floats) -> tuple[int, ...] | None:
 def prior(process: Process, trials: int, first: int = 0) -> Belief:
     """Belief of a receiver before slot `first` if it has heard nothing: x̂ = 0, P = Σ_{first−1}, and Σ0 before slot 0.
 
-    Source: docs/mathematics.md, legitimate estimator.
+    Source: docs/mathematics/model.md, legitimate estimator.
     """
     sigma = process.initial_covariance[:, :, None]
     for _ in range(first - 1):

@@ -56,7 +56,7 @@ class ReferenceCode:
     L_{t,k} = L_k ⋯ L_{t+1} = Σ_k A^{−mᵀ} Σ_t⁻¹ with m = k − t, so that Cov(x_k − L_{t,k} x_t, x_k) = 0. If A is singular, L = A.
     open_loop: L = A for any A. ages_kept: slots whose ages are kept; that of an older slot is computed again.
 
-    Source: docs/mathematics.md, acknowledged references.
+    Source: docs/mathematics/schemes.md, acknowledged references.
     """
 
     def __init__(self, process: Process, open_loop: bool = False, ages_kept: int = _OLDEST_KEPT) -> None:
@@ -265,7 +265,7 @@ class ReferenceReceiver(Receiver):
 
     An estimator whose acknowledgements are not forged always has the reference, because it acknowledged it: r has no error.
 
-    Source: docs/mathematics.md, acknowledged references.
+    Source: docs/mathematics/schemes.md, acknowledged references.
     """
 
     def __init__(self, process: Process, trials: int, open_loop: bool = False) -> None:

@@ -126,6 +126,6 @@ class ReferenceForm(ClosedForm):
 
         After such a packet nothing ends the growth of its error, in any trial.
 
-        Source: docs/mathematics.md, heavy tails.
+        Source: docs/mathematics/model.md, heavy tails.
         """
         return self.acknowledged[1] == 0.0 and has_infinite_variance(self.process, Outcomes.plain(self.received))

@@ -56,7 +56,7 @@ class Schedule:
 
     Known to sensor and legitimate estimator, and to those eavesdroppers that are defined to know it.
 
-    Source: docs/mathematics.md, model.
+    Source: docs/mathematics/model.md, model.
     """
 
     def __init__(self, key: bytes, state_probability: StateProbability, batch: Batch) -> None:

@@ -4,7 +4,7 @@ With Q = G Gᵀ of rank r < n the noise of m slots reaches the range of [G, A G,
 states that noise reaches later come first, and those that it never reaches come before all others; Q becomes diag(0, 1). Every
 covariance that began as 0 then has rows of exact zeros, in floating point too. Which ranges there are is decided here, once.
 
-Source: docs/mathematics.md, singular noise.
+Source: docs/mathematics/numerics.md, singular noise.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ slot · 2⁶⁴ + trial · (16-byte blocks per trial). Any number can be drawn w
 removing, losing or delaying anything does not change the numbers of other streams. The conversions to uniforms and normals
 are this project's own, so that no release of a library changes them.
 
-Source: docs/mathematics.md, random numbers.
+Source: docs/mathematics/numerics.md, random numbers.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Lineage:
     A trial is a function of its random numbers, so one that reads those of another up to some slot is a copy of it up to
     there, with whatever memory links, packets and receivers have.
 
-    Source: docs/mathematics.md, splitting.
+    Source: docs/mathematics/verdicts.md, splitting.
     """
 
     stops: tuple[int, ...] = ()

@@ -9,7 +9,7 @@
 
 Before slot 0 there is the prior of x_0 itself, so slot 0 is not predicted: a lost packet leaves x̂ = 0, P = Σ0, e = x_0.
 
-Source: Theorem IV.1, Lemma V.1; docs/mathematics.md, eavesdroppers.
+Source: Theorem IV.1, Lemma V.1; docs/mathematics/eavesdroppers.md, eavesdroppers.
 """
 
 from __future__ import annotations

@@ -181,7 +181,7 @@ class Needs:
 class PacketLeak:
     """What a packet of a scheme reveals without the secret, to a receiver that knows its type: the mean over the run's slots.
 
-    Source: docs/mathematics.md, leak in bits.
+    Source: docs/mathematics/eavesdroppers.md, leak in bits.
     """
 
     clear_fraction: float

@@ -380,7 +380,7 @@ def _application_objections(scenario: Scenario) -> list[str]:
 
 
 def horizon_mistakes(process: Process, slots: int) -> list[str]:
-    """A mistake if float64 cannot follow the process for that many slots (docs/mathematics.md, horizon)."""
+    """A mistake if float64 cannot follow the process for that many slots (docs/mathematics/numerics.md, horizon)."""
     last = horizon(process, slots)
     if last is None:
         return []

@@ -3,7 +3,7 @@
 For a budget, it is the threshold of the encryption schedule that meets it, and what other thresholds cost and achieve. For when
 to send, it is the best transmission policies against each eavesdropper.
 
-Source: docs/mathematics.md, quantised packets, and the best policy.
+Source: docs/mathematics/schemes.md, quantised packets; docs/mathematics/secrecy.md, the best policy.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ _NEAR = 0.01  # relative to a covariance's largest entry
 def warnings_of(scenario: Scenario) -> list[str]:
     """Warnings that the user should read before the run; the run starts regardless.
 
-    Source: docs/mathematics.md, secrecy and design (stability bound).
+    Source: docs/mathematics/secrecy.md, secrecy and design (stability bound).
     """
     warnings = []
     process, mu_d = scenario.process.process, scenario.encoding.mu_d
@@ -63,7 +63,7 @@ def _reference_warnings(scenario: Scenario, mu: float) -> list[str]:
 
     mu: the quality of its link, 0 if that varies.
 
-    Source: docs/mathematics.md, flipped acknowledgements.
+    Source: docs/mathematics/attacks.md, flipped acknowledgements.
     """
     table = scenario.acknowledgements
     if table is None or table.attack not in FORGING or mu == 0.0:
@@ -82,7 +82,7 @@ def _reference_warnings(scenario: Scenario, mu: float) -> list[str]:
 def _filter_warnings(scenario: Scenario) -> list[str]:
     """Warnings about a Q that does not match the sensor's filter, and about a singular Q, which reveals packet types.
 
-    Source: docs/mathematics.md, a filter at the sensor.
+    Source: docs/mathematics/plant.md, a filter at the sensor.
     """
     warnings = []
     process, driven = scenario.process.process, scenario.driven

@@ -3,7 +3,7 @@
 A sensor that measures and filters has mistakes of its own in its entries. Some eavesdroppers cannot work with a singular Q, each
 for a reason that its message gives.
 
-Source: docs/scenario.md, plant; docs/mathematics.md, a filter at the sensor, and singular noise.
+Source: docs/scenario.md, plant; docs/mathematics/plant.md, a filter at the sensor; docs/mathematics/numerics.md, singular noise.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A receiver whose slots differ has a closed form, as the scheme's class states it.
 
-Source: docs/mathematics.md, acknowledged references, schedules by holding time and noise packets.
+Source: docs/mathematics/schemes.md, acknowledged references, schedules by holding time and noise packets.
 """
 
 from __future__ import annotations
@@ -288,7 +288,10 @@ class Expectation:
         return None if outcomes is None else growth(self.process, outcomes)
 
     def streaks(self, slots: int) -> Streaks | None:
-        """What streaks carry of its error in slots 0 … slots−1; None unless a closed form knows them (docs/mathematics.md)."""
+        """What streaks carry of its error in slots 0 … slots−1; None unless there is a closed form.
+
+        Source: docs/mathematics/verdicts.md, rare events.
+        """
         if self.closed is not None or self._known is None:
             return None
         if self._outcomes is not None and not self._outcomes.leaked:
@@ -298,7 +301,7 @@ class Expectation:
 
     @property
     def infinite_variance(self) -> bool:
-        """Whether the variance of tr P over trials has no bound (docs/mathematics.md, heavy tails)."""
+        """Whether the variance of tr P over trials has no bound (docs/mathematics/model.md, heavy tails)."""
         if self.bound is not None:
             return self.bound.infinite_variance
         if self.closed is not None:

@@ -3,7 +3,7 @@
 The first half of a run does not count: there, few packets decide. Several trials are the samples of a comparison. A single trial,
 and a run that has not ended, is divided into batches of consecutive slots instead.
 
-Source: docs/mathematics.md, verdicts.
+Source: docs/mathematics/verdicts.md, verdicts.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What the packets that an eavesdropper received reveal without the secret: unencrypted states, and bits of other packets.
 
-Source: docs/mathematics.md, leak in bits.
+Source: docs/mathematics/eavesdroppers.md, leak in bits.
 """
 
 from __future__ import annotations

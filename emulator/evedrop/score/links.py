@@ -2,7 +2,8 @@
 
 Of acknowledgements: their channel, the attack on it, and the chart with which the sensor detects the attack.
 
-Source: docs/results.md, links; docs/mathematics.md, links, attacks on acknowledgements, and detecting an attack.
+Source: docs/results.md, links; docs/mathematics/links.md, links;
+docs/mathematics/attacks.md, attacks on acknowledgements and detecting an attack.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What rare events carry of a receiver's expected error, and the z-score of an error that they do not carry.
 
-Source: docs/mathematics.md, rare events and z-scores.
+Source: docs/mathematics/verdicts.md, rare events and z-scores.
 """
 
 from __future__ import annotations

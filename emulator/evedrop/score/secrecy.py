@@ -1,6 +1,6 @@
 """Whether secrecy held in a run, and whether theory promises it. "Too few trials to tell" is a verdict of its own.
 
-Source: docs/mathematics.md, secrecy and design; docs/results.md, verdict.
+Source: docs/mathematics/secrecy.md, secrecy and design; docs/results.md, verdict.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ _PROMISED_SLOTS = 10_000  # for which theory is computed at least
 def sign_of_mean(samples: Floats) -> SignTest:
     """Tests on the mean of samples (R,), by Student's t and by the same corrected for skewness: the larger p-value counts.
 
-    Source: docs/mathematics.md, verdicts.
+    Source: docs/mathematics/verdicts.md, verdicts.
     """
     tests = student_test(samples, 0.0), skewed_test(samples, 0.0)
     possible = [test for test in tests if test is not None]
@@ -161,7 +161,7 @@ def sign_of_median(samples: Floats) -> SignTest:
 def rejected(p_values: Mapping[int, float]) -> list[int]:
     """The hypotheses, by number, that Holm's method rejects: at most one time in a hundred is any of them true.
 
-    Source: docs/mathematics.md, verdicts.
+    Source: docs/mathematics/verdicts.md, verdicts.
     """
     hypotheses = []
     for place, hypothesis in enumerate(sorted(p_values, key=lambda at: p_values[at])):
@@ -358,7 +358,7 @@ def _larger(means: MeanErrors, test: SignTestOf) -> bool | None:
     """Whether the eavesdropper's error is larger in the second half; False: at most `AS_MUCH` times as large; None: undecided.
 
     Where the tails of its error are too heavy for a test of means, half its median may decide: an error that is not negative
-    has a mean of at least that. Source: docs/mathematics.md, verdicts.
+    has a mean of at least that. Source: docs/mathematics/verdicts.md, verdicts.
     """
 
     def tests(less: Floats | None, more: Floats | None, factor: float = 1.0) -> SignTest:
@@ -416,7 +416,7 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
     it has a probability of at most 4.6/R, or one of them would have met it in 99 of 100 studies. The error is then taken to be
     that of the heaviest trial, or, where too few trials lose the first packet, that of a receiver without packets.
 
-    Source: docs/mathematics.md, verdicts.
+    Source: docs/mathematics/verdicts.md, verdicts.
     """
     trials = means.shape[1]
     if theory.known:

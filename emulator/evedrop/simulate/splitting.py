@@ -4,7 +4,7 @@ A copy is a trial that reads the random numbers of its ancestor up to the slot o
 the simulation is that of all other trials, and nothing in it has to be copied. After a split the slots before it are simulated
 again.
 
-Source: docs/mathematics.md, splitting; docs/montecarlo.md, rare events.
+Source: docs/mathematics/verdicts.md, splitting; docs/montecarlo.md, rare events.
 """
 
 from __future__ import annotations

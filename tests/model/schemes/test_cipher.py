@@ -22,7 +22,7 @@ KEY = stream_key(ROOT, "mask")
 
 
 def masked_in_words(process: Process, k: int, x: np.ndarray, trial: int) -> list[float]:
-    """The formula of docs/mathematics.md for one state, in Python's integers."""
+    """The formula of docs/mathematics/schemes.md for one state, in Python's integers."""
     words = Stream(KEY, range(trial, trial + 1), process.n).words(range(k, k + 1))[0, 0].tolist()
     masked = []
     for i, word in enumerate(words):

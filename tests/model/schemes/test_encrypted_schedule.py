@@ -36,7 +36,7 @@ MU, MU_E, ARRIVES = 0.7, 0.6, 0.8
 def quantised_in_words(
     process: Process, k: int, x: float, i: int, trial: int, bits: int, standard_deviations: float
 ) -> float:
-    """The value read of one state by docs/mathematics.md, from the words of the stream."""
+    """The value read of one state by docs/mathematics/schemes.md, from the words of the stream."""
     word = int(Stream(DITHER, range(trial, trial + 1), process.n).words(range(k, k + 1))[0, 0, i])
     step = 2.0 * standard_deviations * float(np.sqrt(state_covariances(process, k + 1)[k, i, i])) / 2.0**bits
     dither = ((word >> 11) / 2.0**53 - 0.5) * step

@@ -36,7 +36,7 @@ def test_theory_of_packets_is_not_inherited(base: type[Scheme]) -> None:
 
 
 def test_the_built_in_classes_say_what_theory_knows() -> None:
-    """The facts are those of docs/mathematics.md: packets of states and innovations, closed forms, floors."""
+    """The facts are those of docs/mathematics/: packets of states and innovations, closed forms, floors."""
     assert {name for name in SCHEMES if SCHEMES[name].sends_states_and_innovations} == {"innovation", "plain"}
     assert {name for name in SCHEMES if SCHEMES[name].closed_forms} == {
         "acknowledged",

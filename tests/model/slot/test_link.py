@@ -91,7 +91,7 @@ def test_bits_do_not_depend_on_pieces_or_on_the_batch(name: str) -> None:
 
 
 def reference(schedule: LinkSchedule, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
-    """Codes and delays of a link of independent losses, packet by packet from docs/mathematics.md, links."""
+    """Codes and delays of a link of independent losses, packet by packet from docs/mathematics/links.md, links."""
     codes, delays = np.zeros((batch.slots, batch.trials), int), np.zeros((batch.slots, batch.trials), int)
     losses, chances = drawn("link/it", 1, batch), drawn("fate/it", 3, batch)
     words = Stream(stream_key(ROOT, "delay/it"), batch.trial_range, 1).words(range(batch.slots))

@@ -88,7 +88,7 @@ def test_a_stable_mode_goes_on_leaking() -> None:
     bits = LeakedBits(UNSTABLE).next(3000)
     expected = 0.5 * math.log2(np.linalg.det(UNSTABLE.Q) / np.linalg.det(remaining_limit(UNSTABLE)))
     assert bits[-1] == pytest.approx(expected, rel=1e-9)
-    assert round(expected, 3) == 0.706  # as docs/mathematics.md says
+    assert round(expected, 3) == 0.706  # as docs/mathematics/eavesdroppers.md says
     growing = Process(np.array([[1.3, 0.2], [0.0, 1.1]]), np.eye(2), np.eye(2))
     assert 0.0 <= LeakedBits(growing).next(400)[-1] < 1e-20
     steep = Process(np.array([[1e10, 0.3], [0.0, 0.999]]), np.array([[1.0, 0.5], [0.5, 1.0]]), np.eye(2))
@@ -111,7 +111,7 @@ def test_bits_do_not_depend_on_how_many_slots_are_asked_for() -> None:
 
 
 def test_schemes_say_what_their_packets_reveal() -> None:
-    """The table of docs/mathematics.md; nothing is claimed where it depends on the packets before."""
+    """The table of docs/mathematics/eavesdroppers.md; nothing is claimed where it depends on the packets before."""
     bits = {}
     for name in SCHEMES:
         revealed = scheme_of(MICROGRID, {"scheme": name, **SCHEMES[name].parameters}).revealed_bits()

@@ -6,7 +6,7 @@ packets were innovations. A packet either starts a new component, or is one more
 
 The genie uses all information in a packet. No eavesdropper without the secret does better.
 
-Source: docs/mathematics.md, bayesian eavesdropper.
+Source: docs/mathematics/eavesdroppers.md, bayesian eavesdropper.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Genie(PacketReader):
 
     Its belief is correct, and its mean error is a lower bound for every eavesdropper behind the same link.
 
-    Source: docs/mathematics.md, genie.
+    Source: docs/mathematics/eavesdroppers.md, genie.
     """
 
     only_against = ("innovation", "uses what innovations leak, and there are none")

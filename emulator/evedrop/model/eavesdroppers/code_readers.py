@@ -22,7 +22,7 @@ class Reference(PacketReader):
 
     Intended only for the schemes `acknowledged`, `open-loop`, `random-code` and `threshold-code`, against which it is optimal.
 
-    Source: docs/mathematics.md, acknowledged references.
+    Source: docs/mathematics/schemes.md, acknowledged references.
     """
 
     only_against = (
@@ -58,7 +58,7 @@ class ClearStates(PacketReader):
     `Belief.memory` is a factor X of P = X Xᵀ, (n, n, R). An unencrypted state is a measurement without noise; the rows of X are
     made triangular, the unencrypted ones first, so no difference of covariances is taken.
 
-    Source: docs/mathematics.md, partial encryption.
+    Source: docs/mathematics/schemes.md, partial encryption.
     """
 
     only_against = (

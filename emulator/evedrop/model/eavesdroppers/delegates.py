@@ -66,7 +66,7 @@ class Delegate(Eavesdropper):
 class Colluding(Delegate):
     """Reads as the strategy `reads_as` does.
 
-    Source: docs/mathematics.md, further eavesdroppers.
+    Source: docs/mathematics/eavesdroppers.md, further eavesdroppers.
     """
 
     pools_links = True
@@ -75,7 +75,7 @@ class Colluding(Delegate):
 class ReplayInformed(Delegate):
     """Learns x_j in the slot j = `learns_at` from `Reception.truth`; otherwise reads as the strategy `reads_as` does.
 
-    Source: docs/mathematics.md, further eavesdroppers.
+    Source: docs/mathematics/eavesdroppers.md, further eavesdroppers.
     """
 
     parameters = MappingProxyType({"learns_at": 40, "reads_as": "smart"})

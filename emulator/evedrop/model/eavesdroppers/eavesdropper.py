@@ -105,7 +105,7 @@ class Eavesdropper(Receiver):
 class PacketTaker(PacketUser, Eavesdropper):
     """The paper's class: uses a packet as the state, or ignores it.
 
-    Source: docs/mathematics.md, eavesdroppers.
+    Source: docs/mathematics/eavesdroppers.md, eavesdroppers.
     """
 
     @classmethod

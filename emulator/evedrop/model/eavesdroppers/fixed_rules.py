@@ -23,7 +23,7 @@ from evedrop.model.streams import Ahead, Batch, BlockReader
 class ConstantEstimate(PacketTaker):
     """b_k = 0 always: x̂ = 0 and P = Σ_k. An eavesdropper with a larger error would do better not to listen.
 
-    Source: docs/mathematics.md, eavesdroppers.
+    Source: docs/mathematics/eavesdroppers.md, eavesdroppers.
     """
 
     @classmethod
@@ -118,7 +118,7 @@ class Selective(PacketReader):
     Intended only for the schemes `encrypted-schedule`, against which it is optimal, and `quantised-schedule`, whose quantiser
     it takes for exact.
 
-    Source: docs/mathematics.md, schedules by holding time and quantised packets.
+    Source: docs/mathematics/schemes.md, schedules by holding time and quantised packets.
     """
 
     only_against = (

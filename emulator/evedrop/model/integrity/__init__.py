@@ -2,7 +2,7 @@
 
 Attacks and policies are registered here by their names in a scenario.
 
-Source: docs/mathematics.md, integrity.
+Source: docs/mathematics/attacks.md, integrity.
 """
 
 from __future__ import annotations

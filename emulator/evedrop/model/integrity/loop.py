@@ -2,7 +2,7 @@
 
 Here every packet arrives, and the controller decides u = −L x̂ in every slot. The watermark e adds to u.
 
-Source: docs/mathematics.md, integrity.
+Source: docs/mathematics/attacks.md, integrity.
 """
 
 from __future__ import annotations

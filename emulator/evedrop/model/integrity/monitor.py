@@ -1,6 +1,6 @@
 """The detector for the sensor's filter, slot by slot: it draws the watermark, and tests the filter's innovations.
 
-Source: docs/mathematics.md, integrity.
+Source: docs/mathematics/attacks.md, integrity.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The closed forms of quickest detection with a watermark: divergence, delay, false alarms and cost.
 
-Source: docs/mathematics.md, integrity.
+Source: docs/mathematics/attacks.md, integrity.
 """
 
 from __future__ import annotations

@@ -202,7 +202,7 @@ def triangular_factor(rows: Rows) -> Rows:
     This is Rᵀ of the QR decomposition of Mᵀ, with its signs fixed. It never forms M Mᵀ, so it works where a Cholesky
     decomposition of the covariance fails. Plain Python floats: 4 µs for n = 2, and the same bits on every machine.
 
-    Source: docs/mathematics.md, encoding noise.
+    Source: docs/mathematics/numerics.md, encoding noise.
     """
     work = [row[:] for row in rows]
     n, m = len(work), len(work[0])

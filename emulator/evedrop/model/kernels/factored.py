@@ -3,7 +3,7 @@
 With a process that grows as ρ^k, the eigenvalues of a covariance are as far apart as ρ^{2k}, and it soon cannot be factored
 any more. Its factors can be propagated instead, because their small entries stay accurate.
 
-Source: Thornton (1976), weighted Gram-Schmidt; docs/mathematics.md, bayesian eavesdropper.
+Source: Thornton (1976), weighted Gram-Schmidt; docs/mathematics/eavesdroppers.md, bayesian eavesdropper.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class Distance(LossModel):
     link begins, if that is within the block), so that two links with the same uniforms fade and are shadowed together, wherever
     their receivers are.
 
-    Source: docs/mathematics.md, path loss.
+    Source: docs/mathematics/links.md, path loss.
     """
 
     parameters = MappingProxyType(

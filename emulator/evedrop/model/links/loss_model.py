@@ -171,7 +171,7 @@ def count_variance(transitions: Floats, stationary: Floats, quality: Floats, slo
 class Bernoulli(LossModel):
     """P(γ_k = 1) = quality, which is μ for the legitimate estimator and μ_e for an eavesdropper.
 
-    Source: docs/mathematics.md, model.
+    Source: docs/mathematics/model.md, model.
     """
 
     parameters = MappingProxyType({"quality": 0.9})

@@ -25,7 +25,7 @@ class GilbertElliott(LossModel):
     At slot 0 the state has its stationary distribution: bad with probability p/(p+r). With good = 0 and bad = 1 a burst's length
     is geometric with mean 1/r.
 
-    Source: Gilbert (1960), Elliott (1963); docs/mathematics.md, losses in bursts.
+    Source: Gilbert (1960), Elliott (1963); docs/mathematics/links.md, losses in bursts.
     """
 
     parameters = MappingProxyType({"p": 0.05, "r": 0.5, "good": 0.0, "bad": 1.0})
@@ -110,7 +110,7 @@ class Markov(LossModel):
 
     At slot 0 the state has the chain's stationary distribution.
 
-    Source: docs/mathematics.md, losses in bursts.
+    Source: docs/mathematics/links.md, losses in bursts.
     """
 
     parameters = MappingProxyType({"transitions": [[0.95, 0.05], [0.5, 0.5]], "loss": [0.0, 1.0]})

@@ -1,6 +1,6 @@
 """The standard error of a mean over trials, and its distance from theory as a z-score.
 
-Source: docs/results.md, standard errors; docs/mathematics.md, z-scores.
+Source: docs/results.md, standard errors; docs/mathematics/verdicts.md, z-scores.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def z_of(of_trials: Floats | None, expected: float | None) -> float | None:
 
     None without theory, for fewer than two trials, and for trials that are all equal or not finite.
 
-    Source: docs/mathematics.md, z-scores.
+    Source: docs/mathematics/verdicts.md, z-scores.
     """
     test = None if expected is None else skewed_test(of_trials, expected)
     return None if test is None else test.z
@@ -93,7 +93,7 @@ def student_test(of_trials: Floats | None, number: float) -> MeanTest | None:
 def skewed_test(of_trials: Floats | None, number: float) -> MeanTest | None:
     """The same for trials whose distribution may be skewed and heavy-tailed, by Hall's transformation of t.
 
-    Source: docs/mathematics.md, z-scores.
+    Source: docs/mathematics/verdicts.md, z-scores.
     """
     test = student_test(of_trials, number)
     if of_trials is None or test is None:

@@ -97,7 +97,7 @@ class Acknowledged(_AcknowledgedReferences):
     secret: receivers differ only in which packets they heard, and the sensor knows that of one of them. The scheme therefore
     depends on acknowledgements that are neither blocked nor forged.
 
-    Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
+    Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics/schemes.md, acknowledged references.
     """
 
     closed_forms = MappingProxyType({"legitimate": _reference_form, "reference": _reference_form})
@@ -132,7 +132,7 @@ def _open_loop_form(scheme: OpenLoop, conditions: ReceiverConditions) -> Referen
 class OpenLoop(_AcknowledgedReferences):
     """Subtracts a reference that the estimator has, carried by A; an eavesdropper that missed it follows the stable modes later.
 
-    Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
+    Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics/schemes.md, acknowledged references.
     """
 
     closed_forms = MappingProxyType({"legitimate": _open_loop_form, "reference": _open_loop_form})

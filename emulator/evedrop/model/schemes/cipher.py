@@ -55,7 +55,7 @@ class CipherEstimator(Receiver):
 class Cipher(Scheme):
     """Masks every packet. Packets are independent of the state, so an eavesdropper can do no better than not to listen.
 
-    Source: docs/mathematics.md, stream cipher.
+    Source: docs/mathematics/schemes.md, stream cipher.
     """
 
     sent_words = ("encrypted state",)
@@ -81,7 +81,7 @@ class Cipher(Scheme):
     def error_floor(self, slots: int) -> tuple[Floats, bool]:
         """Tr Σ_k, (slots,): nothing can be learnt from packets. It grows unless A forgets.
 
-        Source: docs/mathematics.md, model.
+        Source: docs/mathematics/model.md, model.
         """
         traces: Floats = np.trace(state_covariances(self.process, slots), axis1=1, axis2=2)
         return traces, self.process.spectral_radius >= 1.0 - MARGINAL

@@ -76,7 +76,7 @@ class EncryptedSchedule(Scheme):
     For a sensor that can afford to encrypt only some packets. Where acknowledgements are blocked it encrypts all of them,
     which costs more than intended but preserves secrecy.
 
-    Source: after Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics.md, schedules by holding time.
+    Source: after Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics/schemes.md, schedules by holding time.
     """
 
     sent_words = ("state",)
@@ -192,7 +192,7 @@ class QuantisedSchedule(Scheme):
     θ need not be whole: at a holding time of ⌊θ⌋ a coin decides, so that any energy budget between that of unencrypted packets
     and that of a cipher is met exactly. The dither is public: an unencrypted packet is shown as the number that is read from it.
 
-    Source: Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics.md, quantised packets.
+    Source: Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics/schemes.md, quantised packets.
     """
 
     sent_words = ("state",)

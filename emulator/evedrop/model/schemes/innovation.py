@@ -29,7 +29,7 @@ class SharedSecret(Shared):
     χ_k = A L_{k−1} ξ_k with L Lᵀ = Σ_{k−1} factored by QR. Both are addressed by slot, so a lost packet desynchronises
     no one. Noise is drawn only where it is needed.
 
-    Source: docs/mathematics.md, encoding noise.
+    Source: docs/mathematics/numerics.md, encoding noise.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class SharedSecret(Shared):
 class InnovationEncoder(Encoder):
     """z_k = x_k, or x_k − A x_{k−1} + χ_k where ν_k = 1.
 
-    Source: the paper's encoding mechanism, and docs/mathematics.md, model.
+    Source: the paper's encoding mechanism, and docs/mathematics/model.md, model.
     """
 
     def __init__(self, secret: SharedSecret) -> None:
@@ -88,7 +88,7 @@ class InnovationEncoder(Encoder):
 class InnovationEstimator(Receiver):
     """The exact MMSE estimator with the secret.
 
-    Source: Theorem IV.1 (covariance) and docs/mathematics.md, legitimate estimator.
+    Source: Theorem IV.1 (covariance) and docs/mathematics/model.md, legitimate estimator.
     """
 
     def __init__(self, process: Process, trials: int, secret: SharedSecret) -> None:

@@ -67,7 +67,7 @@ class RandomCode(Scheme):
     A flipped acknowledgement leaves sensor and estimator with different references; the next state that it receives, if its
     acknowledgement is not flipped, synchronises them again.
 
-    Source: Lücke, Lu, Quevedo (2022); docs/mathematics.md, flipped acknowledgements.
+    Source: Lücke, Lu, Quevedo (2022); docs/mathematics/attacks.md, flipped acknowledgements.
     """
 
     parameters = MappingProxyType({"plain_probability": 0.3})
@@ -125,7 +125,7 @@ class RandomCode(Scheme):
 def forged_fraction(mu: float, flip: float) -> float:
     """P(γ = 0 | an acknowledgement arrives), where each slot's is flipped with probability p; 0 if none ever arrives.
 
-    Source: docs/mathematics.md, flipped acknowledgements.
+    Source: docs/mathematics/attacks.md, flipped acknowledgements.
     """
     forged = (1.0 - mu) * flip
     arrives = mu * (1.0 - flip) + forged
@@ -158,7 +158,7 @@ class ThresholdCode(Scheme):
 
     The sensor computes its belief from the link's quality and the probability of flips as it is told them.
 
-    Source: Lücke, Lu, Quevedo (2022); docs/mathematics.md, flipped acknowledgements.
+    Source: Lücke, Lu, Quevedo (2022); docs/mathematics/attacks.md, flipped acknowledgements.
     """
 
     parameters = MappingProxyType({"lost_belief": 0.1, "assumed_quality": 0.8, "assumed_flip": 0.1})

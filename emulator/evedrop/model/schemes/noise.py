@@ -94,7 +94,7 @@ class Noise(Scheme):
 
     Noise contains nothing, so an eavesdropper that knew the schedule would be behind only by the quality of its link.
 
-    Source: Crimson, Kennedy, Quevedo (2023); docs/mathematics.md, noise packets.
+    Source: Crimson, Kennedy, Quevedo (2023); docs/mathematics/schemes.md, noise packets.
     """
 
     sent_words = ("state", "noise")

@@ -74,7 +74,7 @@ class PartialEncryption(Scheme):
     For a sensor that can encrypt only few numbers. With μ_d = 0 only the packet of slot 0 is encrypted: an eavesdropper that
     reads everything else has the error A^k e_0, which grows without bound if A is unstable.
 
-    Source: after arXiv 2406.10677; docs/mathematics.md, partial encryption.
+    Source: after arXiv 2406.10677; docs/mathematics/schemes.md, partial encryption.
     """
 
     best_reader = "clear-states"

@@ -337,7 +337,7 @@ class Scheme(ABC):
         To a receiver without the secret that knows ν, beyond what all earlier packets revealed; inf: the packet is the state
         itself. The probability of ν = 0 must be `mu_d`. None: unknown.
 
-        Source: docs/mathematics.md, leak in bits.
+        Source: docs/mathematics/eavesdroppers.md, leak in bits.
         """
         return None
 

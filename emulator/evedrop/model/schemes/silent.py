@@ -43,7 +43,7 @@ class Withholding(Scheme):
     A receiver of a packet has the state, so receivers differ only in their rates. There is no secret: the estimator needs none,
     and an eavesdropper that knew the schedule would gain nothing.
 
-    Source: Tsiamis, Gatsis, Pappas (2017); docs/mathematics.md, withholding.
+    Source: Tsiamis, Gatsis, Pappas (2017); docs/mathematics/schemes.md, withholding.
     """
 
     parameters = MappingProxyType({"state_probability": 0.6})
@@ -124,7 +124,7 @@ class Scheduled(Scheme):
     There is no secret. An eavesdropper that misses the only packet after a silence knows nothing new until after the next
     silence. Where acknowledgements are blocked, the sensor sends in every slot, as `plain` does.
 
-    Source: Leong, Quevedo, Dolz, Dey (2019); docs/mathematics.md, schedules by holding time.
+    Source: Leong, Quevedo, Dolz, Dey (2019); docs/mathematics/schemes.md, schedules by holding time.
     """
 
     closed_forms = MappingProxyType(dict.fromkeys(("legitimate", "naive", "reference", "selective"), _chain_form))

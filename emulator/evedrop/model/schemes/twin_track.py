@@ -95,7 +95,7 @@ class TwinTrack(Scheme):
     x_0 is part of the secret, so the process must start from `initial_state`. Strategies that know the schedule of states and
     innovations do not apply to it, and no strategy has the key of `track` or `start`.
 
-    Source: docs/mathematics.md, twin track.
+    Source: docs/mathematics/schemes.md, twin track.
     """
 
     sent_words = ("track",)
@@ -122,7 +122,7 @@ class TwinTrack(Scheme):
     def error_floor(self, slots: int) -> tuple[Floats, bool]:
         """Half the error of a receiver that knows nothing of x_0, (slots,); it grows with the powers of A.
 
-        Source: docs/mathematics.md, twin track.
+        Source: docs/mathematics/schemes.md, twin track.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             soon, late = (np.abs(np.linalg.matrix_power(self.process.A, power)).max() for power in (_SOON, _LATE))

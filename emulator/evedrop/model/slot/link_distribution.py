@@ -1,6 +1,6 @@
 """The probabilities of a link: how likely each slot's packet has arrived some slots later, segment by segment.
 
-Source: docs/mathematics.md, late packets.
+Source: docs/mathematics/links.md, late packets.
 """
 
 from __future__ import annotations

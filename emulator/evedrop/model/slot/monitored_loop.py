@@ -2,7 +2,7 @@
 
 Its sensor, filter, plant and monitor are those of live runs.
 
-Source: docs/mathematics.md, integrity.
+Source: docs/mathematics/attacks.md, integrity.
 """
 
 from __future__ import annotations

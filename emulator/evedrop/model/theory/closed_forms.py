@@ -61,7 +61,7 @@ class ClosedForm(ABC):
     @property
     @abstractmethod
     def infinite_variance(self) -> bool:
-        """Whether the variance of tr P over trials has no bound (docs/mathematics.md, heavy tails)."""
+        """Whether the variance of tr P over trials has no bound (docs/mathematics/model.md, heavy tails)."""
 
     @property
     def growth(self) -> Growth | None:
@@ -137,7 +137,7 @@ def twin_track_bound(process: Process, slots: int) -> Floats:
 
     Holds for μ_e = 1, without knowledge of coin and starts, which the model takes as ideal random numbers. inf once it overflows.
 
-    Source: docs/mathematics.md, twin track.
+    Source: docs/mathematics/schemes.md, twin track.
     """
     bound = np.empty(slots)
     grown = process.initial_covariance
@@ -170,7 +170,7 @@ def reference_covariances(
     plain: the probability that a packet contains the state: P_k = 0 where that is heard. L: k → L_k; R⁻ = L R Lᵀ then. With
     either these are errors of a reader that takes z plus its own reference for the state: upper bounds on those of the best one.
 
-    Source: docs/mathematics.md, acknowledged references, flipped acknowledgements.
+    Source: docs/mathematics/schemes.md, acknowledged references; docs/mathematics/attacks.md, flipped acknowledgements.
     """
     heard, unheard = acknowledged
     covariances = np.empty((slots, process.n, process.n))
@@ -193,7 +193,7 @@ def reference_covariances(
 def reference_limit(process: Process, received: float, acknowledged: tuple[float, float], plain: float = 0.0) -> float:
     """Trace of the limit of `reference_covariances` with L = A; inf if it is unbounded, NaN if it is too large to compute.
 
-    Source: docs/mathematics.md, acknowledged references, flipped acknowledgements.
+    Source: docs/mathematics/schemes.md, acknowledged references; docs/mathematics/attacks.md, flipped acknowledgements.
     """
     heard, unheard = acknowledged
     if unheard == 0.0:
@@ -216,7 +216,7 @@ class SensorChain:
     Entry [s, r] of the two matrices is the probability, in state s, that the receiver's error is reset to 0, or predicted,
     and that the next state is r. All slots start in `start`.
 
-    Source: docs/mathematics.md, schedules by holding time.
+    Source: docs/mathematics/schemes.md, schedules by holding time.
     """
 
     start: Floats
@@ -276,7 +276,7 @@ class SensorChain:
         With ν the spectral radius of `carried` on the states that occur, the second moment grows as ν ρ⁴. Where ν = 1 the error
         is not reset any more, and grows alike in all trials.
 
-        Source: docs/mathematics.md, heavy tails.
+        Source: docs/mathematics/model.md, heavy tails.
         """
         occurs = self.start > 0.0
         for _ in occurs:
@@ -300,7 +300,7 @@ def scheduled(threshold: int, received: float, acknowledged: tuple[float, float]
     received: the probability that it hears a packet that is sent. acknowledged: the probabilities that such a packet is
     acknowledged to the sensor and was heard by the receiver, and that it is acknowledged and was not heard.
 
-    Source: docs/mathematics.md, schedules by holding time.
+    Source: docs/mathematics/schemes.md, schedules by holding time.
     """
     start, reset, carried = _blank(threshold)
     for s in range(threshold - 1):
@@ -316,7 +316,7 @@ def hijacked_schedule(threshold: int, mu: float, mu_e: float, heed_rule: HeedRul
     serves: 0 … patience, or more. hears: the probability that the receiver hears a packet, by whether the estimator and that
     eavesdropper hear it.
 
-    Source: docs/mathematics.md, the hijacked sensor.
+    Source: docs/mathematics/attacks.md, the hijacked sensor.
     """
     counts, top = heed_rule.patience + 2, threshold - 1
     start, reset, carried = _blank(threshold * counts)
@@ -341,7 +341,7 @@ def encrypted_schedule(threshold: float, received: float, acknowledged: tuple[fl
 
     The threshold θ need not be whole: at a holding time of ⌊θ⌋ a packet is then unencrypted with probability θ − ⌊θ⌋.
 
-    Source: docs/mathematics.md, schedules by holding time and quantised packets.
+    Source: docs/mathematics/schemes.md, schedules by holding time and quantised packets.
     """
     start, reset, carried = _blank(math.ceil(threshold))
     arrives = sum(acknowledged)
@@ -356,7 +356,7 @@ def encrypted_schedule(threshold: float, received: float, acknowledged: tuple[fl
 def encrypted_fraction(threshold: float, arrives: float) -> float:
     """The fraction of packets that are encrypted in the long run, by the probability that a packet is acknowledged.
 
-    (1−p)^{⌊θ⌋−1} (1 − (θ − ⌊θ⌋) p). Source: docs/mathematics.md, quantised packets.
+    (1−p)^{⌊θ⌋−1} (1 − (θ − ⌊θ⌋) p). Source: docs/mathematics/schemes.md, quantised packets.
     """
     whole = math.floor(threshold)
     return (1.0 - arrives) ** (whole - 1) * (1.0 - (threshold - whole) * arrives)
@@ -365,7 +365,7 @@ def encrypted_fraction(threshold: float, arrives: float) -> float:
 def threshold_for(fraction: float, arrives: float) -> float:
     """The threshold θ with which this fraction of packets is encrypted in the long run, 0 < fraction ≤ 1; inf if none has it.
 
-    Source: docs/mathematics.md, quantised packets.
+    Source: docs/mathematics/schemes.md, quantised packets.
     """
     if fraction >= 1.0:
         return 1.0

@@ -30,7 +30,7 @@ LARGEST_OPERATOR = 512
 class Outcomes:
     """Probabilities of a receiver's actions in a slot k ≥ 1; `predicted`, `decoded`, `leaked`, `state`, `misled` sum to 1.
 
-    Source: docs/mathematics.md, expectations.
+    Source: docs/mathematics/model.md, expectations.
     """
 
     predicted: float
@@ -69,7 +69,7 @@ class Outcomes:
     def genie(cls, mu_e: float, mu_d: float) -> Outcomes:
         """A receiver that knows the type of every packet and uses all information in it, behind a link of quality μ_e.
 
-        Source: docs/mathematics.md, genie.
+        Source: docs/mathematics/eavesdroppers.md, genie.
         """
         return cls(1.0 - mu_e, mu_e * mu_d, misled=0.0, decoded=0.0, initial=1.0 - mu_e, leaked=mu_e * (1.0 - mu_d))
 
@@ -96,7 +96,7 @@ NOBODY = Outcomes(predicted=1.0, state=0.0, misled=0.0, decoded=0.0, initial=1.0
 def state_covariances(process: Process, slots: int) -> Floats:
     """Σ_k = E[x_k x_kᵀ] for k = 0 … slots−1, (slots, n, n): Σ_0 given, Σ_k = A Σ_{k−1} Aᵀ + Q; inf once it overflows.
 
-    Source: docs/mathematics.md, model.
+    Source: docs/mathematics/model.md, model.
     """
     return theoretical_covariances(process, NOBODY, slots)
 
@@ -105,7 +105,7 @@ def state_covariances(process: Process, slots: int) -> Floats:
 class NoiseCovariances:
     """E[χ_k χ_kᵀ] = A Σ_{k−1} Aᵀ, a number of slots at a time from k = 0, where it is 0. inf from where it overflows.
 
-    Source: docs/mathematics.md, encoding noise.
+    Source: docs/mathematics/numerics.md, encoding noise.
     """
 
     def __init__(self, process: Process) -> None:
@@ -125,7 +125,7 @@ class NoiseCovariances:
 def noise_covariances(process: Process, slots: int) -> Floats:
     """E[χ_k χ_kᵀ] for k = 0 … slots−1, (slots, n, n); inf from where it overflows.
 
-    Source: docs/mathematics.md, encoding noise.
+    Source: docs/mathematics/numerics.md, encoding noise.
     """
     return NoiseCovariances(process).next(slots)
 
@@ -153,7 +153,7 @@ class TheoreticalCovariance:
     From the slot where a value exceeds double precision, every entry is inf. Leaks differ from slot to slot, so their
     recursion is computed slot by slot.
 
-    Source: Theorem IV.3 (proof, corrected), Theorem V.2 (corrected); docs/mathematics.md, expectations.
+    Source: Theorem IV.3 (proof, corrected), Theorem V.2 (corrected); docs/mathematics/model.md, expectations.
     """
 
     def __init__(self, process: Process, outcomes: Outcomes) -> None:
@@ -221,7 +221,7 @@ class TheoreticalCovariance:
 def theoretical_covariances(process: Process, outcomes: Outcomes, slots: int) -> Floats:
     """E P_k for k = 0 … slots−1, (slots, n, n); inf from where it overflows. `outcomes.reported` gives E of the reported P.
 
-    Source: docs/mathematics.md, expectations.
+    Source: docs/mathematics/model.md, expectations.
     """
     return TheoreticalCovariance(process, outcomes).next(slots)
 
@@ -229,7 +229,7 @@ def theoretical_covariances(process: Process, outcomes: Outcomes, slots: int) ->
 def theoretical_traces(process: Process, outcomes: Outcomes, slots: int) -> Floats:
     """Trace of E P_k for k = 0 … slots−1, (slots,); inf from where it overflows.
 
-    Source: docs/mathematics.md, expectations.
+    Source: docs/mathematics/model.md, expectations.
     """
     return TheoreticalCovariance(process, outcomes).next_traces(slots)
 
@@ -237,7 +237,7 @@ def theoretical_traces(process: Process, outcomes: Outcomes, slots: int) -> Floa
 def radius(process: Process) -> float:
     """ρ(A), exactly 1 for a marginally stable process whatever the rounding of its eigenvalues.
 
-    Source: docs/mathematics.md, limits.
+    Source: docs/mathematics/model.md, limits.
     """
     rho = process.spectral_radius
     return 1.0 if abs(rho - 1.0) <= MARGINAL else rho
@@ -248,7 +248,7 @@ def stability_bound(process: Process, mu: float) -> float:
 
     0 for ρ = 1: any μ_d > 0 exceeds it. 1 or more: no μ_d ≤ 1 does. inf for μ = 0 and ρ ≥ 1.
 
-    Source: docs/mathematics.md, limits.
+    Source: docs/mathematics/model.md, limits.
     """
     rho = radius(process)
     if rho < 1.0:
@@ -267,7 +267,8 @@ def lyapunov(process: Process, kept: float) -> Floats:
 def limit(process: Process, outcomes: Outcomes) -> Floats:
     """Limit of E P_k, (n, n), all inf if it is unbounded: p_d S(1 − kept) for a receiver that is never misled.
 
-    Source: Theorem IV.3, Corollaries V.3 and V.4, Lemma V.6; docs/mathematics.md, limits and genie.
+    Source: Theorem IV.3, Corollaries V.3 and V.4, Lemma V.6; docs/mathematics/model.md, limits;
+    docs/mathematics/eavesdroppers.md, genie.
     """
     source = outcomes.predicted * process.Q
     if outcomes.leaked:
@@ -284,7 +285,7 @@ def limit(process: Process, outcomes: Outcomes) -> Floats:
 def limit_trace(process: Process, outcomes: Outcomes) -> float:
     """Limit of tr E P_k, inf if it is unbounded: J(μ_d) of the legitimate estimator, J_e(μ_d) of an eavesdropper.
 
-    Source: docs/mathematics.md, limits.
+    Source: docs/mathematics/model.md, limits.
     """
     return float(np.trace(limit(process, outcomes)))
 
@@ -295,7 +296,7 @@ def tail_index(process: Process, outcomes: Outcomes) -> float:
     inf too for a receiver that is misled or never uses a state: tr P_k then stays within a factor of its own, growing
     expectation.
 
-    Source: docs/mathematics.md, heavy tails.
+    Source: docs/mathematics/model.md, heavy tails.
     """
     if outcomes.state == 0.0:
         return math.inf
@@ -308,7 +309,7 @@ def tail_index(process: Process, outcomes: Outcomes) -> float:
 def has_infinite_variance(process: Process, outcomes: Outcomes) -> bool:
     """Whether tr P_k has infinite variance in the limit, so that a sample mean proves nothing: α ≤ 2.
 
-    Source: docs/mathematics.md, heavy tails.
+    Source: docs/mathematics/model.md, heavy tails.
     """
     return tail_index(process, outcomes) <= 2.0
 
@@ -426,7 +427,7 @@ def unstable_part(A: Floats, within: Floats, least: float) -> Floats:
 def growth(process: Process, outcomes: Outcomes) -> Growth:
     """Where the expected error of a receiver with these outcomes in every slot grows.
 
-    Source: docs/mathematics.md, verdicts by direction.
+    Source: docs/mathematics/verdicts.md, verdicts by direction.
     """
     basis = unstable_part(process.A, np.eye(process.n), _least(outcomes))
     return Growth(basis, basis)

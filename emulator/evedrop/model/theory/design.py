@@ -1,6 +1,6 @@
 """The choice of μ_d: which values are admissible, secret against which eavesdropper, optimal, and at what cost.
 
-Source: docs/mathematics.md, design.
+Source: docs/mathematics/secrecy.md, design.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def design(
 
     Raises UsageError if no μ_d can keep Ω, or has the ratio, or does both.
 
-    Source: docs/mathematics.md, design.
+    Source: docs/mathematics/secrecy.md, design.
     """
     bound = stability_bound(process, mu)
     own = Outcomes.legitimate(mu, mu_d)
@@ -229,7 +229,7 @@ def perfect_secrecy(process: Process, mu: float, adversary: Adversary) -> Interv
 def relative_secrecy(process: Process, mu: float, adversary: Adversary) -> tuple[Interval, ...]:
     """The intervals of μ_d on which J < J_e ≤ ∞ with J bounded.
 
-    Source: Theorem V.8 for μ_e ≤ μ; docs/mathematics.md, design (for any μ_e).
+    Source: Theorem V.8 for μ_e ≤ μ; docs/mathematics/secrecy.md, design (for any μ_e).
     """
     from scipy.optimize import brentq  # noqa: PLC0415 - slow to import
 
@@ -260,7 +260,7 @@ def least_state_probability(process: Process, mu: float, max_trace: float) -> fl
 
     It is the stability bound for a lossless link. Raises UsageError if not even μ_d = 1 keeps Ω.
 
-    Source: docs/mathematics.md, design; Lemma VI.1 (J falls).
+    Source: docs/mathematics/secrecy.md, design; Lemma VI.1 (J falls).
     """
     from scipy.optimize import brentq  # noqa: PLC0415 - slow to import
 
@@ -286,7 +286,7 @@ def best_difference(process: Process, mu: float, adversary: Adversary) -> float 
 
     None for smart with μ_e ≤ μ, where J_r → ∞ at the lower end.
 
-    Source: docs/mathematics.md, design.
+    Source: docs/mathematics/secrecy.md, design.
     """
     return _argmax(process, mu, adversary, lambda ours, theirs: theirs - ours)
 
@@ -294,7 +294,7 @@ def best_difference(process: Process, mu: float, adversary: Adversary) -> float 
 def best_ratio(process: Process, mu: float, adversary: Adversary) -> float | None:
     """Argmax of J_r / J over the admissible μ_d; None if it has no maximum or J_r is nowhere positive.
 
-    Source: docs/mathematics.md, design.
+    Source: docs/mathematics/secrecy.md, design.
     """
     return _argmax(process, mu, adversary, lambda ours, theirs: (theirs - ours) / ours if ours else math.inf)
 

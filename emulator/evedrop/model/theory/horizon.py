@@ -24,7 +24,7 @@ def horizon(process: Process, slots: int, checked: int = _EACH) -> int | None:
 
     checked: how many numbers the covariances of the slots may have that are checked one by one; later slots are bisected.
 
-    Source: docs/mathematics.md, horizon.
+    Source: docs/mathematics/numerics.md, horizon.
     """
     noise = np.linalg.eigvalsh(process.Q)
     least = noise[noise > _NO_NOISE * noise[-1]][0] if process.singular_noise and noise[-1] > 0.0 else noise[0]

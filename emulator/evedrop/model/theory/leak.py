@@ -6,7 +6,7 @@ covariance Q − QΣ_k⁻¹Q. One triangularisation gives everything, without a 
     [A L_{k−1}  Q^½]   [L_k          0       ]
     [0          Q^½] = [QΣ_k⁻¹ L_k   M_k^½   ] U,   U orthogonal, L_k L_kᵀ = Σ_k, M_k = Q − QΣ_k⁻¹Q.
 
-Source: docs/mathematics.md, genie.
+Source: docs/mathematics/eavesdroppers.md, genie.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def remaining_limit(process: Process) -> Floats:
     limit is what the triangularisation above leaves, with Wᵀx in place of x. States that noise never reaches have no part in it.
     Raises ValueError as `Staircase` does.
 
-    Source: docs/mathematics.md, genie and singular noise.
+    Source: docs/mathematics/eavesdroppers.md, genie; docs/mathematics/numerics.md, singular noise.
     """
     stairs = Staircase(process)
     if stairs.singular:

@@ -7,7 +7,7 @@ z_k = w_{k−1} + χ_k, with χ_k ~ N(0, C_k), C_k = A Σ_{k−1} Aᵀ. The mutu
 
 so the bits are a sum of logarithms of numbers above 1, and nothing cancels.
 
-Source: docs/mathematics.md, leak in bits.
+Source: docs/mathematics/eavesdroppers.md, leak in bits.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class LeakedBits:
     Also valid in slots beyond the horizon, where Σ_k exceeds double precision. Values do not depend on how many slots are asked
     for at a time.
 
-    Source: docs/mathematics.md, leak in bits.
+    Source: docs/mathematics/eavesdroppers.md, leak in bits.
     """
 
     def __init__(self, process: Process) -> None:

@@ -48,7 +48,7 @@ class Policy:
 def held_traces(process: Process, states: int) -> Floats:
     """Trace of W_i = Σ_{l<i} A^l Q A^lᵀ for i = 0 … states, (states + 1,): the error i slots after a state.
 
-    Source: docs/mathematics.md, the best policy.
+    Source: docs/mathematics/secrecy.md, the best policy.
     """
     traces = np.zeros(states + 1)
     W = np.zeros_like(process.Q)
@@ -65,7 +65,7 @@ def best_policy(process: Process, mu: float, mu_e: float, weight: float, states:
     relative value iteration. For each holding time of the eavesdropper the policy is a threshold on the estimator's. μ must be
     above 0. Where silence is as good as a packet it is silent.
 
-    Source: docs/mathematics.md, the best policy.
+    Source: docs/mathematics/secrecy.md, the best policy.
     """
     traces = held_traces(process, states - 1)  # indices are holding times at the end of a slot: 0 … states−1
     cost = weight * traces[:, None] - (1.0 - weight) * traces[None, :]
@@ -87,7 +87,7 @@ def best_policy(process: Process, mu: float, mu_e: float, weight: float, states:
 def least_weight(process: Process, mu: float, mu_e: float, price: float, states: int) -> float | None:
     """The weight, to 1e-4, from which on the best policy sends at all; None if it does not even at 1.
 
-    Source: docs/mathematics.md, the best policy.
+    Source: docs/mathematics/secrecy.md, the best policy.
     """
 
     def sends(weight: float) -> bool:
@@ -107,7 +107,7 @@ def policy_chains(send: NDArray[np.bool_], mu: float, mu_e: float) -> tuple[Sens
 
     send: (S, S), by holding times. The first slot's are S and S.
 
-    Source: docs/mathematics.md, the best policy.
+    Source: docs/mathematics/secrecy.md, the best policy.
     """
     last = len(send) - 1
     index_of = {(last, last): 0}
@@ -227,7 +227,7 @@ def policy_metrics(process: Process, send: NDArray[np.bool_], mu: float, mu_e: f
 
     The errors are exact: only the decisions are cut off, not the covariances.
 
-    Source: docs/mathematics.md, the best policy.
+    Source: docs/mathematics/secrecy.md, the best policy.
     """
     legitimate, eve, sends = policy_chains(send, mu, mu_e)
     return _metrics(process, legitimate, eve, sends)
@@ -236,7 +236,7 @@ def policy_metrics(process: Process, send: NDArray[np.bool_], mu: float, mu_e: f
 def scheduled_metrics(process: Process, links: LinkProbabilities, threshold: int) -> PolicyMetrics:
     """The metrics of the scheme `scheduled`.
 
-    Source: docs/mathematics.md, schedules by holding time.
+    Source: docs/mathematics/schemes.md, schedules by holding time.
     """
     legitimate = scheduled(threshold, links.mu, links.legitimate)
     eve = scheduled(threshold, links.mu_e, links.eavesdropper)
@@ -257,7 +257,7 @@ def front(
 
     Policies that are best for several weights in a row become one point.
 
-    Source: docs/mathematics.md, the best policy.
+    Source: docs/mathematics/secrecy.md, the best policy.
     """
     alone = tuple(scheduled_metrics(process, links, threshold) for threshold in range(1, states + 1))
     points: list[FrontPoint] = []

@@ -4,7 +4,7 @@ A *streak* begins where the error leaves 0, where an innovation misleads the rec
 used; it lasts until a state, or the next misleading innovation, replaces the error. Long streaks are rare, and may
 nevertheless carry most of the expectation: a mean over too few trials then misses it, and its standard error does not show that.
 
-Source: docs/mathematics.md, rare events.
+Source: docs/mathematics/verdicts.md, rare events.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
     None if its error leaves double precision, for a genie, whose slots differ (`modulated_streaks` knows them), and for a misled
     receiver in a run that is too long (LARGEST_RUN).
 
-    Source: docs/mathematics.md, rare events.
+    Source: docs/mathematics/verdicts.md, rare events.
     """
     if outcomes.leaked or (outcomes.misled and slots * process.n**2 > LARGEST_RUN):
         return None

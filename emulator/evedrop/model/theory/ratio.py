@@ -2,7 +2,7 @@
 
 An adversary is an eavesdropper as the design of μ_d needs to know it: where its error is bounded, and how large it is.
 
-Source: docs/mathematics.md, design.
+Source: docs/mathematics/secrecy.md, design.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def adversary_bound(process: Process, adversary: Adversary) -> float:
 
     The error of an eavesdropper that may be misled is bounded at most at μ_d = 1, where nothing misleads.
 
-    Source: docs/mathematics.md, design.
+    Source: docs/mathematics/secrecy.md, design.
     """
     bound = stability_bound(process, adversary.mu_e * adversary.use_state)
     if math.isinf(limit_trace(process, adversary.outcomes(0.5))) and adversary.outcomes(0.5).misled:
@@ -156,7 +156,7 @@ def cheapest(
 
     J falls with μ_d, so it is the largest of them. Raises UsageError if there are none, with the largest ratio there is.
 
-    Source: docs/mathematics.md, design; Lemma VI.1 (J falls).
+    Source: docs/mathematics/secrecy.md, design; Lemma VI.1 (J falls).
     """
     low = stability_bound(process, mu)
     if low >= 1.0:
@@ -190,7 +190,7 @@ def suggestion(
     If that is unbounded, so is the ratio at this μ_d. minimum: as for `cheapest`. None if there is no eavesdropper, or the
     error of one is never larger than the legitimate one.
 
-    Source: docs/mathematics.md, design.
+    Source: docs/mathematics/secrecy.md, design.
     """
     most = largest_ratio(process, mu, adversaries, minimum) if adversaries else None
     if most is None or most.ratio <= 1.0 + _ROUNDING:

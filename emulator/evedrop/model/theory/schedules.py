@@ -31,7 +31,7 @@ class SlotRecursion:
 
     E_0 = p_0 Σ0, E_k = p_k A E_{k−1} Aᵀ + p_d Q + p_i f_k + p_l M_k, with probabilities that are affine in μ_d(k).
 
-    Source: docs/mathematics.md, schedules of μ_d.
+    Source: docs/mathematics/secrecy.md, schedules of the state probability.
     """
 
     def __init__(self, process: Process, outcomes_at: OutcomesAt, slots: int) -> None:
@@ -260,7 +260,7 @@ def best_schedule(
 
     Raises UsageError if not even sending every state keeps Ω.
 
-    Source: docs/mathematics.md, schedules of μ_d.
+    Source: docs/mathematics/secrecy.md, schedules of the state probability.
     """
     legitimate = SlotRecursion(process, lambda mu_d: Outcomes.legitimate(mu, mu_d), slots)
     problem = ScheduleProblem(legitimate, SlotRecursion(process, eavesdropper_at, slots), slots, max_trace, weight)

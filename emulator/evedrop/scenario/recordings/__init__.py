@@ -1,4 +1,4 @@
 """Recordings: of links, messages, states and a plant's disturbances, and the models that explain them best.
 
-Source: docs/links.md; docs/mathematics.md, estimating a link.
+Source: docs/links.md; docs/mathematics/links.md, estimating a link.
 """

@@ -7,7 +7,8 @@ the chunks. The goodness of fit compares the lengths of bursts and gaps in the r
 
 The fit of recorded messages is a link for a wire, whose delays are in seconds, and for a scenario, in slots.
 
-Source: Baum, Petrie, Soules, Weiss (1970); Rabiner (1989) for the scaling; docs/mathematics.md, estimating a link; docs/links.md.
+Source: Baum, Petrie, Soules, Weiss (1970); Rabiner (1989) for the scaling;
+docs/mathematics/links.md, estimating a link; docs/links.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The process that explains a recording of states best: A and Q by least squares, with standard errors.
 
-Source: docs/mathematics.md, given states; docs/programs.md, a model of the states.
+Source: docs/mathematics/plant.md, given states; docs/programs.md, a model of the states.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Crimson, Kennedy and Quevedo: noise in place of estimates, without acknowledgements.
 
-Source: docs/papers/crimson2023.md; docs/mathematics.md, noise packets and when noise begins.
+Source: docs/papers/crimson2023.md; docs/mathematics/schemes.md, noise packets and when noise begins.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Lücke, Lu and Quevedo: a state-secrecy code whose acknowledgements are flipped.
 
-Source: docs/papers/luecke2022.md; docs/mathematics.md, flipped acknowledgements.
+Source: docs/papers/luecke2022.md; docs/mathematics/attacks.md, flipped acknowledgements.
 """
 
 from __future__ import annotations

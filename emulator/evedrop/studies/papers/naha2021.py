@@ -1,6 +1,6 @@
 """Naha, Teixeira, Ahlén and Dey: a watermark for the quickest detection of false measurements.
 
-Source: docs/papers/naha2021.md; docs/mathematics.md, integrity.
+Source: docs/papers/naha2021.md; docs/mathematics/attacks.md, integrity.
 """
 
 from __future__ import annotations

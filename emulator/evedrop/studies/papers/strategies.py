@@ -1,6 +1,6 @@
 """Finite-k expectations of every receiver compared with simulation: the actual error, and the error it reports.
 
-Source: Theorem IV.3 and Theorem V.2, corrected (docs/mathematics.md, expectations).
+Source: Theorem IV.3 and Theorem V.2, corrected (docs/mathematics/model.md, expectations).
 """
 
 from __future__ import annotations

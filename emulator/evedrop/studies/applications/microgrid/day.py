@@ -12,7 +12,7 @@ The power of the roof's solar panels comes from the clear sky over a real place,
 irradiance and cell temperature. The clouds alternate between clear and cloudy spells; each cloudy spell has a depth of its own,
 edges that take some seconds to cross the panels, and a flicker.
 
-Source: docs/microgrid.md, the day; docs/mathematics.md, random numbers.
+Source: docs/microgrid.md, the day; docs/mathematics/numerics.md, random numbers.
 """
 
 from __future__ import annotations
