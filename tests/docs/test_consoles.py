@@ -19,7 +19,6 @@ NOT_RUN = {
     "docs/control.md": 2,
     "docs/hosts.md": 6,
     "docs/integrity.md": 1,
-    "docs/mathematics/verdicts.md": 1,
     "docs/microgrid.md": 8,
     "docs/montecarlo.md": 2,
     "docs/papers.md": 1,
