@@ -71,7 +71,7 @@ def _nine(folder: Path) -> Path:
 
 
 def wire_at_work(folder: Path) -> Path:
-    """The wire of docs/wire.md, with a robot and its base that publish for 28 s as the page says."""
+    """The wire of docs/wire/results.md, with a robot and its base that publish for 28 s as the page says."""
     out = folder / "wire"
     if out.exists():
         return out
@@ -130,7 +130,7 @@ PICTURES: Mapping[str, Callable[[Path, Path], None]] = {
     "live_view.png": _viewed(ROOT / "README.md", lambda folder: run_of("vehicle", folder)),
     "vehicle.gif": _viewed(DOCS / "view.md", lambda folder: run_of("vehicle", folder)),
     "microgrid_view.png": _viewed(DOCS / "view.md", lambda folder: run_of("microgrid", folder)),
-    "wire_view.png": _viewed(DOCS / "wire.md", wire_at_work),
+    "wire_view.png": _viewed(DOCS / "wire" / "results.md", wire_at_work),
     "compare.png": _compare,
 }
 """File in docs/ → what draws it: called with a folder for results, and the path of the picture."""

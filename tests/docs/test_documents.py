@@ -16,10 +16,10 @@ PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
 
 
 def commands(page: str) -> list[list[str]]:
-    """The `evedrop` commands in a page's code blocks, and those of pytest."""
+    """The `evedrop` commands in a page's code blocks, and those of pytest; without what a shell does with their output."""
     text = (DOCS / page).read_text(encoding="utf-8")
     lines = [line.strip().removeprefix("$ ") for line in text.splitlines()]
-    texts = [line.partition("  #")[0] for line in lines if line.startswith(("evedrop ", "python -m pytest "))]
+    texts = [re.split(r"  #| [>|&] ?", line)[0] for line in lines if line.startswith(("evedrop ", "python -m pytest "))]
     return [shlex.split(line) for line in texts if " -m pytest " not in line or "test_theory_errata.py" in line]
 
 

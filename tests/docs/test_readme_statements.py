@@ -72,7 +72,7 @@ def test_every_guarantee_names_its_tests() -> None:
     assert all(re.search(r"\[tests\]\(tests/[\w/]+\.py\)", item) for item in items)
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/wire.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/links.md"])
 def test_a_run_over_a_wire_works_as_printed(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the example of a wire, as the line above it writes it; in memory, where it is quick."""
     (line,) = re.findall(

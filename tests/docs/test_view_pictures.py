@@ -84,7 +84,7 @@ def test_every_picture_has_a_command_that_draws_it() -> None:
         (ROOT / "README.md", "live_view.png"),
         (DOCS / "view.md", "vehicle.gif"),
         (DOCS / "view.md", "microgrid_view.png"),
-        (DOCS / "wire.md", "wire_view.png"),
+        (DOCS / "wire" / "results.md", "wire_view.png"),
     ):
         assert cli.parser_of().parse_args(quoted(page, picture)).command is not None
 

@@ -1,6 +1,6 @@
 """Cases in which a wire is disturbed between programs: its journal must be true to what its receivers got.
 
-Source: docs/wire.md, the journal; a wire that starts again.
+Source: docs/wire/results.md, the journal; a wire that starts again.
 """
 
 from __future__ import annotations

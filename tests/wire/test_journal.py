@@ -51,8 +51,8 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
 
 
 def test_the_lines_of_the_page_read_a_journal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As they stand in docs/wire.md: of a wire that has heard nothing yet, and of one that goes on."""
-    page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
+    """As they stand in docs/wire/results.md: of a wire that has heard nothing yet, and of one that goes on."""
+    page = (Path(__file__).parents[2] / "docs" / "wire" / "results.md").read_text(encoding="utf-8")
     (lines,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "journal_tables" in block)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs" / "robot").mkdir(parents=True)

@@ -24,7 +24,7 @@ from tests.conftest import wait_until
 from tests.pages import checked
 from tests.wire.wire_at_work import ANYWHERE, WireAtWork, at_work, both_ways, program
 
-PAGE = Path(__file__).parents[2] / "docs" / "wire.md"
+PAGE = Path(__file__).parents[2] / "docs" / "wire" / "file.md"
 LINK = {"name": "scan", "from": "robot", "to": "base", "quality": 0.6}
 
 

@@ -155,8 +155,8 @@ def test_the_history_of_a_key() -> None:
 
 
 def test_the_page_shows_what_the_command_prints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The example file, the answer of --check, and the mistakes of a file are in docs/wire.md as they are printed."""
-    page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
+    """The example file, the answer of --check, and the mistakes of a file are in docs/wire/file.md as they are printed."""
+    page = (Path(__file__).parents[2] / "docs" / "wire" / "file.md").read_text(encoding="utf-8")
     assert f"```toml\n{example_wire()}```" in page
     path = tmp_path / "robot.toml"
     path.write_text(example_wire())
@@ -176,7 +176,7 @@ def test_the_page_shows_what_the_command_prints(tmp_path: Path, capsys: pytest.C
 
 def test_the_events_of_the_page() -> None:
     """They are accepted with the example."""
-    page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "wire" / "file.md").read_text(encoding="utf-8")
     (events,) = [block for block in re.findall(r"```toml\n(.*?)```", page, re.DOTALL) if block.startswith("[[event]]")]
     plan = wire_of(tomllib.loads(example_wire()) | tomllib.loads(events))
     assert [event.note for event in plan.events][-1] == "the robot enters the lift"

@@ -19,7 +19,7 @@ from evedrop.wire.records import WireFate
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import ANYWHERE, WireAtWork, at_work, both_ways, link, plan_of
 
-PAGE = Path(__file__).parents[2] / "docs" / "wire.md"
+PAGE = Path(__file__).parents[2] / "docs" / "wire" / "semantics.md"
 
 
 def alive(session: zenoh.Session, key: str = "**") -> list[str]:
@@ -52,7 +52,7 @@ def wire_knows(wire: WireAtWork, side: str) -> bool:
 
 
 def test_matching_status_is_always_true(tmp_path: Path) -> None:
-    """Without any program at the other side, as docs/wire.md says: what the wire itself declares matches everything."""
+    """Without any program at the other side, as docs/wire/semantics.md says: what the wire itself declares matches everything."""
     with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as robot:
         publisher, querier = robot.declare_publisher("no/sub"), robot.declare_querier("no/such")
         wait_until(lambda: _matches(publisher) and _matches(querier), "both match")

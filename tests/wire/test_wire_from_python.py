@@ -266,9 +266,12 @@ def test_a_journal_with_two_fates_of_a_message_is_refused(tmp_path: Path) -> Non
 def test_the_page_shows_the_example_and_every_method() -> None:
     """As it is executed, and all that a wire has."""
     docs = Path(__file__).parents[2] / "docs"
-    page = (docs / "wire.md").read_text(encoding="utf-8")
+    page = (docs / "wire" / "python.md").read_text(encoding="utf-8")
     _, shown = re.findall(r"```python\n(.*?)```", page[page.index("## From Python") :], re.DOTALL)
     assert shown in (docs / "examples" / "wire" / "test_chatter.py").read_text(encoding="utf-8")
+    tutorial = (docs / "wire" / "tutorial.md").read_text(encoding="utf-8")
+    for program in ("talker.py", "listener.py"):
+        assert (docs / "examples" / "wire" / program).read_text(encoding="utf-8") in tutorial
     for name in vars(RunningWire):
         if not name.startswith("_") and name not in {"is_running"}:
             assert f"`{name}(" in page

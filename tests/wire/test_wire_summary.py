@@ -123,7 +123,7 @@ def test_changes_and_cuts_are_part_of_the_distribution(tmp_path: Path) -> None:
 
 
 def test_gaps_of_a_wire_have_first_fates_and_those_of_its_journal_the_last_ones(tmp_path: Path) -> None:
-    """A running wire's summary and its journal may differ in gaps (docs/wire.md), but never in counts or in the rate."""
+    """A running wire's summary and its journal may differ in gaps (docs/wire/results.md), but never in counts or in the rate."""
     plan = wire_plan(link=BURSTS)
     (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
     with WireJournal(tmp_path, plan) as journal:
@@ -514,7 +514,7 @@ def test_a_metric_of_a_link_is_one_line_of_the_registry(tmp_path: Path, monkeypa
 
 def test_the_page_lists_every_metric_of_a_link() -> None:
     """In the section about expectations."""
-    page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "wire" / "results.md").read_text(encoding="utf-8")
     section = page.partition("## Expectations")[2].partition("\n## ")[0]
     assert [name for name in WIRE_METRICS if name not in section] == []
 

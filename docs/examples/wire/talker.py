@@ -1,7 +1,4 @@
-"""Publishes numbers once a listener is there, for as long as it is told to: talker.py ENDPOINT COUNT SECONDS_BETWEEN.
-
-A program as any other that uses Zenoh: it knows nothing of Evedrop.
-"""
+"""Publishes numbers as soon as a listener is there: talker.py ENDPOINT COUNT SECONDS_BETWEEN."""
 
 import sys
 import threading
@@ -11,8 +8,9 @@ import zenoh
 
 endpoint, count, seconds = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
 config = zenoh.Config()
-config.insert_json5("mode", '"client"')
+config.insert_json5("mode", '"client"')  # connects to this endpoint and nowhere else
 config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+config.insert_json5("connect/timeout_ms", "-1")  # waits for a wire that starts later
 with zenoh.open(config) as session:
     listening = threading.Event()
     listeners = session.liveliness().declare_subscriber("listener", lambda _: listening.set(), history=True)

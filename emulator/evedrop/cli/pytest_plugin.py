@@ -1,6 +1,6 @@
 """A pytest plugin that runs scenario files as tests: `pytest scenarios/`, `pytest my.toml`. One file is one test and one run.
 
-Its fixture `evedrop_wire` gives a test wires between programs (docs/wire.md, from pytest).
+Its fixture `evedrop_wire` gives a test wires between programs (docs/wire/python.md, from pytest).
 
 pytest loads this plugin in every project of an environment that has Evedrop installed. So it imports nothing of Evedrop before it
 finds a TOML file, and only what runs a scenario when a scenario is run.

@@ -3,7 +3,7 @@
 `WireSummary` has a class for each kind of entry in it; the fields of a class are the entry's keys, in their order. Imports
 neither Zenoh nor Rerun.
 
-Source: docs/wire.md, the summary.
+Source: docs/wire/results.md, the summary.
 """
 
 from __future__ import annotations

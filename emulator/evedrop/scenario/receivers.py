@@ -4,8 +4,7 @@
 on it. `[wire]` names receivers whose links draw their random numbers as the links of a wire do, so that packets have the same
 fates.
 
-Source: docs/scenario.md, links, legitimate and eavesdroppers, acknowledgements, and wire; docs/wire.md, a wire as the network of
-a run.
+Source: docs/scenario.md, links, legitimate and eavesdroppers, acknowledgements, and wire; docs/links.md, the links of a wire.
 """
 
 from __future__ import annotations

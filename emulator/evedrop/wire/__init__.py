@@ -1,4 +1,4 @@
-"""A wire: links with faults between programs that know nothing of Evedrop, over Zenoh. docs/wire.md.
+"""A wire: links with faults between programs that know nothing of Evedrop, over Zenoh. docs/wire/.
 
     from evedrop import wire
 

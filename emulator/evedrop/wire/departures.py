@@ -8,7 +8,7 @@ Zenoh does not tell how full a channel is, either. So the messages are counted w
 on until the channel is empty. Messages that come meanwhile count, too. Programs that connect again and again must not fill the
 history, so each matter has a limited number of lines.
 
-Source: docs/wire.md, what Zenoh drops by itself, and what programs need.
+Source: docs/wire/semantics.md, what Zenoh drops by itself, and what programs need.
 """
 
 from __future__ import annotations

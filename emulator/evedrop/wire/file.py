@@ -3,7 +3,7 @@
 Mistakes of tables are reported together; without any, those that only show when tables are compared: names, endpoints, events.
 An explanation has the links in order, which of them each key takes, and entries that are probably mistakes.
 
-Source: docs/wire.md, the file, and which link a key takes.
+Source: docs/wire/file.md, the file, and which link a key takes.
 """
 
 from __future__ import annotations

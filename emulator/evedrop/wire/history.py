@@ -3,7 +3,7 @@
 A wire that starts again in the same folder continues from here, so that the n-th message of a key has the same fate whether or
 not the wire was ended or killed between.
 
-Source: docs/wire.md, a wire that starts again.
+Source: docs/wire/results.md, a wire that starts again.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ times as much, above all since other threads run meanwhile. Until it is closed, 
 the records of a key until it ends, there is a limit on the keys that programs use: one for each side, so that programs of one
 side cannot use up the keys of others.
 
-Source: docs/wire.md, the journal, a wire that starts again, and many keys.
+Source: docs/wire/results.md, the journal, a wire that starts again; docs/wire/semantics.md, many keys.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ A token lives at a side as long as a program there, or at a side joined to it, h
 and the end of the last, among them those of the wire, and does not say who holds one. So the wire mirrors no token at a side
 whose programs hold it already; and when it gives up a mirrored token, it looks whether a program there holds the same one.
 
-Source: docs/wire.md, liveliness.
+Source: docs/wire/semantics.md, liveliness.
 """
 
 from __future__ import annotations

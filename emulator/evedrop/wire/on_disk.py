@@ -2,7 +2,7 @@
 
 The closing report has the summary as a table, and sentences below it, as text.
 
-Source: docs/wire.md, from Python, and the summary.
+Source: docs/wire/python.md, from Python; docs/wire/results.md, the summary.
 """
 
 from __future__ import annotations

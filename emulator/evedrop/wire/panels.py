@@ -2,7 +2,7 @@
 
 The graph has a box for each side, and on the way from one to another a box for each link with its losses.
 
-Source: docs/wire.md, the view.
+Source: docs/wire/results.md, the view.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ another side has, since ROS 2 asks complete queryables only. Zenoh hands a query
 except that one for complete queryables goes to the complete ones alone. So one queryable is responsible for each query, and the
 others ignore it: the first complete one whose expression includes the query's key, or else the one for everything.
 
-Source: docs/wire.md, queries.
+Source: docs/wire/semantics.md, queries.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The wire appends blocks of rows to a list; a thread counts them and writes the file that viewers read. A viewer or a disk that is
 slow, hung or absent cannot delay the wire.
 
-Source: docs/wire.md, the view.
+Source: docs/wire/results.md, the view.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ file is made from it later. Its place on the disk is taken when it is made, so a
 byte of a record, which is written last, is its fate + 1: a record whose last byte is 0 is not whole. Its highest bit is set
 until a message that is to be delivered has been delivered.
 
-Source: docs/wire.md, the journal.
+Source: docs/wire/results.md, the journal.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 It is shown in a window, on a page for browsers, or only in a file. Neither Rerun nor the viewer is loaded before a view is asked
 for.
 
-Source: docs/wire.md, the view.
+Source: docs/wire/results.md, the view.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A wire in a process of its own, for programs and tests in Python.
 
-Source: docs/wire.md, from Python.
+Source: docs/wire/python.md, from Python.
 """
 
 from __future__ import annotations
@@ -177,13 +177,13 @@ class RunningWire:
         return status
 
     def rows(self) -> pa.Table:
-        """The journal so far: a row for each message and link (docs/wire.md, the journal)."""
+        """The journal so far: a row for each message and link (docs/wire/results.md, the journal)."""
         import pyarrow as pa  # noqa: PLC0415 - only for this
 
         return pa.concat_tables(journal_tables(self.folder))
 
     def summary(self) -> Mapping[str, Any]:
-        """What became of the messages so far: the entries of summary.json (docs/wire.md, the summary)."""
+        """What became of the messages so far: the entries of summary.json (docs/wire/results.md, the summary)."""
         return self.typed_summary().as_dict()
 
     def typed_summary(self) -> WireSummary:

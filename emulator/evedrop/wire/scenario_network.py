@@ -2,7 +2,7 @@
 
 The packet of slot k has the fate of the k-th message that a program publishes on a key of the wire.
 
-Source: docs/wire.md, a wire as the network of a run.
+Source: docs/links.md, the links of a wire.
 """
 
 from __future__ import annotations

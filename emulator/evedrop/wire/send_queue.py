@@ -4,7 +4,7 @@ A program that no longer reads lets Zenoh wait, up to 5 seconds for each message
 side waits in a queue for its turn at another one. If the queue is full, messages over a link wait for room, and with them
 their sender, as `CongestionControl.BLOCK` asks for; but not for a side that takes almost nothing. Copies over a tap never wait.
 
-Source: docs/wire.md, programs that stop reading.
+Source: docs/wire/semantics.md, programs that stop reading.
 """
 
 from __future__ import annotations

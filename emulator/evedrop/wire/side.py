@@ -1,6 +1,6 @@
 """The session of a side: a Zenoh router to which programs connect, their permissions, and where it listens.
 
-Source: docs/wire.md, sides.
+Source: docs/wire/file.md, sides.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 `evedrop link`, `partition`, `heal` and `status` work as for a run. The operator has a router session of its own on this machine,
 so no program at a side can steer the wire.
 
-Source: docs/wire.md, events and control.
+Source: docs/wire/file.md, events and control.
 """
 
 from __future__ import annotations

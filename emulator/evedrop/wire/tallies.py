@@ -3,7 +3,7 @@
 Counted are fates, delays and runs of missing messages of each link. A wire file can expect something of the metrics, which
 `WIRE_METRICS` lists.
 
-Source: docs/wire.md, the summary and expectations.
+Source: docs/wire/results.md, the summary and expectations.
 """
 
 from __future__ import annotations
@@ -187,4 +187,4 @@ WIRE_METRICS: Mapping[str, WireMetric] = {
     "gap_messages": WireMetric(lambda link, _tally, _quantile: link.gap_messages if link.heard else None),
     "gap_seconds": WireMetric(lambda link, _tally, _quantile: link.gap_seconds if link.heard else None),
 }
-"""Name, as in `metric = "LINK.name"` → the metric, in the order of docs/wire.md."""
+"""Name, as in `metric = "LINK.name"` → the metric, in the order of docs/wire/results.md."""

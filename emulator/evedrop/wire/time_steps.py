@@ -4,7 +4,7 @@ Steps are counted from rows of the journal; from a few numbers for each link and
 of long stretches in which nothing arrives and of losses of the wire's own. Memory and work are bounded: rows are counted with
 three passes over a block, and at most `_SPAN` steps are open at a time. Does not use Rerun.
 
-Source: docs/wire.md, the view.
+Source: docs/wire/results.md, the view.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A link is cut while an event cuts it, or while its two sides are partitioned. Changes of its settings that last at the same time
 apply in the order in which they began, and end one by one.
 
-Source: docs/wire.md, events.
+Source: docs/wire/file.md, events.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Each thread of the wire marks the work that it has in hand, and further threads put questions to each side and the journal. If a
 piece of work takes too long, the process ends at once: its journal is on disk at every instruction.
 
-Source: docs/wire.md, a wire that hangs.
+Source: docs/wire/results.md, a wire that hangs.
 """
 
 from __future__ import annotations

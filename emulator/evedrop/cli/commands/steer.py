@@ -212,7 +212,7 @@ COMMANDS = (
         (_going_on, _two_sides),
         section="steer",
         example="partition runs/wire robot base",
-        page="wire",
+        page="wire/file",
     ),
     Command(
         "heal",
@@ -221,7 +221,7 @@ COMMANDS = (
         (_going_on, _two_sides),
         section="steer",
         example="heal runs/wire robot base",
-        page="wire",
+        page="wire/file",
     ),
     Command(
         "pause",

@@ -113,6 +113,6 @@ COMMANDS = (
         (_file, _changes, _course),
         section="run",
         example="wire robot.toml --out runs/wire",
-        page="wire",
+        page="wire/tutorial",
     ),
 )

@@ -1,6 +1,6 @@
 """The words of a wire's summary: its tables, and the sentences below them.
 
-Source: docs/wire.md, the summary.
+Source: docs/wire/results.md, the summary.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Time is divided into equal steps. A link needs a few hundred numbers for each, however many messages it took. Messages that are
 not yet in a Parquet file, because the wire runs or was killed, are left out.
 
-Source: docs/wire.md, the journal.
+Source: docs/wire/results.md, the journal.
 """
 
 from __future__ import annotations
