@@ -23,9 +23,9 @@ def test_no_text_promises_more_than_a_stream_cipher() -> None:
     assert {name: words for name, words in findalls.items() if words} == {}
 
 
-def test_the_page_of_the_cipher_says_what_it_is() -> None:
+def test_the_section_about_the_cipher_says_what_it_is() -> None:
     """An ideal pad in the model, AES-256 in the program, and what follows."""
-    text = " ".join((ROOT / "docs" / "schemes" / "cipher.md").read_text(encoding="utf-8").split())
+    text = " ".join((ROOT / "docs" / "schemes" / "encryption.md").read_text(encoding="utf-8").split())
     assert "modelled as an ideal pad, uniform and used once, and implemented as a stream cipher: AES-256" in text
     assert "computational secrecy" in text
 

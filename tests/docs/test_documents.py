@@ -67,13 +67,15 @@ def test_a_page_that_names_a_file_of_the_program_says_where_it_is(page: str) -> 
         assert re.search(r"\b(clone of the repository|of the repository|the checkout)\b", text)
 
 
-def test_every_scheme_has_a_page_or_shares_one() -> None:
-    """The index links each name to its page, and that page is about it."""
+def test_every_scheme_has_a_section_or_shares_one() -> None:
+    """The index links each name to its section, and that section is about it."""
     index = (DOCS / "schemes.md").read_text(encoding="utf-8")
-    pages = dict(re.findall(r"^\| \[`([a-z-]+)`\]\((schemes/[a-z-]+\.md)\)", index, re.MULTILINE))
-    assert set(pages) == set(SCHEMES)
-    for name, page in pages.items():
-        assert f"`{name}`" in (DOCS / page).read_text(encoding="utf-8").splitlines()[0], name
+    rows = re.findall(r"^\| \[`([a-z-]+)`\]\((schemes/[a-z-]+\.md)#([a-z-]+)\)", index, re.MULTILINE)
+    assert {name for name, _, _ in rows} == set(SCHEMES)
+    for name, page, anchor in rows:
+        assert name in re.split(r"-and-", anchor), name
+        headings = re.findall(r"^## (.*)$", (DOCS / page).read_text(encoding="utf-8"), re.MULTILINE)
+        assert any(f"`{name}`" in heading for heading in headings), name
 
 
 def test_the_pages_that_show_commands_have_some() -> None:

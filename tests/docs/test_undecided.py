@@ -94,7 +94,7 @@ def test_a_wire_that_heard_nothing_fails_unless_it_must_be_silent(
 
 
 def test_where_the_sensor_detects_nothing_detection_is_null() -> None:
-    """Not only without acknowledgements: no chart tells a hijacked sensor, as docs/results.md says."""
+    """Not only without acknowledgements: no chart tells a hijacked sensor, as docs/metrics.md says."""
     assert chart_of(load("hijacked")) is None
     assert "null without acknowledgements, and where no chart can tell the attack" in page("results.md")
-    assert "as under `hijack`" in page("results.md")
+    assert "as under `hijack`" in page("metrics.md")

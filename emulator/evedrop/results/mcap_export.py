@@ -2,7 +2,7 @@
 
 Messages are JSON with a schema. The tables are read and written in batches, so that memory does not grow with the run.
 
-Source: docs/results.md, MCAP.
+Source: docs/export.md, MCAP.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Totals of a closed loop: failed decisions, clipped inputs, and the errors of the two possible estimators.
 
-Source: docs/results.md, controller.
+Source: docs/metrics.md, controller.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Errors and verdicts by direction: of vᵀx for the scenario's directions v.
 
-Source: docs/mathematics/verdicts.md, verdicts by direction; docs/results.md, directions.
+Source: docs/mathematics/verdicts.md, verdicts by direction; docs/metrics.md, directions.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Errors against the true state, for a sensor that filters: it sends an estimate, so these differ from the usual errors.
 
-Source: docs/results.md, filter.
+Source: docs/metrics.md, filter.
 """
 
 from __future__ import annotations

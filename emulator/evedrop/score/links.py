@@ -2,7 +2,7 @@
 
 Of acknowledgements: their channel, the attack on it, and the chart with which the sensor detects the attack.
 
-Source: docs/results.md, links; docs/mathematics/links.md, links;
+Source: docs/metrics.md, links; docs/mathematics/links.md, links;
 docs/mathematics/attacks.md, attacks on acknowledgements and detecting an attack.
 """
 

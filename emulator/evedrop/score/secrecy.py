@@ -1,6 +1,6 @@
 """Whether secrecy held in a run, and whether theory promises it. "Too few trials to tell" is a verdict of its own.
 
-Source: docs/mathematics/secrecy.md, secrecy and design; docs/results.md, verdict.
+Source: docs/mathematics/secrecy.md, secrecy and design; docs/metrics.md, verdict.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ whatever the number of states: of all Gaussian errors with this trace, one along
 and Bakirov 2003), and there 20 is exceeded with probability 7.7e-6. Errors up to 20 times those of one step's noise, tr Q, are
 those of a receiver that follows the process step by step.
 
-Source: docs/view.md, who knows what; docs/results.md, lost synchronisation.
+Source: docs/view.md, who knows what; docs/metrics.md, lost synchronisation.
 """
 
 from __future__ import annotations

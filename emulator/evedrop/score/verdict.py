@@ -1,6 +1,6 @@
 """The verdict: whether the state is kept secret, as a glyph, a word and a sentence, which everything that reports a run shows.
 
-Source: docs/results.md, verdict.
+Source: docs/metrics.md, verdict.
 """
 
 from __future__ import annotations

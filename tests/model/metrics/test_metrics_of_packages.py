@@ -126,8 +126,8 @@ def test_a_metric_that_cannot_be_loaded_is_left_out(evedrop: Evedrop, name: str,
 
 
 def test_docs_say_of_every_metric_what_it_says_itself() -> None:
-    """In the table of docs/results.md, and in the entry of docs/scenario.md those that an expectation can name."""
-    results, scenario = ((DOCS / page).read_text(encoding="utf-8") for page in ("results.md", "scenario.md"))
+    """In the table of docs/metrics.md, and in the entry of docs/scenario.md those that an expectation can name."""
+    results, scenario = ((DOCS / page).read_text(encoding="utf-8") for page in ("metrics.md", "scenario.md"))
     for name in METRICS:
         meaning = metric(name).meaning.replace("|", "\\|")
         assert f"\n| `{name}` | {meaning} |\n" in results

@@ -309,7 +309,7 @@ def test_every_mode_has_its_page(tmp_path: Path, mode: Mode) -> None:
 
 
 def slot_by_slot(errors: list[float], traces: list[float], noise: float) -> Iterator[str]:
-    """The rule of docs/results.md, written out."""
+    """The rule of docs/metrics.md, written out."""
     for error, trace in zip(errors, traces, strict=True):
         if error > 20 * trace and error > 20 * noise:
             yield "overconfident"

@@ -47,7 +47,7 @@ class ReportedResults(ABC):
     def to_csv(self, path: str | Path) -> list[Path]:
         """Write the tables that the command prints as CSV, with every number at full precision, and return the files' paths.
 
-        The first table goes to `path`, a second one to NAME-2.csv. Source: docs/results.md, tables in other programs.
+        The first table goes to `path`, a second one to NAME-2.csv. Source: docs/export.md, tables in other programs.
 
         Raises UsageError if a file cannot be written.
         """
@@ -69,7 +69,7 @@ class ReportedResults(ABC):
         """The tables that the command prints."""
 
     def report(self: _InFolder) -> Path:
-        """Write report.html into the folder, and return its path. Source: docs/results.md, report.html.
+        """Write report.html into the folder, and return its path. Source: docs/export.md, report.html.
 
         Raises UsageError if the results cannot be read, and OSError if the page cannot be written.
         """

@@ -3,7 +3,7 @@
 They are made from the events of the recorder and, at each scrape, from the metrics that the run has on disk; the run itself does
 nothing for them. prometheus_client is imported only here: a run without metrics needs neither it nor a web server.
 
-Source: docs/results.md, metrics of a live run.
+Source: docs/export.md, metrics of a live run.
 """
 
 from __future__ import annotations

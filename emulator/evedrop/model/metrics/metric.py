@@ -2,7 +2,7 @@
 
 The class of a metric says how it is summed, merged, checked and shown. No other code depends on its name.
 
-Source: docs/results.md, summary.json; docs/your-own.md, a metric.
+Source: docs/metrics.md, receivers; docs/your-own.md, a metric.
 """
 
 from __future__ import annotations

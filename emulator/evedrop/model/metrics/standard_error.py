@@ -1,6 +1,6 @@
 """The standard error of a mean over trials, and its distance from theory as a z-score.
 
-Source: docs/results.md, standard errors; docs/mathematics/verdicts.md, z-scores.
+Source: docs/metrics.md, standard errors; docs/mathematics/verdicts.md, z-scores.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def standard_error(of_trials: Floats | None) -> float | None:
 def ratio_error(over: Floats, under: Floats) -> float | None:
     """The standard error of the ratio of two means over the same trials, (R,) each, to first order; None as above.
 
-    Source: docs/results.md, standard errors.
+    Source: docs/metrics.md, standard errors.
     """
     mean = float(np.mean(under))
     if not mean > 0.0 or not math.isfinite(mean):

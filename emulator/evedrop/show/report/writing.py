@@ -2,7 +2,7 @@
 
 To add a kind of results that has a report, write a function that makes its page and add it to `KINDS`.
 
-Source: docs/results.md, report.html.
+Source: docs/export.md, report.html.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 `[integrity]` has the policy with its thresholds. Metrics are false alarms, detections and their delay, and the cost of the
 watermark, each with its theory.
 
-Source: docs/integrity.md; docs/scenario.md, integrity; docs/results.md, integrity; docs/mathematics/attacks.md, integrity.
+Source: docs/integrity.md; docs/scenario.md, integrity; docs/metrics.md, integrity; docs/mathematics/attacks.md, integrity.
 """
 
 from __future__ import annotations

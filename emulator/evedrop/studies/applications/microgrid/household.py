@@ -6,7 +6,7 @@ reveals about the house: when people are at home and active. A day is divided in
 guessed the load of every window takes the larger guesses for activity. The measure of success is the area under the curve of
 detections over false alarms: 1 if the guess for every active window is above that for every quiet one, ½ for a coin.
 
-Source: docs/scenario.md, household; docs/microgrid.md, energy and privacy; docs/results.md, household.
+Source: docs/scenario.md, household; docs/microgrid.md, energy and privacy; docs/metrics.md, household.
 """
 
 from __future__ import annotations
