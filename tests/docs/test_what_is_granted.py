@@ -62,7 +62,7 @@ def test_the_strategies_that_are_granted_something_are_named(page: str) -> None:
 def test_the_table_of_strategies_says_what_each_knows() -> None:
     """The column `knows` of docs/eavesdroppers.md."""
     page = (ROOT / "docs" / "eavesdroppers.md").read_text(encoding="utf-8")
-    begin = page.index("| `strategy` | reads | knows | theory |")
+    begin = page.index("| strategy | what it does | knows | theory |")
     _, _, *rows = page[begin : page.index("\n\n", begin)].splitlines()
     knows = dict(re.findall(r"^\| `([\w-]+)` \|[^|]*\| ([^|]*) \|", "\n".join(rows), re.MULTILINE))
     granted = with_streams_of_the_secret()
