@@ -78,7 +78,7 @@ def test_the_limits_of_a_file() -> None:
 
 def test_a_quantile_is_strictly_between_0_and_1() -> None:
     """As its row says."""
-    assert "| `quantile` | between 0 and 1, both excluded |" in page("scenario.md")
+    assert "| `quantile` | between 0 and 1, both excluded: the quantile" in page("scenario.md")
     for edge in (0.0, 1.0):
         with pytest.raises(ValidationError):
             TypeAdapter(Quantile).validate_python(edge)

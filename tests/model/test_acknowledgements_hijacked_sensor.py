@@ -132,7 +132,7 @@ def test_without_lost_acknowledgements_it_is_the_honest_sensor() -> None:
 def test_perfect_secrecy_needs_an_acknowledgement_channel_that_loses_nothing(
     threshold: int, alpha: float, honest: float, hijacked: float
 ) -> None:
-    """Of `scheduled`: the table of docs/schemes/with-acknowledgements.md. The legitimate error stays what it was, and so does the rate of packets."""
+    """Of `scheduled`: the table of docs/schemes/with-acknowledgements.md. The legitimate error and the rate of packets stay."""
     before, after = limits(alpha, "none", threshold), limits(alpha, "hijack", threshold)
     assert after["legitimate"] == pytest.approx(before["legitimate"])
     assert before["eve"] == pytest.approx(honest, rel=1e-3)

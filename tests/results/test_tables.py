@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from evedrop.results.folder import UNFINISHED
 from evedrop.results.reading import Results
 from evedrop.results.tables import DIGESTS, JOURNAL
 from evedrop.scenario.expect import ExpectTable
-from evedrop.scenario.loading import parse
+from evedrop.scenario.loading import checked, parse
 from evedrop.scenario.tables import Scenario
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -37,12 +38,22 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     return montecarlo("eavesdroppers", slots=30, trials=12, out=tmp_path_factory.mktemp("run") / "run")
 
 
+def examples(page: str) -> list[str]:
+    """The TOML blocks of a page."""
+    return re.findall(r"```toml\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+
+
 def test_every_example_of_the_scenario_reference_is_right() -> None:
-    """Each TOML block is a whole scenario without a mistake."""
-    blocks = re.findall(r"```toml\n(.*?)```", (DOCS / "scenario.md").read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) >= 2
-    for block in blocks:
-        parse(block, "docs/scenario.md")
+    """The first TOML block is a whole scenario; the tables of each other block can take the place of its own."""
+    base, *others = examples("scenario.md")
+    assert parse(base, "docs/scenario.md").slots
+    others += examples("eavesdroppers.md")
+    assert len(others) >= 8
+    for block in others:
+        tables = tomllib.loads(base) | tomllib.loads(block)
+        if set(tables["eavesdroppers"]) != {"naive", "suspicious", "smart"}:  # those that it names are gone
+            tables["expect"] = []
+        assert checked(tables, f"docs/scenario.md, {block}").slots
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.__name__)
