@@ -3,7 +3,7 @@
     python -m tests.faults.campaign --seed 1 --count 100
 
 Each case has a number, and its scenario, faults and moments are drawn from that: the same number is the same case. Folders of
-cases in which something promised does not hold are kept. Source: docs/testing.md, faults.
+cases in which something promised does not hold are kept. Source: docs/maintainers/tests.md, faults.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python -m tests.faults.mutation
 
 Prints a row for each mutant: what noticed it, and after how many cases. A mutant that the campaign does not notice is a gap of
-its judge. Source: docs/testing.md, faults.
+its judge. Source: docs/maintainers/tests.md, faults.
 """
 
 from __future__ import annotations

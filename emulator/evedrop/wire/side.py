@@ -132,7 +132,8 @@ def side_config(side: Side, largest: int, users: str | None) -> ZenohConfig:
             "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        # A router may hang for ever if its administration space is asked while a program declares something (docs/upstream.md).
+        # A router may hang for ever if its administration space is asked while a program declares something:
+        # docs/maintainers/tests.md, Zenoh.
         "adminspace": {"enabled": False},
         "timestamping": {"enabled": False},
         "transport": {"link": link},

@@ -1,4 +1,7 @@
-"""The golden blocks of docs/protocol.md, and the functions of the program that each of them describes."""
+"""The golden blocks of the pages, and the functions of the program that each of them describes.
+
+`bytes` are in hexadecimal, with spaces anywhere; `00*N` is N zero bytes.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,17 @@ from evedrop.model.slot.link import COUNTED_BURSTS, Account, Change
 from evedrop.model.slot.link_core import Arrivals, Late
 from evedrop.model.slot.records import LinkSlots, PacketSlots, ReceiverSlots, SensorSlots
 
-TEXT = (Path(__file__).parents[3] / "docs" / "protocol.md").read_text(encoding="utf-8")
-GOLDEN: dict[str, str] = dict(re.findall(r"^```golden ([^\n]+)\n(.*?)^```$", TEXT, re.S | re.M))
+DOCS = Path(__file__).parents[3] / "docs"
+PAGES = {
+    name: (DOCS / name).read_text(encoding="utf-8")
+    for name in ("protocol.md", "numerical-spec.md", "random-streams.md", "digests.md")
+}
+MORE = (Path(__file__).parent / "more_golden.md").read_text(encoding="utf-8")
+"""Blocks of further messages, which no page needs."""
+BLOCKS: list[tuple[str, str]] = re.findall(
+    r"^```golden ([^\n]+)\n(.*?)^```$", "\n".join([*PAGES.values(), MORE]), re.S | re.M
+)
+GOLDEN: dict[str, str] = dict(BLOCKS)
 MESSAGES = [name for name in GOLDEN if "\nbytes " in GOLDEN[name]]
 KEY = "evedrop/golden"
 Encode = Callable[[dict[str, Any], dict[str, Any]], bytes]
@@ -37,7 +49,8 @@ def parts_of(block: str) -> tuple[dict[str, Any], dict[str, Any], bytes]:
     match = re.fullmatch(r"(?:shape (.*?)\n)?value (.*)\nbytes (.*)", block, re.S)
     assert match is not None, block
     shape, value, raw = match.groups()
-    return json.loads(shape or "{}"), json.loads(value), bytes.fromhex(raw)
+    written = re.sub(r"\b00\*(\d+)", lambda zeros: "00" * int(zeros[1]), raw)
+    return json.loads(shape or "{}"), json.loads(value), bytes.fromhex(written)
 
 
 def flags(rows: Any) -> np.ndarray:

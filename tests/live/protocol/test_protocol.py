@@ -1,4 +1,4 @@
-"""Every golden block of docs/protocol.md, against the program, in both directions."""
+"""Every golden block of the pages, against the program, in both directions."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from evedrop.model.digest import BlockDigests, RunDigest
 from evedrop.model.kernels.elementary import normal_quantile
 from evedrop.model.receiver import Beliefs
 from evedrop.model.streams import Stream, normals, root_of_seed, stream_key, uniforms
-from tests.live.protocol.golden import CODECS, GOLDEN, KEY, MESSAGES, TEXT, parts_of
+from tests.live.protocol.golden import BLOCKS, CODECS, GOLDEN, KEY, MESSAGES, PAGES, parts_of
 
 
 def test_the_document_has_every_block() -> None:
     """Every kind of message is there, and everything else that is pinned: a renamed block is not silently skipped."""
     assert {name.split(",")[0] for name in MESSAGES} == set(CODECS)
+    assert len(BLOCKS) == len(GOLDEN), "two blocks have the same name"
     others = {"brief", "keys", "words", "uniforms", "normals", "far words", "quantile", "digest"}
     assert set(GOLDEN) - set(MESSAGES) == others
 
@@ -125,7 +126,9 @@ def test_table_of_keys_is_the_access_table() -> None:
     documented: dict[tuple[str, str], set[str]] = {}
     everybody = {"sensor": ["sensor"], "router": ["router"], "recorder": ["recorder"], "receiver": list(receivers)}
     everybody |= {"legitimate": ["legitimate"], "controller": ["controller"]}
-    rows = re.findall(r"^\| (`[a-z]+(?:/.*?)?`.*?) \| (.*?) \| (.*?) \| (.*?) \|$", TEXT.split("## A run")[0], re.M)
+    rows = re.findall(
+        r"^\| (`[a-z]+(?:/.*?)?`.*?) \| (.*?) \| (.*?) \| (.*?) \|$", PAGES["protocol.md"].split("## A run")[0], re.M
+    )
     assert len(rows) == 14
     for paths, _, writers, readers in rows:
         for path in re.findall(r"`(.*?)`", paths):

@@ -8,7 +8,7 @@ Tables are merged some slots at a time, so that a long run's tables fit into mem
 slots, but the receivers alternate as they did in the run. A merged table has, for every few thousand slots, one receiver after
 the other, like the table of an unsharded run that reports that many at once.
 
-Source: docs/scale.md, shards.
+Source: docs/performance.md, shards.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Trials share only the scenario, and every random number is addressed by its trial. So a shard is a complete run, with router,
 sensor, receivers and recorder, independent of all others. `gathering` merges their results.
 
-Source: docs/scale.md.
+Source: docs/performance.md, shards.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A process's connection with its router: one Zenoh session after another, each with everything the process has declared.
 
 Zenoh would reconnect a session by itself, but then may deliver one key's messages to another key's subscriber
-(docs/upstream.md). So a session that has lost its router is closed and another one is opened, which holds nothing that
+(docs/maintainers/tests.md). So a session that has lost its router is closed and another one is opened, which holds nothing that
 could be out of date. The process keeps one object for each publisher, subscription or other entity that it declares: it reads a
 subscription without a break while another subscriber replaces the subscription's own.
 

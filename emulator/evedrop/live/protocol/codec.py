@@ -1,8 +1,8 @@
 """Encodes and reads messages: msgpack maps whose arrays are little-endian bytes. Errors name the sender of a malformed message.
 
 Every message begins with an envelope, the full key it was put on, and a reader drops messages that name another key: Zenoh may
-deliver one key's messages to another key's subscriber after connections flap (docs/upstream.md). Only the message itself shows
-this: the sample shows the key of the subscriber.
+deliver one key's messages to another key's subscriber after connections flap (docs/maintainers/tests.md). Only the message
+itself shows this: the sample shows the key of the subscriber.
 
 Source: docs/protocol.md, messages and envelope.
 """
