@@ -24,6 +24,8 @@ def test_the_document_has_every_block() -> None:
     """Every kind of message is there, and everything else that is pinned: a renamed block is not silently skipped."""
     assert {name.split(",")[0] for name in MESSAGES} == set(CODECS)
     assert len(BLOCKS) == len(GOLDEN), "two blocks have the same name"
+    shown = re.findall(r"^```golden (\w[\w-]*)", PAGES["protocol.md"], re.M)
+    assert set(CODECS) - {"state"} == set(shown) - {"brief"}, "a state has the form of an estimate"
     others = {"brief", "keys", "words", "uniforms", "normals", "far words", "quantile", "digest"}
     assert set(GOLDEN) - set(MESSAGES) == others
 
