@@ -9,7 +9,7 @@ from tests.builders import digests_of
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
 from tests.packages import install
-from tests.scenario.conformance.own_classes import BLOCK, PAGE
+from tests.scenario.conformance.own_classes import BLOCK, TEXT
 from tests.show.view.read_back import rows
 
 COMMAND = """
@@ -58,7 +58,7 @@ NEW = {"flipped", "chaser", "shifts", "steady", "dim", "largest_error", "ratio",
 @pytest.fixture
 def environment(evedrop: Evedrop) -> dict[str, str]:
     """An environment in which the package is installed."""
-    blocks = {name: code for name, code in BLOCK.findall(PAGE.read_text(encoding="utf-8")) if name.endswith(".py")}
+    blocks = {name: code for name, code in BLOCK.findall(TEXT) if name.endswith(".py")}
     install(evedrop.folder / "site", {**blocks, "greeting.py": COMMAND, "steady.py": DELAY}, ENTRIES)
     return {**evedrop.environment, "PYTHONPATH": str(evedrop.folder / "site")}
 

@@ -224,4 +224,4 @@ class NotRegistered(KeyError):
         self.why = why
 
     def __str__(self) -> str:
-        return f"{self.name}{self.why or ' is not the name of a class; look at docs/your-own.md'}"
+        return f"{self.name}{self.why or ' is not the name of a class; look at docs/your-own/overview.md'}"

@@ -2,7 +2,7 @@
 
 A plug-in needs nothing else of Evedrop. Every name here keeps its meaning within a major version.
 
-Source: docs/your-own.md.
+Source: docs/your-own/overview.md.
 """
 
 from __future__ import annotations

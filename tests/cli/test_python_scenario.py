@@ -25,7 +25,7 @@ from evedrop.simulate.montecarlo import Plan
 from evedrop.wire.file import example_wire, wire_of
 from evedrop.wire.timeline import with_change
 from tests.builders import GOOD, digests_of, mistakes_in_good
-from tests.scenario.conformance.own_classes import BLOCK, PAGE
+from tests.scenario.conformance.own_classes import BLOCK, TEXT
 
 
 def vehicle(**others: Any) -> Scenario:
@@ -37,7 +37,7 @@ def vehicle(**others: Any) -> Scenario:
 @pytest.fixture
 def own(tmp_path: Path) -> Iterator[Any]:
     """The module `flipped` of the tutorial, imported from a folder as a user does."""
-    blocks = dict(BLOCK.findall(PAGE.read_text(encoding="utf-8")))
+    blocks = dict(BLOCK.findall(TEXT))
     (tmp_path / "flipped.py").write_text(blocks["flipped.py"])
     sys.path.insert(0, str(tmp_path))
     yield importlib.import_module("flipped")

@@ -6,6 +6,7 @@ and on a line of its own for any lines. All commands of a page share a folder. A
 
     <!-- file: mine.toml -->        the text is written to this file, as it is if its first line is `# mine.toml`
     <!-- exit status: 1 -->         of the last command; otherwise all must be 0
+    <!-- with: other.md, third.md -->  the files of these pages, from the same folder of pages, are there, too
     <!-- not run: needs docker -->  shown only
 
 `python -m tests.docs.consoles PAGE` writes the output into the page wherever the page's differs.
@@ -44,6 +45,12 @@ class Block:
         """The name of the file that it contains, by the comment above it or its own first line."""
         match = re.match(r"# ([\w./-]+\.(?:py|toml))\n", self.text)
         return self._note("file") or (match[1] if match else None)
+
+    @property
+    def others(self) -> list[str]:
+        """The pages whose files its commands use, too."""
+        names = self._note("with")
+        return names.split(", ") if names else []
 
     @property
     def not_run(self) -> str | None:
@@ -117,9 +124,10 @@ class Carried:
 def carry_out(page: Path, folder: Path) -> Iterator[tuple[Block, list[Carried]]]:
     """Each block of commands with what its commands did, in order."""
     for block in blocks(page):
-        if block.file is not None:
-            (folder / block.file).parent.mkdir(parents=True, exist_ok=True)
-            (folder / block.file).write_text(block.text, encoding="utf-8")
+        _write(block, folder)
+        for name in block.others:
+            for other in blocks(page.parent / name):
+                _write(other, folder)
         if block.is_run:
             commands = list(block.commands())
             yield (
@@ -129,6 +137,12 @@ def carry_out(page: Path, folder: Path) -> Iterator[tuple[Block, list[Carried]]]
                     for i, (command, shown) in enumerate(commands)
                 ],
             )
+
+
+def _write(block: Block, folder: Path) -> None:
+    if block.file is not None:
+        (folder / block.file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / block.file).write_text(block.text, encoding="utf-8")
 
 
 def _carried(command: str, shown: str, status: int, folder: Path) -> Carried:

@@ -80,12 +80,14 @@ def test_output_is_compared(printed: str, shown: str, same: bool) -> None:
 
 
 def test_a_page_that_is_wrong_is_found(tmp_path: Path) -> None:
-    """A file, a wrong number, a status other than the stated one, and a command that fails without a word."""
+    """A file, one of another page, a wrong number or status, and a command that fails without a word."""
     page = tmp_path / "page.md"
+    (tmp_path / "other.md").write_text("```toml\n# b.toml\n```\n")
     page.write_text(
         "<!-- file: a.txt -->\n```text\n1\n```\n\n```console\n$ cat a.txt\n1\n$ cat a.txt; echo \\\n  3\n1\n2\n$ false\n```\n"
+        "<!-- with: other.md -->\n```console\n$ cat b.toml\n# b.toml\n```\n"
         "<!-- exit status: 3 -->\n```console\n$ true\n$ exit 3\n```\n"
         "<!-- not run: it never ends -->\n```console\n$ sleep 1000\n```\n"
     )
     done = [[command.is_right for command in commands] for _, commands in carry_out(page, tmp_path)]
-    assert done == [[True, False, False], [True, True]]
+    assert done == [[True, False, False], [True], [True, True]]

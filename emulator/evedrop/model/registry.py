@@ -1,6 +1,6 @@
 """Classes by their name in a scenario: built in, of an installed package, or custom, named PACKAGE.MODULE:CLASS.
 
-Source: docs/your-own.md.
+Source: docs/your-own/overview.md.
 """
 
 from __future__ import annotations

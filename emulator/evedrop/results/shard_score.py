@@ -167,7 +167,7 @@ def dump_score(run_tally: RunTally, folder: Path, scenario: Scenario) -> None:
                 unpacked(packed(kept), blank[watch])
             except NotData as error:
                 kept.fail(
-                    f"a shard cannot store its tally ({error}); docs/your-own.md says what a tally may consist of"
+                    f"a shard cannot store its tally ({error}); docs/your-own/metric.md says what a tally may consist of"
                 )
     with private_replacement(folder / _NAME) as unfinished:
         unfinished.write_bytes(packed(run_tally))

@@ -1,6 +1,6 @@
 """A dry run of classes that are not built in: a few slots of the scenario in memory, before any process is started.
 
-Source: docs/your-own.md.
+Source: docs/your-own/rules.md.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The processes of a run import these modules for the classes in them. No other file of the folder is imported, unless a named
 module imports it.
 
-Source: docs/your-own.md.
+Source: docs/your-own/overview.md.
 """
 
 from __future__ import annotations

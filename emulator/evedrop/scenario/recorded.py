@@ -2,7 +2,7 @@
 
 Somebody else may have written the folder. A class of its own in it would run with all the rights of the user who looks.
 
-Source: docs/your-own.md, results are data.
+Source: docs/your-own/rules.md, results are data.
 """
 
 from __future__ import annotations

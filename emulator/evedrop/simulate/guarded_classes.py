@@ -3,7 +3,7 @@
 Encoders and receivers are checked as in a live run (`evedrop.scenario.conformance.checked`); the further requirements of a
 simulation are checked here.
 
-Source: docs/your-own.md, mistakes.
+Source: docs/your-own/rules.md, mistakes.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from tests.builders import GOOD
 from tests.pages import Checked, checked
-from tests.scenario.conformance.own_classes import BLOCK, PAGE
+from tests.scenario.conformance.own_classes import BLOCK, TEXT
 
 SCENARIO = Scenario(GOOD).replace(slots=30, trials=2, record_trials=2)
 
@@ -189,7 +189,7 @@ def test_a_sweep_is_drawn_as_its_file_is() -> None:
 @pytest.fixture
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The module `flipped` of the tutorial, imported from a folder as a user does."""
-    (tmp_path / "flipped.py").write_text(dict(BLOCK.findall(PAGE.read_text(encoding="utf-8")))["flipped.py"])
+    (tmp_path / "flipped.py").write_text(dict(BLOCK.findall(TEXT))["flipped.py"])
     monkeypatch.syspath_prepend(str(tmp_path))
     yield importlib.import_module("flipped")
     del sys.modules["flipped"]

@@ -10,8 +10,10 @@ from tests.conftest import Evedrop
 from tests.packages import install
 
 DOCS = Path(__file__).parents[3] / "docs"
-COMMAND = (DOCS / "your-own.md").read_text(encoding="utf-8").partition("# greeting.py\n")[2].partition("```")[0]
-"""The module of docs/your-own.md."""
+COMMAND = (
+    (DOCS / "your-own" / "command.md").read_text(encoding="utf-8").partition("# greeting.py\n")[2].partition("```")[0]
+)
+"""The module of docs/your-own/command.md."""
 
 
 def test_a_package_adds_a_command_by_its_metadata(evedrop: Evedrop) -> None:

@@ -1,4 +1,4 @@
-"""Metrics of installed packages: the one in docs/your-own.md in every kind of run, and metrics that fail."""
+"""Metrics of installed packages: the one in docs/your-own/metric.md in every kind of run, and metrics that fail."""
 
 from __future__ import annotations
 
@@ -32,8 +32,10 @@ def installed(evedrop: Evedrop, module: str, name: str = "largest_error") -> dic
 
 
 def of_the_docs() -> str:
-    """The module of docs/your-own.md."""
-    return (DOCS / "your-own.md").read_text(encoding="utf-8").partition("# largest.py\n")[2].partition("```")[0]
+    """The module of docs/your-own/metric.md."""
+    return (
+        (DOCS / "your-own" / "metric.md").read_text(encoding="utf-8").partition("# largest.py\n")[2].partition("```")[0]
+    )
 
 
 @pytest.mark.long
@@ -84,7 +86,10 @@ def test_a_tally_that_is_not_data_fails_alone_in_shards(evedrop: Evedrop) -> Non
     run = ("run", "eavesdroppers", "--view", "off", "--set", "shards=2", "--json", *RUN)
     done = evedrop.process(*run, "--out", "shards", env=installed(evedrop, module))
     assert done.status == 3
-    assert "a shard cannot store its tally (an instance where the example has none); docs/your-own.md says" in done.err
+    assert (
+        "a shard cannot store its tally (an instance where the example has none); docs/your-own/metric.md says"
+        in done.err
+    )
     smart = json.loads(done.out)["peers"]["smart"]
     assert smart["largest_error"] is None
     assert smart["mean_squared_error"] > 0

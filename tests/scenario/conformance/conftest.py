@@ -15,7 +15,7 @@ from evedrop.model.eavesdroppers import REMOTE_CALLS, remote_class
 from evedrop.scenario.conformance import answering
 from evedrop.scenario.plugins import look_in
 from tests.conftest import Evedrop
-from tests.scenario.conformance.own_classes import BLOCK, PAGE
+from tests.scenario.conformance.own_classes import BLOCK, TEXT
 
 
 @pytest.fixture
@@ -58,6 +58,6 @@ def asked_here(imports_forgotten: None) -> Iterator[None]:
 @pytest.fixture
 def tutorial(evedrop: Evedrop) -> Evedrop:
     """The command in a folder with the files of the tutorial."""
-    for name, text in BLOCK.findall(PAGE.read_text(encoding="utf-8")):
+    for name, text in BLOCK.findall(TEXT):
         (evedrop.folder / name).write_text(text, encoding="utf-8")
     return evedrop

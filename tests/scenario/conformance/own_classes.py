@@ -1,11 +1,15 @@
-"""Classes of anybody's own: the tutorial, a scenario, and the beginning of a module."""
+"""Classes of anybody's own: the pages about them, a scenario, and the beginning of a module."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-PAGE = Path(__file__).parents[3] / "docs" / "your-own.md"
+FOLDER = Path(__file__).parents[3] / "docs" / "your-own"
+PAGES = [FOLDER / f"{name}.md" for name in ("scheme", "eavesdropper", "link", "overview")]
+PAGES += sorted({*FOLDER.glob("*.md")} - {*PAGES})
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+"""All pages: first those whose classes the scenario of the overview names."""
 BLOCK = re.compile(r"^```(?:python|toml)\n# (\S+\.\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 SCENARIO = """

@@ -14,14 +14,14 @@ from evedrop.scenario.loading import load, with_event
 from tests.builders import digests_of
 from tests.conftest import Evedrop
 from tests.packages import install
-from tests.scenario.conformance.own_classes import BLOCK, PAGE
+from tests.scenario.conformance.own_classes import BLOCK, TEXT
 
 pytestmark = pytest.mark.usefixtures("imports_forgotten")
 
 
 def test_the_tutorial_has_short_classes_and_a_scenario() -> None:
     """Each is complete in less than 40 lines; a metric with its tally, and an application, in less than 50."""
-    blocks = dict(BLOCK.findall(PAGE.read_text(encoding="utf-8")))
+    blocks = dict(BLOCK.findall(TEXT))
     modules = {
         "flipped.py",
         "tracker.py",
@@ -40,7 +40,7 @@ def test_the_tutorial_has_short_classes_and_a_scenario() -> None:
 
 def test_the_tutorial_works_as_it_is_typed(tutorial: Evedrop) -> None:
     """Its classes are checked, and run live, in memory and again from the results, with the same digests."""
-    lines = PAGE.read_text(encoding="utf-8").splitlines()
+    lines = TEXT.splitlines()
     commands = [line.split()[2:] for line in lines if line.startswith("$ evedrop ")]
     assert {words[0] for words in commands} == {"check", "run", "montecarlo", "diff"}
     for words in [*commands, ["check", "--scheme", "flipped:Flipped"]]:
@@ -167,7 +167,7 @@ def test_design_is_for_the_scheme_it_is_for(tutorial: Evedrop) -> None:
 
 def test_a_plug_in_needs_one_module(tutorial: Evedrop) -> None:
     """The tutorial imports `evedrop.extend` and nothing else of Evedrop; every name there is documented and importable."""
-    text = PAGE.read_text(encoding="utf-8")
+    text = TEXT
     assert set(re.findall(r"^(?:from|import) (evedrop[\w.]*)", text, flags=re.MULTILINE)) == {"evedrop.extend"}
     assert set(re.findall(r"evedrop\.(?:model|kernels|streams|live|memory)[\w.]*", text)) == set()
     assert all(

@@ -33,7 +33,7 @@ def with_package(evedrop: Evedrop, code: str) -> dict[str, str]:
 
 def test_an_event_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
     """The one of the docs, a file and a line of metadata: in memory and live, with equal digests, and in both summaries."""
-    page = (DOCS / "your-own.md").read_text(encoding="utf-8")
+    page = (DOCS / "your-own" / "event.md").read_text(encoding="utf-8")
     environment = with_package(evedrop, page.partition("# dimming.py\n")[2].partition("```")[0])
     (evedrop.folder / "dim.toml").write_text(SCENARIO)
     (evedrop.folder / "bright.toml").write_text(SCENARIO.replace('{ at = 20, dim = "smart" }, ', ""))
@@ -71,7 +71,7 @@ def test_mistakes_in_an_event_of_a_package_are_named(
     evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch, event: str, line: str
 ) -> None:
     """In the words for the events here."""
-    page = (DOCS / "your-own.md").read_text(encoding="utf-8")
+    page = (DOCS / "your-own" / "event.md").read_text(encoding="utf-8")
     with_package(evedrop, page.partition("# dimming.py\n")[2].partition("```")[0])
     monkeypatch.syspath_prepend(str(evedrop.folder))
     (evedrop.folder / "dim.toml").write_text(SCENARIO.replace('{ at = 20, dim = "smart" }', event))
@@ -113,7 +113,7 @@ FAILING = {
 def test_an_event_that_fails_is_a_mistake_of_who_uses_it(evedrop: Evedrop, case: str) -> None:
     """Before anything is started, with the error and its line."""
     line, instead, message = FAILING[case]
-    page = (DOCS / "your-own.md").read_text(encoding="utf-8")
+    page = (DOCS / "your-own" / "event.md").read_text(encoding="utf-8")
     code = page.partition("# dimming.py\n")[2].partition("```")[0]
     assert line in code
     environment = with_package(evedrop, code.replace(line, instead))

@@ -136,7 +136,7 @@ PLATOON = {"evedrop.applications": {"platoon": "platooning:Platoon"}}
 @pytest.mark.long
 def test_an_application_of_another_package_needs_nothing_here(evedrop: Evedrop) -> None:
     """The one of the docs, a file and a line of metadata: in memory, live and in a sweep, with expectation and closing line."""
-    page = (Path(__file__).parents[3] / "docs" / "your-own.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "your-own" / "application.md").read_text(encoding="utf-8")
     install(evedrop.folder, {"platooning.py": page.partition("# platooning.py\n")[2].partition("```")[0]}, PLATOON)
     (evedrop.folder / "two.toml").write_text(SCENARIO)
     environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}

@@ -2,7 +2,7 @@
 
 The class of a metric says how it is summed, merged, checked and shown. No other code depends on its name.
 
-Source: docs/metrics.md, receivers; docs/your-own.md, a metric.
+Source: docs/metrics.md, receivers; docs/your-own/metric.md.
 """
 
 from __future__ import annotations

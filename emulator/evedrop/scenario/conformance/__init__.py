@@ -1,4 +1,4 @@
 """Rules for classes that are used in a run, checked on small problems, by `evedrop check` and before every run.
 
-Source: docs/your-own.md.
+Source: docs/your-own/rules.md.
 """

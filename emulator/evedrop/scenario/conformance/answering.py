@@ -3,7 +3,7 @@
 It is told where modules are, then one question per line, each a list: the name of a class, the question, and arguments.
 Each answer is one line. The process ends when no question comes for some seconds, and when the asking process is gone.
 
-Source: docs/your-own.md, where a class runs.
+Source: docs/your-own/rules.md, where a class runs.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _dry_run(
     process: tuple[Any, ...],
     batch: tuple[int, int, int],
 ) -> str | None:
-    """Report what breaks in some slots of a scenario. Source: docs/your-own.md, mistakes."""
+    """Report what breaks in some slots of a scenario. Source: docs/your-own/rules.md, mistakes."""
     del kind  # the class of the strategy, or of the strategy it reads as
     from evedrop.model.schemes import SCHEMES, scheme_of  # noqa: PLC0415 - the same
     from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks, EavesdropperSetup  # noqa: PLC0415 - needed last

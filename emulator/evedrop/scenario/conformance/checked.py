@@ -3,7 +3,7 @@
 A dry run calls these classes for the first slots only (`evedrop.scenario.dry_run`). An error or a wrong result in any later slot
 ends the run, and the message names class, slots and trials.
 
-Source: docs/your-own.md, mistakes.
+Source: docs/your-own/rules.md, mistakes.
 """
 
 from __future__ import annotations

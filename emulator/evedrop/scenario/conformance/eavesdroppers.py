@@ -1,6 +1,6 @@
 """The rules for eavesdroppers.
 
-Source: docs/your-own.md.
+Source: docs/your-own/rules.md.
 """
 
 from __future__ import annotations

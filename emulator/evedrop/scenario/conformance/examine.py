@@ -1,6 +1,6 @@
 """Checks classes by name against every rule, for `evedrop check --scheme NAME` and its like.
 
-Source: docs/your-own.md.
+Source: docs/your-own/rules.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The rules for loss models and delay models.
 
-Source: docs/your-own.md.
+Source: docs/your-own/rules.md.
 """
 
 from __future__ import annotations

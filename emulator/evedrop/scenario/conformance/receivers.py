@@ -2,7 +2,7 @@
 
 Blocks of slots give the same bits as single slots, wherever the blocks begin; a scheme's encoder keeps this rule, too.
 
-Source: docs/your-own.md, many slots at once.
+Source: docs/your-own/rules.md, many slots at once.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The kinds of event by their name in a scenario: the built-in ones, and those of installed packages.
 
-Source: docs/scenario.md, events; docs/your-own.md, an event.
+Source: docs/scenario.md, events; docs/your-own/event.md.
 """
 
 from __future__ import annotations

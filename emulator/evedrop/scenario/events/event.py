@@ -3,7 +3,7 @@
 The code that carries out effects on links, receivers and processes knows neither the kinds of event nor those of effect: it asks
 an effect what it does. `note`, a line in the list of events, is the kind without an effect.
 
-Source: docs/architecture.md, events; docs/scenario.md, events; docs/your-own.md, an event.
+Source: docs/architecture.md, events; docs/scenario.md, events; docs/your-own/event.md.
 """
 
 from __future__ import annotations

@@ -20,8 +20,7 @@ from tests.conftest import Evedrop
 from tests.packages import install
 from tests.show.view.read_back import rows
 
-PAGE = Path(__file__).parents[4] / "docs" / "your-own.md"
-SECTION = re.compile(r"^## A panel$.*?(?=^## )", re.MULTILINE | re.DOTALL)
+PAGE = Path(__file__).parents[4] / "docs" / "your-own" / "panel.md"
 BLOCK = re.compile(r"^```(?:python|toml)\n# (\S+\.\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 GROUP = "evedrop.panels"
 SLOTS = 60
@@ -42,9 +41,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.fixture
 def tutorial(site: Path) -> Path:
     """The package of the tutorial."""
-    match = SECTION.search(PAGE.read_text(encoding="utf-8"))
-    assert match is not None
-    blocks = dict(BLOCK.findall(match[0]))
+    blocks = dict(BLOCK.findall(PAGE.read_text(encoding="utf-8")))
     entries = tomllib.loads(blocks["pyproject.toml"])["project"]["entry-points"]
     install(site, {"ratio.py": blocks["ratio.py"]}, entries)
     return site

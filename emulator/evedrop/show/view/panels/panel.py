@@ -2,7 +2,7 @@
 
 Heights of rows and lanes are fractions of a small window of 720 pixels. Larger windows have room to spare.
 
-Source: docs/your-own.md, a panel.
+Source: docs/your-own/panel.md.
 """
 
 from __future__ import annotations
