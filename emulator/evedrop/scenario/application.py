@@ -3,7 +3,7 @@
 An application has a table of its own in a scenario, metrics in the summary and in expectations, lines in the closing report,
 panels in the view and a picture of a sweep. Nothing else names an application: it asks those whose tables a scenario contains.
 
-Source: docs/your-own/overview.md, applications.
+Source: docs/your-own/application.md.
 """
 
 from __future__ import annotations

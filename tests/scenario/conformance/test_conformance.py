@@ -105,8 +105,8 @@ class Boastful(Naive):
 @pytest.mark.parametrize(
     ("kind", "rule", "message"),
     [
-        (Forgetful, "a slot asked for again", "Belief.memory"),
-        (Boastful, "what it says to theory", "correct use_probabilities, which must be the same in every slot"),
+        (Forgetful, "slots computed again", "Belief.memory"),
+        (Boastful, "theory agrees with simulation", "correct use_probabilities, which must be the same in every slot"),
     ],
 )
 def test_an_eavesdropper_that_breaks_a_rule_is_told_which(kind: Any, rule: str, message: str) -> None:

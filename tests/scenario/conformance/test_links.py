@@ -60,10 +60,10 @@ class Whole(Bernoulli):
 @pytest.mark.parametrize(
     ("kind", "parameters", "rule", "message"),
     [
-        (Better, {"quality": 0.8}, "the quality it says", "quality_at() says 0.8"),
-        (Unsteady, {"p": 0.05, "r": 0.1}, "the quality it says", "give `chain`"),
-        (InPlace, {"quality": 0.9}, "a copy that goes on", "never change an array of it in place"),
-        (Whole, {"quality": 0.9}, "slots in pieces", "not on how many slots"),
+        (Better, {"quality": 0.8}, "quality agrees with simulation", "quality_at() says 0.8"),
+        (Unsteady, {"p": 0.05, "r": 0.1}, "quality agrees with simulation", "give `chain`"),
+        (InPlace, {"quality": 0.9}, "independent copies", "never change an array of it in place"),
+        (Whole, {"quality": 0.9}, "blocks of any length", "not on how many slots"),
     ],
 )
 def test_a_loss_model_that_breaks_a_rule_is_told_which(
@@ -84,4 +84,4 @@ class Early(Normal):
 def test_a_delay_model_that_breaks_a_rule_is_told_which() -> None:
     """As a loss model is."""
     result = broken(DelayChecks(lambda: Early(2.0, 1.0), Early).verdicts())
-    assert "and arrived(" in result["the delays it says"]
+    assert "and arrived(" in result["delays agree with simulation"]

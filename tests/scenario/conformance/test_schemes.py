@@ -113,27 +113,27 @@ class Apart(Cipher):
 
 
 SCHEME_RULES: dict[str, tuple[type[Scheme], str, str]] = {
-    "a trial by itself": (plain_with(Centred), "slot 0, trial 0: Packet.z is ", "no sum over trials"),
-    "the same scheme made twice": (plain_with(Counted), "with another one of its kind", "keep no state outside"),
-    "a slot asked for again": (plain_with(estimator=Remembers), "when the slot is asked for again", "Belief.memory"),
-    "packets that were lost": (
+    "independent trials": (plain_with(Centred), "slot 0, trial 0: Packet.z is ", "no sum over trials"),
+    "same results when made again": (plain_with(Counted), "with another one of its kind", "keep no state outside"),
+    "slots computed again": (plain_with(estimator=Remembers), "when the slot is asked for again", "Belief.memory"),
+    "lost packets unused": (
         plain_with(estimator=Peeks),
         "depending on z where nothing was received",
         "where gamma is true alone",
     ),
-    "actions that γ tells": (
+    "actions predictable from receptions": (
         plain_with(estimator=Discards),
         "act() says STATE and step() did DISCARDED",
         "reads_packets",
     ),
-    "no worse than prediction": (
+    "better than open-loop prediction": (
         plain_with(Negative),
         "for a receiver that hears nothing",
         "decode what encode() has made",
     ),
-    "slot 0": (NoFirst, "slot 0, trial 0: nu is true", "no state before the first"),
-    "sensor and estimator apart": (Apart, "made from shared()", "from the keys alone"),
-    "what it says to theory": (
+    "a state in slot 0": (NoFirst, "slot 0, trial 0: nu is true", "no state before the first"),
+    "separate sensor and estimator": (Apart, "made from shared()", "from the keys alone"),
+    "theory agrees with simulation": (
         plain_with(outcomes=lambda self, mu: Outcomes.plain(mu / 2)),  # noqa: ARG005 - a method
         "the mean squared error is",
         "or return None",

@@ -77,10 +77,9 @@ def _check_classes(names: dict[str, str], parameters: dict[str, Any]) -> int:
     status = 0
     for examination in examined(names, parameters):
         broken = [verdict for verdict in examination.verdicts if verdict.broken is not None]
-        print(
-            f"{examination.title}: {f'{len(broken)} broken' if broken else 'all'} of {len(examination.verdicts)} rules"
-            + ("" if broken else " kept")
-        )
+        rules = len(examination.verdicts)
+        found = f"{len(broken)} of {rules} rules are broken" if broken else f"all {rules} rules hold"
+        print(f"{examination.title}: {found}")
         for verdict in examination.verdicts:
             tell(f"  {'ok' if verdict.broken is None else 'BROKEN':<8}{verdict.rule}", "BROKEN")
             if verdict.broken is not None:

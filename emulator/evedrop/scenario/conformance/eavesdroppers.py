@@ -108,14 +108,14 @@ def eavesdropper_verdicts(setup: EavesdropperSetup) -> list[RuleVerdict]:
     slots = 0 if at is None else min(at + 3, 200)
     exact = [
         ("shapes and types", checks.shapes),
-        ("the same eavesdropper made twice", checks.twice),
-        ("a trial by itself", checks.alone),
-        ("a slot asked for again", checks.again),
-        ("packets that were lost", checks.lost),
-        ("actions that γ tells", checks.actions),
+        ("same results when made again", checks.twice),
+        ("independent trials", checks.alone),
+        ("slots computed again", checks.again),
+        ("lost packets unused", checks.lost),
+        ("actions predictable from receptions", checks.actions),
         ("many slots at once", checks.blocks),
     ]
-    return judged((exact, small(slots)), ([("what it says to theory", checks.theory)], large()))
+    return judged((exact, small(slots)), ([("theory agrees with simulation", checks.theory)], large()))
 
 
 @final

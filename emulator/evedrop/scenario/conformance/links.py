@@ -48,12 +48,12 @@ class LossChecks:
         """Check every rule, on small problems."""
         exact = [
             ("shapes and types", self.shapes),
-            ("the same link made twice", self.twice),
-            ("a trial by itself", self.alone),
-            ("slots in pieces", self.pieces),
-            ("a copy that goes on", self.copied),
+            ("same results when made again", self.twice),
+            ("independent trials", self.alone),
+            ("blocks of any length", self.pieces),
+            ("independent copies", self.copied),
         ]
-        return judged((exact, small()), ([("the quality it says", self.rate)], [_long(loss) for loss in large()]))
+        return judged((exact, small()), ([("quality agrees with simulation", self.rate)], [_long(loss) for loss in large()]))
 
     def _made(self) -> LossModel:
         with calling(f"{self._kind.__name__}(…)", self._kind):
@@ -180,10 +180,10 @@ class DelayChecks:
         """Check every rule, on small problems."""
         exact = [
             ("shapes and types", self.shapes),
-            ("a trial by itself", self.alone),
-            ("slots in pieces", self.pieces),
+            ("independent trials", self.alone),
+            ("blocks of any length", self.pieces),
         ]
-        return judged((exact, small()), ([("the delays it says", self.says)], large()))
+        return judged((exact, small()), ([("delays agree with simulation", self.says)], large()))
 
     def _delays(self, problem: Problem, bounds: tuple[int, ...] = ()) -> Floats:
         reader, parts = BlockReader(key("delay"), problem.batch, 1), []

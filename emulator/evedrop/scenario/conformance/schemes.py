@@ -44,16 +44,16 @@ def scheme_verdicts(scheme_of: SchemeOf, kind: type[Scheme]) -> list[RuleVerdict
     checks = SchemeChecks(scheme_of, kind)
     exact = [
         ("shapes and types", checks.shapes),
-        ("the same scheme made twice", checks.twice),
-        ("a trial by itself", checks.alone),
-        ("sensor and estimator apart", checks.apart),
-        ("a slot asked for again", checks.again),
-        ("packets that were lost", checks.lost),
-        ("slot 0", checks.first),
-        ("actions that γ tells", checks.actions),
+        ("same results when made again", checks.twice),
+        ("independent trials", checks.alone),
+        ("separate sensor and estimator", checks.apart),
+        ("slots computed again", checks.again),
+        ("lost packets unused", checks.lost),
+        ("a state in slot 0", checks.first),
+        ("actions predictable from receptions", checks.actions),
         ("many slots at once", checks.blocks),
     ]
-    in_the_mean = [("no worse than prediction", checks.prediction), ("what it says to theory", checks.theory)]
+    in_the_mean = [("better than open-loop prediction", checks.prediction), ("theory agrees with simulation", checks.theory)]
     return judged((exact, small()), (in_the_mean, large()))
 
 
