@@ -125,7 +125,7 @@ def test_a_panel_that_the_recording_lacks_is_refused(simulated: Callable[..., Si
     names = str(told.value).partition("; give ")[2].partition(";")[0].replace(" or ", ", ").split(", ")
     page = (Path(__file__).parents[3] / "docs" / "view.md").read_text(encoding="utf-8")
     named = re.findall(
-        r"`([a-z-]+)`", page.partition("a list of those that it has:")[2].partition(" for the scenario")[0]
+        r"`([a-z-]+)`", page.partition("`vehicle` has the panels")[2].partition(".")[0]
     )
     assert names[:2] == ["scene", "numbers"]
     assert {*names[2:]} == {*named, "naive", "suspicious", "smart"}

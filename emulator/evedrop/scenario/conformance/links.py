@@ -53,7 +53,9 @@ class LossChecks:
             ("blocks of any length", self.pieces),
             ("independent copies", self.copied),
         ]
-        return judged((exact, small()), ([("quality agrees with simulation", self.rate)], [_long(loss) for loss in large()]))
+        return judged(
+            (exact, small()), ([("quality agrees with simulation", self.rate)], [_long(loss) for loss in large()])
+        )
 
     def _made(self) -> LossModel:
         with calling(f"{self._kind.__name__}(…)", self._kind):

@@ -53,7 +53,10 @@ def scheme_verdicts(scheme_of: SchemeOf, kind: type[Scheme]) -> list[RuleVerdict
         ("actions predictable from receptions", checks.actions),
         ("many slots at once", checks.blocks),
     ]
-    in_the_mean = [("better than open-loop prediction", checks.prediction), ("theory agrees with simulation", checks.theory)]
+    in_the_mean = [
+        ("better than open-loop prediction", checks.prediction),
+        ("theory agrees with simulation", checks.theory),
+    ]
     return judged((exact, small()), (in_the_mean, large()))
 
 
