@@ -62,4 +62,7 @@ def test_how_often_a_right_covariance_is_called_wrong() -> None:
     """P(χ² with one degree of freedom > 20): the number in the page."""
     probability = math.erfc(math.sqrt(FACTOR / 2.0))
     page = text("docs/view.md")
-    assert rf"exceeds the factor {FACTOR:.0f} with probability at most ${probability * 1e6:.1f} \cdot 10^{{-6}}$ a slot" in page
+    assert (
+        rf"exceeds the factor {FACTOR:.0f} with probability at most ${probability * 1e6:.1f} \cdot 10^{{-6}}$ a slot"
+        in page
+    )

@@ -124,9 +124,7 @@ def test_a_panel_that_the_recording_lacks_is_refused(simulated: Callable[..., Si
         picture_apart(rrd, tmp_path / "r.png", panel="smurt")
     names = str(told.value).partition("; give ")[2].partition(";")[0].replace(" or ", ", ").split(", ")
     page = (Path(__file__).parents[3] / "docs" / "view.md").read_text(encoding="utf-8")
-    named = re.findall(
-        r"`([a-z-]+)`", page.partition("`vehicle` has the panels")[2].partition(".")[0]
-    )
+    named = re.findall(r"`([a-z-]+)`", page.partition("`vehicle` has the panels")[2].partition(".")[0])
     assert names[:2] == ["scene", "numbers"]
     assert {*names[2:]} == {*named, "naive", "suspicious", "smart"}
     assert [path.name for path in tmp_path.iterdir()] == ["r.rrd"]
