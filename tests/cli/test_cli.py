@@ -267,7 +267,7 @@ def test_a_wrong_golden_digest_is_reported(monkeypatch: pytest.MonkeyPatch, caps
 
 @pytest.mark.parametrize(
     "arguments",
-    [(), ("nonsense",), ("run",), ("run", "numerical", "--slots", "many"), ("run", "numerical", "--view", "sideways")],
+    [("nonsense",), ("run",), ("run", "numerical", "--slots", "many"), ("run", "numerical", "--view", "sideways")],
 )
 def test_a_command_line_that_is_none_is_exit_2(evedrop: Evedrop, arguments: tuple[str, ...]) -> None:
     """Argparse says what it expected."""

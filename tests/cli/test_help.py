@@ -123,7 +123,8 @@ def test_a_word_that_resembles_no_other_gets_no_hint(capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize(
-    ("given", "message"), [([], "COMMAND"), (["--version", "rn"], "evedrop "), (["links", "--help", "fitt"], "links")]
+    ("given", "message"),
+    [(["links"], "COMMAND"), (["--version", "rn"], "evedrop "), (["links", "--help", "fitt"], "links")],
 )
 def test_argparse_finds_what_comes_before_a_command(
     given: list[str], message: str, capsys: pytest.CaptureFixture[str]

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from evedrop.cli.commands import GROUP, MODULES, ROLES
+from evedrop.cli.next_step import print_next_step, print_start
 from evedrop.cli.parser import Parser
 from evedrop.cli.tables import written_tables
 from evedrop.cli.words import words_of_commands
@@ -46,6 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _status(given: list[str]) -> int:
     """Run the command line, and report its errors, and what the machine lacks."""
+    if not given and "_ARGCOMPLETE" not in os.environ:
+        print_start()
+        return UsageError.exit_status
     refuse_scipy_without_room()
     try:
         return _status_of(given)
@@ -66,10 +70,14 @@ def _status_of(given: list[str]) -> int:
     except SystemExit as left:  # argparse has printed the help, or said what it expected
         return int(left.code or 0)
     command: Callable[[argparse.Namespace], int] = options.command
+    described: Command = options.described
     try:
         _check_names(options)
         with written_tables(options), words_of_commands():
-            return command(options)
+            status = command(options)
+        if status == 0:
+            print_next_step(described, options)
+        return status
     except EvedropError as error:
         sys.stdout.flush()
         say(error.illustrated, "evedrop:")
@@ -116,7 +124,8 @@ def parser_of(first: str = "") -> Parser:
     parser = Parser(
         prog="evedrop",
         description="A network emulator for secrecy in remote state estimation.",
-        epilog="evedrop COMMAND --help describes a command; evedrop docs lists the pages of the documentation.",
+        epilog="first: evedrop demo, then evedrop docs tutorial. evedrop COMMAND --help describes a command; "
+        "evedrop docs lists the pages of the documentation.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     top = parser.add_commands()
@@ -128,7 +137,7 @@ def parser_of(first: str = "") -> Parser:
                 groups[command.group] = _added(top, command.group, f"commands about {command.group}").add_commands()
             where = groups[command.group]
         added = _added(where, command.name, does, _epilog(command))
-        added.set_defaults(command=command.run, parser=added)
+        added.set_defaults(command=command.run, described=command, parser=added)
         for option in command.options:
             option(added)
         name = command.name if command.group is None else f"{command.group} {command.name}"
