@@ -84,10 +84,11 @@ ONLY ?=
 test-mutants: $(READY)
 	$(BIN)/python -m tests.faults.mutation --only "$(ONLY)"
 
-# The pages as a site, in build/site. Fails on broken links, on pages that the navigation does not have, and on commands that do
-# not print what a page shows; BUILD_ONLY=1 leaves out the commands, which take minutes. The environment gets
-# what builds the site only here, so that the other targets do not wait for it.
+# The pages as a site, in build/site. Prints how many words each page has, and fails on too many, on broken links, on pages that
+# the navigation does not have, and on commands that do not print what a page shows; BUILD_ONLY=1 leaves out the commands, which
+# take minutes. The environment gets what builds the site only here, so that the other targets do not wait for it.
 docs: $(DOCS_READY)
+	$(BIN)/python tools/site/words.py
 	NO_MKDOCS_2_WARNING=1 PYTHONPATH=tools/site $(BIN)/python -m mkdocs build --clean
 ifndef BUILD_ONLY
 	$(BIN)/python -m tests.docs.reports build/site/screens

@@ -11,7 +11,6 @@ import re
 from pathlib import Path
 
 from picture_folder import PICTURES, program_digest
-from view_pictures import view_pictures, view_section
 
 from evedrop import Scenario, montecarlo
 from evedrop.scenarios import built_in_text, shipped
@@ -36,7 +35,7 @@ def gallery_page() -> str:
         title = Scenario.load(name).title
         parts += [f"## {name}\n", f"**{title}.** {description(name)}\n", f"```text\nevedrop run {name}\n```\n"]
         parts += [f"![Errors, packets and estimates of {name}](gallery/{name}.png)\n"]
-    return "\n".join([*parts, view_section()])
+    return "\n".join(parts)
 
 
 def description(name: str) -> str:
@@ -52,9 +51,9 @@ def description(name: str) -> str:
 
 
 def pictures() -> dict[str, bytes]:
-    """The picture of each scenario, and those of the view, as PNG."""
+    """The picture of each scenario, as PNG."""
     PICTURES.mkdir(parents=True, exist_ok=True)
-    return {name: _picture(name) for name in sorted(shipped())} | view_pictures()
+    return {name: _picture(name) for name in sorted(shipped())}
 
 
 def _picture(name: str) -> bytes:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import html
+import posixpath
 import re
+from collections.abc import Collection
 from html.parser import HTMLParser
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from commands import commands_page
@@ -18,14 +20,17 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 from screens import screens_page
 
-ROOT = Path(__file__).parents[2]
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
 _OF_THE_ROOT = {
-    "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
     "CHANGELOG.md": "changelog.md",
 }
 """Pages outside docs/, and their names on the site."""
+_FRONT = {"README.md": "index.md"}
+"""Links to README lead to the front page of the site."""
+_COPIED = ("site.css", "logo.svg")
 
 _OF_THE_REPOSITORY = re.compile(r"\[([^\]\n]+)\]\(((?:tests/|CITATION\.cff)[^)#\n]*)\)")
 """A link to a file that the repository has and the site has not."""
@@ -38,14 +43,15 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are not in docs/."""
     made = {there: (ROOT / name).read_text(encoding="utf-8") for name, there in _OF_THE_ROOT.items()}
     made |= {
+        "index.md": (HERE / "front.md").read_text(encoding="utf-8"),
         "gallery.md": gallery_page(),
         "screens.md": screens_page(),
         "reference/scenario-keys.md": keys_page(),
         "reference/commands.md": commands_page(),
         "reference/evedrop.md": "# The module `evedrop`\n\n::: evedrop\n\n## wire\n\n::: evedrop.wire.running.wire\n",
         "reference/extend.md": "# The module `evedrop.extend`\n\n::: evedrop.extend\n",
-        "site.css": (Path(__file__).parent / "site.css").read_text(encoding="utf-8"),
     }
+    made |= {name: (HERE / name).read_text(encoding="utf-8") for name in _COPIED}
     for name, text in made.items():
         files.append(File.generated(config, name, content=text))
     for name, picture in pictures().items():
@@ -55,7 +61,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     """Make links between docs/ and the folder above it, as they are in the repository, lead to the site's."""
-    for name, there in _OF_THE_ROOT.items():
+    for name, there in (_OF_THE_ROOT | _FRONT).items():
         markdown = re.sub(rf"\]\((\.\./)?{re.escape(name)}(?=[)#])", f"]({there}", markdown)
     if page.file.src_uri in _OF_THE_ROOT.values():
         markdown = re.sub(r"\]\(docs/", "](", markdown)
@@ -70,9 +76,29 @@ def _named(link: re.Match[str]) -> str:
     return words if path in words else f"{words} (`{path}`)"
 
 
-def on_page_content(page_html: str, **_: Any) -> str:
-    """Write formulas as MathML, which browsers show without a script."""
-    return re.sub(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', _formula, page_html, flags=re.DOTALL)
+def on_page_content(page_html: str, page: Page, files: Files, **_: Any) -> str:
+    """Write formulas as MathML, which browsers show without a script; let pictures open large, and follow the theme."""
+    page_html = re.sub(
+        r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', _formula, page_html, flags=re.DOTALL
+    )
+    folder = PurePosixPath(page.file.dest_uri).parent
+    there = {file.dest_uri for file in files}
+    return _PICTURE.sub(lambda match: match[1] or _opening_large(match[2], match[3], folder, there), page_html)
+
+
+_PICTURE = re.compile(r'(<a\b(?:(?!</a>).)*</a>)|(<img\b[^>]*?\bsrc="([^":]+)"[^>]*>)', re.DOTALL)
+"""A link with all that is in it; or else a picture, and its address."""
+
+
+def _opening_large(picture: str, address: str, folder: PurePosixPath, there: Collection[str]) -> str:
+    """A picture that leads to itself; also that of the light theme, NAME-light.png, if there is one beside it."""
+    light = re.sub(r"(\.\w+)$", r"-light\1", address)
+    if posixpath.normpath(folder / light) not in there:
+        return f'<a class="large" href="{address}">{picture}</a>'
+    return "".join(
+        f'<a class="large" href="{place}">{picture.replace(address, f"{place}#only-{theme}")}</a>'
+        for place, theme in ((address, "dark"), (light, "light"))
+    )
 
 
 def _formula(match: re.Match[str]) -> str:

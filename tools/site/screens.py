@@ -10,8 +10,8 @@ from pathlib import Path
 SCREENS = Path(__file__).parents[2] / "docs" / "screens"
 _HEAD = """# Screens
 
-Evedrop as it is seen on terminals and screens of different sizes. `make docs` makes the dark scenes and the terminals again,
-and fails if one has changed. `make pictures` draws all scenes; those of the light theme are taken from a browser.
+Evedrop on screens and terminals of different sizes. The scenes follow the theme of this page. `make docs` makes the dark scenes
+and the terminals again, and fails if one has changed; `make pictures` draws all scenes, the light ones in a browser.
 
 ## The view
 """
@@ -46,8 +46,8 @@ def screens_page() -> str:
         parts.append(f"### {title}\n")
         for path in sorted(SCREENS.glob(f"{name}-*.png")):
             size, _, theme = path.stem.removeprefix(f"{name}-").partition("-")
-            words = f"{title}, {size.replace('x', ' × ')} pixels, {theme or 'dark'}"
-            parts.append(f"![{words}](screens/{path.name})\n")
+            if not theme:
+                parts.append(f"![{title}, {size.replace('x', ' × ')} pixels](screens/{path.name})\n")
     parts.append(_TERMINAL)
     for path in sorted(SCREENS.glob("*.txt"), key=lambda path: int(path.stem)):
         _, _, text = path.read_text(encoding="utf-8").partition("\n\n")

@@ -1,0 +1,39 @@
+"""Prints how many words README and the pages of docs/ have, and fails if they have more than the limit.
+
+    python tools/site/words.py
+
+Words are counted as `wc -w` counts them, commands and their output included. Pages that the site generates are not counted.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+LIMIT = 125_000
+
+
+def words(root: Path = ROOT) -> dict[str, int]:
+    """Page → its words, the longest page first."""
+    pages = [root / "README.md", *(root / "docs").rglob("*.md")]
+    counted = {page.relative_to(root).as_posix(): len(page.read_text(encoding="utf-8").split()) for page in pages}
+    return dict(sorted(counted.items(), key=lambda item: (-item[1], item[0])))
+
+
+def table(counted: Mapping[str, int]) -> str:
+    """A line for each page, and one for the total."""
+    lines = [f"{count:7,}  {page}" for page, count in counted.items()]
+    return "\n".join([*lines, f"{sum(counted.values()):7,}  in all, of at most {LIMIT:,}"])
+
+
+def main() -> int:
+    """Print the table; 1 if there are too many words."""
+    counted = words()
+    print(table(counted))  # noqa: T201
+    return int(sum(counted.values()) > LIMIT)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
