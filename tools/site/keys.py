@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
+import textwrap
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from typing import Any
 
 from evedrop.model.controllers import CONTROLLERS
@@ -13,6 +17,8 @@ from evedrop.model.links import LOSS_MODELS
 from evedrop.model.metrics import METRICS
 from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.events import EVENTS
+from evedrop.scenario.events.table import EventTable
+from evedrop.scenario.table import Table
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import as_toml
 
@@ -20,8 +26,8 @@ Schema = Mapping[str, Any]
 
 _HEAD = """# Scenario keys
 
-All keys of a scenario, with their types, limits, defaults and examples. This page is made from the schema that checks scenarios.
-[The scenario file](../scenario.md) says what each key means.
+All keys of a scenario: what each means, its type and limits, its default and an example. This page is made from the classes that
+check scenarios. [The scenario file](../scenario.md) explains the tables by examples.
 """
 _LIMITS = (("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("exclusiveMaximum", "<"))
 _TYPES = {
@@ -47,34 +53,75 @@ _REGISTRIES = (
 
 def keys_page() -> str:
     """The page in Markdown: a section for each table, and one for each kind of class that a scenario names."""
-    schema = Scenario.model_json_schema()
-    parts = [_HEAD, "## Top level", "", *_rows(schema)]
-    for name, table in sorted(schema["$defs"].items()):
-        parts += ["", f"## {_title(name)}", "", table.get("description", ""), "", *_rows(table)]
+    parts = [_HEAD, "## Top level", "", *_rows(Scenario)]
+    for table in inner_tables(Scenario):
+        title, _, words = _first_line(table).partition(": ")
+        parts += [
+            "",
+            f"## {title} {{ #{_anchor(table.__name__)} }}",
+            "",
+            f"{words[0].upper()}{words[1:]}",
+            "",
+            *_rows(table),
+        ]
     for title, key, classes in _REGISTRIES:
         parts += ["", f"## Built-in {title}", "", f"| {key} | parameters, with an example of each | |", "|---|---|---|"]
         parts += [
-            f"| `{name}` | {_parameters(classes[name])} | {_cell(_summary(classes[name]))} |"
+            f"| `{name}` | {_parameters(classes[name])} | {_cell(_first_line(classes[name]))} |"
             for name in sorted(classes)
         ]
     return "\n".join(parts) + "\n"
 
 
-def _rows(table: Schema) -> Iterator[str]:
-    yield "| key | type | default | example |"
-    yield "|---|---|---|---|"
-    required = table.get("required", ())
-    for name, field in table["properties"].items():
+def inner_tables(table: type[Table]) -> list[type[Table]]:
+    """The tables inside a table, each followed by those inside it; that of events with the entries of all kinds."""
+    inner = [found for entry in table.entries() if (found := table.inner(entry)) is not None]
+    return list(dict.fromkeys(found for one in inner for found in (one, *inner_tables(one))))
+
+
+def descriptions(table: type[Table]) -> dict[str, str]:
+    """Key → the description of it, which is the string below its declaration in the class, or in one of its bases."""
+    classes = [*reversed(table.__mro__)]
+    if issubclass(table, EventTable):  # it is made from its kinds
+        classes += table.kinds.values()
+    found = {}
+    for class_ in classes:
+        if issubclass(class_, Table) and class_.__module__.startswith("evedrop."):
+            found |= _described(class_)
+    return {field.alias or name: found.get(name, "") for name, field in table.model_fields.items()}
+
+
+def _described(class_: type[Table]) -> dict[str, str]:
+    """Name of a field → the string below its declaration, for the fields that this class declares."""
+    try:
+        (declared,) = ast.parse(textwrap.dedent(inspect.getsource(class_))).body
+    except OSError:  # it was made by a function
+        return {}
+    assert isinstance(declared, ast.ClassDef)  # noqa: S101
+    return {
+        field.target.id: " ".join(text.value.value.split())
+        for field, text in pairwise(declared.body)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant) and isinstance(text.value.value, str)
+    }
+
+
+def _rows(table: type[Table]) -> Iterator[str]:
+    yield "| key | meaning | type | default | example |"
+    yield "|---|---|---|---|---|"
+    schema = table.model_json_schema()
+    required = schema.get("required", ())
+    for name, description in descriptions(table).items():
+        field = schema["properties"][name]
         default = "required" if name in required else _default(field)
         example = _code(as_toml(field["examples"][0])) if field.get("examples") else ""
-        yield f"| `{name}` | {_cell(_type(field))} | {default} | {example} |"
+        yield f"| `{name}` | {_cell(description)} | {_cell(_type(field))} | {default} | {example} |"
 
 
 def _type(field: Schema) -> str:
     """The type in words, with its limits; None, which means that the key is left out, is not one."""
     if "$ref" in field:
-        name = field["$ref"].rpartition("/")[2]
-        return f"[table](#{_title(name).lower().replace(' ', '-')})"
+        return f"[table](#{_anchor(field['$ref'].rpartition('/')[2])})"
     if "anyOf" in field:
         return " or ".join(dict.fromkeys(_type(choice) for choice in field["anyOf"] if choice.get("type") != "null"))
     if "allOf" in field:
@@ -106,18 +153,17 @@ def _default(field: Schema) -> str:
     return "" if value is None or value in ([], {}) else _code(as_toml(value))
 
 
-def _title(name: str) -> str:
-    """The heading of a table, from the name of its class."""
-    words = "".join(f" {letter.lower()}" if letter.isupper() else letter for letter in name.removesuffix("Table"))
-    return words.strip().capitalize()
+def _anchor(name: str) -> str:
+    """The anchor of the section of a table, from the name of its class."""
+    return name.removesuffix("Table").lower()
 
 
 def _parameters(of: Any) -> str:
     return ", ".join(_code(f"{name} = {as_toml(value)}") for name, value in getattr(of, "parameters", {}).items())
 
 
-def _summary(of: Any) -> str:
-    return (of.__doc__ or "").partition("\n")[0]
+def _first_line(of: Any) -> str:
+    return (inspect.getdoc(of) or "").partition("\n")[0]
 
 
 def _code(text: str) -> str:

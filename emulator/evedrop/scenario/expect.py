@@ -63,20 +63,35 @@ class ExpectTable(Table):
     """`[[expect]]`: one of `metric`, `link`, `secrecy` and `synchronised`, with the entries that go with it."""
 
     metric: Annotated[str | None, Field(examples=["legitimate.mean_squared_error"])] = None
+    """The metric, as RECEIVER.METRIC, links.RECEIVER.METRIC, directions.RECEIVER.NAME or a metric of an application."""
     below: Annotated[Number | None, Field(examples=[0.01])] = None
+    """The metric must be less."""
     above: Annotated[Number | None, Field(examples=[0.01])] = None
+    """The metric must be greater."""
     near: Annotated[Number | None, Field(examples=[0.01])] = None
+    """The metric must be close to this number; `within` or `within_relative` says how close."""
     within: Annotated[Distance | None, Field(examples=[0.002])] = None
+    """The largest distance from `near`."""
     within_relative: Annotated[Distance | None, Field(examples=[0.1])] = None
+    """The largest distance as a fraction of `near`: 0.1 is ten per cent."""
     slots: Annotated[Range | None, Field(examples=[[100, 200]])] = None
+    """The metric only over the slots from ≤ k < to."""
     quantile: Annotated[Quantile | None, Field(examples=[0.9])] = None
+    """The quantile over trials of a trial's mean, in place of the mean over trials."""
     link: Annotated[str | None, Field(examples=["legitimate"])] = None
+    """The receiver whose link must deliver as often as its model says, within a confidence interval."""
     secrecy: Annotated[Secrecy | None, Field(examples=["relative"])] = None
+    """The kind of secrecy that theory must promise and the run must show."""
     against: Annotated[str | None, Field(examples=["smart"])] = None
+    """The eavesdropper against which there must be secrecy."""
     direction: Annotated[str | None, Field(examples=["position"])] = None
+    """One of the process's `directions`, in which there must be secrecy."""
     synchronised: Annotated[str | None, Field(examples=["legitimate"])] = None
+    """The receiver that must have used a packet as the state, in every trial."""
     by: Annotated[Slot | None, Field(examples=[40])] = None
+    """The last slot by which it must have done so."""
     since: Annotated[Slot | None, Field(examples=[0])] = None
+    """The first slot that counts; 0 by default."""
 
     def mistakes(self) -> Iterable[Mistake]:
         """Mistakes unless the table has exactly one subject, all the entries that this subject needs, and no others."""

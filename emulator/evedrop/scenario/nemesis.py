@@ -41,16 +41,25 @@ class NemesisTable(Table):
     """`[nemesis]`: which faults hit which receivers, how often and for how long."""
 
     faults: Annotated[list[FaultName], Field(min_length=1, examples=[["kill", "pause", "cut"]])]
+    """The kinds of fault that are drawn: `kill` (with a restart), `pause`, `cut`, `set`, `partition`."""
     targets: Annotated[
         list[Annotated[str, Field(strict=True)]] | None, Field(min_length=1, examples=[["legitimate"]])
     ] = None
+    """The receivers that faults hit; all by default."""
     every: Annotated[Mean, Field(examples=[200])]
+    """The mean number of slots from the end of a receiver's fault to its next one."""
     lasting: Annotated[Mean, Field(examples=[50])]
+    """The mean duration of a fault, in slots."""
     start: Annotated[Slot, Field(alias="from", examples=[100])] = 0
+    """The first slot in which a fault may begin."""
     to: Annotated[Slot | None, Field(examples=[1800])] = None
+    """The slot by which all faults are over; `slots` by default."""
     seed: Annotated[int | None, Field(ge=0, lt=2**256, strict=True, examples=[3])] = None
+    """The seed of the faults; that of the scenario by default."""
     state: Annotated[Literal["prior", "last"] | None, Field(examples=["last"])] = None
+    """The state with which a killed receiver is restarted: `prior` (default), or its `last` estimate."""
     set: Annotated[dict[str, Any] | None, Field(min_length=1, examples=[{"quality": 0.2}])] = None
+    """What the fault `set` changes on a link."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """Entries that a fault lacks or that no fault uses, a span that ends before it begins, and names that appear twice."""

@@ -28,21 +28,37 @@ class PlantTable(Table):
     """`[plant]`: inputs, disturbances, limits and noise of the true states."""
 
     inputs: Annotated[Names, Field(examples=[["P_H", "P_grid"]])] = Field(default_factory=list)
+    """The names of the m inputs u, which the controller decides."""
     input_matrix: Annotated[Matrix | None, Field(examples=[[[0.00156, 0.00156], [-0.00566, 0.0]]])] = None
+    """B, n × m."""
     input_units: Annotated[Names | None, Field(examples=[["kW", "kW"]])] = None
+    """The units of the inputs."""
     input_lower: Annotated[Numbers | None, Field(examples=[[-1.5, -3.0]])] = None
+    """Lower limits of the inputs. An input beyond its limits is clipped, and counted."""
     input_upper: Annotated[Numbers | None, Field(examples=[[1.5, 3.0]])] = None
+    """Upper limits of the inputs."""
     disturbances: Annotated[Names, Field(examples=[["P_solar", "P_load"]])] = Field(default_factory=list)
+    """The names of the q disturbances d, which also move the plant."""
     disturbance_matrix: Annotated[Matrix | None, Field(examples=[[[0.00156, -0.00156], [0.0, 0.0]]])] = None
+    """B_d, n × q."""
     disturbance_units: Annotated[Names | None, Field(examples=[["kW", "kW"]])] = None
+    """The units of the disturbances. Those of `disturbance_file` must be the same, except that W and kW are converted."""
     disturbance_file: Annotated[str | None, Field(strict=True, examples=["day.csv"])] = None
+    """A CSV file, or a built-in one: a line of names, each with its unit, such as `P_load [kW]`, then a line for each slot."""
     disturbance_values: Annotated[Matrix | None, Field(examples=[[[0.0, 0.4], [0.0, 0.4]]])] = None
+    """The same numbers in place of a file: a row for each slot."""
     noise: Annotated[Matrix | None, Field(examples=[[[1e-6, 0.0], [0.0, 1e-6]]])] = None
+    """The covariance of the plant's own noise, n × n, semidefinite; 0 by default. It is not Q."""
     output_matrix: Annotated[Matrix | None, Field(examples=[[[1.0, 0.0]]])] = None
+    """C, p × n: the sensor measures y = C x + v, and transmits the estimate of its Kalman filter."""
     measurement_noise: Annotated[Matrix | None, Field(examples=[[[0.01]]])] = None
+    """The covariance of v, p × p."""
     start: Annotated[Numbers | None, Field(examples=[[55.0, 50.0]])] = None
+    """The mean of the first state, as levels. `process.reference` by default."""
     state_lower: Annotated[Numbers | None, Field(examples=[[20.0, 10.0]])] = None
+    """Lower limits within which a controller should keep the states, if its strategy uses them."""
     state_upper: Annotated[Numbers | None, Field(examples=[[90.0, 90.0]])] = None
+    """Upper limits of the states."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """Entries that do not fit each other; whether they fit the process is checked later."""
@@ -119,12 +135,19 @@ class ControllerTable(Table):
     model_config = ConfigDict(extra="allow")
 
     strategy: Annotated[str, Field(strict=True, examples=["lqr"]), AfterValidator(one_of(CONTROLLERS))]
+    """How the controller decides. Its parameters are further entries."""
     period: Annotated[int, Field(strict=True, ge=1, le=1_000_000, examples=[60])] = 1
+    """Slots between two decisions; inputs are held in between."""
     acts_on: Annotated[Literal["estimate", "truth"], Field(examples=["estimate"])] = "estimate"
+    """The legitimate estimate, or, for comparison, the true state."""
     state_weights: Annotated[Numbers, Field(examples=[[1.0, 0.3]])]
+    """Weights of the squared deviations of the states in the cost, one for each state."""
     input_weights: Annotated[Numbers, Field(examples=[[0.02, 0.05]])]
+    """Weights of the squared inputs, one for each input."""
     rate_weights: Annotated[Numbers | None, Field(examples=[[1.0, 0.02]])] = None
+    """Weights of the squared changes of the inputs between decisions; 0 by default."""
     rate_limits: Annotated[Numbers | None, Field(examples=[[0.05, 3.0]])] = None
+    """How much each input may change per slot; no limit by default."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """Weights and limits below 0, and missing, unknown or wrong parameters of the strategy."""

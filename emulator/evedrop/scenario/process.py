@@ -48,11 +48,15 @@ class ProgramTable(Table):
     """`zenoh = {…}` of a process: the key on which a program publishes the states, and how it is reached."""
 
     key: Annotated[str, Field(strict=True, examples=["robot/pose"]), AfterValidator(_key)]
+    """The Zenoh key on which the program publishes the states, without wildcards."""
     connect: Endpoint | None = None
+    """The endpoint of a router that the program uses. Either this or `listen`."""
     listen: Endpoint | None = None
+    """The endpoint to which the program itself connects. Either this or `connect`."""
     offsets: Annotated[
         list[Annotated[int, Field(strict=True, ge=0, le=_MOST_BYTES)]] | None, Field(examples=[[4, 12]])
     ] = None
+    """For binary messages: the byte at which each state's float64 begins. Without it, messages are JSON."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """Neither or both of `connect` and `listen`."""
@@ -109,26 +113,40 @@ _MATRICES = ("A", "Q", "initial_covariance")
 
 
 class ProcessTable(Table):
-    """`[process]`: x_{k+1} = A x_k + w_k, w ~ N(0, Q), x_0 ~ N(0, initial_covariance), or where else states come from."""
+    """`[process]`: the linear model x⁺ = A x + w with w ~ N(0, Q) and x₀ ~ N(0, Σ₀), and where else true states come from."""
 
     A: Annotated[Matrix, Field(examples=[[[1.0, 0.3], [0.5, 1.001]]])]
+    """The system matrix, n × n, with at most 64 states."""
     Q: Annotated[Matrix, Field(examples=[[[0.001, 0.0], [0.0, 0.001]]])]
+    """The covariance of the process noise, symmetric and positive definite, or `"filter"`: that of what the sensor's
+    Kalman filter adds to its estimate in each slot."""
     initial_covariance: Annotated[Matrix, Field(examples=[[[1.0, 0.0], [0.0, 1.0]]])]
+    """Σ₀, the covariance of the first state, positive definite, or `"filter"`: that of the filter's steady state."""
     singular_noise: Annotated[bool, Field(strict=True, examples=[True])] = False
+    """Whether Q may be singular. `Q = "filter"` implies it."""
     reference: Annotated[list[Number] | None, Field(examples=[[55.0, 50.0]])] = None
+    """The public levels that states are deviations from: tables and view show `reference` + x; packets contain x."""
     states: Annotated[
         list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["SOC", "LOH"]])
     ] = None
+    """The names of the states, for tables and view, and in files and messages of states."""
     units: Annotated[list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["%", "%"]])] = None
+    """The units of the states."""
 
     directions: Annotated[dict[ProcessName, list[Number]] | None, Field(examples=[{"sum": [1.0, 1.0]}])] = None
+    """Vectors v, by name: the error of vᵀx is given for each receiver, with a verdict on secrecy in this direction."""
     source: Annotated[Source | None, Field(examples=["file"])] = None
+    """Where the true states come from: the model above (default), a recording, or a program."""
     state_file: Annotated[str | None, Field(strict=True, examples=["pose.csv"])] = None
+    """For `source = "file"`: a CSV file with a column for each of `states`, and a line for each slot."""
     state_values: Annotated[list[list[Number]] | None, Field(examples=[[[0.0, 0.1], [0.1, 0.1]]])] = None
+    """The same numbers in place of a file: a row for each slot."""
     zenoh: Annotated[ProgramTable | None, Field(examples=[{"key": "robot/pose", "connect": "tcp/127.0.0.1:7447"}])] = (
         None
     )
+    """For `source = "zenoh"`: how the program that publishes the states is reached."""
     theory: Annotated[bool | None, Field(strict=True, examples=[True])] = None
+    """For a recording or a program: whether A and Q describe its states, so that theory's errors are given."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """Matrices that are not square or do not fit each other, and lists without an entry for each state.

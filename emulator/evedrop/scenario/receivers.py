@@ -32,7 +32,10 @@ class CorrelationTable(Table):
     """`correlation = {…}`: the link whose losses this link's are tied to, and how strongly."""
 
     to: Annotated[str, Field(strict=True, alias="with", examples=["legitimate"])]
+    """The receiver with whose link the losses are correlated. Its loss model must be the same."""
     strength: Annotated[Probability, Field(examples=[0.5])]
+    """The probability that both links have the same cause in a slot: 0 is independent; at 1, equal links lose the same
+    packets."""
 
 
 def _loss(loss: dict[str, Any]) -> dict[str, Any]:
@@ -55,19 +58,29 @@ class LinkTable(Table):
     """Whether a link without losses needs neither a quality nor a loss model."""
 
     quality: Annotated[Probability | None, Field(examples=[0.9])] = None
+    """The arrival probability of a packet, independent in every slot and trial: μ, or μ_e. Short for the loss model
+    `bernoulli`."""
     loss: Annotated[
         Annotated[dict[str, Any], AfterValidator(_loss)] | None,
         Field(examples=[{"model": "gilbert-elliott", "p": 0.05, "r": 0.5}]),
     ] = None
+    """A loss model as `model`, with its parameters, in place of `quality`."""
     correlation: Annotated[CorrelationTable | None, Field(examples=[{"with": "legitimate", "strength": 0.5}])] = None
+    """Correlates the losses with those of another receiver's link."""
     delay: Annotated[
         Annotated[dict[str, Any], AfterValidator(_delay)] | None, Field(examples=[{"model": "constant", "value": 2.0}])
     ] = None
+    """A delay model as `model`, its parameters, and `unit`: `slots`, the default, or `seconds`, which needs `slot_seconds`."""
     reorder: Annotated[Probability, Field(examples=[0.1])] = 0.0
+    """The probability that a packet is not delayed, and so overtakes others. Needs `delay`."""
     duplicate: Annotated[Probability, Field(examples=[0.05])] = 0.0
+    """The probability that a packet arrives twice. Receivers recognise it, so estimates do not change."""
     corrupt: Annotated[Probability, Field(examples=[0.01])] = 0.0
+    """The probability that a packet is damaged. Its checksum shows it, and it counts as lost."""
     rate: Annotated[float | None, Field(strict=True, gt=0.0, le=1e6, examples=[0.9])] = None
+    """The capacity of the link, in packets a slot. Below 1, the queue fills."""
     queue: Annotated[int | None, Field(strict=True, ge=0, le=1_000_000, examples=[100])] = None
+    """How many packets wait before a link of limited rate; 100 by default. Further ones are lost."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """Mistakes unless there is one of quality and loss, and no entry is pointless."""
@@ -149,16 +162,24 @@ class AckChannelTable(Table):
     """`link = {…}` of the acknowledgements: each is lost independently or arrives at once."""
 
     quality: Annotated[Probability, Field(examples=[0.9])]
+    """The probability that an acknowledgement reaches the sensor."""
 
 
 class AcknowledgementsTable(Table):
     """`[acknowledgements]`: their channel to the sensor, for schemes that need them, and an attack on it."""
 
     link: Annotated[AckChannelTable, Field(examples=[{"quality": 0.9}])]
+    """The channel of the acknowledgements."""
     attack: Annotated[str, Field(strict=True, examples=["critical"]), AfterValidator(one_of(ATTACKS))] = "none"
+    """Blocks all (`all`) or those of packets that the jammer missed (`critical`), sends one for every packet (`forge`), flips
+    some (`flip`), or makes the sensor heed first those of packets that the jammer heard (`hijack`). It lasts for the whole run,
+    or only during events `jam`."""
     jammer: Annotated[str | None, Field(strict=True, examples=["smart"])] = None
+    """The eavesdropper by whose link the attacks `critical` and `hijack` decide. They need it; others refuse it."""
     flip: Annotated[Probability | None, Field(examples=[0.1])] = None
+    """The probability with which the attack `flip` inverts an acknowledgement. It needs it; others refuse it."""
     false_alarms: Annotated[float, Field(strict=True, ge=10.0, le=1e9, examples=[1e4])] = 1e4
+    """The mean number of packets between false alarms of the sensor's detector."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """Mistakes in the entries of attacks: two need a jammer with a link of its own, `flip` a probability."""
@@ -202,10 +223,13 @@ class WireTable(Table):
     """`[wire]`: the packet of slot k has the fate of the k-th message that is published on a key."""
 
     seed: Annotated[int, Field(ge=0, lt=2**256, strict=True, examples=[7])]
+    """The seed of the wire."""
     key: Annotated[str, Field(strict=True, min_length=1, examples=["robot/pose"])]
+    """The Zenoh key of its messages."""
     links: Annotated[
         dict[str, Annotated[str, Field(strict=True, min_length=1)]], Field(examples=[{"legitimate": "radio"}])
     ]
+    """Receiver → the name of the wire's link whose random numbers its link draws."""
 
     def stream_keys(self, streams: tuple[str, ...]) -> Mapping[str, bytes]:
         """Stream → its key, for those streams of receivers' links that are a wire's."""
@@ -222,8 +246,11 @@ class LegitimateTable(Table):
     """`[legitimate]`: the legitimate estimator's link and window, and whether it knows the inputs."""
 
     link: LinkField
+    """The link from the router to the legitimate estimator."""
     window: WindowField = 0
+    """By how many slots a packet may be late and still be used. With 0, late packets are lost."""
     knows_input: Annotated[bool, Field(strict=True, examples=[True])] = False
+    """Whether it is told the controller's decisions, and predicts A x̂ + B u in place of A x̂."""
 
 
 class EavesdropperTable(Table):
@@ -232,17 +259,25 @@ class EavesdropperTable(Table):
     model_config = ConfigDict(extra="allow")
 
     strategy: Annotated[str, Field(strict=True, examples=["smart"]), AfterValidator(registered(STRATEGIES))]
+    """How the eavesdropper reads packets. Some strategies have parameters, which are further entries."""
     link: Annotated[LinkTable | None, Field(examples=[{"quality": 0.9}])] = None
+    """The link from the router to it. Every strategy but `colluding` needs one."""
     links: Annotated[
         list[LinkTable] | None, Field(min_length=2, max_length=16, examples=[[{"quality": 0.6}, {"quality": 0.5}]])
     ] = None
+    """The links that `colluding` pools, each with only a `quality` or a `loss`."""
     reads_as: Annotated[
         Annotated[str, Field(strict=True), AfterValidator(registered(READERS))] | None, Field(examples=["smart"])
     ] = None
+    """The strategy as which `colluding` and `replay-informed` read packets. Its parameters are given as well."""
     learns_at: Annotated[int | None, Field(ge=0, strict=True, examples=[40])] = None
+    """The slot whose true state `replay-informed` is told."""
     window: WindowField = 0
+    """By how many slots a packet may be late and still be used. With 0, late packets are lost."""
     use_state: Annotated[Probability | None, Field(examples=[0.8])] = None
+    """The probability μ_b that `suspicious` uses a state which it received."""
     use_innovation: Annotated[Probability | None, Field(examples=[0.2])] = None
+    """The probability that `suspicious` takes an innovation for the state."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """Missing, unknown and wrong parameters of the strategy, and a missing link."""

@@ -64,6 +64,7 @@ class EncodingTable(Table):
     model_config = ConfigDict(extra="allow")
 
     scheme: Annotated[str, Field(strict=True, examples=["innovation"]), AfterValidator(registered(SCHEMES))]
+    """The scheme, which decides what a packet contains. Its parameters are further entries of this table."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """Missing, unknown and wrong parameters of the scheme."""
@@ -141,14 +142,18 @@ class EnergyTable(Table):
     """`[energy]`: what packets cost the sensor, in any unit; it does not change the trials."""
 
     packet: Annotated[_Energy, Field(examples=[1.0])] = EnergyModel.packet
+    """Energy of sending a packet, whatever its size."""
     bit: Annotated[_Energy, Field(examples=[0.01])] = EnergyModel.bit
+    """Energy of each bit of payload and header, in addition."""
     encryption: Annotated[_Energy, Field(examples=[0.5])] = EnergyModel.encryption
+    """Energy of encrypting a packet, in addition, for schemes that encrypt."""
 
 
 class NetworkTable(Table):
     """`[network]`: how the processes of a live run are connected; it does not change the trials."""
 
     routers: Annotated[int, Field(ge=1, le=2, strict=True, examples=[2])] = 1
+    """With 2, the sensor connects to the router, and all other processes to a second one, the relay, which is linked to it."""
 
 
 def _folder(path: str) -> str:
@@ -204,42 +209,68 @@ class Scenario(Table):
     """Set by `evedrop.scenario.loading` when it is imported."""
 
     title: Annotated[str, Field(min_length=1, max_length=200, examples=["Two eavesdroppers near a planar vehicle"])]
+    """One line, for tables, reports and the view."""
     slots: Annotated[int, Field(ge=1, le=MOST_SLOTS, strict=True, examples=[2000])]
+    """The number of discrete time steps, k = 0 … slots − 1."""
     seed: Annotated[int, Field(ge=0, lt=2**256, strict=True, examples=[7])] = 0
+    """The seed of all random numbers: the same seed gives the same digests."""
     trials: Annotated[int, Field(ge=1, le=1_000_000, strict=True, examples=[1])] = 1
+    """The number of independent repetitions, computed in one batch."""
     first_trial: Annotated[int, Field(ge=0, le=2**48, strict=True, examples=[0])] = 0
+    """The number of the first trial. Trial 17 is the same alone or among a thousand."""
     record_trials: Annotated[int, Field(ge=1, strict=True, examples=[1])] = 1
+    """How many trials, from the first on, are recorded slot by slot. At most `trials`."""
     shards: Annotated[int, Field(ge=1, le=64, strict=True, examples=[2])] = 1
+    """How many sets of processes share the trials of a live run. At most `trials`; the results do not change."""
     pace: Annotated[float, Field(ge=0.0, le=3600.0, strict=True, examples=[0.02])] = 0.0
+    """Seconds per slot of a live run; 0 is as fast as possible."""
     longest_outage: Annotated[float, Field(ge=0.0, le=86400.0, strict=True, examples=[30.0])] = 30.0
+    """Seconds for which a process of a live run may be cut off, or silent, before the run is given up."""
     slot_seconds: Annotated[float | None, Field(gt=0.0, le=1e6, strict=True, examples=[0.02])] = None
+    """The duration of a slot, for delays in seconds and for time axes. It does not pace the run."""
     secret_file: Annotated[str | None, Field(examples=["secret.bin"])] = None
+    """A file of at least 32 random bytes, from which the secret of sensor and estimator is derived; otherwise `seed` is used."""
     modules: Annotated[Annotated[str, AfterValidator(_folder)] | None, Field(strict=True, examples=["."])] = None
+    """The folder of your own classes, relative to the scenario's folder, which is the default."""
     process: Annotated[ProcessTable, Field(examples=[{"A": [[1.0]], "Q": [[0.001]], "initial_covariance": [[1.0]]}])]
+    """The process model, which everybody knows, and where the true states come from."""
     encoding: Annotated[EncodingTable, Field(examples=[{"scheme": "innovation", "state_probability": 0.6}])]
+    """The transmission scheme and its parameters."""
     legitimate: Annotated[LegitimateTable, Field(examples=[{"link": {"quality": 0.9}}])]
+    """The legitimate estimator and its link."""
     eavesdroppers: Annotated[
         dict[ProcessName, EavesdropperTable],
         Field(max_length=MOST_EAVESDROPPERS, examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}]),
     ] = Field(default_factory=dict)
+    """The eavesdroppers, each by a name that you choose."""
     plant: Annotated[PlantTable | None, Field(examples=[{"noise": [[1e-6, 0.0], [0.0, 1e-6]]}])] = None
+    """Inputs, disturbances and measurements, if more than the process moves or observes the true states."""
     controller: Annotated[ControllerTable | None, Field(examples=[{"strategy": "lqr"}])] = None
+    """The controller that decides the inputs of the plant. Required if there are inputs."""
     acknowledgements: Annotated[AcknowledgementsTable | None, Field(examples=[{"link": {"quality": 0.9}}])] = None
+    """The channel from the estimator back to the sensor, for schemes that need acknowledgements, and an attack on it."""
     energy: Annotated[EnergyTable | None, Field(examples=[{"packet": 1.0, "encryption": 0.5}])] = None
+    """What packets cost the sensor. It does not change the trials."""
     wire: Annotated[
         WireTable | None, Field(examples=[{"seed": 7, "key": "robot/pose", "links": {"legitimate": "radio"}}])
     ] = None
+    """Which links draw the random numbers of a wire, so that packets have the fates of its messages."""
     network: Annotated[NetworkTable | None, Field(examples=[{"routers": 2}])] = None
+    """How the processes of a live run are connected. It does not change the trials."""
     event: Annotated[list[AnyEvent], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
         default_factory=list
     )
+    """What happens in which slot: faults, attacks and changes of links."""
     nemesis: Annotated[
         NemesisTable | None, Field(examples=[{"faults": ["kill", "cut"], "every": 200, "lasting": 50}])
     ] = None
+    """Random faults, which become events before the run."""
     expect: Annotated[
         list[ExpectTable], Field(examples=[[{"metric": "legitimate.mean_squared_error", "below": 0.01}]])
     ] = Field(default_factory=list)
+    """Conditions that the run must meet. If one fails, the exit status is 1."""
     made_with: Annotated[dict[str, str], Field(exclude=True)] = Field(default_factory=dict)
+    """The versions that made a results folder. Ignored when it is read."""
     __pydantic_extra__: dict[str, Annotated[SerializeAsAny[Table], PlainValidator(_application_table)]]
 
     model_config = ConfigDict(extra="allow")

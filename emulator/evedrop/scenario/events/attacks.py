@@ -53,6 +53,7 @@ class Jam(Attack):
     """`jam`: the attack lasts only during such events."""
 
     jam: Annotated[str, Field(examples=["acknowledgements"])]
+    """`"acknowledgements"`: the attack that `[acknowledgements]` describes lasts only during such events."""
 
     kind = "jam"
     attacked = Jamming.attacked
@@ -72,6 +73,7 @@ class Spoof(Attack):
     """`spoof`: the attack lasts only during such events."""
 
     spoof: Annotated[str, Field(examples=["measurements"])]
+    """`"measurements"`: the attack that `[integrity]` describes lasts only during such events."""
 
     kind = "spoof"
     attacked = Spoofing.attacked

@@ -191,8 +191,11 @@ class When(Table):
     """The slots of an event."""
 
     at: Slot | None = None
+    """The slot in which it happens."""
     start: Annotated[Slot | None, Field(alias="from")] = None
+    """The first slot in which it lasts."""
     to: Slot | None = None
+    """The first slot in which it is over."""
 
 
 class EventKind(When):
@@ -299,6 +302,7 @@ class Note(EventKind):
     """`note`: nothing happens; the text appears in the list of events."""
 
     note: Annotated[str, Field(examples=["the door is opened"])]
+    """A text for the journal. Nothing happens."""
 
     kind = "note"
     does = Nothing

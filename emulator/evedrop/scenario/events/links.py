@@ -25,7 +25,9 @@ class Set(EventKind):
     """`link` and `set`: entries of the links change. At the end, all changes that events have made to them are undone."""
 
     link: Annotated[Names, Field(description="the link that is changed", examples=["legitimate"])]
+    """The link that `set` changes, or a list of links."""
     set: Annotated[dict[str, Any], AfterValidator(_some), Field(examples=[{"quality": 0.2}])]
+    """The changed entries of the link. With `to`, all changes by events are undone at the end."""
 
     kind = "set"
     does = LinkSettings
@@ -58,6 +60,7 @@ class Cut(EventKind):
     """`cut`: packets that are sent over these links are lost."""
 
     cut: Annotated[Names, Field(examples=["legitimate"])]
+    """Cuts a link, or a list of links: packets sent meanwhile are lost; packets under way arrive."""
 
     kind = "cut"
     does = LinkCut
@@ -75,6 +78,7 @@ class Heal(EventKind):
     """`heal`: these links are no longer cut."""
 
     heal: Annotated[Names, Field(examples=["legitimate"])]
+    """Ends the cut of a link, or of a list of links."""
 
     kind = "heal"
     does = LinkHealed
@@ -90,6 +94,7 @@ class Partition(EventKind):
     """`partition`: a list of receivers, whose links are all cut."""
 
     partition: Annotated[list[str], Field(examples=[["legitimate", "smart"]])]
+    """Cuts a list of receivers off together."""
 
     kind = "partition"
     does = LinkCut

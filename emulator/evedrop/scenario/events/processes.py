@@ -28,7 +28,9 @@ class Kill(EventKind):
     """`kill`: the receiver's process is ended. It comes back at the end of the event, or with a restart."""
 
     kill: Annotated[str, Field(examples=["legitimate"])]
+    """Ends a receiver's process (SIGKILL)."""
     state: State = None
+    """The state with which it is restarted: `prior` (default), or its `last` estimate."""
 
     kind = "kill"
     does = Leave
@@ -48,7 +50,9 @@ class Restart(EventKind):
     """`restart`: the receiver's process is started again."""
 
     restart: Annotated[str, Field(examples=["legitimate"])]
+    """Starts a killed receiver's process again."""
     state: State = None
+    """The state with which it begins: `prior` (default), or its `last` estimate."""
 
     kind = "restart"
     does = Return
@@ -69,6 +73,7 @@ class Pause(EventKind):
     """`pause`: the receiver's process is stopped."""
 
     pause: Annotated[str, Field(examples=["legitimate"])]
+    """Stops a receiver's process (SIGSTOP)."""
 
     kind = "pause"
     does = Leave
@@ -87,6 +92,7 @@ class Resume(EventKind):
     """`resume`: the receiver's process continues."""
 
     resume: Annotated[str, Field(examples=["legitimate"])]
+    """Lets a paused receiver's process continue (SIGCONT), with all it knew."""
 
     kind = "resume"
     does = Return

@@ -19,7 +19,7 @@ from evedrop.scenario.words import as_toml, listed
 
 
 class EventTable(When):
-    """A table with the entries of these kinds of event; any entry may be missing."""
+    """`[[event]]`: a table with the entries of these kinds of event; any entry may be missing."""
 
     kinds: ClassVar[Mapping[str, type[EventKind]]]
     broken: ClassVar[Mapping[str, str]]

@@ -41,9 +41,13 @@ class ComfortTable(Table):
     """`[comfort]`: the room's temperature in °C, the heater's power in kW, and the temperatures that are comfortable."""
 
     temperature: Annotated[Name, Field(examples=["T_room"])]
+    """The state that is the room's temperature, in °C."""
     heater: Annotated[Name, Field(examples=["P_heat"])]
+    """The input that is the heater's power, in kW."""
     lowest: Annotated[Number, Field(examples=[20.0])]
+    """The lowest comfortable temperature."""
     highest: Annotated[Number, Field(examples=[23.0])]
+    """The highest comfortable temperature."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """A range without temperatures."""

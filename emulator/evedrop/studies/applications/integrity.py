@@ -97,15 +97,19 @@ def _is_matrix(value: Any) -> bool:
 
 
 class IntegrityTable(Table):
-    """`[integrity]`: the policy's parameters are further entries."""
+    """`[integrity]`: a watermark, an attack on the sensor's measurements, and the detector that finds it."""
 
     model_config = ConfigDict(extra="allow")
 
     policy: Annotated[str, Field(strict=True, examples=["always"]), AfterValidator(one_of(POLICIES))]
+    """When there is a watermark, and which statistic raises the alarm. Its parameters are further entries."""
     watermark: Annotated[Annotated[Matrix, AfterValidator(_covariance)] | None, Field(examples=[[[0.3]]])] = None
+    """The covariance of the noise that is added to the inputs, m × m; no watermark by default."""
     attack: Annotated[
         Annotated[dict[str, Any], AfterValidator(_attack)] | None, Field(examples=[{MODEL: "replay", "recorded": 100}])
     ] = None
+    """The attack on the measurements, with a `model` and its entries. It lasts for the whole run, or only during events
+    `spoof`."""
 
     def mistakes(self) -> list[Mistake]:
         """Mistakes in the policy's parameters."""

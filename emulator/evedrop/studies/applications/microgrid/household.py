@@ -95,15 +95,22 @@ Name = Annotated[str, Field(strict=True, min_length=1)]
 
 
 class HouseholdTable(Table):
-    """`[household]`: names of the plant's inputs, disturbances and states, powers in kW."""
+    """`[household]`: which inputs, disturbances and states of the plant are those of a house. Powers are in kW."""
 
     grid: Annotated[Name, Field(examples=["P_grid"])]
+    """The input that is the power taken from the grid; power given to it is negative."""
     load: Annotated[Name, Field(examples=["P_load"])]
+    """The disturbance that is the power which the house draws."""
     battery: Annotated[Name, Field(examples=["SOC"])]
+    """The state that is the level which the load moves."""
     sun: Annotated[Name | None, Field(examples=["P_solar"])] = None
+    """The disturbance that is the power of the solar panels. The neighbour knows it."""
     window_seconds: Annotated[float, Field(strict=True, gt=0.0, le=1e6, examples=[60.0])] = 60.0
+    """The length of the windows in which the house is active or not, rounded to whole periods of the controller."""
     active_above: Annotated[float, Field(strict=True, gt=0.0, le=1e6, examples=[0.7])] = 0.7
+    """The mean load of a window from which on the house counts as active."""
     false_alarms: Annotated[float, Field(strict=True, gt=0.0, lt=1.0, examples=[0.05])] = 0.05
+    """The fraction of the quiet windows that may be taken for active."""
 
     def window(self, period_seconds: float) -> int:
         """The number of decisions in a window, at least 1; a decision lasts period_seconds."""
