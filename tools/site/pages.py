@@ -103,7 +103,11 @@ def _opening_large(picture: str, address: str, folder: PurePosixPath, there: Col
 
 def _formula(match: re.Match[str]) -> str:
     display = "block" if match[2] == "[" else "inline"
-    return f'<{match[1]} class="formula">{convert(html.unescape(match[3]), display=display)}</{match[1]}>'
+    tex = html.unescape(match[3])
+    made = convert(tex, display=display)
+    if unknown := re.search(r"\\[a-zA-Z]+", made):
+        raise PluginError(f"{tex}: {unknown[0]} is not known to latex2mathml; write it in another way")
+    return f'<{match[1]} class="formula">{made}</{match[1]}>'
 
 
 def layers(source: str, *_: Any, **__: Any) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from evedrop.cli.options import Command
 from evedrop.cli.parser import print_names
+from evedrop.cli.plain_formulas import plain
 from evedrop.errors import UsageError
 from evedrop.system.hints import near
 
@@ -23,7 +24,8 @@ def docs(options: argparse.Namespace) -> int:
     name = str(options.page).removesuffix(".md")
     if name not in pages:
         raise UsageError(f"there is no page {name}{near(name, pages) or '; evedrop docs lists them'}")
-    print(pages[name].read_text(encoding="utf-8"), end="")
+    text = pages[name].read_text(encoding="utf-8")
+    print(plain(text) if "$" in text else text, end="")
     return 0
 
 
