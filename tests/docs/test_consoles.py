@@ -21,7 +21,6 @@ NOT_RUN = {
     "docs/integrity.md": 1,
     "docs/links.md": 1,
     "docs/maintainers/tests.md": 1,
-    "docs/mathematics.md": 1,
     "docs/microgrid.md": 8,
     "docs/montecarlo.md": 2,
     "docs/papers.md": 1,
@@ -29,10 +28,8 @@ NOT_RUN = {
     "docs/performance.md": 1,
     "docs/testing.md": 3,
     "docs/tutorial.md": 1,
-    "docs/upstream.md": 2,
     "docs/wire/file.md": 4,
     "docs/view.md": 3,
-    "docs/wire.md": 5,
 }
 """The number of command blocks of each page that are not run; those of other pages need a reason."""
 
