@@ -7,7 +7,7 @@ sides carry nothing. Where routers are connected to several sides, the wire find
 random number that was never sent before, so that a program at one side cannot pretend that one of them came from another side:
 neither by a guess, nor with an old one.
 
-Source: docs/wire/semantics.md, no loops, and what programs need.
+Source: docs/wire/semantics.md, loops, and what programs need.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Made by `evedrop.wire.file` and read by everything else. Zenoh's advanced publis
 KEY: KEY/@adv/… for their history, heartbeats and recovery. After `@adv` come the Zenoh id of a session, and numbers of its own,
 which differ from run to run.
 
-Source: docs/wire/file.md, the file; docs/wire/semantics.md, what comes late.
+Source: docs/wire/file.md, the file; docs/wire/semantics.md, late joiners.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 At a side, a key that comes often has a publisher; all others do without one. Payloads stay in Zenoh's memory: nothing here copies
 one into Python.
 
-Source: docs/wire/semantics.md, how messages cross.
+Source: docs/wire/semantics.md, messages.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A running wire: the sessions of its sides, and everything that crosses between them.
 
-Source: docs/wire/semantics.md, how messages cross.
+Source: docs/wire/semantics.md, messages.
 """
 
 from __future__ import annotations

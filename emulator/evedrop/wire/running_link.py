@@ -6,7 +6,7 @@ unchanged. Time-dependent effects are not part of that fate. A message meets, in
 the limit of its size, sides that are joined outside the wire, a cut, and the fate that the link's models give it. A message that
 is never lost meets the limit and joined sides only. Messages that are held back are passed on in the order of their times.
 
-Source: docs/wire/semantics.md, the same traffic, the same losses, and how messages cross.
+Source: docs/wire/semantics.md, the same traffic, the same losses, and messages.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ The model of a link says how many messages of a key it lets through: the mean an
 are counted apart: a message that was cut, or for which the queue was full, is left out of `ranges`. The means and variances of
 several keys, or links, add up, since their random numbers are independent.
 
-Source: docs/wire/results.md, the summary, and a link and its model; docs/mathematics/links.md, losses in bursts.
+Source: docs/wire/results.md, the summary; docs/mathematics/links.md, losses in bursts.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Lengths of time, sizes and rates are numbers in seconds, bytes and bytes per second, or texts with a unit. An endpoint says where
 a side listens. `[[expect]]` is a condition on what a link delivered, how long it held messages back, and its longest gaps.
 
-Source: docs/wire/file.md, the file, units and sides; docs/wire/results.md, expectations.
+Source: docs/wire/file.md, the file and sides; docs/wire/results.md, expectations.
 """
 
 from __future__ import annotations
