@@ -2,7 +2,7 @@
 
 Every table that is printed on `evedrop.cli.report.terminal` is taken, so that a command with these options need do nothing.
 
-Source: docs/export.md, tables in other programs.
+Source: docs/export.md, tables.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class ReportedResults(ABC):
     def to_csv(self, path: str | Path) -> list[Path]:
         """Write the tables that the command prints as CSV, with every number at full precision, and return the files' paths.
 
-        The first table goes to `path`, a second one to NAME-2.csv. Source: docs/export.md, tables in other programs.
+        The first table goes to `path`, a second one to NAME-2.csv. Source: docs/export.md, tables.
 
         Raises UsageError if a file cannot be written.
         """

@@ -2,7 +2,7 @@
 
 In CSV, every number is at full precision; in LaTeX, it is as it is shown.
 
-Source: docs/export.md, tables in other programs.
+Source: docs/export.md, tables.
 """
 
 from __future__ import annotations
