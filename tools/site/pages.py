@@ -103,11 +103,15 @@ def _opening_large(picture: str, address: str, folder: PurePosixPath, there: Col
 
 def _formula(match: re.Match[str]) -> str:
     display = "block" if match[2] == "[" else "inline"
-    tex = html.unescape(match[3])
+    tex = _UNSIZED.sub("", html.unescape(match[3])).replace(r"\arg", r"\operatorname{arg}")
     made = convert(tex, display=display)
     if unknown := re.search(r"\\[a-zA-Z]+", made):
         raise PluginError(f"{tex}: {unknown[0]} is not known to latex2mathml; write it in another way")
     return f'<{match[1]} class="formula">{made}</{match[1]}>'
+
+
+_UNSIZED = re.compile(r"\\[bB]igg?[lr]?(?=\\[lr](?:floor|ceil))")
+"""Sizes of delimiters that latex2mathml takes without a size only."""
 
 
 def layers(source: str, *_: Any, **__: Any) -> str:
