@@ -14,13 +14,13 @@ from evedrop.scenario.loading import load
 from evedrop.simulate.simulation import Simulation
 from tests.conftest import Evedrop
 
-PAGE = Path(__file__).parents[2] / "docs" / "schemes" / "quantised-schedule.md"
+PAGE = Path(__file__).parents[2] / "docs" / "design.md"
 
 
 @pytest.fixture
 def scenario(tmp_path: Path) -> Path:
-    """The scenario of the scheme's page."""
-    match = re.search(r"```toml\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    """The scenario of the page."""
+    match = re.search(r"<!-- file: quantised.toml -->\n```toml\n(.*?)```", PAGE.read_text(), re.DOTALL)
     assert match is not None
     path = tmp_path / "quantised.toml"
     path.write_text(match[1])
