@@ -4,7 +4,7 @@ A wire passes ROS 2 on as it passes on everything else. It reads this to name pu
 one side on the others, and to wait long enough for their replies. A file beside the journal has the names behind its gids: every
 entity of ROS 2 that the wire has seen.
 
-Source: docs/ros2.md, what the wire reads, and the journal.
+Source: docs/ros2.md, what the wire reads.
 """
 
 from __future__ import annotations
