@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import pytest
@@ -14,16 +13,38 @@ from evedrop.scenario.loading import load
 from evedrop.simulate.simulation import Simulation
 from tests.conftest import Evedrop
 
-PAGE = Path(__file__).parents[2] / "docs" / "design.md"
+SCENARIO = """
+title = "Five bits a state, and encryption for 1.4 times the energy of a packet"
+slots = 400
+
+[process]
+A = [[0.9, 0.3], [0.0, 0.8]]
+Q = [[1e-3, 0.0], [0.0, 1e-3]]
+initial_covariance = [[1e-3, 0.0], [0.0, 1e-3]]
+
+[encoding]
+scheme = "quantised-schedule"
+threshold = 1.8333
+bits = 5
+standard_deviations = 6.0
+
+[acknowledgements]
+link = { quality = 0.9 }
+
+[legitimate]
+link = { quality = 0.8 }
+
+[eavesdroppers.listener]
+strategy = "selective"
+link = { quality = 0.8 }
+"""
 
 
 @pytest.fixture
 def scenario(tmp_path: Path) -> Path:
-    """The scenario of the page."""
-    match = re.search(r"<!-- file: quantised.toml -->\n```toml\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert match is not None
+    """The file of the scenario."""
     path = tmp_path / "quantised.toml"
-    path.write_text(match[1])
+    path.write_text(SCENARIO)
     return path
 
 

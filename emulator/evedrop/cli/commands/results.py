@@ -122,7 +122,7 @@ COMMANDS = (
         (argument("run", "FOLDER"),),
         section="inspect",
         example="report runs/vehicle",
-        page="results",
+        page="export",
     ),
     Command(
         "export",
@@ -131,7 +131,7 @@ COMMANDS = (
         (argument("run", "FOLDER"), _written),
         section="inspect",
         example="export runs/vehicle vehicle.mcap",
-        page="results",
+        page="export",
     ),
     Command(
         "diff",
