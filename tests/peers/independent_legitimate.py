@@ -1,4 +1,4 @@
-"""A legitimate estimator written from docs/protocol.md alone: nothing of this project is imported, nor numpy.
+"""A legitimate estimator written from docs/protocol.md and the pages it names: nothing of this project is imported, nor numpy.
 
 `python independent_legitimate.py BRIEF` takes part in a run; `Estimator` can be driven with recorded messages.
 """

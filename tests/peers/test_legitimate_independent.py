@@ -1,4 +1,4 @@
-"""A legitimate estimator written from docs/protocol.md alone agrees with ours to the last bit."""
+"""A legitimate estimator written from docs/protocol.md and the pages that it names agrees with ours to the last bit."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ from tests.messages import packet
 
 
 def uniforms_of(key: bytes, slots: int, trials: range) -> np.ndarray:
-    """The link's uniforms (slots, R), word by word from docs/protocol.md: one word of each block of two is used."""
+    """The link's uniforms (slots, R), word by word from docs/random-streams.md: one word of each block of two is used."""
     encryptor = Cipher(algorithms.AES(key), modes.ECB()).encryptor()  # noqa: S305 - the protocol's counter mode
     drawn = [
         [struct.unpack("<Q", encryptor.update(((k << 64) + r).to_bytes(16, "big"))[:8])[0] for r in trials]
