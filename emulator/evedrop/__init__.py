@@ -1,8 +1,11 @@
 """Evedrop: a network emulator for secrecy in remote state estimation.
 
-    from evedrop import Scenario, run, preloaded, montecarlo, sweep, compare, cost, learned, design, load_results, wire
+    from evedrop import Scenario, run, montecarlo, sweep, compare, design, load_results, wire
 
-These names are loaded when they are used: a peer imports this package, too, and needs none of them.
+These names, and those of `evedrop.extend`, are the public ones; all other modules may change in any version. They are loaded when
+they are used: a peer imports this package, too, and needs none of them.
+
+Source: docs/python.md, what is stable.
 """
 
 from __future__ import annotations
@@ -13,6 +16,9 @@ if TYPE_CHECKING:
     from typing import Any
 
     from evedrop.cli.api import (
+        ComparisonResults,
+        RunResults,
+        SweepResults,
         compare,
         cost,
         design,
@@ -25,13 +31,17 @@ if TYPE_CHECKING:
         run,
         sweep,
     )
+    from evedrop.errors import EvedropError, Interrupted, RunError, ScenarioError, UsageError
     from evedrop.live.launch.starter import preloaded
     from evedrop.scenario.loading import Scenario
+    from evedrop.simulate.montecarlo import Plan
+    from evedrop.wire.journal import journal_tables
     from evedrop.wire.running import wire  # the package `wire`, which can be called: see there
 
 __all__ = [
-    "Scenario", "compare", "cost", "design", "design_budget", "design_policy", "design_schedule", "learned", "load_results",
-    "montecarlo", "preloaded", "run", "sweep", "wire",
+    "ComparisonResults", "EvedropError", "Interrupted", "Plan", "RunError", "RunResults", "Scenario", "ScenarioError",
+    "SweepResults", "UsageError", "compare", "cost", "design", "design_budget", "design_policy", "design_schedule",
+    "journal_tables", "learned", "load_results", "montecarlo", "preloaded", "run", "sweep", "wire",
 ]  # fmt: skip
 
 

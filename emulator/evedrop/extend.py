@@ -17,6 +17,7 @@ from evedrop.model.delays import ConstantDelay, DelayModel
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge, PacketReader, PacketTaker
 from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.model.kernels import elementary
+from evedrop.model.links import loss_of
 from evedrop.model.links.loss_model import Bernoulli, Chain, Fate, LossModel, fates_of
 from evedrop.model.metrics.metric import MeanMetric, Metric, MetricColumn, MetricTally, ScoredSlots
 from evedrop.model.process import Floats, Process
@@ -139,6 +140,7 @@ __all__ = [
     "elementary",
     "fates_of",
     "line_style",
+    "loss_of",
     "prior",
     "probability_mistakes",
     "recent_slots",

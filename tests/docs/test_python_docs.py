@@ -37,9 +37,17 @@ def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_table_has_every_function() -> None:
     """Those of `evedrop`, which has all of `evedrop.cli.api`."""
     named = re.findall(r"^\| `(\w+)\(", PAGE, re.MULTILINE)
-    functions = {name for name in evedrop.__all__ if name != "Scenario"}
+    functions = {name for name in evedrop.__all__ if not inspect.isclass(getattr(evedrop, name))}
     assert {name for name in api.__all__ if inspect.isfunction(getattr(api, name))} <= functions
     assert sorted(named) == sorted(functions)
+
+
+def test_the_public_classes_are_named() -> None:
+    """In the section about what is stable."""
+    stable = PAGE.partition("## What is stable")[2]
+    assert {name for name in evedrop.__all__ if inspect.isclass(getattr(evedrop, name))} <= {
+        *re.findall(r"`(\w+)`", stable)
+    }
 
 
 def test_the_commands_without_a_function_are_listed() -> None:
