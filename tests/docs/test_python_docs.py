@@ -15,7 +15,12 @@ import evedrop
 from evedrop.cli import api
 from evedrop.cli.commands import MODULES
 
-PAGE = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[2]
+SHOWING_PYTHON = [
+    path.relative_to(ROOT).as_posix()
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "docs").rglob("*.ipynb"))]
+]
+PAGE = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(python|pycon)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 
 
@@ -48,6 +53,15 @@ def test_the_public_classes_are_named() -> None:
     assert {name for name in evedrop.__all__ if inspect.isclass(getattr(evedrop, name))} <= {
         *re.findall(r"`(\w+)`", stable)
     }
+
+
+IMPORT = re.compile(r"^\s*\"?(?:from|import) (evedrop[\w.]*)", re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", SHOWING_PYTHON)
+def test_pages_import_public_modules(name: str) -> None:
+    """A user who copies a page uses nothing that may change in any version."""
+    assert {*IMPORT.findall((ROOT / name).read_text(encoding="utf-8"))} <= {"evedrop", "evedrop.extend"}
 
 
 def test_the_commands_without_a_function_are_listed() -> None:
