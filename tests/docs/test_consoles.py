@@ -24,6 +24,7 @@ NOT_RUN = {
     "docs/microgrid.md": 8,
     "docs/microgrid.md": 3,
     "docs/montecarlo.md": 2,
+    "docs/montecarlo.md": 1,
     "docs/papers.md": 1,
     "docs/programs.md": 2,
     "docs/performance.md": 1,

@@ -1,6 +1,6 @@
 """Z-scores and verdicts at the sizes and for the systems that the documents use, over many independent studies.
 
-`python -m pytest tests/score/test_verdict_calibration.py -m long -s` prints the table of docs/montecarlo.md.
+`python -m pytest tests/score/test_verdict_calibration.py -m long -s` prints the table of which docs/montecarlo.md has the sums.
 """
 
 from __future__ import annotations
