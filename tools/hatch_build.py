@@ -1,4 +1,4 @@
-"""Builds the C kernels with the package.
+"""Builds the C kernels with the package, and makes the description of the package from README.md.
 
 Where no compiler works, the package is installed without them and says so; or the build fails, if the environment variable
 `EVEDROP_KERNELS_REQUIRED` is 1, as it must be for a wheel that is published for a platform.
@@ -8,14 +8,31 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 _KERNELS = Path("emulator/evedrop/model/kernels")
 _REQUIRED = "EVEDROP_KERNELS_REQUIRED"
+
+
+class ReadmeHook(MetadataHookInterface):
+    """Makes README.md the description of the package, which is shown where the repository's files are not."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Set `readme`."""
+        text = (Path(self.root) / "README.md").read_text(encoding="utf-8")
+        metadata["readme"] = {"content-type": "text/markdown", "text": without_files(text)}
+
+
+def without_files(text: str) -> str:
+    """Markdown without the pictures and links that lead to files: of a link, its words stay."""
+    text = re.sub(r"^!\[[^]]*\]\((?!https?:)[^)]*\)\n+", "", text, flags=re.MULTILINE)
+    return re.sub(r"\[([^]]*)\]\((?!https?:)[^)]*\)", r"\1", text)
 
 
 class KernelsHook(BuildHookInterface):

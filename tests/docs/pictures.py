@@ -127,9 +127,10 @@ def _draw(page: Path, results: Path, picture: Path) -> None:
 
 
 PICTURES: Mapping[str, Callable[[Path, Path], None]] = {
-    "live_view.png": _viewed(ROOT / "README.md", lambda folder: run_of("vehicle", folder)),
+    "live_view.png": _viewed(DOCS / "tutorial.md", lambda folder: run_of("vehicle", folder)),
     "vehicle.gif": _viewed(DOCS / "view.md", lambda folder: run_of("vehicle", folder)),
     "microgrid_view.png": _viewed(DOCS / "view.md", lambda folder: run_of("microgrid", folder)),
+    "wire.gif": _viewed(ROOT / "README.md", wire_at_work),
     "wire_view.png": _viewed(DOCS / "wire" / "results.md", wire_at_work),
     "compare.png": _compare,
 }

@@ -6,8 +6,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
 
@@ -44,10 +42,9 @@ def strategies(names: list[str], message: str) -> str:
     )
 
 
-@pytest.mark.parametrize("page", ["README.md", "SECURITY.md"])
-def test_the_strategies_that_are_granted_something_are_named(page: str) -> None:
+def test_the_strategies_that_are_granted_something_are_named() -> None:
     """Those with the schedule, those with a true state, and those that have what another strategy has."""
-    text = re.sub(r"\s+", " ", (ROOT / page).read_text(encoding="utf-8"))
+    text = re.sub(r"\s+", " ", (ROOT / "docs" / "who-may-know-what.md").read_text(encoding="utf-8"))
     granted = with_streams_of_the_secret()
     assert set().union(*granted.values()) == {"schedule"}
     betrayed = [name for name, (cls, given) in built_in().items() if cls.betrayed(given) is not None]
@@ -89,3 +86,12 @@ def test_the_protocol_lists_the_keys_of_each_strategy() -> None:
                 granted[name] = set(re.findall(r"`(\w+)`", keys))
     asked = {name: set(cls.streams(given)) for name, (cls, given) in built_in().items()}
     assert granted == {name: streams for name, streams in asked.items() if streams}
+
+
+def test_pages_that_name_the_rule_lead_to_the_exceptions() -> None:
+    """What an eavesdropper cannot obtain is qualified wherever it is claimed."""
+    for page in ("README.md", "SECURITY.md"):
+        (claim,) = re.findall(
+            r"^- An eavesdropper's process gets .*?(?=^- )", (ROOT / page).read_text("utf-8"), re.M | re.S
+        )
+        assert "(docs/who-may-know-what.md)" in claim
