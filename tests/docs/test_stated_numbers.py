@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from evedrop.errors import MOST_MISTAKES
+from evedrop.errors import MOST_MISTAKES, EvedropError
 from evedrop.model.checks import as_toml
 from evedrop.model.schemes import SCHEMES
 from evedrop.names import RESERVED
@@ -82,6 +82,17 @@ def test_a_quantile_is_strictly_between_0_and_1() -> None:
     for edge in (0.0, 1.0):
         with pytest.raises(ValidationError):
             TypeAdapter(Quantile).validate_python(edge)
+
+
+def test_the_table_of_exit_statuses_has_all() -> None:
+    """Those of errors, and of a command that completed."""
+    kinds, statuses = [EvedropError], {0, 1}
+    while kinds:
+        kind = kinds.pop()
+        kinds += kind.__subclasses__()
+        statuses.add(kind.exit_status)
+    text = (ROOT / "docs" / "exit-statuses.md").read_text(encoding="utf-8")
+    assert [int(number) for number in re.findall(r"^\| (\d+) \|", text, re.MULTILINE)] == sorted(statuses)
 
 
 def test_a_leap_of_a_counter() -> None:

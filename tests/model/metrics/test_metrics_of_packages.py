@@ -134,7 +134,9 @@ def test_docs_say_of_every_metric_what_it_says_itself() -> None:
     """In the table of docs/metrics.md, and in the entry of docs/scenario.md those that an expectation can name."""
     results, scenario = ((DOCS / page).read_text(encoding="utf-8") for page in ("metrics.md", "scenario.md"))
     for name in METRICS:
-        meaning = metric(name).meaning.replace("|", "\\|")
+        meaning = metric(name).meaning
+        for plain, typeset in (("|x − x̂|²", r"$\lvert x - \hat x\rvert^2$"), ("tr P", r"$\operatorname{tr} P$")):
+            meaning = meaning.replace(plain, typeset)
         assert f"\n| `{name}` | {meaning} |\n" in results
         assert (f"`{name}`" in scenario) == (metric(name).only_in_mode is None)
 
