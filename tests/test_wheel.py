@@ -92,6 +92,15 @@ def test_an_installed_wheel_has_the_kernels_where_there_is_no_compiler(installed
     assert "kernels         C (" in done.stdout
 
 
+def test_the_description_leads_to_no_file_of_the_repository(installed: Installed) -> None:
+    """It is README.md, whose links keep their words where there are no files."""
+    [metadata] = installed.packages.glob("evedrop-*.dist-info/METADATA")
+    _, _, description = metadata.read_text(encoding="utf-8").partition("\n\n")
+    assert description.startswith("# Evedrop\n")
+    assert "](docs/" not in description
+    assert "The tutorial goes on from here." in description
+
+
 SPIED = """
 title = "A spy of theirs"
 slots = 20

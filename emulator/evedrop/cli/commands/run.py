@@ -143,7 +143,7 @@ COMMANDS = (
         _LIVE,
         section="run",
         example="demo",
-        page="view",
+        page="run",
     ),
     Command(
         "run",
@@ -152,6 +152,6 @@ COMMANDS = (
         (scenario, over_wire, *_LIVE, _over_ssh),
         section="run",
         example="run vehicle --view web",
-        page="scenario",
+        page="run",
     ),
 )

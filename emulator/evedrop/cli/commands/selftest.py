@@ -30,6 +30,6 @@ COMMANDS = (
         "check this machine against reference digests",
         section="inspect",
         example="selftest",
-        page="testing",
+        page="install",
     ),
 )
