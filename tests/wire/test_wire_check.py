@@ -159,7 +159,7 @@ def test_the_page_shows_what_the_command_prints(tmp_path: Path, capsys: pytest.C
     assert f"```toml\n{example_wire()}```" in page
     path = tmp_path / "robot.toml"
     path.write_text(example_wire())
-    assert main(["wire", "--check", str(path), "robot/scan/front", "robot/@config/x"]) == 0
+    assert main(["wire", "--check", str(path), "robot/scan/front"]) == 0
     _, word, keys = capsys.readouterr().out.partition("  key  robot/scan/front\n")
     assert f"…\n{word}{keys}```" in page
 
