@@ -71,7 +71,7 @@ def _rows(command: argparse.ArgumentParser) -> Iterator[str]:
 
 def _sentence(text: str) -> str:
     """A text of the command line, in which pages are links."""
-    return linked(text, "../", ".md")
+    return linked(text, "../")
 
 
 def _cell(text: str) -> str:

@@ -17,7 +17,7 @@ class Doctests(Extension):
     def on_object(self, *, obj: Object, **_: Any) -> None:
         """For the docstring of an object."""
         if obj.docstring is not None:
-            obj.docstring.value = linked(_EXAMPLE.sub(_fenced, obj.docstring.value), "../", ".html")
+            obj.docstring.value = linked(_EXAMPLE.sub(_fenced, obj.docstring.value), "../")
 
 
 def _fenced(match: re.Match[str]) -> str:

@@ -1,67 +1,222 @@
-"""The gallery: every built-in scenario with its description, its command and a picture of its results.
+"""The gallery: a card for each built-in scenario, a page for each, and the list of them in the reference.
 
-The pictures are made in memory, some hundreds of thousand trial-slots each, and kept in build/gallery for as long as neither the
-scenario nor the program changes.
+Cards are filtered by style sheets alone: each has classes, and radio buttons hide those without the chosen one.
 """
 
 from __future__ import annotations
 
-import hashlib
+import html
 import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
-from picture_folder import PICTURES, program_digest
+from gallery_pictures import Kept, kept
 
-from evedrop import Scenario, montecarlo
+from evedrop import Scenario
 from evedrop.scenarios import built_in_text, shipped
 
-_TRIAL_SLOTS = 200_000
-_MOST_TRIALS = 200
-_MOST_SLOTS = 5_000  # of the day in a house
-_LEAST_DESCRIPTION = 60
-_THIS = Path(__file__).read_bytes()
-_HEAD = """# Gallery
+_LEARNED = re.compile(r"\A# What you learn: (?P<words>(?:.+\n)(?:# .+\n)*)")
+_HEAD = """---
+hide: [toc]
+---
 
-Every built-in scenario, with errors, packets and estimates of a study in memory of at most 5000 slots.
-`evedrop show NAME` prints a scenario, with comments that say what to look for; `evedrop run NAME` runs it live.
-[Results](results.md) and [the view](view.md) explain the metrics and colours.
+# Gallery
+
+Each card shows a built-in scenario: above, the truth (ring) and where each receiver believes it to be; below, how far off each of
+them is. A card leads to pictures, the verdict and a recording for Rerun's viewer, which is not embedded: it is tens of megabytes.
 """
+_WIRE = """<a class="card wire" href="wire.html"><img alt="" loading="lazy" src="wire_view.png">
+<span class="card-title">A wire between programs</span>
+<span class="card-learned">What bursts, delay and a partition do to messages between two unchanged programs.</span>
+<span class="card-tags">wire</span></a>
+"""
+_FILTERS = {
+    "all": "all",
+    "attack": "attacks",
+    "closed-loop": "closed loop",
+    "faults": "faults",
+    "links": "bursts, delay, distance",
+    "wire": "wire",
+}
+_LOSSES_AS_USUAL = "bernoulli"
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A built-in scenario in the gallery."""
+
+    name: str
+    title: str
+    learned: str
+    """What one learns from it, a sentence or two."""
+    scheme: str
+    kinds: tuple[str, ...]
+    """Those of `_FILTERS` that it belongs to."""
+
+
+@cache
+def shown() -> tuple[Shown, ...]:
+    """All of them, by name."""
+    found = []
+    for name in sorted(shipped()):
+        scenario = Scenario.load(name)
+        found.append(Shown(name, scenario.title, learned(name), scenario.encoding.scheme, tuple(_kinds(scenario))))
+    return tuple(found)
+
+
+def learned(name: str) -> str:
+    """What one learns from a built-in scenario, as the first lines of its file say it."""
+    match = _LEARNED.match(built_in_text(name))
+    if match is None:
+        raise ValueError(f"{name}.toml does not begin with `# What you learn: …`")
+    return " ".join(match["words"].replace("\n# ", " ").split())
+
+
+def _kinds(scenario: Scenario) -> Iterator[str]:
+    acknowledgements = scenario.acknowledgements
+    attacked = acknowledgements is not None and acknowledgements.attack != "none"
+    if attacked or any(event.kind in {"jam", "spoof"} for event in scenario.event):
+        yield "attack"
+    if scenario.controller is not None:
+        yield "closed-loop"
+    if scenario.nemesis is not None or any(event.kind not in {"jam", "spoof", "note"} for event in scenario.event):
+        yield "faults"
+    links = scenario.links.values()
+    if any(link.delay or link.correlation or link.loss_spec["model"] != _LOSSES_AS_USUAL for link in links):
+        yield "links"
 
 
 def gallery_page() -> str:
-    """The page in Markdown."""
-    parts = [_HEAD]
-    for name in sorted(shipped()):
-        title = Scenario.load(name).title
-        parts += [f"## {name}\n", f"**{title}.** {description(name)}\n", f"```text\nevedrop run {name}\n```\n"]
-        parts += [f"![Errors, packets and estimates of {name}](gallery/{name}.png)\n"]
+    """The page of cards in Markdown."""
+    schemes = sorted({one.scheme for one in shown()})
+    parts = [_HEAD, '<div class="gallery">', *_choice("kind", _FILTERS)]
+    parts += _choice("scheme", {"all": "all", **{scheme: scheme for scheme in schemes}})
+    parts += [
+        '<div class="cards">',
+        *map(_card, shown()),
+        _WIRE,
+        "</div>",
+        "</div>\n",
+        f"<style>{_rules(schemes)}</style>",
+    ]
     return "\n".join(parts)
 
 
-def description(name: str) -> str:
-    """The first sentence of a scenario's comment, and the next ones if it is very short."""
-    comment = re.search(r"^#(?:.+\n#)*.+\n", built_in_text(name), re.MULTILINE)
-    if comment is None:
-        return ""
-    sentences = re.split(r"(?<=[.!?]) (?=[A-Z`])", " ".join(re.sub("^# ?", "", comment[0], flags=re.MULTILINE).split()))
-    text = sentences.pop(0)
-    while len(text) < _LEAST_DESCRIPTION and sentences:
-        text += f" {sentences.pop(0)}"
-    return text
+def _choice(group: str, choices: dict[str, str]) -> Iterator[str]:
+    yield f'<fieldset class="filters"><legend>{group}</legend>'
+    for value, words in choices.items():
+        checked = " checked" if value == "all" else ""
+        yield f'<label><input type="radio" name="{group}" value="{value}"{checked}>{words}</label>'
+    yield "</fieldset>"
 
 
-def pictures() -> dict[str, bytes]:
-    """The picture of each scenario, as PNG."""
-    PICTURES.mkdir(parents=True, exist_ok=True)
-    return {name: _picture(name) for name in sorted(shipped())}
+def _rules(schemes: list[str]) -> str:
+    """Hide the cards that are not of the chosen kind, or not of the chosen scheme."""
+    classes = [("kind", kind, kind) for kind in _FILTERS if kind != "all"]
+    classes += [("scheme", scheme, f"scheme-{scheme}") for scheme in schemes]
+    return "".join(
+        f'.gallery:has([name="{group}"][value="{value}"]:checked) .card:not(.{name}){{display:none}}'
+        for group, value, name in classes
+    )
 
 
-def _picture(name: str) -> bytes:
-    kept = PICTURES / f"{hashlib.sha256(program_digest() + _THIS + built_in_text(name).encode()).hexdigest()[:16]}.png"
-    if not kept.exists():
-        slots = min(Scenario.load(name).slots, _MOST_SLOTS)
-        results = montecarlo(name, trials=min(_MOST_TRIALS, _TRIAL_SLOTS // slots), slots=slots)
-        new = kept.with_suffix(".new")
-        results.plot().savefig(new, format="png", dpi=80)
-        new.replace(kept)
-    return kept.read_bytes()
+def _card(one: Shown) -> str:
+    pictures = "".join(_moving(one.name, theme) for theme in ("dark", "light"))
+    tags = " · ".join([one.scheme, *(_FILTERS[kind] for kind in one.kinds)])
+    return (
+        f'<a class="card {" ".join(one.kinds)} scheme-{one.scheme}" href="gallery/{one.name}.html">{pictures}\n'
+        f'<span class="card-title">{html.escape(one.title)}</span>\n'
+        f'<span class="card-learned">{_spoken(one.learned)}</span>\n<span class="card-tags">{tags}</span></a>'
+    )
+
+
+def _moving(name: str, theme: str) -> str:
+    """The picture of a card in a theme; one that does not move for readers who want less motion."""
+    ending = f"{'' if theme == 'dark' else '-light'}.svg#only-{theme}"
+    still = f'<source media="(prefers-reduced-motion: reduce)" srcset="gallery/{name}-still{ending}">'
+    picture = f'<img alt="" loading="lazy" width="320" height="180" src="gallery/{name}{ending}">'
+    return f"<picture>{still}{picture}</picture>"
+
+
+def _spoken(text: str) -> str:
+    """A sentence in HTML, with code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+
+
+def scenario_pages() -> Iterator[tuple[str, str]]:
+    """The path of each scenario's page, and the page in Markdown."""
+    for one in shown():
+        yield f"gallery/{one.name}.md", _page(one, kept(one.name))
+
+
+def _page(one: Shown, made: Kept) -> str:
+    trials = "1 trial" if made.trials == 1 else f"{made.trials} trials"
+    verdict = f"> {made.verdict}" if made.verdict else "> No eavesdropper listens: there is no verdict on secrecy."
+    size = (made.folder / "recording.rrd").stat().st_size / 1e6
+    return f"""---
+hide: [navigation, toc]
+---
+
+[Gallery](../gallery.md)
+
+# {one.title}
+
+**{one.learned}**
+
+{verdict}
+
+{made.slots:,} slots, {trials}, in memory. Live, with the view:
+
+```text
+evedrop run {one.name}
+```
+
+![Pictures of a run of {one.name}]({one.name}-run.png)
+
+[Recording of the view]({one.name}.rrd) ({size:.1f} MB). Open it with Rerun's viewer, which is installed with Evedrop:
+
+```text
+rerun {one.name}.rrd
+```
+
+## The scenario
+
+`evedrop show {one.name}` prints it, and `evedrop new mine.toml --from {one.name}` copies it.
+[Scenario keys](../reference/scenario-keys.md) describes each key.
+
+```toml
+{built_in_text(one.name).rstrip()}
+```
+"""
+
+
+def scenario_files() -> Iterator[tuple[str, Path]]:
+    """The address of each picture and recording on the site, and its file."""
+    for one in shown():
+        folder = kept(one.name).folder
+        for theme in ("", "-light"):
+            yield f"gallery/{one.name}{theme}.svg", folder / f"card{theme}.svg"
+            yield f"gallery/{one.name}-still{theme}.svg", folder / f"card-still{theme}.svg"
+            yield f"gallery/{one.name}-run{theme}.png", folder / f"run{theme}.png"
+        yield f"gallery/{one.name}.rrd", folder / "recording.rrd"
+
+
+def scenarios_page() -> str:
+    """The list of built-in scenarios for the reference, in Markdown."""
+    rows = [
+        f"| [`{one.name}`](../gallery/{one.name}.md) | {one.title} | {one.learned} | `{one.scheme}` |"
+        for one in shown()
+    ]
+    return "\n".join([
+        "# Built-in scenarios",
+        "",
+        "`evedrop list` prints their names, `evedrop show NAME` a scenario with comments that say what to look for, and",
+        "`evedrop run NAME` runs one. The [gallery](../gallery.md) shows them.",
+        "",
+        "| name | title | what you learn | scheme |",
+        "|---|---|---|---|",
+        *rows,
+        "",
+    ])  # fmt: skip

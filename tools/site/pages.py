@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from commands import commands_page
-from gallery import gallery_page, pictures
+from gallery import gallery_page, scenario_files, scenario_pages, scenarios_page
 from keys import keys_page
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
@@ -48,14 +48,16 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "screens.md": screens_page(),
         "reference/scenario-keys.md": keys_page(),
         "reference/commands.md": commands_page(),
+        "reference/scenarios.md": scenarios_page(),
         "reference/evedrop.md": "# The module `evedrop`\n\n::: evedrop\n\n## wire\n\n::: evedrop.wire.running.wire\n",
         "reference/extend.md": "# The module `evedrop.extend`\n\n::: evedrop.extend\n",
     }
+    made |= dict(scenario_pages())
     made |= {name: (HERE / name).read_text(encoding="utf-8") for name in _COPIED}
     for name, text in made.items():
         files.append(File.generated(config, name, content=text))
-    for name, picture in pictures().items():
-        files.append(File.generated(config, f"gallery/{name}.png", content=picture))
+    for address, path in scenario_files():
+        files.append(File.generated(config, address, content=path.read_bytes()))
     return files
 
 
