@@ -199,6 +199,7 @@ MEANT_OTHERWISE = {
         "tests/show/report/test_report.py",
         "tests/show/view/*",
         "tests/studies/papers/*",
+        "tools/site/gallery_pictures.py",
     ),
 }
 """Former word → the files in which it, or its plural, means something else: here a picture."""

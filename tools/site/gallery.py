@@ -19,7 +19,7 @@ from evedrop.scenarios import built_in_text, shipped
 
 _LEARNED = re.compile(r"\A# What you learn: (?P<words>(?:.+\n)(?:# .+\n)*)")
 _HEAD = """---
-hide: [toc]
+hide: [navigation, toc]
 ---
 
 # Gallery
@@ -108,7 +108,7 @@ def _choice(group: str, choices: dict[str, str]) -> Iterator[str]:
     yield f'<fieldset class="filters"><legend>{group}</legend>'
     for value, words in choices.items():
         checked = " checked" if value == "all" else ""
-        yield f'<label><input type="radio" name="{group}" value="{value}"{checked}>{words}</label>'
+        yield f'<label><input type="radio" name="{group}" id="{group}-{value}"{checked}>{words}</label>'
     yield "</fieldset>"
 
 
@@ -117,8 +117,7 @@ def _rules(schemes: list[str]) -> str:
     classes = [("kind", kind, kind) for kind in _FILTERS if kind != "all"]
     classes += [("scheme", scheme, f"scheme-{scheme}") for scheme in schemes]
     return "".join(
-        f'.gallery:has([name="{group}"][value="{value}"]:checked) .card:not(.{name}){{display:none}}'
-        for group, value, name in classes
+        f".gallery:has(#{group}-{value}:checked) .card:not(.{name}){{display:none}}" for group, value, name in classes
     )
 
 

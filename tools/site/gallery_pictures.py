@@ -78,7 +78,7 @@ def _make(name: str, folder: Path) -> None:
         ("-light", _attack_figure(scenario, results) if attacked else results.plot()),
         ("", darkened(_attack_figure(scenario, results) if attacked else results.plot())),
     ):
-        figure.savefig(folder / f"run{theme}.png", dpi=80, transparent=True)
+        figure.savefig(folder / f"run{theme}.png", dpi=110, transparent=True)
     for dark, theme in ((True, ""), (False, "-light")):
         shown = _shown(scenario, results, dark=dark)
         (folder / f"card{theme}.svg").write_text(card(shown, dark=dark), encoding="utf-8")
@@ -188,16 +188,13 @@ def _attack_figure(scenario: Scenario, results: RunResults) -> Figure:
         world.set_ylabel(state)
         inputs.plot(attack.inputs, color=OCHRE, linewidth=1.2, label=f"input {entry}")
         inputs.set_ylabel(entry)
-        evidence.plot(attack.statistic, color=SLATE, label="the detector's statistic")
+        evidence.plot(attack.statistic, color=hexadecimal(TRUTH_CURVE), label="the detector's statistic")
         evidence.axhline(attack.threshold, color=hexadecimal(ALARM), linestyle="--", label="threshold: alarm")
         evidence.set_ylabel("evidence (nats)")
         evidence.set_xlabel("slot")
         for axes in (world, inputs, evidence):
-            axes.axvline(attack.begins, color=hexadecimal(ALARM), linewidth=0.8)
+            axes.axvline(attack.begins, color=hexadecimal(ALARM), linewidth=0.8, label="the attack begins")
             axes.legend(loc="upper left")
-        world.annotate(
-            "the attack begins", (attack.begins, 1.0), xycoords=("data", "axes fraction"), va="bottom", fontsize=8
-        )
     return figure
 
 
