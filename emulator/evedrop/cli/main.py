@@ -123,7 +123,7 @@ def parser_of(first: str = "") -> Parser:
     """The parser; first: the first argument. If it names a command, only that command's module is loaded."""
     parser = Parser(
         prog="evedrop",
-        description="A network emulator for secrecy in remote state estimation.",
+        description="A network emulator for secrecy in remote state estimation, and fault injection for programs that use Zenoh.",
         epilog="first: evedrop demo, then evedrop docs tutorial. evedrop COMMAND --help describes a command; "
         "evedrop docs lists the pages of the documentation.",
     )

@@ -32,6 +32,7 @@ _NEXT = {
     "check": ("to run it live", "run {scenarios[0]}"),
     **dict.fromkeys(("demo", "run"), ("to repeat it 200 times in memory", "montecarlo {scenario} --trials 200")),
     "montecarlo": ("to watch a trial live", "run {scenario}"),
+    "wire": ("to see it again", "view {out}"),
     "wire --check": ("to start it", "wire {file}"),
     "partition": ("to end it", "heal {run} {one} {other}"),
     "pause": ("to advance it by a slot", "step {run} 1"),

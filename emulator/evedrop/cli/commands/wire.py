@@ -48,6 +48,7 @@ def wire(options: argparse.Namespace) -> int:
 
     gc.freeze()  # imported modules stay: the collections that new keys cause need not look at them
     with results_folder(options.out, f"wire-{options.file.stem}") as folder:
+        options.out = folder
         speaking = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}
         with zenoh_log_apart():
             status = run_wire(plan, folder, seconds=seconds, view=options.view, **speaking)
