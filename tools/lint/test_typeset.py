@@ -8,19 +8,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
-TYPESET = (
-    "mathematics.md",
-    "mathematics/*.md",
-    "notation.md",
-    "learning.md",
-    "integrity.md",
-    "microgrid.md",
-    "errata.md",
-    "papers.md",
-    "papers/*.md",
-)
-"""The pages in which this is demanded."""
-PAGES = sorted(path.relative_to(DOCS).as_posix() for pattern in TYPESET for path in DOCS.glob(pattern))
+PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
 
 _CODE = re.compile(r"^(```|~~~).*?^\1|^(?: {4}|\t)\S.*?$|`[^`\n]*`|\]\([^)\s]*\)|<!--.*?-->", re.DOTALL | re.MULTILINE)
 """Code, and where links lead."""
