@@ -27,7 +27,7 @@ hide: [navigation, toc]
 Each card shows a built-in scenario: above, the truth (ring) and where each receiver believes it to be; below, how far off each of
 them is. A card leads to pictures, the verdict and a recording for Rerun's viewer, which is not embedded: it is tens of megabytes.
 """
-_WIRE = """<a class="card wire" href="wire.html"><img alt="" loading="lazy" src="wire_view.png">
+_WIRE = """<a class="card wire" href="wire/tutorial.html"><img alt="" loading="lazy" src="wire_view.png">
 <span class="card-title">A wire between programs</span>
 <span class="card-learned">What bursts, delay and a partition do to messages between two unchanged programs.</span>
 <span class="card-tags">wire</span></a>

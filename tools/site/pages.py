@@ -63,8 +63,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     """Make links between docs/ and the folder above it, as they are in the repository, lead to the site's."""
+    up = "../" * page.file.src_uri.count("/")
     for name, there in (_OF_THE_ROOT | _FRONT).items():
-        markdown = re.sub(rf"\]\((\.\./)?{re.escape(name)}(?=[)#])", f"]({there}", markdown)
+        markdown = re.sub(rf"\]\((?:\.\./)*{re.escape(name)}(?=[)#])", f"]({up}{there}", markdown)
     if page.file.src_uri in _OF_THE_ROOT.values():
         markdown = re.sub(r"\]\(docs/", "](", markdown)
         markdown = _OF_THE_REPOSITORY.sub(_named, markdown)
