@@ -133,7 +133,7 @@ def _type(field: Schema) -> str:
         words = f"list of: {_type(field['items'])}"
     if field.get("type") == "object" and isinstance(field.get("additionalProperties"), dict):
         words = f"table of names, each: {_type(field['additionalProperties'])}"
-    limits = [f"{sign} {_number(field[name])}" for name, sign in _LIMITS if name in field]
+    limits = [f"{sign}\u00a0{_number(field[name])}" for name, sign in _LIMITS if name in field]
     limits += [f"at most {_number(field[name])} {unit}" for name, unit in _MOST if name in field]
     return f"{words}, {', '.join(limits)}" if limits else words
 

@@ -18,6 +18,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
+from python_page import python_page
 from screens import screens_page
 
 HERE = Path(__file__).parent
@@ -49,7 +50,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "reference/scenario-keys.md": keys_page(),
         "reference/commands.md": commands_page(),
         "reference/scenarios.md": scenarios_page(),
-        "reference/evedrop.md": "# The module `evedrop`\n\n::: evedrop\n\n## wire\n\n::: evedrop.wire.running.wire\n",
+        "reference/evedrop.md": python_page(),
         "reference/extend.md": "# The module `evedrop.extend`\n\n::: evedrop.extend\n",
     }
     made |= dict(scenario_pages())
@@ -58,7 +59,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, name, content=text))
     for address, path in scenario_files():
         files.append(File.generated(config, address, content=path.read_bytes()))
+    for drawing in [file for file in files if file.src_uri.endswith(".svg") and _BY_THE_SYSTEM in file.content_string]:
+        text = drawing.content_string
+        files.remove(drawing)
+        for suffix, chosen in ((".svg", "@media all"), ("-light.svg", "@media not all")):
+            address = drawing.src_uri.removesuffix(".svg") + suffix
+            files.append(File.generated(config, address, content=text.replace(_BY_THE_SYSTEM, chosen)))
     return files
+
+
+_BY_THE_SYSTEM = "@media (prefers-color-scheme: dark)"
+"""How a drawing chooses its colours; on the site, a reader can choose another theme than the system's."""
 
 
 def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
@@ -106,7 +117,11 @@ def _opening_large(picture: str, address: str, folder: PurePosixPath, there: Col
 
 def _formula(match: re.Match[str]) -> str:
     display = "block" if match[2] == "[" else "inline"
-    tex = _UNSIZED.sub("", html.unescape(match[3])).replace(r"\arg", r"\operatorname{arg}")
+    tex = (
+        _UNSIZED.sub("", html.unescape(match[3]))
+        .replace(r"\arg", r"\operatorname{arg}")
+        .replace(r"\top", r"\mathsf{T}")
+    )
     made = convert(tex, display=display)
     if unknown := re.search(r"\\[a-zA-Z]+", made):
         raise PluginError(f"{tex}: {unknown[0]} is not known to latex2mathml; write it in another way")

@@ -5,6 +5,7 @@ docs/screens has them; tests/docs/pictures.py and tests/docs/screens.py make the
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 SCREENS = Path(__file__).parents[2] / "docs" / "screens"
@@ -51,5 +52,6 @@ def screens_page() -> str:
     parts.append(_TERMINAL)
     for path in sorted(SCREENS.glob("*.txt"), key=lambda path: int(path.stem)):
         _, _, text = path.read_text(encoding="utf-8").partition("\n\n")
-        parts.append(f"### {path.stem} columns\n\n```text\n{text.rstrip()}\n```\n")
+        block = f"```text\n{text.rstrip()}\n```\n"
+        parts.append(f'??? note "{path.stem} columns"\n\n{textwrap.indent(block, "    ")}')
     return "\n".join([*parts, _PAPER])
