@@ -196,6 +196,8 @@ def test_lists_fit_a_narrow_terminal(
     assert main(command) == 0
     narrow, _, _ = capsys.readouterr().out.partition("\nnext, ")
     assert max(map(len, lines)) > 40 >= max(map(len, narrow.splitlines()))
+    narrow, _, step = narrow.partition("next, ")
+    assert "evedrop" in step
     assert "".join(narrow.split()) == "".join("".join(lines).split())
 
 
