@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 from evedrop.cli import main as cli
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.loading import load, parse
+from evedrop.studies.matchups import ATTACKERS
 from evedrop.wire.file import example_wire, load_wire
 from evedrop.wire.running_link import KeyFates
 from tests.conftest import LIMIT
@@ -122,6 +125,13 @@ def test_a_run_over_a_wire_works_as_printed(tmp_path: Path, monkeypatch: pytest.
     command, *words = shlex.split(line)
     assert command == "run"
     assert cli.main(["montecarlo", *words, "--trials", "20", "--workers", "1"]) == 0
+
+
+def test_it_counts_what_there_is() -> None:
+    """Schemes, eavesdroppers, and attacks on acknowledgements."""
+    counts = re.search(r"\[(\d+) schemes\]\(docs/schemes\.md\) against (\d+) eavesdroppers and (\d+) attacks", README)
+    assert counts is not None
+    assert [*map(int, counts.groups())] == [len(SCHEMES), len(STRATEGIES.names), len(ATTACKERS)]
 
 
 def test_the_first_page_is_short() -> None:
