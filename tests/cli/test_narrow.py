@@ -196,8 +196,8 @@ def test_lists_fit_a_narrow_terminal(
     assert main(command) == 0
     narrow = capsys.readouterr().out
     assert max(map(len, lines)) > 40 >= max(map(len, narrow.splitlines()))
-    narrow, _, step_after = narrow.partition("\nnext, ")
-    assert "evedrop" in step_after
+    narrow, _, advice = narrow.partition("\nnext, ")
+    assert "evedrop" in advice
     assert "".join(narrow.split()) == "".join("".join(lines).split())
 
 
