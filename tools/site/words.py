@@ -2,7 +2,7 @@
 
     python tools/site/words.py
 
-A word has a letter or a digit: bars of tables and signs by themselves are none. Commands and their output are counted, and pages that
+A word has a letter or a digit: bars of tables and signs by themselves are none. Commands and their output are counted; pages that
 the site generates are not.
 """
 
