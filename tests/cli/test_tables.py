@@ -177,6 +177,21 @@ def test_text_is_escaped(text: str, latex: str) -> None:
     assert latex_escaped(text) == latex
 
 
+def test_a_verdict_is_a_word_in_latex() -> None:
+    """Its mark needs a package, or a font; elsewhere a question mark is a question mark."""
+    table = TextTable.headed(["verdict"], [])
+    for text in ("✔ perfectly secret", "✓ secret", "? cannot tell yet", "✗ not secret", "what? it"):
+        table.add(text)
+    rows = [line for line in latex_text(table).splitlines() if line.endswith("\\\\")][1:]
+    assert [row.removesuffix(" \\\\") for row in rows] == [
+        "perfectly secret",
+        "secret",
+        "cannot tell yet",
+        "not secret",
+        "what? it",
+    ]
+
+
 def test_a_narrow_terminal_changes_no_file(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a narrow terminal leaves out is in the file."""
     words = shlex.split(COMMANDS["montecarlo"])

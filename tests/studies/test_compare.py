@@ -18,7 +18,7 @@ from evedrop.results.comparison import Comparison, read_comparison
 from evedrop.results.summary_file import plain
 from evedrop.scenario.loading import load
 from evedrop.score.verdict import SecrecyOutcome
-from evedrop.show.report.comparison import verdict
+from evedrop.show.report.comparison import conclusion, verdict
 from evedrop.show.report.comparison_sections import COMPARISON_SECTIONS, ComparisonSource
 from evedrop.show.report.writing import write_report
 from evedrop.simulate.montecarlo import Plan
@@ -208,6 +208,22 @@ def test_simulation_agrees_with_theory(everything: Everything) -> None:
                 assert abs(peer.z) < 4.5, cell.match
                 judged += 1
     assert judged > 40
+
+
+def test_trials_alone_do_not_rank_schemes(tmp_path: Path) -> None:
+    """Without a closed form for the link, as with a recording, it is not said that no scheme dominates."""
+    trace = {"model": "pattern", "outcomes": "1101110111"}
+    result = compare(
+        "bayesian",
+        schemes=["cipher", "plain"],
+        adversaries=["smart"],
+        out=tmp_path,
+        legitimate__link={"loss": trace},
+        **MARGINAL,
+    )
+    assert not result.dominant
+    assert result.without_limit == ("cipher", "plain")
+    assert conclusion(result).startswith("no scheme is known to dominate: theory does not give")
 
 
 @pytest.mark.long

@@ -264,6 +264,11 @@ class Comparison:
             )
         )
 
+    @property
+    def without_limit(self) -> tuple[str, ...]:
+        """Schemes whose legitimate error in the long run no theory gives, so that `price` has that of the trials."""
+        return tuple(scheme.name for scheme in self.schemes.values() if math.isnan(_limit(scheme.legitimate)))
+
     def cell(self, scheme: str, adversary: str) -> Cell:
         """The cell of one pair. Raises UnknownName, a KeyError, for a scheme or an adversary that was not compared."""
         return ByName("adversary", ByName("scheme", self.schemes)[scheme].cells)[adversary]

@@ -10,6 +10,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from evedrop.model.metrics.text import ShownNumber, estimate, fraction_text, number_text
+from evedrop.scenario.words import listed
 from evedrop.score.summary import RARE_FRACTION
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.closing import rare_events_words
@@ -37,6 +38,11 @@ def conclusion(comparison: Comparison) -> str:
         return (
             f"{', '.join(comparison.dominant)}: {alone}: no other scheme costs the legitimate estimator less in the long run, "
             f"and no other scheme gives the closest adversary a larger error{more}"
+        )
+    if comparison.without_limit:
+        return (
+            f"no scheme is known to dominate: theory does not give the legitimate error of {listed(comparison.without_limit)} in "
+            f"the long run, and errors of trials are too inexact to rank schemes{more}"
         )
     return (
         "no scheme dominates: each one costs the legitimate estimator more in the long run than another scheme, or gives the "

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from evedrop.errors import UsageError
 from evedrop.model.metrics.text import ShownNumber, scientific
+from evedrop.score.verdict import SecrecyOutcome
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,11 @@ def latex_text(table: TextTable) -> str:
 
 
 def _row(cells: Sequence[str]) -> str:
-    return " & ".join(map(latex_escaped, cells)) + r" \\"
+    return " & ".join(latex_escaped(_MARKS.sub("", cell)) for cell in cells) + r" \\"
+
+
+_MARKS = re.compile(f"^[{''.join(outcome.glyph for outcome in SecrecyOutcome)}] ")
+"""The mark of a verdict before its word, for which LaTeX needs a package or a font."""
 
 
 _SPECIAL = {
