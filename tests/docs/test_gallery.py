@@ -40,6 +40,14 @@ def test_cards_lead_to_pages_and_belong_to_what_they_are_about() -> None:
     assert set().union(*kinds.values()) | {"all", "wire"} == set(gallery._FILTERS)
 
 
+def test_the_demo_comes_first_and_then_what_belongs_together() -> None:
+    """Attacks before closed loops, in the order of the filters."""
+    names = re.findall(r'href="gallery/([\w-]+)\.html"', site_tool("gallery").gallery_page())
+    assert sorted(names) == sorted(shipped())
+    assert names[0] == "vehicle"
+    assert names.index("acknowledged") < names.index("late") < names.index("nemesis") < names.index("microgrid")
+
+
 def test_a_filter_hides_the_cards_without_its_class() -> None:
     """Some cards have the class, and the button that the rule names is there."""
     page = site_tool("gallery").gallery_page()

@@ -35,9 +35,9 @@ _WIRE = """<a class="card wire" href="wire/tutorial.html"><img alt="" loading="l
 _FILTERS = {
     "all": "all",
     "attack": "attacks",
-    "closed-loop": "closed loop",
-    "faults": "faults",
     "links": "bursts, delay, distance",
+    "faults": "faults",
+    "closed-loop": "closed loop",
     "wire": "wire",
 }
 _LOSSES_AS_USUAL = "bernoulli"
@@ -95,13 +95,18 @@ def gallery_page() -> str:
     parts += _choice("scheme", {"all": "all", **{scheme: scheme for scheme in schemes}})
     parts += [
         '<div class="cards">',
-        *map(_card, shown()),
+        *map(_card, sorted(shown(), key=_place)),
         _WIRE,
         "</div>",
         "</div>\n",
         f"<style>{_rules(schemes)}</style>",
     ]
     return "\n".join(parts)
+
+
+def _place(one: Shown) -> tuple[int, bool, str]:
+    """The order of cards: secrecy as such, beginning with the demo, then by kind in the order of the filters."""
+    return (list(_FILTERS).index((*one.kinds, "all")[0]), one.name != "vehicle", one.name)
 
 
 def _choice(group: str, choices: dict[str, str]) -> Iterator[str]:
