@@ -144,6 +144,14 @@ def test_docs_lists_every_page(capsys: pytest.CaptureFixture[str]) -> None:
     assert {line.split()[0].rpartition("/")[2] for line in output.splitlines()} == {page.stem for page in pages}
 
 
+def test_docs_lists_the_pages_of_a_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    """When the argument is a folder, such as `wire`, and not a page."""
+    assert main(["docs", "wire"]) == 0
+    names = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert "wire/tutorial" in names
+    assert all(name.startswith("wire/") for name in names)
+
+
 def test_new_copies_a_built_in_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The copy is what `show` prints."""
     assert main(["new", str(tmp_path / "mine.toml"), "--from", "vehicle"]) == 0

@@ -16,12 +16,16 @@ _SHELLS = ("bash", "zsh", "fish")
 
 
 def docs(options: argparse.Namespace) -> int:
-    """Print a page of the documentation; list the pages if none is named."""
+    """Print a page of the documentation; list the pages if none is named, or those of a folder."""
     pages = _pages()
     if options.page is None:
         print_names({name: _title(path) for name, path in pages.items()})
         return 0
     name = str(options.page).removesuffix(".md")
+    inside = {page: _title(path) for page, path in pages.items() if page.startswith(f"{name}/")}
+    if name not in pages and inside:
+        print_names(inside)
+        return 0
     if name not in pages:
         raise UsageError(f"there is no page {name}{near(name, pages) or '; evedrop docs lists them'}")
     text = pages[name].read_text(encoding="utf-8")
@@ -50,7 +54,9 @@ def _title(path: Path) -> str:
 
 
 def _page(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("page", nargs="?", metavar="PAGE", help="the page, as evedrop docs lists it")
+    parser.add_argument(
+        "page", nargs="?", metavar="PAGE", help="the page, or a folder of pages, as evedrop docs lists it"
+    )
 
 
 def _shell(parser: argparse.ArgumentParser) -> None:
