@@ -135,7 +135,7 @@ def test_docs_say_of_every_metric_what_it_says_itself() -> None:
     results, scenario = ((DOCS / page).read_text(encoding="utf-8") for page in ("metrics.md", "scenario.md"))
     for name in METRICS:
         meaning = metric(name).meaning
-        for plain, typeset in (("|x − x̂|²", r"$\lvert x - \hat x\rvert^2$"), ("tr P", r"$\operatorname{tr} P$")):
+        for plain, typeset in (("|x − x̂|²", r"$\lvert x - \hat x\rvert^2$"), ("tr P", r"$\mathrm{tr}\ P$")):
             meaning = meaning.replace(plain, typeset)
         assert f"\n| `{name}` | {meaning} |\n" in results
         assert (f"`{name}`" in scenario) == (metric(name).only_in_mode is None)
