@@ -218,6 +218,7 @@ def test_trials_alone_do_not_rank_schemes(tmp_path: Path) -> None:
         schemes=["cipher", "plain"],
         adversaries=["smart"],
         out=tmp_path,
+        expect=[],
         legitimate__link={"loss": trace},
         **MARGINAL,
     )
