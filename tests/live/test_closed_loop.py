@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,17 @@ import pytest
 import tomli_w
 
 from evedrop.cli.api import run
+from evedrop.cli.api.results import RunResults
 from evedrop.errors import UsageError
-from evedrop.model.metrics.standard_error import z_of
+from evedrop.model.metrics.standard_error import ratio_error, z_of
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.progress_events import silent
+from evedrop.score.after_start import ratio_interval
+from evedrop.score.filtering import FilterTally
+from evedrop.score.verdict import times_text
+from evedrop.show.report import closing
 from evedrop.simulate.montecarlo import Plan, simulate
 from evedrop.simulate.simulation import Mode
 from tests.builders import changed, digests_of
@@ -158,6 +164,52 @@ def test_errors_against_the_true_state_are_given_beside_those_of_the_transmitted
         both = transmitted + summary_["mean_squared_error"]
         assert summary_["mean_true_squared_errors"][name] == pytest.approx(both, rel=0.03)
         assert summary_["mean_true_squared_errors"][name] > transmitted
+
+
+def test_a_verdict_says_what_errors_are_measured_against(tmp_path: Path) -> None:
+    """Its ratio is against the transmitted estimate; that against the truth is said beside it, with its interval."""
+    results = RunResults.read(in_memory(tmp_path / "run", trials=60, **MEASURED).folder)
+    verdict, filtered = results.verdict, results.filter
+    assert verdict is not None
+    assert filtered is not None
+    true = filtered.true_ratios["smart"]
+    assert verdict.reason.startswith("the estimator is ")
+    assert " off the sensor's estimate, the best eavesdropper (smart) " in verdict.reason
+    assert verdict.reason.endswith(f", {times_text(true.ratio, true.interval)} against the true state")
+    assert true.interval is not None
+    assert true.interval[0] < true.ratio < true.interval[1]
+    shown = list(closing.remarks(results.typed_summary))
+    assert any(line.startswith("the sensor sends its filter's estimate") and "legitimate " in line for line in shown)
+
+
+def test_the_ratio_against_the_truth_counts_the_second_half_of_all_trials() -> None:
+    """Its interval is that of a ratio of means, and it does not depend on how slots and trials are divided."""
+    trials = 6
+    alone = [FilterTally(9, 1) for _ in range(trials)]
+    draw = np.random.default_rng(2)
+    errors = {name: factor * draw.exponential(size=(9, trials)) for name, factor in FACTORS.items()}
+    together = FilterTally(9, trials)
+    for part in (slice(0, 3), slice(3, 7), slice(7, 9)):
+        together.add_errors({name: error[part] for name, error in errors.items()})
+        for trial, tally in enumerate(alone):
+            tally.add_errors({name: error[part, trial : trial + 1] for name, error in errors.items()})
+    whole = together.compared("smart")
+    sums = {name: error[5:].sum(axis=0) for name, error in errors.items()}
+    assert whole.ratio == pytest.approx(sums["smart"].mean() / sums["legitimate"].mean())
+    spread = ratio_error(sums["smart"], sums["legitimate"])
+    assert whole.interval == pytest.approx(ratio_interval(whole.ratio, spread, trials))
+    merged = FilterTally.merged(alone)
+    assert merged is not None
+    assert merged.compared("smart") == whole
+    assert together.compared("smart", infinite_variance=True).interval is None
+    assert math.isnan(FilterTally(9, 2).compared("smart").ratio)
+    short = FilterTally(20, trials)
+    short.add_errors(errors)
+    assert short.compared("smart").interval is None
+    assert short.compared("smart").ratio == pytest.approx(errors["smart"].mean() / errors["legitimate"].mean())
+
+
+FACTORS = {"sensor": 0.5, "legitimate": 1.0, "smart": 3.0}
 
 
 def test_errors_against_the_true_state_have_standard_errors(tmp_path: Path) -> None:

@@ -250,6 +250,8 @@ class Comparison:
     schemes: Mapping[str, SchemeResult] = field(default_factory=dict)
     left_out: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Scheme that cannot be used with the process → why not, in lines."""
+    of_estimate: bool = False
+    """Whether errors are against the estimate of a sensor that measures, and not against the true state."""
 
     @property
     def dominant(self) -> tuple[str, ...]:
@@ -281,6 +283,7 @@ class Comparison:
             "trials": self.trials,
             "seed": self.seed,
             "first_trial": self.first_trial,
+            **({"of_estimate": True} if self.of_estimate else {}),
             "adversaries": list(self.adversaries),
             "dominant": list(self.dominant),
             "schemes": {
@@ -366,6 +369,7 @@ def _comparison(data: Mapping[str, Any]) -> Comparison:
             for name, table in data["schemes"].items()
         },
         {name: tuple(why) for name, why in data["left_out"].items()},
+        bool(data.get("of_estimate", False)),
     )
 
 

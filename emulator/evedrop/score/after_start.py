@@ -76,6 +76,21 @@ class AfterStart:
         return cls(ratio, interval, larger, distances, "the errors scatter too much in time", in_one_trial=True)
 
 
+def ratio_interval(ratio: float, error: float | None, trials: int) -> tuple[float, float] | None:
+    """The 99 % interval of a ratio of means over several trials: Student's, of its logarithm; error: its standard error.
+
+    None without a standard error, and for a ratio, or a limit, that is 0 or cannot be written.
+
+    Source: docs/mathematics/verdicts.md, after the start.
+    """
+    if error is None or not 0.0 < ratio < math.inf:
+        return None
+    from scipy.special import stdtrit  # noqa: PLC0415 - takes a quarter of a second, and not every process judges
+
+    reach = float(stdtrit(trials - 1, 1.0 - ERROR_RATE / 2)) * error / ratio
+    return (ratio * math.exp(-reach), ratio * math.exp(reach)) if reach + math.log(ratio) < FARTHEST else None
+
+
 def _limits(samples: Floats) -> tuple[float, float]:
     """One-sided confidence limits of the mean of samples in time, each at 99 %."""
     from scipy.special import stdtrit  # noqa: PLC0415 - takes a quarter of a second, and not every process judges

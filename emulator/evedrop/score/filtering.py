@@ -5,6 +5,7 @@ Source: docs/metrics.md, filter.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from typing import final
@@ -13,13 +14,14 @@ import numpy as np
 
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.local_filter import LocalFilter, Steps
-from evedrop.model.metrics.standard_error import standard_error, z_of
+from evedrop.model.metrics.standard_error import ratio_error, standard_error, z_of
 from evedrop.model.process import Floats
 from evedrop.model.streams import Batch
-from evedrop.names import SENSOR
+from evedrop.names import LEGITIMATE, SENSOR
 from evedrop.scenario.tables import Scenario
-from evedrop.score.summary import FilterSummary
-from evedrop.score.sums import squared_errors
+from evedrop.score.after_start import AfterStart, BatchMeans, ratio_interval
+from evedrop.score.summary import FilterSummary, TrueRatio
+from evedrop.score.sums import WINDOWS, squared_errors, window_bounds
 
 
 def local_filter_of(
@@ -27,9 +29,14 @@ def local_filter_of(
 ) -> LocalFilter | None:
     """The sensor's filter; None if the sensor knows the state. spoofing: as for `LocalFilter`."""
     driven = scenario.driven
-    if driven is None or driven.output_matrix is None:
+    if driven is None or not sends_an_estimate(scenario):
         return None
     return LocalFilter(scenario.process.process, driven, key, batch, spoofing)
+
+
+def sends_an_estimate(scenario: Scenario) -> bool:
+    """Whether the sensor measures and sends the estimate of its filter: then errors are against this estimate."""
+    return scenario.driven is not None and scenario.driven.output_matrix is not None
 
 
 def true_errors(true: Floats, x: Floats, x_hats: Mapping[str, Floats]) -> dict[str, Floats]:
@@ -41,7 +48,12 @@ def true_errors(true: Floats, x: Floats, x_hats: Mapping[str, Floats]) -> dict[s
 class FilterTally:
     """Sums of errors against the true state, over the slots and trials so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, slots: int, trials: int) -> None:
+        """slots: of the whole run."""
+        self._run, self._first = slots, int(window_bounds(slots)[WINDOWS // 2])
+        self._alone = trials == 1
+        self._later: dict[str, Floats] = {}
+        self._batches: dict[str, BatchMeans] = {}
         self.count = 0
         """Slots times trials so far."""
         self.slots = 0
@@ -51,16 +63,19 @@ class FilterTally:
         """The same for each trial, (R,)."""
 
     @classmethod
-    def from_scenario(cls, scenario: Scenario) -> FilterTally | None:
-        """A tally for a scenario; None if its sensor knows the state."""
-        driven = scenario.driven
-        return None if driven is None or driven.output_matrix is None else cls()
+    def from_scenario(cls, scenario: Scenario, trials: int) -> FilterTally | None:
+        """A tally of some trials of a scenario; None if its sensor knows the state."""
+        return cls(scenario.slots, trials) if sends_an_estimate(scenario) else None
 
     def add_errors(self, errors: Mapping[str, Floats]) -> None:
         """Add the next slots, errors as from `true_errors`, (c, R) each."""
+        later = max(0, self._first - self.slots)
         self.slots += len(errors[SENSOR])
         self.count += errors[SENSOR].size
         for name, error in errors.items():
+            self._later[name] = self._later.get(name, 0.0) + error[later:].sum(axis=0)
+            if self._alone:
+                self._batches.setdefault(name, BatchMeans()).add(error[:, 0], error[:, 0])
             self.sums[name] = self.sums.get(name, 0.0) + float(error.sum(axis=1).sum())
             self.of_trials[name] = self.of_trials.get(name, 0.0) + error.sum(axis=0)
 
@@ -77,13 +92,35 @@ class FilterTally:
             whole.count += part.count
             for name, value in part.sums.items():
                 whole.sums[name] = whole.sums.get(name, 0.0) + value
-        whole.of_trials = {
-            name: np.concatenate([part.of_trials[name] for part in tallies]) for name in tallies[0].of_trials
-        }
+        whole.of_trials, whole._later = (
+            {name: np.concatenate([getattr(part, kept)[name] for part in tallies]) for name in tallies[0].of_trials}
+            for kept in ("of_trials", "_later")
+        )
+        whole._alone = whole._alone and len(tallies) == 1
         return whole
 
-    def summary(self, scenario: Scenario) -> FilterSummary:
-        """The summary's entry on the filter."""
+    def compared(self, name: str, infinite_variance: bool = False) -> AfterStart:
+        """A receiver's error against the true state over the legitimate one, in the same slots as the ratio of a verdict.
+
+        infinite_variance: of an error of either, so that there is no interval over several trials.
+        """
+        if self._alone and name in self._batches:
+            return AfterStart.of_batches(self._batches[LEGITIMATE], self._batches[name])
+        sums = self._later if self.slots == self._run > self._first else self.of_trials
+        if name not in sums or not self._alike:
+            return AfterStart(math.nan)
+        over, under = sums[name], sums[LEGITIMATE]
+        ratio = float(np.mean(over)) / float(np.mean(under))
+        error = None if infinite_variance or self.slots < self._run else ratio_error(over, under)
+        return AfterStart(ratio, ratio_interval(ratio, error, len(over)))
+
+    @property
+    def _alike(self) -> bool:
+        """Whether all trials have the same slots."""
+        return all(self.slots * len(values) == self.count for values in self.of_trials.values())
+
+    def summary(self, scenario: Scenario, compared: Mapping[str, AfterStart]) -> FilterSummary:
+        """The summary's entry on the filter; compared: eavesdropper → what `compared` gives."""
         driven = scenario.driven
         assert driven is not None  # noqa: S101 - else there is no tally
         steps = Steps(scenario.process.process, driven)
@@ -96,11 +133,16 @@ class FilterTally:
         errors = {name: value / max(1, self.count) for name, value in self.sums.items()}
         own = errors.pop(SENSOR, None)
         mean_trace = mean if self.slots else None
-        alike = all(self.slots * len(values) == self.count for values in self.of_trials.values())
+        alike = self._alike
         spread = {
             name: standard_error(values / self.slots) if alike else None for name, values in self.of_trials.items()
         }
         error, own_of_trials = spread.pop(SENSOR, None), self.of_trials.get(SENSOR)
         z = z_of(own_of_trials / self.slots, mean_trace) if alike and self.slots and own_of_trials is not None else None
         of_mean = {"mean_squared_error": error, "mean_true_squared_errors": spread}
-        return FilterSummary(mean_trace, own, errors, of_mean, z)
+        ratios = {
+            name: TrueRatio(values.ratio, values.interval)
+            for name, values in compared.items()
+            if math.isfinite(values.ratio)
+        }
+        return FilterSummary(mean_trace, own, errors, of_mean, z, ratios)

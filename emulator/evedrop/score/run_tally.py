@@ -52,7 +52,7 @@ class RunTally:
             cls.nothing(scenario, trials).tallies,
             Detection(trials),
             LoopTally.from_scenario(scenario, trials),
-            FilterTally.from_scenario(scenario),
+            FilterTally.from_scenario(scenario, trials),
         )
 
     def begin(self) -> None:

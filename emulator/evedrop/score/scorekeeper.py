@@ -5,6 +5,7 @@ The summary is described in docs/results.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -21,9 +22,10 @@ from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import Expectation, TheoreticalTraceStream, error_floor_of, expectations_of
+from evedrop.score.after_start import AfterStart
 from evedrop.score.directions import directions_of
 from evedrop.score.expectations_held import Evidence
-from evedrop.score.filtering import true_errors
+from evedrop.score.filtering import sends_an_estimate, true_errors
 from evedrop.score.leak import HeardBitsStream
 from evedrop.score.links import link_summary_of
 from evedrop.score.rare_events import rare_events_of, z_of_error
@@ -148,15 +150,24 @@ class RunOutcome:
 
 
 def verdicts(
-    scenario: Scenario, tallies: Mapping[str, Tally], expected: Mapping[str, Expectation]
+    scenario: Scenario,
+    tallies: Mapping[str, Tally],
+    expected: Mapping[str, Expectation],
+    true: Mapping[str, AfterStart] | None = None,
 ) -> tuple[list[Secrecy], Verdict | None]:
-    """Secrecy against every eavesdropper, from all receivers' tallies and what theory expects of them, and the verdict on all."""
+    """Secrecy against every eavesdropper, from all receivers' tallies and what theory expects of them, and the verdict on all.
+
+    true: eavesdropper → the comparison of errors against the true state, for a sensor that sends an estimate.
+    """
     legitimate, unit = (tallies[LEGITIMATE], expected[LEGITIMATE]), unit_of(scenario)
     each = [
         secrecy(legitimate, (name, tallies[name], expected[name]), unit, partial(_floor_grows, scenario, name))
         for name in tallies
         if name != LEGITIMATE
     ]
+    if sends_an_estimate(scenario):
+        true, unknown = true or {}, AfterStart(math.nan)
+        each = [entry.against_truth(true.get(entry.eavesdropper, unknown), unit) for entry in each]
     return each, verdict_of([entry.compared for entry in each if entry.compared is not None], unit)
 
 
@@ -175,7 +186,8 @@ def summary_of(
     applications = {} if loop is None else {name: entry.entry() for name, entry in loop.applications.items()}
     legitimate = tallies[LEGITIMATE]
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
-    each, verdict = verdicts(scenario, tallies, expected)
+    true = true_ratios(run_tally, expected)
+    each, verdict = verdicts(scenario, tallies, expected, true)
     secret = {entry.eavesdropper: entry for entry in each}
     directions = directions_of(tallies, expected)
     expectations = Evidence(scenario, peers, links, tallies, secret, applications, directions).judged(ending.replay)
@@ -202,13 +214,24 @@ def summary_of(
         controller=None
         if loop is None
         else loop.summary(scenario, peers[LEGITIMATE], run_tally.solve_times, digests[CONTROLLER]),
-        filter=None if run_tally.filter is None else run_tally.filter.summary(scenario),
+        filter=None if run_tally.filter is None else run_tally.filter.summary(scenario, true),
         applications=applications,
         surprising=_surprising(scenario, tallies),
         expectations=expectations,
         directions=directions,
         verdict=verdict,
     )
+
+
+def true_ratios(run_tally: RunTally, expected: Mapping[str, Expectation]) -> dict[str, AfterStart]:
+    """Eavesdropper → its error against the true state, compared with the legitimate one; empty for a sensor that knows it."""
+    tally = run_tally.filter
+    if tally is None:
+        return {}
+    heavy = {name for name, expectation in expected.items() if expectation.infinite_variance}
+    return {
+        name: tally.compared(name, not heavy.isdisjoint({name, LEGITIMATE})) for name in expected if name != LEGITIMATE
+    }
 
 
 def _floor_grows(scenario: Scenario, receiver: str) -> bool:

@@ -20,7 +20,7 @@ from evedrop.model.theory.covariances import NOBODY, TheoreticalCovariance
 from evedrop.model.theory.rare_events import RARE
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.theory import Alike, Expectation, TheoreticalTraceStream
-from evedrop.score.after_start import AS_MUCH, ERROR_RATE, FARTHEST, AfterStart
+from evedrop.score.after_start import AS_MUCH, ERROR_RATE, AfterStart, ratio_interval
 from evedrop.score.rare_events import rare_events_of
 from evedrop.score.summary import RARE_FRACTION, LeakSummary, SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_bounds, window_means, window_of
@@ -73,6 +73,13 @@ class Secrecy:
     """The comparison after the start, on which the verdict rests; None for results that are read."""
     verdict: Verdict | None = None
     """None in results of an older version."""
+
+    def against_truth(self, true: AfterStart, unit: str) -> Secrecy:
+        """The same with the comparison of errors against the true state, for a sensor that sends an estimate."""
+        if self.compared is None:
+            return self
+        compared = replace(self.compared, true=true)
+        return replace(self, compared=compared, verdict=verdict_on(compared, unit))
 
     @property
     def summary(self) -> SecrecySummary:
@@ -344,12 +351,7 @@ def _after_start(
         return AfterStart(1.0, None, False, distances)
     if legitimate.done != legitimate.slots:
         return AfterStart(value, None, None, distances, "the run was cut short")
-    interval = None
-    if scatter is not None and 0.0 < value < math.inf:
-        from scipy.special import stdtrit  # noqa: PLC0415 - takes a quarter of a second, and not every process judges
-
-        reach = float(stdtrit(legitimate.trials - 1, 1.0 - ERROR_RATE / 2)) * scatter / value
-        interval = (value * math.exp(-reach), value * math.exp(reach)) if reach + math.log(value) < FARTHEST else None
+    interval = ratio_interval(value, scatter, legitimate.trials)
     larger = _larger(means, test)
     return AfterStart(value, interval, larger, distances, f"{legitimate.trials:,} trials are too few")
 

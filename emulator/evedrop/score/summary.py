@@ -282,6 +282,15 @@ class ControllerSummary:
 
 
 @dataclass(frozen=True)
+class TrueRatio:
+    """An eavesdropper's error against the true state over the legitimate one, in the second half of the run."""
+
+    ratio: float
+    interval: tuple[float, float] | None = None
+    """At 99 %; None if it is not known."""
+
+
+@dataclass(frozen=True)
 class FilterSummary:
     """Errors against the true state, for a sensor that filters."""
 
@@ -291,6 +300,8 @@ class FilterSummary:
     standard_errors: StandardErrors = field(default_factory=dict)
     z: float | None = None
     """The z-score of `mean_squared_error` against its expectation, `mean_trace_covariance`."""
+    true_ratios: Mapping[str, TrueRatio] = field(default_factory=dict)
+    """Eavesdropper → its ratio; empty in results of an older version."""
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,8 @@ class Compared:
     """Whether perfect secrecy held: its error grows without bound, by theory as well."""
     denied: bool = False
     """Whether theory says that its error is not larger in the long run."""
+    true: AfterStart | None = None
+    """The same for errors against the true state, if the sensor sends an estimate; its ratio is NaN if that is unknown."""
 
     @property
     def outcome(self) -> SecrecyOutcome:
@@ -104,11 +106,15 @@ def verdict_on(compared: Compared, unit: str = "", *, best: bool = False) -> Ver
         return Verdict(outcome.value, values.why_open or "nothing was measured", name)
     who = f"the best eavesdropper ({name})" if best else name
     times = times_text(values.ratio, values.interval)
+    off = "off" if compared.true is None else "off the sensor's estimate"
     if values.distances is None:
-        numbers = f"{who} has {times} the estimator's squared error"
+        of_what = "" if compared.true is None else " to the sensor's estimate"
+        numbers = f"{who} has {times} the estimator's squared error{of_what}"
     else:
         ours, theirs = (distance_text(distance, unit) for distance in values.distances)
-        numbers = f"the estimator is {ours} off, {who} {theirs}: {times} the squared error"
+        numbers = f"the estimator is {ours} {off}, {who} {theirs}: {times} the squared error"
+    if compared.true is not None and not math.isnan(compared.true.ratio):
+        numbers += f", {times_text(compared.true.ratio, compared.true.interval)} against the true state"
     if values.in_one_trial:
         numbers += ", in this trial"
     match outcome:

@@ -12,7 +12,7 @@ import contextlib
 import itertools
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +34,11 @@ from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import Expectation, error_floor_of, expectations_of
+from evedrop.score.filtering import sends_an_estimate
 from evedrop.score.leak import revealed_by_packets
 from evedrop.score.rare_events import rare_events_of, z_of_error
-from evedrop.score.scorekeeper import verdicts
+from evedrop.score.run_tally import RunTally
+from evedrop.score.scorekeeper import true_ratios, verdicts
 from evedrop.score.sums import LEVELS, Tally, trial_means
 from evedrop.simulate.chunk import PacketTally
 from evedrop.simulate.finished_tasks import finished_tasks, study_of
@@ -129,7 +131,7 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
         groups = [(group, merger) for group, merger in played if group.scheme == scheme]
         cells = {match.adversary: Cell(match) for match in matchups.undefined if match.scheme == scheme}
         for group, merger in groups:
-            cells |= _cells(group, merger.run_tally.tallies)
+            cells |= _cells(group, merger.run_tally)
         scenario, merger = groups[0][0].scenario, groups[0][1]
         legitimate = merger.run_tally.tallies[LEGITIMATE]
         schemes[scheme] = SchemeResult(
@@ -141,14 +143,23 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
             _leak(scenario),
         )
     return Comparison(
-        title, some.slots, some.trials, some.seed, some.first_trial, matchups.adversaries, schemes, matchups.left_out
+        title,
+        some.slots,
+        some.trials,
+        some.seed,
+        some.first_trial,
+        matchups.adversaries,
+        schemes,
+        matchups.left_out,
+        sends_an_estimate(some),
     )
 
 
-def _cells(group: Group, totals: Mapping[str, Tally]) -> dict[str, Cell]:
+def _cells(group: Group, run_tally: RunTally) -> dict[str, Cell]:
+    totals = run_tally.tallies
     expected = expectations_of(group.scenario)
     measured = {name: _measured(group.scenario, name, tally, expected[name]) for name, tally in totals.items()}
-    each, _ = verdicts(group.scenario, totals, expected)
+    each, _ = verdicts(group.scenario, totals, expected, true_ratios(run_tally, expected))
     secrecy = {estimate.eavesdropper: estimate for estimate in each}
     return {
         estimate.adversary: Cell(

@@ -26,7 +26,8 @@ from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.scenarios import shipped
 from evedrop.score.scorekeeper import RunOutcome
-from evedrop.score.summary import Summary
+from evedrop.score.summary import FilterSummary, Summary
+from evedrop.score.verdict import times_text
 from evedrop.simulate.finished_tasks import finished_tasks, study_of
 from evedrop.simulate.montecarlo import Merger, Plan, check_mode, progress_counter
 from evedrop.simulate.trials import BatchResult, tasks_of
@@ -204,6 +205,11 @@ def _title(source: str | Path | Scenario) -> str:
     return source.title if isinstance(source, Scenario) else str(source)
 
 
+def _true_times(filter_: FilterSummary, name: str) -> str | None:
+    true = filter_.true_ratios.get(name)
+    return None if true is None else times_text(true.ratio, true.interval)
+
+
 def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[str, Any]]:
     """A row for each peer: the point, the metrics, the verdict."""
     for name, peer in summary.peers.items():
@@ -235,5 +241,6 @@ def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[s
             "ratio_from": None if secrecy is None else secrecy.ratio_from,
             "verdict": None if verdict is None else verdict.outcome,
             "times": None if verdict is None else verdict.times,
+            **({} if summary.filter is None else {"true_times": _true_times(summary.filter, name)}),
             "digest": peer.digest,
         }

@@ -19,7 +19,7 @@ from evedrop.model.metrics import shown_metric
 from evedrop.model.metrics.text import number_text
 from evedrop.results.comparison import COMPARISON, Comparison, read_comparison
 from evedrop.results.reading import ByName, Results
-from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary, Summary
+from evedrop.score.summary import FilterSummary, Judged, LinkSummary, PeerSummary, SecrecySummary, Summary
 from evedrop.score.verdict import Verdict
 from evedrop.show.report import closing
 from evedrop.show.report.closing import sweep_table
@@ -109,6 +109,11 @@ class RunResults(Results, ReportedResults):
     def verdict(self) -> Verdict | None:
         """Whether the state is kept secret from all eavesdroppers, as every report says it; None without any."""
         return self._typed.verdict
+
+    @property
+    def filter(self) -> FilterSummary | None:
+        """Errors against the true state, for a sensor that measures; None for one that knows the state."""
+        return self._typed.filter
 
     @property
     def expectations(self) -> list[Judged]:

@@ -12,18 +12,20 @@ from typing import Any
 from evedrop.model.metrics import all_metrics, columns, error_column, shown_metric, unloadable_metrics, z_column
 from evedrop.model.metrics.text import count_text, estimate, fraction_text, number_text
 from evedrop.model.theory.rare_events import RARE
+from evedrop.names import SENSOR
 from evedrop.scenario.application import applications_in
 from evedrop.score.summary import (
     RARE_FRACTION,
     ControllerSummary,
     DirectionSummary,
+    FilterSummary,
     Judged,
     LinkSummary,
     PeerSummary,
     Summary,
     failed,
 )
-from evedrop.score.verdict import SecrecyOutcome
+from evedrop.score.verdict import SecrecyOutcome, times_text
 from evedrop.show.report.text_table import TextColumn, TextTable
 
 
@@ -148,6 +150,19 @@ def remarks(summary: Summary) -> Iterator[str]:
     yield from _link_lines(summary.links)
     if summary.controller is not None:
         yield _loop_line(summary.controller)
+    if summary.filter is not None:
+        yield _filter_line(summary.filter)
+
+
+def _filter_line(filter_: FilterSummary) -> str:
+    """What errors of receivers are measured against, and those against the true state."""
+    scatter = filter_.standard_errors.get("mean_true_squared_errors")
+    of_mean = dict(scatter) if isinstance(scatter, Mapping) else {}
+    own = filter_.standard_errors.get("mean_squared_error")
+    of_mean[SENSOR] = None if isinstance(own, Mapping) else own
+    errors = {SENSOR: filter_.mean_squared_error, **filter_.mean_true_squared_errors}
+    against = ", ".join(f"{name} {estimate(error, of_mean.get(name))}" for name, error in errors.items())
+    return f"the sensor sends its filter's estimate, which other errors are measured against; against the true state: {against}"
 
 
 def verdict_lines(summary: Summary) -> Iterator[tuple[SecrecyOutcome, str]]:
@@ -159,6 +174,8 @@ def verdict_lines(summary: Summary) -> Iterator[tuple[SecrecyOutcome, str]]:
     names = max(map(len, verdicts), default=0)
     for name, verdict in verdicts.items():
         times = f"{verdict.times} its squared error" if verdict.times else ""
+        if summary.filter is not None and (true := summary.filter.true_ratios.get(name)) is not None:
+            times += f", {times_text(true.ratio, true.interval)} against the true state"
         yield SecrecyOutcome(verdict.outcome), f"{verdict.headline:{words}}  {name:{names}}  {times}".rstrip()
 
 
@@ -273,9 +290,11 @@ def sweep_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> TextT
     """A row for each point and receiver; rows: those of sweep.parquet, keys: the entries that the sweep changed."""
     metrics = columns("sweep_column")
     compared = [z_column(name) for name in all_metrics() if rows and z_column(name) in rows[0]]
-    heads = [*keys, "peer", *(column.heading for column in metrics), "z", "verdict", "times the error"]
+    filtered = any("true_times" in row for row in rows)
+    true = ["times the true error"] if filtered else []
+    heads = [*keys, "peer", *(column.heading for column in metrics), "z", "verdict", "times the error", *true]
     least = ["z", *(column.heading for column in list(metrics)[:0:-1]), "times the error"]
-    words = {"peer", "verdict", "times the error"}
+    words = {"peer", "verdict", "times the error", *true}
     table = TextTable([TextColumn(head, head not in words) for head in heads], least=least)
     for row in rows:
         table.add(
@@ -288,5 +307,6 @@ def sweep_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> TextT
             number_text(shown_metric(row, compared), "+.1f"),
             "–" if row["verdict"] is None else SecrecyOutcome(row["verdict"]).headline,
             row["times"] or "–",
+            *([row.get("true_times") or "–"] if filtered else []),
         )
     return table

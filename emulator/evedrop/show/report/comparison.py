@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 def comparison_heading(comparison: Comparison) -> str:
     """What was compared, and how much of it."""
     trials = f"{comparison.trials:,} trials" if comparison.trials > 1 else "1 trial"
-    return f"{comparison.title} · {comparison.slots:,} slots · {trials}"
+    against = " · errors against the sensor's estimate" if comparison.of_estimate else ""
+    return f"{comparison.title} · {comparison.slots:,} slots · {trials}{against}"
 
 
 def conclusion(comparison: Comparison) -> str:

@@ -292,8 +292,10 @@ def _errors(of: RunSource) -> Iterator[Markup]:
     if not curves:
         return
     several = of.summary.trials > 1
+    against = "" if of.summary.filter is None else " to the sensor's estimate"
     bands = "bands: its 95 % interval; " if several else ""
-    caption = f"Mean squared error over {of.summary.trials:,} trials" if several else "Squared error of the trial"
+    caption = f"Mean squared error{against} over {of.summary.trials:,} trials"
+    caption = caption if several else f"Squared error{against} of the trial"
     chart = LogChart(
         f"{caption} in every slot, by receiver, with what theory expects. The table above has its means.",
         "slot",

@@ -160,7 +160,8 @@ def _metrics(of: SweepSource) -> Iterator[Markup]:
     """The metrics of all points, with their standard errors, theory, and z."""
     caption = (
         "A row for each point and receiver: means ± standard errors; z: the z-score of the error against theory; "
-        "times the error: an eavesdropper's squared error over the legitimate one, in the second half of the run"
+        "times the error: an eavesdropper's squared error over the legitimate one, in the second half of the run; "
+        "if the sensor measures, against the estimate that it sends, and times the true error: against the true state"
     )
     yield made("table", sweep_table(of.rows, tuple(of.grid)), caption)
 

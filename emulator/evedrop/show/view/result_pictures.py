@@ -90,7 +90,10 @@ def run_figure(
         for name, axes in zip(names, places, strict=True):
             if name == "errors":
                 floor = error_floor(recorded_noise(results.folder), pc.max(rows["trials"]).as_py())
-                _errors(axes, rows, inks, slots, floor, f"squared error{squared_unit(recorded_units(results.folder))}")
+                y_label = f"squared error{squared_unit(recorded_units(results.folder))}"
+                if results.summary.get("filter") is not None:
+                    y_label += "\nto the sensor's estimate"
+                _errors(axes, rows, inks, slots, floor, y_label)
             elif recorded_trial is not None:
                 (recorded_trial.lanes if name == "lanes" else recorded_trial.plane)(axes)
             height = heights[names.index(name)]
