@@ -26,7 +26,7 @@ from evedrop.model.slot.link_distribution import LinkDistribution, distribution_
 from evedrop.model.theory import covariances as theory
 from evedrop.model.theory.closed_forms import ClosedForm, Hijack, ReceiverConditions
 from evedrop.model.theory.covariances import Growth, Outcomes, OutcomesAt, SlotOutcomes, TheoreticalCovariance, growth
-from evedrop.model.theory.rare_events import Streaks, streaks, total_of
+from evedrop.model.theory.rare_events import Streaks, rare_in_slots, streaks, total_of
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.tables import Scenario
 
@@ -298,6 +298,18 @@ class Expectation:
             return streaks(self.process, self._outcomes, slots)
         total = total_of(self.stream().next_traces, slots)
         return modulated_streaks(self.process, *self._known, slots, total, self.slots_at)
+
+    def rare(self, slots: int, trials: int) -> Floats | None:
+        """What rare events carry of its error in each of the slots 0 … slots−1, (slots,), if this number of trials is simulated.
+
+        None unless the error of the run itself is expected, behind a link with independent losses.
+
+        Source: docs/mathematics/verdicts.md, rare events.
+        """
+        if self.closed is not None or self.of_model or self._outcomes is None:
+            return None
+        fractions = rare_in_slots(self.process, self._outcomes, slots, trials)
+        return None if fractions is None else fractions * self.traces(slots)
 
     @property
     def infinite_variance(self) -> bool:

@@ -5,13 +5,17 @@ Source: docs/mathematics/verdicts.md, rare events and z-scores.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
+from evedrop.errors import UsageError
 from evedrop.model.metrics.standard_error import mean_skewness, z_of
 from evedrop.model.process import Floats
-from evedrop.scenario.theory import Alike, Expectation
+from evedrop.scenario.recorded import recorded
+from evedrop.scenario.theory import Alike, Expectation, expectations_of
 from evedrop.score.summary import RARE_FRACTION, RareEvents
 from evedrop.score.sums import Tally
 
@@ -28,6 +32,27 @@ def rare_events_of(expected: Expectation, tally: Tally) -> RareEvents | None:
 def _rare_events(expected: Alike, slots: int, trials: int) -> RareEvents | None:
     streaks = expected.expectation.streaks(slots)
     return None if streaks is None else RareEvents(streaks.fraction(trials), streaks.trials_for(RARE_FRACTION))
+
+
+def recorded_rare_errors(folder: Path, slots: int, trials: int) -> Mapping[str, Floats]:
+    """Receiver → what rare events carry of its expected error in each slot, for the scenario in a results folder.
+
+    Without receivers for which that is unknown; empty if the scenario cannot be read, or names classes that are not built in.
+    """
+    try:
+        of = recorded(folder)
+        rare = {name: expected.rare(slots, trials) for name, expected in expectations_of(of.scenario).items()}
+    except UsageError:
+        return {}
+    return {name: carried for name, carried in rare.items() if carried is not None} if of.complete else {}
+
+
+def sound_errors(standard_errors: Floats, rare: Floats | None) -> Floats:
+    """The standard errors of slots, NaN where rare events carry more than two of them: there the mean is probably too small.
+
+    rare: what rare events carry of the expected error in these slots; None if that is unknown.
+    """
+    return standard_errors if rare is None else np.where(rare > 2.0 * standard_errors, np.nan, standard_errors)
 
 
 def z_of_error(

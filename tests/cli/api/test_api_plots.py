@@ -52,6 +52,31 @@ def test_errors_are_those_of_the_table_in_the_colours_of_the_view(results: RunRe
     assert (len(axes.get_lines()), len(axes.collections), axes.get_yscale()) == (4, 2, "log")
 
 
+def test_no_band_where_rare_events_carry_the_mean() -> None:
+    """A lost first packet, with Σ0 far above Q: the mean of its slots is too small, and so is its standard error.
+
+    Theory then lies many standard errors above the mean. Every such slot is without a band, and those of many losses have one.
+    """
+    changes = {"encoding.state_probability": 0.85, "process.initial_covariance": [[1.0, 0.0], [0.0, 1.0]]}
+    unstable = Scenario.load("numerical", changes).replace(slots=20)
+    study = montecarlo(unstable, trials=10_000)
+    (axes,) = study.plot("errors").axes
+    bands = dict(zip(study.peers, axes.collections, strict=True))
+    rows = [row for row in study.slots.to_pylist() if row["peer"] == "legitimate"]
+    away = np.array([(r["mean_squared_error"] - r["theoretical_trace_covariance"]) / r["standard_error"] for r in rows])
+    drawn = {
+        x
+        for path in bands["legitimate"].get_paths()
+        for x in np.asarray(path.vertices)[:, 0].round().astype(int).tolist()
+    }
+    wrong = set(np.flatnonzero(away < -5.0).tolist())
+    assert len(wrong) > 2
+    assert not drawn & wrong
+    assert set(range(3)) <= drawn
+    assert "no band: rare events" in axes.get_title(loc="left")
+    assert "none where rare events carry the mean" in study.report().read_text(encoding="utf-8")
+
+
 def test_the_error_of_the_only_slot_is_a_dot() -> None:
     """A line through one slot would not be seen."""
     (axes,) = montecarlo(SCENARIO.replace(slots=1, trials=1, record_trials=1), trials=1).plot("errors").axes

@@ -12,7 +12,7 @@ from evedrop.model import process as parts_of_runs
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory import rare_events
 from evedrop.model.theory.covariances import NOBODY, Outcomes, theoretical_traces
-from evedrop.model.theory.rare_events import Streaks, streaks
+from evedrop.model.theory.rare_events import RARE, Streaks, rare_in_slots, streaks
 
 PLANE = Process(
     np.array([[1.1, 0.3], [0.0, 0.7]]), np.array([[0.5, 0.1], [0.1, 0.3]]), np.array([[9.0, 1.0], [1.0, 4.0]])
@@ -25,8 +25,11 @@ LOST, MISLEADING, FIRST = range(3)
 
 
 def enumerated(process: Process, outcomes: Outcomes, slots: int) -> tuple[Floats, Floats]:
-    """The numbers and carried errors of `Streaks`, (3, slots) each, from every course that a run can take."""
-    number, carried = np.zeros((2, 3, slots))
+    """The numbers and carried errors of streaks, (3, slots, slots): kind, slot of the streak, slot of the run.
+
+    From every course that a run can take.
+    """
+    number, carried = np.zeros((2, 3, slots, slots))
     sigma = [process.initial_covariance]
     for _ in range(1, slots):
         sigma.append(process.A @ sigma[-1] @ process.A.T + process.Q)
@@ -52,8 +55,8 @@ def enumerated(process: Process, outcomes: Outcomes, slots: int) -> tuple[Floats
                     else:
                         P = moved
                 if kind is not None:
-                    number[kind, length] += weight
-                    carried[kind, length] += weight * float(np.trace(P))
+                    number[kind, length, k] += weight
+                    carried[kind, length, k] += weight * float(np.trace(P))
     return number, carried
 
 
@@ -71,10 +74,33 @@ def found_in(process: Process, outcomes: Outcomes, slots: int) -> Streaks:
 def test_streaks_are_those_of_all_courses_of_a_run(process: Process, outcomes: Outcomes) -> None:
     """Numbers and carried errors agree with the enumeration of every course of six slots, kind by kind and slot by slot."""
     streaks_ = found_in(process, outcomes, 6)
-    number, carried = enumerated(process, outcomes, 6)
+    number, carried = (of.sum(axis=2) for of in enumerated(process, outcomes, 6))
     assert streaks_.number == pytest.approx(number, rel=1e-12, abs=1e-15)
     assert streaks_.carried == pytest.approx(carried, rel=1e-12, abs=1e-15)
     assert streaks_.total == pytest.approx(carried.sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("process", [PLANE, STABLE], ids=["plane", "stable"])
+@pytest.mark.parametrize("trials", [10, 40, 200, 3000, 10**5])
+@pytest.mark.parametrize(
+    "outcomes", [LEGITIMATE, MISLED, SMART, NOBODY], ids=["legitimate", "misled", "smart", "nobody"]
+)
+def test_the_rare_events_of_a_slot_are_those_of_all_courses_of_a_run(
+    process: Process, outcomes: Outcomes, trials: int
+) -> None:
+    """Rare in a slot: what streaks of a kind carry that are at least as long as too few trials are expected to have."""
+    number, carried = enumerated(process, outcomes, 6)
+    at_least = (
+        np.cumsum(number[:, ::-1], axis=1)[:, ::-1] * trials
+    )  # expected trials in a streak of this length or a longer one
+    rare = np.where(at_least < RARE * (1.0 - 1e-12), carried, 0.0).sum(axis=(0, 1)) / carried.sum(axis=(0, 1))
+    assert rare_in_slots(process, outcomes, 6, trials) == pytest.approx(rare, rel=1e-9, abs=2e-9)
+
+
+def test_rare_events_of_slots_are_unknown_for_a_genie_and_for_too_much_work() -> None:
+    """Neither wrong nor endless."""
+    assert rare_in_slots(PLANE, Outcomes.genie(0.9, 0.5), 6, 100) is None
+    assert rare_in_slots(STABLE, NOBODY, 2**20, 100) is None
 
 
 @pytest.mark.parametrize("outcomes", [LEGITIMATE, MISLED, SMART, Outcomes.legitimate(0.8, 0.0)])

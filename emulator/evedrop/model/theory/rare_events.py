@@ -101,6 +101,52 @@ def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
     return Streaks(terms[0], terms[1], total)
 
 
+_LARGEST_TABLE = 2**26
+"""The most steps, slots × lengths of streaks, for which the rare events of single slots are computed."""
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def rare_in_slots(process: Process, outcomes: Outcomes, slots: int, trials: int) -> Floats | None:
+    """The fraction of tr E P_k that rare events carry in each of the slots 0 … slots−1, (slots,), 0 … 1; 0 where tr E P_k is 0.
+
+    Rare in slot k are the streaks of a kind that have lasted for l slots or more, if fewer than RARE of all trials are
+    expected to be in one. None where `streaks` knows nothing, and for streaks that last too long.
+
+    Source: docs/mathematics/verdicts.md, rare events.
+    """
+    kept, lengths = outcomes.propagated, slots
+    if kept < 1.0:  # longer streaks are rare
+        lengths = 1 + math.floor(math.log(RARE / trials) / math.log(kept)) if kept > 0.0 and trials > RARE else 1
+        lengths = min(slots, lengths)
+    if outcomes.leaked or slots * lengths > _LARGEST_TABLE or slots * process.n**2 > LARGEST_RUN:
+        return None
+    expected = TheoreticalCovariance(process, outcomes).next_traces(slots)
+    begun = np.zeros((3, slots))
+    begun[0] = outcomes.predicted * _Synchronised(outcomes).next(slots)
+    begun[1, 1:], begun[2, 0] = outcomes.misled, outcomes.initial
+    within = begun.copy()  # the probability of being in a streak of this kind
+    for k in range(1, slots):
+        within[:, k] += kept * within[:, k - 1]
+    misled = 2.0 * NoiseCovariances(process).next(slots) if outcomes.misled else np.zeros((slots, *process.A.shape))
+    met, F, noise = np.zeros(slots), np.eye(process.n), 0.0
+    for length in range(lengths):
+        weight, first = kept**length, slots - length
+        from_loss = float(np.trace(F @ process.Q @ F.T)) + noise
+        from_start = float(np.trace(F @ process.initial_covariance @ F.T)) + noise
+        # begun[:, j] streaks are in their slot `length` in slot j + length; F and noise contain the factor kept**length
+        carried = [
+            begun[0, :first] * from_loss,
+            begun[1, :first] * (np.einsum("ij,kjl,il->k", F, misled[:first], F) + noise),
+            begun[2, :first] * from_start,
+        ]
+        frequent = weight * within[:, :first] * trials >= RARE
+        met[length:] += np.where(frequent, carried, 0.0).sum(axis=0)
+        noise = kept * noise + outcomes.predicted * float(np.trace(F @ process.Q @ F.T))
+        F = math.sqrt(kept) * process.A @ F
+    fraction = np.where(expected > 0.0, 1.0 - met / expected, 0.0)
+    return np.where(fraction > REST, np.minimum(fraction, 1.0), 0.0)
+
+
 def total_of(next_traces: Callable[[int], Floats], slots: int) -> float:
     """Σ_k tr E P_k over slots 0 … slots−1; next_traces: returns tr E P_k of as many next slots as it is asked for."""
     return sum_in_order(float(next_traces(len(part)).sum()) for part in parts_of(range(slots)))

@@ -26,6 +26,7 @@ from evedrop.model.receiver import NOTHING, SILENT, Codes, Flags
 from evedrop.results.reading import Results
 from evedrop.scenario.recorded import recorded_noise, recorded_strategies
 from evedrop.score.expectations_held import repeating
+from evedrop.score.rare_events import recorded_rare_errors, sound_errors
 from evedrop.score.summary import Summary
 from evedrop.score.synchronisation import FACTOR, LongestSpans, LostSpan, Synchronisation, synchronisation_of
 from evedrop.show.report import closing
@@ -203,8 +204,10 @@ class RunSource:
         columns = ["slot", "mean_squared_error", "mean_actual_trace_covariance", "standard_error"]
         table = SlotRows(self.results, "slots", self.summary.peers)
         groups = {name: GroupMeans(extent.rows, POINTS, 5) for name, extent in table.extents.items()}
+        slots, trials = 1 + max((extent.last for extent in table.extents.values()), default=0), self.summary.trials
+        rare = recorded_rare_errors(self.folder, slots, trials) if trials > 1 else {}
         for name, rows in table.pieces([*columns, "theoretical_trace_covariance"]):
-            groups[name].add(_means(rows))
+            groups[name].add(_means(rows, rare.get(name)))
         return {
             name: SlotMeans(extent.first, extent.last, *groups[name].means) for name, extent in table.extents.items()
         }
@@ -231,14 +234,18 @@ class RunSource:
         return recorded_noise(self.folder)
 
 
-def _means(rows: Mapping[str, Any]) -> Floats:
-    """Slot, error, the ends of its interval, and what theory expects, (5, c)."""
+def _means(rows: Mapping[str, Any], rare: Floats | None) -> Floats:
+    """Slot, error, the ends of its interval, and what theory expects, (5, c).
+
+    rare: what rare events carry of the expected error in each slot of the run.
+    """
     error = _numbers(rows["mean_squared_error"])
     actual = _numbers(rows["mean_actual_trace_covariance"])
     error = np.where(np.isnan(error), actual, error)
-    low, high = mean_band(error, _numbers(rows["standard_error"]))
+    slot, scatter = _numbers(rows["slot"]), _numbers(rows["standard_error"])
+    low, high = mean_band(error, sound_errors(scatter, None if rare is None else rare[slot.astype(np.int64)]))
     theory = _numbers(rows["theoretical_trace_covariance"])
-    return np.stack([_numbers(rows["slot"]), error, low, high, theory])
+    return np.stack([slot, error, low, high, theory])
 
 
 def _numbers(column: Any) -> Floats:
@@ -294,6 +301,8 @@ def _errors(of: RunSource) -> Iterator[Markup]:
     several = of.summary.trials > 1
     against = "" if of.summary.filter is None else " to the sensor's estimate"
     bands = "bands: its 95 % interval; " if several else ""
+    if several and any(np.isnan(mean.low).any() for mean in of.means.values()):
+        bands = "bands: its 95 % interval (none where rare events carry the mean); "
     caption = f"Mean squared error{against} over {of.summary.trials:,} trials"
     caption = caption if several else f"Squared error{against} of the trial"
     chart = LogChart(

@@ -29,6 +29,7 @@ from evedrop.results.reading import Results
 from evedrop.results.tables import swept_strategies
 from evedrop.scenario.arguments import refuse_unless
 from evedrop.scenario.recorded import recorded, recorded_noise, recorded_strategies, recorded_units
+from evedrop.score.rare_events import recorded_rare_errors, sound_errors
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.view import journal_column, palette
 from evedrop.show.view.axis_name import as_mathematics, axis_name, squared_unit
@@ -93,7 +94,8 @@ def run_figure(
                 y_label = f"squared error{squared_unit(recorded_units(results.folder))}"
                 if results.summary.get("filter") is not None:
                     y_label += "\nto the sensor's estimate"
-                _errors(axes, rows, inks, slots, floor, y_label)
+                rare = recorded_rare_errors(results.folder, last + 1, pc.max(rows["trials"]).as_py())
+                _errors(axes, rows, inks, slots, floor, y_label, rare)
             elif recorded_trial is not None:
                 (recorded_trial.lanes if name == "lanes" else recorded_trial.plane)(axes)
             height = heights[names.index(name)]
@@ -105,13 +107,20 @@ def run_figure(
 
 
 def _errors(
-    axes: Axes, rows: pa.Table, inks: Mapping[str, str], slots: range | None, floor: float, y_label: str
+    axes: Axes,
+    rows: pa.Table,
+    inks: Mapping[str, str],
+    slots: range | None,
+    floor: float,
+    y_label: str,
+    rare: Mapping[str, Floats],
 ) -> None:
     """The mean squared error of each slot, theory dashed, and a band of two standard errors of its logarithm.
 
-    inks: of each receiver; floor: values below it are drawn at it.
+    inks: of each receiver; floor: values below it are drawn at it; rare: receiver → what rare events carry of its expected error
+    in each slot of the run. There is no band where they carry more than it covers.
     """
-    many, heights = False, list[Floats]()
+    many, gaps, heights = False, False, list[Floats]()
     for i, (name, ink) in enumerate(inks.items()):
         mine = rows.filter(pc.equal(rows["peer"], name))
         if slots is not None:
@@ -128,9 +137,9 @@ def _errors(
         if (columns["trials"] > 1).any():
             many = True
             with np.errstate(all="ignore"):
-                fraction = np.exp(
-                    2.0 * columns["standard_error"] / error
-                )  # symmetric on the logarithmic axis, and never below 0
+                scatter = sound_errors(columns["standard_error"], rare[name][columns["slot"]] if name in rare else None)
+                fraction = np.exp(2.0 * scatter / error)  # symmetric on the logarithmic axis, and never below 0
+                gaps |= bool(np.isnan(scatter[columns["trials"] > 1]).any())
             edges = (np.maximum(edge, floor) for edge in (error / fraction, error * fraction))
             axes.fill_between(columns["slot"], *edges, color=ink, alpha=0.25, linewidth=0)
     axis = ErrorAxis.of(heights, floor)
@@ -140,6 +149,7 @@ def _errors(
     axes.set_xlabel("slot")
     axes.set_ylabel(y_label)
     title = "squared error" + (", mean ± 2 standard errors" if many else "") + "; dashed: theory"
+    title += "; no band: rare events" if gaps else ""
     axes.set_title(f"{title}; {floor_words(floor)}" if axis is not None and axis.below else title)
 
 
