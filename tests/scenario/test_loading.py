@@ -93,6 +93,20 @@ def test_a_mistake_is_named_with_path_found_and_expected(key: str, value: Any, p
     golden("check", mistakes)
 
 
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("state_probability", "encoding.state_probability"),
+        ("A", "process.A"),
+        ("quality", "legitimate.link.quality or acknowledgements.link.quality"),
+        ("slot", "slots"),
+    ],
+)
+def test_an_entry_of_an_inner_table_is_suggested_with_its_dotted_key(name: str, meant: str) -> None:
+    """As after `--set state_probability=0.5`."""
+    assert f"{name}: is not an entry of this table; did you mean {meant}?" in mistakes_in_good({name: 0.5})
+
+
 @pytest.mark.parametrize("entry", ["title", "slots", "process", "process.Q", "encoding.scheme", "legitimate.link"])
 def test_a_missing_entry_is_named(entry: str) -> None:
     """A missing entry is named by its path."""

@@ -11,7 +11,8 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Self, get_args
+from types import UnionType
+from typing import Annotated, Any, Self, Union, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
@@ -100,6 +101,11 @@ class Table(BaseModel):
     def entries(cls) -> list[str]:
         """The names of its entries."""
         return [field.alias or name for name, field in cls.model_fields.items()]
+
+    @classmethod
+    def all_entries(cls) -> list[str]:
+        """The same with those that only some kinds of the table have, such as parameters of schemes."""
+        return cls.entries()
 
     @classmethod
     def inner(cls, entry: str) -> type[Table] | None:
@@ -193,6 +199,8 @@ def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
     if kind == "missing":
         return f"is missing; expected {name}" + (f" = {example.removeprefix(', such as ')}" if example else "")
     if kind == "extra_forbidden":
+        if table is root and not near(name, table.entries()) and (places := _places(root, name)):
+            return f"is not an entry of this table; did you mean {listed(places[:_MOST_PLACES])}?"
         return no_entry(name, table.entries())
     if kind == "expected":
         ending = context.get("ending") or f"; expected {context['expected']}{context['hint'] or example}"
@@ -208,6 +216,19 @@ def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
         return f"has {limit} {things}; expected {'at least' if few else 'at most'} that many"
     expected = _EXPECTED.get(kind, detail["msg"])
     return f"is {as_toml(value)}; expected {expected}{example}"
+
+
+def _places(table: type[Table], name: str, within: str = "") -> list[str]:
+    """The dotted keys of a table, at most two tables deep, that end in an entry of this name."""
+    places = [f"{within}{name}"] if within and name in table.all_entries() else []
+    if within.count(".") == 2:
+        return places
+    for outer, field in table.model_fields.items():
+        plain = get_args(field.annotation) if get_origin(field.annotation) in {Union, UnionType} else [field.annotation]
+        inner = table.inner(outer)
+        if inner in plain:  # rather than in a list of such tables, or in a table of them
+            places += _places(inner, name, f"{within}{outer}.")
+    return places
 
 
 def _field(location: Sequence[int | str], root: type[Table]) -> tuple[type[Table], FieldInfo | None]:
@@ -230,6 +251,7 @@ _LARGEST_BITS = 4096  # of a whole number; a seed has 256
 _LONGEST_NAME = 200
 _PLAIN = {"\n", "\t"}
 _MOST_TOLD = 20
+_MOST_PLACES = 3
 MOST_EAVESDROPPERS = 64
 
 

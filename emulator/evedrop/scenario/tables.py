@@ -66,6 +66,11 @@ class EncodingTable(Table):
     scheme: Annotated[str, Field(strict=True, examples=["innovation"]), AfterValidator(registered(SCHEMES))]
     """The scheme, which decides what a packet contains. Its parameters are further entries of this table."""
 
+    @classmethod
+    def all_entries(cls) -> list[str]:
+        """With the parameters of all built-in schemes."""
+        return [*cls.entries(), *(name for scheme in SCHEMES.values() for name in scheme.parameters)]
+
     def mistakes(self) -> Iterator[Mistake]:
         """Missing, unknown and wrong parameters of the scheme."""
         scheme, given = SCHEMES[self.scheme], self.parameters
