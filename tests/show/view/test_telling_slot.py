@@ -57,13 +57,22 @@ def test_without_an_eavesdropper_the_legitimate_estimator_counts() -> None:
 
 
 def test_the_slots_around_it_fill_the_panels() -> None:
-    """Neither the beginning nor the end is chosen; of a short run, the last slot is."""
+    """Neither the beginning nor the end is chosen; of a short run, the last of the slots that show as much."""
     errors = errors_of(1000, naive=(20, 1e6), other=(990, 1e6))
     errors["naive"][500] = 100.0
     assert most_telling(errors, reported(errors), 0.1) == 500
     for slots in (1, 60, 105):
         errors = errors_of(slots, naive=(0, 5.0))
         assert most_telling(errors, reported(errors), 0.1) == slots - 1
+
+
+def test_of_a_short_run_a_slot_in_which_every_eavesdropper_has_just_heard_the_state_is_not_chosen() -> None:
+    """Such as the last two of `numerical`: no receiver is off there, and the picture would show nothing."""
+    errors = errors_of(80, naive=(0, 5.0))
+    errors["naive"][:78] = 50.0
+    errors["naive"][77] = 80.0
+    errors["naive"][78:] = 0.0
+    assert most_telling(errors, reported(errors), 0.1) == 77
 
 
 def test_the_first_recorded_trial_decides(tmp_path: Path) -> None:

@@ -68,10 +68,16 @@ def most_telling(errors: Mapping[str, Floats], traces: Mapping[str, Floats], noi
     ends = np.arange(len(separation)) + 1
     means = ((sums[ends] - sums[np.maximum(ends - _BEFORE, 0)]) / _BEFORE)[candidates]
     about_largest = means >= means.max() - (1.0 - _ABOUT) * abs(means.max())
-    return int(candidates.start) + int(np.argmax(np.where(about_largest, separation[candidates], -np.inf)))
+    chosen = np.where(about_largest, separation[candidates], -np.inf)
+    return int(candidates.start) + int(np.flatnonzero(chosen == chosen.max())[-1])
 
 
 def _candidates(slots: int) -> slice:
-    """The slots that may be chosen: not the first, in which receivers begin, nor the last, so that the panels are filled."""
-    first = min(_BEFORE, slots - 1)
+    """The slots that may be chosen: not the first, in which receivers begin, nor the last, so that the panels are filled.
+
+    Of a run that cannot fill them, the last quarter: in its very last slot, each eavesdropper may have just heard the state.
+    """
+    if slots <= _BEFORE + _AFTER:
+        return slice(3 * slots // 4, slots)
+    first = _BEFORE
     return slice(first, max(first + 1, slots - _AFTER))
