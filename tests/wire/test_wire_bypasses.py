@@ -24,7 +24,7 @@ from tests.conftest import wait_until
 from tests.pages import checked
 from tests.wire.wire_at_work import ANYWHERE, WireAtWork, at_work, both_ways, program
 
-PAGE = Path(__file__).parents[2] / "docs" / "wire" / "file.md"
+PAGE = Path(__file__).parents[2] / "docs" / "wire" / "semantics.md"
 LINK = {"name": "scan", "from": "robot", "to": "base", "quality": 0.6}
 
 
@@ -150,8 +150,9 @@ def test_a_wire_without_expectations_fails_too(tmp_path: Path) -> None:
         use()
 
 
-def test_the_first_paragraph_of_the_page_says_what_programs_need() -> None:
-    """And the section about it names the entry that allows mode peer."""
-    first = PAGE.read_text(encoding="utf-8").split("\n\n")[1]
-    assert "`client`" in first
-    assert "multicast" in first
+def test_the_first_section_of_the_page_says_what_programs_need() -> None:
+    """And what for: other programs find each other by multicast, unless they are told not to."""
+    _, title, section, *_ = re.split(r"^## (.*)$", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert title == "What programs need"
+    assert section.lstrip().startswith("**Each program connects to one side, in Zenoh's mode `client`**")
+    assert "multicast" in section

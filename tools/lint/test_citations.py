@@ -58,7 +58,7 @@ def test_every_cited_section_exists() -> None:
 def test_every_cited_section_of_the_mathematics_exists() -> None:
     """Wherever code cites a page of docs/mathematics/, as its source or in passing."""
     headings = {
-        path.stem: re.findall(r"^## (.+)$", path.read_text(encoding="utf-8").lower(), re.MULTILINE)
+        path.stem: re.findall(r"^##+ (.+)$", path.read_text(encoding="utf-8").lower(), re.MULTILINE)
         for path in (ROOT / "docs" / "mathematics").glob("*.md")
     }
     cited = [

@@ -199,9 +199,7 @@ def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
     if kind == "missing":
         return f"is missing; expected {name}" + (f" = {example.removeprefix(', such as ')}" if example else "")
     if kind == "extra_forbidden":
-        if table is root and not near(name, table.entries()) and (places := _places(root, name)):
-            return f"is not an entry of this table; did you mean {listed(places[:_MOST_PLACES])}?"
-        return no_entry(name, table.entries())
+        return _unknown_entry(name, table, _places(root, name) if table is root else [])
     if kind == "expected":
         ending = context.get("ending") or f"; expected {context['expected']}{context['hint'] or example}"
         return f"is {as_toml(value)}{ending}"
@@ -218,6 +216,13 @@ def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
     return f"is {as_toml(value)}; expected {expected}{example}"
 
 
+def _unknown_entry(name: str, table: type[Table], places: Sequence[str]) -> str:
+    """places: the dotted keys of other tables that end in this name."""
+    if places and not near(name, table.entries()):
+        return f"is not an entry of this table; did you mean {listed(places[:_MOST_PLACES])}?"
+    return no_entry(name, table.entries())
+
+
 def _places(table: type[Table], name: str, within: str = "") -> list[str]:
     """The dotted keys of a table, at most two tables deep, that end in an entry of this name."""
     places = [f"{within}{name}"] if within and name in table.all_entries() else []
@@ -226,7 +231,7 @@ def _places(table: type[Table], name: str, within: str = "") -> list[str]:
     for outer, field in table.model_fields.items():
         plain = get_args(field.annotation) if get_origin(field.annotation) in {Union, UnionType} else [field.annotation]
         inner = table.inner(outer)
-        if inner in plain:  # rather than in a list of such tables, or in a table of them
+        if inner is not None and inner in plain:  # rather than in a list of such tables, or in a table of them
             places += _places(inner, name, f"{within}{outer}.")
     return places
 
