@@ -33,11 +33,11 @@ from evedrop.errors import UsageError
 from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest
+from evedrop.wire.deliveries import KeyDeliveries, bounds
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.records import Records, WireFate
 from evedrop.wire.relay import WireRelay
-from evedrop.wire.scorekeeper import bounds, expected
 from evedrop.wire.side import SideSession
 
 _ANYWHERE = ("tcp/127.0.0.1:0",)
@@ -223,7 +223,7 @@ def losses(count: int) -> Iterator[Row]:
         fates = dict(wire.fates)
     outside, fractions = [], []
     for at, (name, model) in enumerate(models.items()):
-        low, high = bounds(*expected({"loss": model}, (), [range(count)]), count)
+        low, high = bounds([KeyDeliveries({"loss": model}, (), [range(count)])], count)
         delivered = fates.get((at, WireFate.DELIVERED), 0)
         fractions.append(f"{name} {delivered / count:.4f}")
         if not low <= delivered <= high:

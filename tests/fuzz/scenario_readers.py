@@ -22,9 +22,9 @@ from evedrop.scenario.recordings.disturbance_file import read_disturbances
 from evedrop.scenario.recordings.link_recording import LinkRecording
 from evedrop.scenario.recordings.process_fit import fit_process
 from evedrop.scenarios import shipped
+from evedrop.wire.deliveries import KeyDeliveries, bounds
 from evedrop.wire.file import example_wire, key_lines, load_wire, resolved_wire, warnings_of_wire, wire_lines, wire_of
 from evedrop.wire.running_link import KeyFates
-from evedrop.wire.scorekeeper import expected
 from evedrop.wire.timeline import moments
 from tests.fuzz.mutation import words_of
 from tests.fuzz.reader import Reader, as_json, as_toml, cells, parquet_of, raw, tried
@@ -104,7 +104,7 @@ def _wire(data: bytes, folder: Path) -> None:
     assert moments(plan)
     for link in plan.links:
         KeyFates(link, "robot/scan", "put", plan.seed).next()
-        expected(link.settings, [], [range(10)])
+        bounds([KeyDeliveries(link.settings, [], [range(10)])], 10)
 
 
 def _disturbances(data: bytes, folder: Path, name: str = "day.csv") -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,15 +11,116 @@ import pytest
 
 from evedrop.model.links import loss_of
 from evedrop.model.links.loss_model import Fate
+from evedrop.model.process import Floats
 from evedrop.model.slot.link import Change
+from evedrop.wire.deliveries import KeyDeliveries, bounds, normal_bounds
 from evedrop.wire.running_link import KeyFates
-from evedrop.wire.scorekeeper import bounds, expected
 from tests.wire.wire_links import LOSSES, wire_link
 
 SEED = 5
+TRIALS = 10_000
 KEYS = 60
 POOR: dict[str, Any] = {"loss": LOSSES["gilbert-elliott"], "corrupt": 0.2}
 RANGES = (range(100), range(150, 151), range(160, 700), range(800, 2000))
+
+
+def expected(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Iterable[range]) -> tuple[float, float]:
+    """Mean and variance of the messages that get through."""
+    stream = KeyDeliveries(settings, changes, ranges)
+    return stream.mean, stream.variance
+
+
+def exact_counts(settings: Mapping[str, Any], changes: Sequence[Change], taken: Sequence[int]) -> Floats:
+    """The probability of each number of deliveries of a chain, message by message: over counts and states."""
+    chain = loss_of(settings["loss"]).chain
+    assert chain is not None
+    odds = np.zeros((len(taken) + 1, len(chain.stationary)))
+    odds[0], at = chain.stationary, taken[0]
+    for n in taken:
+        odds = odds @ np.linalg.matrix_power(chain.transitions, n - at)
+        corrupt = next((change.settings for change in changes[::-1] if change.at <= n), None) or settings
+        quality = chain.quality * (1.0 - corrupt.get("corrupt", 0.0))
+        through = odds * quality
+        odds = odds * (1.0 - quality)
+        odds[1:] += through[:-1]
+        at = n
+    counts: Floats = odds.sum(axis=1)
+    return counts
+
+
+def between(counts: Floats) -> tuple[int, int]:
+    """The bounds of 99 % of a distribution."""
+    odds = np.cumsum(counts)
+    return int(np.searchsorted(odds, 0.005, side="right")), int(np.searchsorted(odds, 0.995))
+
+
+@pytest.mark.parametrize("count", [5, 162, 700])
+@pytest.mark.parametrize("model", ["bernoulli", "gilbert-elliott", "markov"])
+def test_bounds_of_a_chain_are_those_of_its_distribution(model: str, count: int) -> None:
+    """Message by message, with gaps and corruption that changes; of one key, and of three added up."""
+    settings = {"loss": LOSSES[model], "corrupt": 0.05}
+    changes = [Change(count // 2, {"loss": LOSSES[model], "corrupt": 0.3})]
+    ranges = [range(1, count // 3 + 1), range(count // 3 + 2, count)]
+    counts = exact_counts(settings, changes, [n for some in ranges for n in some])
+    stream, number = KeyDeliveries(settings, changes, ranges), sum(map(len, ranges))
+    assert bounds([stream], number) == between(counts)
+    other = KeyDeliveries(settings, [], [range(count)])
+    both = np.convolve(np.convolve(counts, counts), exact_counts(settings, [], range(count)))
+    assert bounds([stream, stream, other], 2 * number + count) == between(both)
+
+
+@pytest.mark.parametrize("count", [20, 162, 1000])
+@pytest.mark.parametrize("keys", [1, 3])
+@pytest.mark.parametrize("model", LOSSES)
+def test_at_most_one_wire_of_two_hundred_is_below_its_bounds_and_as_many_above(
+    model: str, keys: int, count: int
+) -> None:
+    """Of 10,000 wires, with 4.5 standard errors; the bounds are no wider than that asks for."""
+    settings = {"loss": LOSSES[model]}
+    rng, delivered = np.random.default_rng(SEED), np.zeros(TRIALS, np.int64)
+    for _ in range(keys):
+        loss = loss_of(settings["loss"])
+        for first in range(0, count, 20):
+            uniforms = rng.random((20, loss.uniforms_per_slot, TRIALS))
+            delivered += (loss.fates(first, uniforms)[: count - first] == Fate.DELIVERED).sum(axis=0)
+    low, high = bounds([KeyDeliveries(settings, [], [range(count)])] * keys, keys * count)
+    most = 0.005 + 4.5 * math.sqrt(0.005 * 0.995 / TRIALS)
+    assert (delivered < low).mean() <= most
+    assert (delivered > high).mean() <= most
+    least = 0.005 - 4.5 * math.sqrt(0.005 * 0.995 / TRIALS)
+    if np.ptp(delivered):
+        assert (delivered <= low).mean() >= least
+        assert (delivered >= high).mean() >= least
+
+
+@pytest.mark.parametrize("burst", [4, 300])
+def test_bounds_of_many_messages_are_those_of_the_distribution_to_a_twentieth(burst: int) -> None:
+    """Where the counts have a grid: against the same chain's distribution, message by message."""
+    settings = {"loss": {"model": "gilbert-elliott", "p": 1.0 / (9 * burst), "r": 1.0 / burst}}
+    stream = KeyDeliveries(settings, [], [range(6000)])
+    assert stream.variance > 0.0
+    apart = np.subtract(bounds([stream], 6000), between(exact_counts(settings, [], range(6000))))
+    assert np.abs(apart).max() <= max(1.0, 0.05 * math.sqrt(stream.variance))
+
+
+def test_bounds_of_short_runs_in_bursts_hold() -> None:
+    """A tenth lost, four at a time: a normal variable's lower bound would be missed by two wires of a hundred."""
+    stream = KeyDeliveries({"loss": {"model": "gilbert-elliott", "p": 0.0278, "r": 0.25}}, [], [range(162)])
+    low, high = bounds([stream], 162)
+    assert (low, high) == between(
+        exact_counts({"loss": {"model": "gilbert-elliott", "p": 0.0278, "r": 0.25}}, [], range(162))
+    )
+    assert low < normal_bounds(stream.mean, stream.variance, 162)[0] - 3.0
+
+
+def test_bounds_without_a_distribution_are_those_of_a_normal_variable() -> None:
+    """A chain of many states, and a sample."""
+    many = np.full((9, 9), 1.0 / 9.0)
+    for stream in (
+        KeyDeliveries({"loss": {"model": "markov", "transitions": many.tolist(), "loss": [0.5] * 9}}, [], [range(100)]),
+        KeyDeliveries({"loss": LOSSES["bernoulli"]}, [], [range(200)], sampled=100),
+    ):
+        assert bounds([stream], 100) == normal_bounds(stream.mean, stream.variance, 100)
 
 
 @pytest.mark.parametrize("model", LOSSES)
@@ -31,12 +133,12 @@ def test_measured_deliveries(model: str) -> None:
         fates = KeyFates(wire_link(settings), f"key/{key}", "put", SEED, changes=changes)
         codes[key] = [fates.next()[0] for _ in range(2000)]
     for ranges in ([range(2000)], RANGES):
-        mean, variance = expected(settings, changes, ranges)
+        stream = KeyDeliveries(settings, changes, ranges)
         taken = np.concatenate([np.arange(some.start, some.stop) for some in ranges])
         delivered = (codes[:, taken] == Fate.DELIVERED).sum(axis=1)
-        low, high = bounds(KEYS * mean, KEYS * variance, KEYS * len(taken))
+        low, high = bounds([stream] * KEYS, KEYS * len(taken))
         assert low <= delivered.sum() <= high
-        spread, wide = float(np.var(delivered)) / variance, 4.0 * math.sqrt(2.0 / KEYS)
+        spread, wide = float(np.var(delivered)) / stream.variance, 4.0 * math.sqrt(2.0 / KEYS)
         assert spread < 1.0 + wide
         if loss_of(LOSSES[model]).chain is not None or len(ranges) == 1:
             assert spread > 1.0 - wide
@@ -110,8 +212,8 @@ def test_many_messages() -> None:
 
 def test_bounds() -> None:
     """They hold 99 % of a normal distribution, stay within the possible counts, and meet where nothing is random."""
-    assert bounds(500.0, 100.0, 1000) == pytest.approx((500 - 26.258, 500 + 26.258), abs=1e-3)
-    assert bounds(0.2, 0.2, 1000)[0] == 0.0
-    assert bounds(999.8, 0.2, 1000)[1] == 1000.0
-    assert bounds(7.0, 0.0, 10) == pytest.approx((7.0, 7.0), abs=1e-4)
+    assert normal_bounds(500.0, 100.0, 1000) == pytest.approx((500 - 26.258, 500 + 26.258), abs=1e-3)
+    assert normal_bounds(0.2, 0.2, 1000)[0] == 0.0
+    assert normal_bounds(999.8, 0.2, 1000)[1] == 1000.0
+    assert normal_bounds(7.0, 0.0, 10) == pytest.approx((7.0, 7.0), abs=1e-4)
     assert expected({"loss": LOSSES["bernoulli"]}, [], []) == (0.0, 0.0)

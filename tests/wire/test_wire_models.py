@@ -8,8 +8,8 @@ from pathlib import Path
 import zenoh
 
 from evedrop.model.links.loss_model import Fate
+from evedrop.wire.deliveries import KeyDeliveries, bounds
 from evedrop.wire.running_link import KeyFates
-from evedrop.wire.scorekeeper import bounds, expected
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import at_work, link, plan_of
 from tests.wire.wire_links import LOSSES
@@ -55,6 +55,5 @@ def test_what_arrives_is_what_the_fates_say(tmp_path: Path) -> None:
         wait_until(lambda: sum(map(len, heard.values())) >= sum(map(len, due.values())), "all messages have arrived")
     assert heard == due
     for wire_link in plan.links:
-        mean, variance = expected(wire_link.settings, [], [range(COUNT)])
-        low, high = bounds(mean, variance, COUNT)
+        low, high = bounds([KeyDeliveries(wire_link.settings, [], [range(COUNT)])], COUNT)
         assert low <= len(heard[wire_link.name]) <= high

@@ -1,21 +1,19 @@
 """Adds up the summary of a wire: the fates of all messages, each link against its model, and whether expectations held.
 
-The model of a link says how many messages of a key it lets through: the mean and the variance over seeds. Time-dependent effects
-are counted apart: a message that was cut, or for which the queue was full, is left out of `ranges`. The means and variances of
-several keys, or links, add up, since their random numbers are independent.
+The model of a link says how many messages of a key it lets through. Time-dependent effects are counted apart: a message that was
+cut, or for which the queue was full, is left out of `ranges`.
 
-Source: docs/wire/results.md, the summary; docs/mathematics/links.md, losses in bursts.
+Source: docs/wire/results.md, the summary.
 """
 
 from __future__ import annotations
 
 import importlib.metadata
-import math
 import platform
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import accumulate, groupby, pairwise
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, final
 
@@ -25,11 +23,6 @@ from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
 from evedrop.model.kernels.elementary import sum_in_order
-from evedrop.model.links import loss_of
-from evedrop.model.links.loss_model import Chain, LossModel, count_variance
-from evedrop.model.process import Floats
-from evedrop.model.slot.link import NEVER, Change, LinkSchedule
-from evedrop.model.slot.link_distribution import stretches
 from evedrop.results.folder import replace_private
 from evedrop.results.wire_summary import (
     WIRE_SUMMARY_FILE,
@@ -39,6 +32,7 @@ from evedrop.results.wire_summary import (
 )
 from evedrop.score.summary import Judged
 from evedrop.system.output import warn
+from evedrop.wire.deliveries import KeyDeliveries, bounds
 from evedrop.wire.journal import JournalOnDisk, WireJournal
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.records import REASONS, UNLINKED, Kind, Records, WireFate
@@ -185,14 +179,14 @@ class WireScorekeeper:
         tried, passed = (sum(getattr(counts, name) for counts in streams) for name in ("tried", "passed"))
         rate = model = between = within = None
         if tried:
-            shared: dict[Any, tuple[float, float]] = {}
-            moments = [
-                self._moments(link, *stream, stream_tally, shared)
+            shared: dict[Any, KeyDeliveries] = {}
+            counted = [
+                self._stream(link, *stream, stream_tally, shared)
                 for stream, stream_tally in tally.streams.items()
                 if stream_tally.tried
             ]
-            mean, variance = (sum_in_order(counts[i] for counts in moments) for i in (0, 1))
-            low, high = bounds(mean, variance, tried)
+            mean = sum_in_order(stream.mean for stream in counted)
+            low, high = bounds(counted, tried)
             rate, model, between, within = (
                 passed / tried,
                 mean / tried,
@@ -220,10 +214,10 @@ class WireScorekeeper:
             gap_seconds=max((counts.silence for counts in streams), default=0.0),
         )
 
-    def _moments(
-        self, link: WireLink, key: int, kind: int, tally: StreamTally, shared: dict[Any, tuple[float, float]]
-    ) -> tuple[float, float]:
-        """How many of a stream's messages its models should have let through, and the variance of this number.
+    def _stream(
+        self, link: WireLink, key: int, kind: int, tally: StreamTally, shared: dict[Any, KeyDeliveries]
+    ) -> KeyDeliveries:
+        """How many of a stream's messages its models should have let through.
 
         shared: those of the link so far, which streams with the same numbers and settings share: a key that never came again
         is like all others. Raises UsageError if a message has two fates, which only a journal on disk that was changed can say.
@@ -239,14 +233,7 @@ class WireScorekeeper:
                         f"the journal has two fates for message {after.start} of {self._journal.key_of(key)!r} on the link "
                         f"{link.name!r}; a file of it was changed, so give the results folder as the wire wrote it"
                     )
-            mean, variance = expected(link.settings, changes, ranges)
-            if tally.scattered:  # a sample of a known range: the range varies as a whole, and the sample within it
-                fraction = tally.tried / sum(map(len, ranges))
-                mean, variance = (
-                    mean * fraction,
-                    variance * fraction**2 + mean * fraction * (1.0 - mean * fraction / tally.tried),
-                )
-            shared[name] = (mean, variance)
+            shared[name] = KeyDeliveries(link.settings, changes, ranges, tally.tried if tally.scattered else None)
         return shared[name]
 
 
@@ -264,109 +251,3 @@ def _firsts(columns: NDArray[np.int64]) -> list[list[int]]:
     """The columns of each group."""
     firsts: list[list[int]] = columns[:, np.r_[0, _changes(columns)]].T.tolist()
     return firsts
-
-
-_STANDARD_DEVIATIONS = 2.5758293035489004  # of a normal variable, for 99 %
-_AT_ONCE = 1 << 20
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Consecutive messages between which the settings do not change."""
-
-    loss: int
-    """Which of the loss models decides on them: the number of the change that brought it."""
-    spec: Mapping[str, Any]
-    slots: range
-    passes: float
-    """Probability that a message that is not lost gets through."""
-
-
-def expected(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Iterable[range]) -> tuple[float, float]:
-    """Mean and variance of the number of messages of one key that get through.
-
-    settings: `WireLink.settings`; changes: as for `KeyFates`; ranges: the numbers of the messages, disjoint and ascending.
-
-    The variance is exact for losses without a memory, and for those of a Markov chain, whatever is left out. For other losses
-    with a memory it is that of the model for a single range, and an upper bound for several.
-    """
-    mean = variance = 0.0
-    for _, group in groupby(_parts(settings, changes, ranges), key=lambda part: part.loss):
-        parts = list(group)
-        loss = loss_of(parts[0].spec)
-        mean += sum_in_order(part.passes * _delivered(loss, part.slots) for part in parts)
-        variance += _variance(loss, parts)
-    return mean, variance
-
-
-def bounds(mean: float, variance: float, count: int) -> tuple[float, float]:
-    """Between which numbers the deliveries among `count` messages are in 99 % of all wires."""
-    reach = _STANDARD_DEVIATIONS * math.sqrt(variance) + (0.5 if variance > 0.0 else 1e-6 * max(1.0, mean))
-    return max(0.0, mean - reach), min(float(count), mean + reach)
-
-
-def _parts(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Iterable[range]) -> Iterator[_Part]:
-    marks = stretches(LinkSchedule(settings, changes=tuple(changes)))
-    models = accumulate((new["loss"] != old["loss"] for (_, old, _), (_, new, _) in pairwise(marks)), initial=0)
-    ends = [*(start for start, _, _ in marks[1:]), NEVER]
-    parts = [*zip(models, marks, ends, strict=True)]
-    for some in ranges:
-        for model, (start, new, _), stop in parts:
-            slots = range(max(some.start, start), min(some.stop, stop))
-            if slots:
-                yield _Part(model, new["loss"], slots, 1.0 - new.get("corrupt", 0.0))
-
-
-def _delivered(loss: LossModel, slots: range) -> float:
-    """The mean number of these messages that are not lost."""
-    if loss.chain is not None:
-        return len(slots) * loss.quality
-    pieces = (slots[i : i + _AT_ONCE] for i in range(0, len(slots), _AT_ONCE))
-    return sum_in_order(float(loss.quality_at(piece).sum()) for piece in pieces)
-
-
-def _variance(loss: LossModel, parts: Sequence[_Part]) -> float:
-    if loss.chain is not None:
-        return _variance_of_chain(loss.chain, parts)
-    each = [
-        part.passes**2 * loss.rate_variance(part.slots) * len(part.slots) ** 2
-        + part.passes * (1.0 - part.passes) * _delivered(loss, part.slots)
-        for part in parts
-    ]
-    return sum_in_order(each) if loss.memoryless else sum_in_order(map(math.sqrt, each)) ** 2
-
-
-def _variance_of_chain(chain: Chain, parts: Sequence[_Part]) -> float:
-    """The variance for parts of one chain, which continues between them.
-
-    w is the row Σ passes_i E[(γ_i − mean); state at the present message] over the messages i so far, so that the covariance of
-    all of them with the message is w · (quality − mean). Its entries sum to 0; so the chain's stationary part can be left out.
-    """
-    mean = float(chain.stationary @ chain.quality)
-    centred = chain.quality - mean
-    fading = chain.transitions - chain.stationary
-    sums: dict[int, tuple[Floats, Floats]] = {}
-    w, at, total = np.zeros(len(centred)), parts[0].slots.start, 0.0
-    for part in parts:
-        count, passes = len(part.slots), part.passes
-        if count not in sums:
-            sums[count] = _power_and_sum(fading, count)
-        power, partial = sums[count]
-        w = w @ np.linalg.matrix_power(fading, part.slots.start - at)
-        own = passes**2 * count_variance(chain.transitions, chain.stationary, chain.quality, count)
-        total += own + passes * (1.0 - passes) * count * mean + 2.0 * passes * float(w @ partial @ centred)
-        w = w @ power + passes * ((chain.stationary * centred) @ partial @ fading)
-        at = part.slots.stop
-    return total
-
-
-def _power_and_sum(matrix: Floats, count: int) -> tuple[Floats, Floats]:
-    """The power `count` of a matrix, and the sum of its powers below that one, by doubling."""
-    power, partial = np.eye(len(matrix)), np.zeros_like(matrix)
-    for bit in f"{count:b}":
-        partial = partial + power @ partial
-        power = power @ power
-        if bit == "1":
-            partial = partial + power
-            power = power @ matrix
-    return power, partial

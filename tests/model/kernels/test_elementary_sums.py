@@ -17,7 +17,7 @@ from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.scenario.estimates import warnings_of
 from evedrop.scenario.loading import load
 from evedrop.scenarios import shipped
-from evedrop.wire.scorekeeper import expected
+from evedrop.wire.deliveries import KeyDeliveries, bounds
 from tests.examples import mostly_long
 
 PLAIN = builtins.sum
@@ -69,9 +69,10 @@ def test_no_metric_of_a_study_is_a_compensated_sum(name: str, tmp_path: Path) ->
 def test_no_metric_of_a_wire_is_a_compensated_sum(loss: dict[str, Any]) -> None:
     """The expected deliveries of a link that counted many pieces."""
     ranges = [range(start, start + 40) for start in range(0, 4000, 100)]
-    mean, variance = expected({"loss": loss, "corrupt": 0.1}, (), ranges)
-    assert 0.0 < mean < 1600.0
-    assert variance > 0.0
+    stream = KeyDeliveries({"loss": loss, "corrupt": 0.1}, (), ranges)
+    assert 0.0 < stream.mean < 1600.0
+    assert stream.variance > 0.0
+    assert bounds([stream], 1600) is not None
 
 
 def test_a_sum_of_floats_is_noticed(sums: None) -> None:

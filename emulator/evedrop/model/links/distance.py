@@ -6,14 +6,16 @@ Expectations for such a link are theory, which enters no digest and may therefor
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evedrop.model.checks import as_toml, number_mistakes
 from evedrop.model.kernels.elementary import exp, log, normal_quantile, sum_in_order
+from evedrop.model.links.counts import Counted, Spectrum
 from evedrop.model.links.loss_model import LossModel, fates_of
 from evedrop.model.links.way import FARTHEST, Way, way_mistakes
 from evedrop.model.process import Floats
@@ -22,6 +24,7 @@ from evedrop.model.receiver import Codes
 _NEPER = 0.23025850929940458  # ln 10 / 10: decibels as a natural logarithm
 _LONGEST_BLOCK = 1_000_000
 _AT_ONCE = 8192  # packets whose fates are decided together
+_MOST_WORK = 1 << 27  # factors whose products give the distribution of counts
 _SAMPLE = 4096  # slots over which the mean quality of a moving link is computed
 
 
@@ -146,6 +149,37 @@ class Distance(LossModel):
             total += blocks * self._count_variance(whole, outer)
         return total / len(slots) ** 2
 
+    def count_spectrum(self, parts: Sequence[Counted]) -> Spectrum | None:
+        """Block by block of shadowing; None if a block of fading does not divide it, or for too much work."""
+        shadowed = self._standard_deviation > 0.0
+        outer = self._shadowing_block if shadowed else self._fading_block
+        nodes, weights = shadowing_rule(self._standard_deviation)
+        count, points = sum(len(slots) for slots, _ in parts), len(parts[0].w)
+        if outer % self._fading_block or count * points > min(_NUMBERS_AT_ONCE << 2, _MOST_WORK // len(nodes)):
+            return None
+        slots = np.concatenate([np.arange(some.start, some.stop) for some, _ in parts])
+        which = np.repeat(np.arange(len(parts)), [len(some) for some, _ in parts])
+        needed = self._needed(slots.astype(np.float64))
+        spectrum = np.ones(points, np.complex128)
+        known: dict[Any, Spectrum] = {}
+        for block in _groups(slots // outer):
+            fading = [
+                block.start + np.r_[part] for part in _groups(slots[block.start : block.stop] // self._fading_block)
+            ]
+            name = tuple((needed[some].tobytes(), which[some].tobytes()) for some in fading)
+            if name not in known:
+                given = np.ones((len(nodes), points), np.complex128)
+                for some in fading:
+                    order = some[np.argsort(needed[some], kind="stable")]
+                    factors = np.stack([np.ones(points), *(parts[i].w for i in which[order])]).cumprod(axis=0)
+                    above = np.exp(
+                        -np.append(0.0, needed[order]) * nodes[:, None]
+                    )  # that at least so many are delivered
+                    given *= (above - np.append(above[:, 1:], np.zeros((len(nodes), 1)), axis=1)) @ factors
+                known[name] = weights @ given
+            spectrum *= known[name]
+        return spectrum
+
     def _count_variance(self, slots: range, outer: int) -> float:
         if not slots:
             return 0.0
@@ -214,6 +248,12 @@ def _shared_slot(sender: Way, receiver: Way) -> int | None:
 
 
 _NUMBERS_AT_ONCE = 1 << 20  # numbers
+
+
+def _groups(numbers: NDArray[np.int64]) -> Iterator[range]:
+    """The places of equal numbers next to each other."""
+    marks = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
+    return map(range, marks, marks[1:])
 
 
 def shadowing_rule(standard_deviation: float) -> tuple[Floats, Floats]:

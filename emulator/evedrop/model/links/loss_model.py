@@ -19,9 +19,12 @@ import numpy as np
 
 from evedrop.model.checks import probability_mistakes
 from evedrop.model.kernels.elementary import sum_in_order
+from evedrop.model.links.counts import Counted, Spectrum, chain_spectrum
 from evedrop.model.links.way import Way
 from evedrop.model.process import Floats, parts_of
 from evedrop.model.receiver import Codes, Flags
+
+_MOST_COUNTED = 1 << 20  # packets whose qualities are looked at one by one
 
 
 class Fate(IntEnum):
@@ -115,6 +118,21 @@ class LossModel(ABC):
             return count_variance(chain.transitions, chain.stationary, chain.quality, count) / count**2
         qualities = (self.quality_at(part) for part in parts_of(slots))
         return sum_in_order(float((quality * (1.0 - quality)).sum()) for quality in qualities) / count**2
+
+    def count_spectrum(self, parts: Sequence[Counted]) -> Spectrum | None:
+        """The distribution, over trials, of the number of packets that get through; None if it is not known, or too much work.
+
+        parts: in ascending order. From the chain, or from independence.
+        """
+        if self.chain is not None:
+            return chain_spectrum(self.chain, parts)
+        if not self.memoryless or sum(len(slots) for slots, _ in parts) > _MOST_COUNTED:
+            return None
+        spectrum = np.ones(len(parts[0].w), np.complex128)
+        for slots, w in parts:
+            for quality, count in zip(*np.unique(self.quality_at(slots), return_counts=True), strict=True):
+                spectrum *= (1.0 + float(quality) * (w - 1.0)) ** int(count)
+        return spectrum
 
     @property
     def memoryless(self) -> bool:

@@ -5,7 +5,7 @@ A trace is read once or repeatedly, from its beginning or from a random place.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.checks import flag_mistakes, word_mistakes
+from evedrop.model.links.counts import Counted, Spectrum
 from evedrop.model.links.loss_model import LossModel, fates_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
@@ -58,6 +59,8 @@ class Pattern(LossModel):
 
 
 MOST_OUTCOMES = 10_000_000
+MOST_BEGINNINGS = 4096
+"""Of a recording whose distribution of counts is computed; times the ranges of packets that count."""
 
 
 class RecordedLoss(LossModel):
@@ -120,6 +123,30 @@ class RecordedLoss(LossModel):
         delivered = np.concatenate(([0], np.cumsum(~self._ring)))
         rest = len(slots) % length  # whole rounds give every trial the same count
         return float(np.var(delivered[rest : rest + length] - delivered[:length])) / len(slots) ** 2
+
+    def count_spectrum(self, parts: Sequence[Counted]) -> Spectrum | None:
+        """For a random start, over all places where it may begin."""
+        length = len(self._lost)
+        if not self._random or length > MOST_BEGINNINGS or len(parts) > MOST_BEGINNINGS // length:
+            return super().count_spectrum(parts) if not self._random else None
+        delivered = np.concatenate(([0], np.cumsum(~self._ring)))
+        begins, total = np.arange(length), int(delivered[length])
+        counts = np.stack(
+            [
+                len(slots) // length * total
+                + delivered[(begins + slots.start) % length + len(slots) % length]
+                - delivered[(begins + slots.start) % length]
+                for slots, _ in parts
+            ]
+        )
+        each, times = np.unique(counts, axis=1, return_counts=True)
+        spectrum = np.zeros(len(parts[0].w), np.complex128)
+        for column, count in zip(each.T.tolist(), times.tolist(), strict=True):
+            term = np.full(len(spectrum), count / length, np.complex128)
+            for number, part in zip(column, parts, strict=True):
+                term *= part.w**number
+            spectrum += term
+        return spectrum
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
         """The outcomes by slot and by the place where the trial began."""

@@ -1,0 +1,212 @@
+"""How many messages a link lets through: mean and variance over seeds, and the bounds of 99 % of all wires.
+
+The distribution is computed from its Fourier transform E[z^D], which for a Markov chain is a product of small matrices, and for
+several keys, whose random numbers are independent, the product of theirs. Without a transform the bounds are those of a normal
+variable.
+
+Source: docs/mathematics/links.md, losses in bursts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate, groupby, pairwise
+from typing import Any, final
+
+import numpy as np
+
+from evedrop.model.kernels.elementary import sum_in_order
+from evedrop.model.links import loss_of
+from evedrop.model.links.counts import Counted, Spectrum
+from evedrop.model.links.loss_model import Chain, LossModel, count_variance
+from evedrop.model.process import Floats
+from evedrop.model.slot.link import NEVER, Change, LinkSchedule
+from evedrop.model.slot.link_distribution import stretches
+
+_OUTSIDE = 0.005  # of all wires, on each side of the bounds
+_STANDARD_DEVIATIONS = 2.5758293035489004  # of a normal variable, for 99 %
+_POINTS = 4096
+_FARTHEST = (
+    32.0  # standard deviations from the mean: farther are less than a thousandth of all wires, for any distribution
+)
+_SMOOTHED = 1.5  # points of the grid, where it is coarser than the counts
+_MARGIN = 16  # points
+_MOST_PARTS, _POWERS = 2048, 16  # ranges of different streams, and how many of them the powers of a chain cost
+_AT_ONCE = 1 << 20
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Consecutive messages between which the settings do not change."""
+
+    loss: int
+    """Which of the loss models decides on them: the number of the change that brought it."""
+    spec: Mapping[str, Any]
+    slots: range
+    passes: float
+    """Probability that a message that is not lost gets through."""
+
+
+@final
+class KeyDeliveries:
+    """The number of messages of one key that get through.
+
+    settings: `WireLink.settings`; changes: as for `KeyFates`; ranges: the numbers of the messages, disjoint and ascending;
+    sampled: how many of them count, picked at random; None: all.
+
+    The variance is exact for losses without a memory, and for those of a Markov chain, whatever is left out. For other losses
+    with a memory it is that of the model for a single range, and an upper bound for several.
+    """
+
+    __slots__ = ("_groups", "mean", "parts", "sampled", "variance")
+
+    def __init__(
+        self,
+        settings: Mapping[str, Any],
+        changes: Iterable[Change],
+        ranges: Iterable[range],
+        sampled: int | None = None,
+    ) -> None:
+        self.parts = list(_parts(settings, changes, ranges))
+        self._groups = [[*group] for _, group in groupby(self.parts, key=lambda part: part.loss)]
+        self.sampled = sampled is not None
+        self.mean = self.variance = 0.0
+        for parts in self._groups:
+            loss = loss_of(parts[0].spec)
+            self.mean += sum_in_order(part.passes * _delivered(loss, part.slots) for part in parts)
+            self.variance += _variance(loss, parts)
+        if sampled is not None:  # a sample of a known range: the range varies as a whole, and the sample within it
+            fraction = sampled / sum(len(part.slots) for part in self.parts)
+            self.mean *= fraction
+            self.variance = self.variance * fraction**2 + self.mean * (1.0 - self.mean / sampled)
+
+    def spectrum(self, z: Spectrum) -> Spectrum | None:
+        """E[z^D] of the number D; None if it is not known, or too much work."""
+        if self.sampled:
+            return None
+        spectrum = np.ones_like(z)
+        for parts in self._groups:
+            factors = {passes: 1.0 + passes * (z - 1.0) for passes in {part.passes for part in parts}}
+            factor = loss_of(parts[0].spec).count_spectrum(
+                [Counted(part.slots, factors[part.passes]) for part in parts]
+            )
+            if factor is None:
+                return None
+            spectrum *= factor
+        return spectrum
+
+
+def deliveries_between(streams: Sequence[KeyDeliveries], count: int) -> tuple[int, int] | None:
+    """The bounds of 99 % of all wires: the least and the most deliveries among `count` messages of independent streams.
+
+    At most 0.5 % of all wires deliver fewer, and at most 0.5 % more. None if the distribution is not known or too much work.
+    """
+    mean, variance = (sum_in_order(getattr(stream, name) for stream in streams) for name in ("mean", "variance"))
+    different = Counter(streams)
+    if variance <= 0.0 or sum(_POWERS + len(stream.parts) for stream in different) > _MOST_PARTS:
+        return None
+    period = min(count + 1, math.ceil(2.0 * _FARTHEST * math.sqrt(variance)) + 2)
+    points = min(_POINTS, 1 << (period - 1).bit_length())
+    step = period / (points - 2 * _MARGIN) if period > points else 1.0  # counts from a point of the grid to the next
+    around = _MARGIN * step if step > 1.0 else 0.0  # what is smoothed reaches over the least and the greatest count
+    angles = 2.0 * np.pi / (points * step) * np.arange(points // 2 + 1)
+    z = np.exp(1j * angles)
+    spectrum = np.ones_like(z)
+    for stream, times in different.items():
+        factor = stream.spectrum(z)
+        if factor is None:
+            return None
+        spectrum *= factor**times
+    first = round(max(-around, min(mean - points * step / 2.0, count + 1 + around - points * step)))
+    spectrum *= np.exp(-1j * angles * first)
+    if step > 1.0:
+        spectrum *= np.exp(-0.5 * (_SMOOTHED * step * angles) ** 2)
+    odds = np.cumsum(np.fft.irfft(np.conj(spectrum), points))  # of at most first + i · step deliveries
+    low = int(np.searchsorted(odds, _OUTSIDE, side="right"))
+    high = int(np.searchsorted(odds, 1.0 - _OUTSIDE, side="left"))
+    return max(0, first + math.floor(low * step)), min(count, first + math.ceil(high * step))
+
+
+def bounds(streams: Sequence[KeyDeliveries], count: int) -> tuple[float, float]:
+    """Between which numbers the deliveries among `count` messages are in 99 % of all wires."""
+    between = deliveries_between(streams, count)
+    if between is not None:
+        return between
+    mean, variance = (sum_in_order(getattr(stream, name) for stream in streams) for name in ("mean", "variance"))
+    return normal_bounds(mean, variance, count)
+
+
+def normal_bounds(mean: float, variance: float, count: int) -> tuple[float, float]:
+    """The same for a normal variable, with a correction for whole numbers."""
+    reach = _STANDARD_DEVIATIONS * math.sqrt(variance) + (0.5 if variance > 0.0 else 1e-6 * max(1.0, mean))
+    return max(0.0, mean - reach), min(float(count), mean + reach)
+
+
+def _parts(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Iterable[range]) -> Iterator[_Part]:
+    marks = stretches(LinkSchedule(settings, changes=tuple(changes)))
+    models = accumulate((new["loss"] != old["loss"] for (_, old, _), (_, new, _) in pairwise(marks)), initial=0)
+    ends = [*(start for start, _, _ in marks[1:]), NEVER]
+    parts = [*zip(models, marks, ends, strict=True)]
+    for some in ranges:
+        for model, (start, new, _), stop in parts:
+            slots = range(max(some.start, start), min(some.stop, stop))
+            if slots:
+                yield _Part(model, new["loss"], slots, 1.0 - new.get("corrupt", 0.0))
+
+
+def _delivered(loss: LossModel, slots: range) -> float:
+    """The mean number of these messages that are not lost."""
+    if loss.chain is not None:
+        return len(slots) * loss.quality
+    pieces = (slots[i : i + _AT_ONCE] for i in range(0, len(slots), _AT_ONCE))
+    return sum_in_order(float(loss.quality_at(piece).sum()) for piece in pieces)
+
+
+def _variance(loss: LossModel, parts: Sequence[_Part]) -> float:
+    if loss.chain is not None:
+        return _variance_of_chain(loss.chain, parts)
+    each = [
+        part.passes**2 * loss.rate_variance(part.slots) * len(part.slots) ** 2
+        + part.passes * (1.0 - part.passes) * _delivered(loss, part.slots)
+        for part in parts
+    ]
+    return sum_in_order(each) if loss.memoryless else sum_in_order(map(math.sqrt, each)) ** 2
+
+
+def _variance_of_chain(chain: Chain, parts: Sequence[_Part]) -> float:
+    """The variance for parts of one chain, which continues between them.
+
+    w is the row Σ passes_i E[(γ_i − mean); state at the present message] over the messages i so far, so that the covariance of
+    all of them with the message is w · (quality − mean). Its entries sum to 0; so the chain's stationary part can be left out.
+    """
+    mean = float(chain.stationary @ chain.quality)
+    centred = chain.quality - mean
+    fading = chain.transitions - chain.stationary
+    sums: dict[int, tuple[Floats, Floats]] = {}
+    w, at, total = np.zeros(len(centred)), parts[0].slots.start, 0.0
+    for part in parts:
+        count, passes = len(part.slots), part.passes
+        if count not in sums:
+            sums[count] = _power_and_sum(fading, count)
+        power, partial = sums[count]
+        w = w @ np.linalg.matrix_power(fading, part.slots.start - at)
+        own = passes**2 * count_variance(chain.transitions, chain.stationary, chain.quality, count)
+        total += own + passes * (1.0 - passes) * count * mean + 2.0 * passes * float(w @ partial @ centred)
+        w = w @ power + passes * ((chain.stationary * centred) @ partial @ fading)
+        at = part.slots.stop
+    return total
+
+
+def _power_and_sum(matrix: Floats, count: int) -> tuple[Floats, Floats]:
+    """The power `count` of a matrix, and the sum of its powers below that one, by doubling."""
+    power, partial = np.eye(len(matrix)), np.zeros_like(matrix)
+    for bit in f"{count:b}":
+        partial = partial + power @ partial
+        power = power @ power
+        if bit == "1":
+            partial = partial + power
+            power = power @ matrix
+    return power, partial
