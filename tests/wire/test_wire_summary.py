@@ -14,7 +14,7 @@ import pytest
 
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.results.wire_summary import WIRE_FILE, WireLinkSummary, WireSummary
-from evedrop.show.report.wire import WITHOUT_MODEL, wire_failures, wire_sentences, wire_table
+from evedrop.show.report.wire import NOTHING_HEARD, WITHOUT_MODEL, wire_failures, wire_sentences, wire_table
 from evedrop.show.report.writing import write_report
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
@@ -291,6 +291,8 @@ link = "scan"
     nothing, status = run(tmp_path / "silent", plan, messages=0)
     assert status == 1
     assert {(judged["held"], judged["why"]) for judged in nothing["expectations"]} == {(None, "the link heard nothing")}
+    assert NOTHING_HEARD in closing_lines(read(tmp_path / "silent"))
+    assert NOTHING_HEARD not in sentences
     (tmp_path / "silent" / WIRE_FILE).write_text(resolved_wire(plan))
     write_report(tmp_path / "silent")
     page = checked(tmp_path / "silent")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import threading
 import weakref
 from pathlib import Path
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
+from evedrop.results.wire_summary import WireSummary
 from evedrop.show.view import recording
 from evedrop.wire.panels import Pace
 from evedrop.wire.plan import WireEvent
@@ -289,7 +291,16 @@ def test_a_view_follows_a_running_wire(tmp_path: Path, capfd: pytest.CaptureFixt
     assert "cut" in table
     assert "partition robot, base" in [text for _, text in texts(path)]
     capfd.readouterr()
-    assert main(["view", str(out), "--table"]) == 0
+    files = tmp_path / "t.csv", tmp_path / "t.tex"
+    assert main(["view", str(out), "--table", "--csv", str(files[0]), "--latex", str(files[1])]) == 0
+    heads, *rows = csv.reader(files[0].read_text().splitlines())
+    links = WireSummary.read(out / "summary.json").links
+    assert [(row[0], int(row[heads.index("heard")])) for row in rows] == [
+        (name, link.heard) for name, link in links.items()
+    ]
+    rates = ["" if link.rate is None else repr(link.rate) for link in links.values()]
+    assert [row[heads.index("rate")] for row in rows] == rates
+    assert "tabular" in files[1].read_text()
     printed = capfd.readouterr().out
     assert printed.strip() == "\n".join(messages[-1 - printed.count("\n") : -1]).strip()
     replayed = replay_wire(out, tmp_path / "replayed.rrd")

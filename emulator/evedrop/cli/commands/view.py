@@ -166,7 +166,8 @@ def _chosen_slot(run: Path) -> int | None:
 
 def _view_wire(options: argparse.Namespace) -> int:
     """Show or draw a wire, from its journal, or print its table."""
-    from evedrop.show.report.wire import wire_failures
+    from evedrop.cli.report import terminal
+    from evedrop.show.report.wire import wire_failures, wire_table
     from evedrop.show.view.picture import picture_apart
     from evedrop.show.view.viewer import WebAddress, open_run
     from evedrop.system.signals import raise_on_signals
@@ -178,6 +179,7 @@ def _view_wire(options: argparse.Namespace) -> int:
         raise UsageError(f"--slot is for runs, and {options.run} is the folder of a wire; give --time")
     if options.table:
         summary = summary_of_wire(options.run)
+        terminal().take(wire_table(summary))
         for line in closing_lines(summary):
             tell(line)
         for line in wire_failures(summary):

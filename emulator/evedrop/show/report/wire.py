@@ -5,8 +5,9 @@ Source: docs/wire/results.md, the summary.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
+from evedrop.model.metrics.text import ShownNumber
 from evedrop.results.wire_summary import WireSummary
 from evedrop.score.summary import failed
 from evedrop.show.report.closing import expectations_outcome
@@ -14,6 +15,11 @@ from evedrop.show.report.text_table import TextTable
 
 WITHOUT_MODEL = {"overflow", "cut", "unlinked", "too_large", "looped", "too_many_keys"}
 """The reasons for which messages are lost before a link's models decide on them."""
+NOTHING_HEARD = (
+    "no message was heard: do the programs connect to the wire's endpoints, in Zenoh's mode client "
+    "(ROS 2: with rmw_zenoh)?"
+)
+"""What to look at after a wire through which nothing went."""
 _MARKS = {True: "yes", False: "NO", None: "–"}
 
 
@@ -33,17 +39,14 @@ def wire_table(summary: WireSummary) -> TextTable:
     )
     for name, link in summary.links.items():
         median = link.delays.get("0.5")
+        lost, dropped = sum(link.lost_by.values()), sum(link.dropped_by.values())
         table.add(
             name,
-            f"{link.heard:,}",
-            f"{link.delivered:,}",
-            f"{sum(link.lost_by.values()):,}",
-            f"{sum(link.dropped_by.values()):,}",
-            "–" if link.rate is None else f"{link.rate:.4f}",
-            "–" if link.expected_rate is None else f"{link.expected_rate:.4f}",
+            *(ShownNumber(f"{count:,}", count) for count in (link.heard, link.delivered, lost, dropped)),
+            *(ShownNumber("–" if rate is None else f"{rate:.4f}", rate) for rate in (link.rate, link.expected_rate)),
             _MARKS[link.within_bounds],
-            "–" if median is None else f"{1000 * median:.3g} ms",
-            f"{link.gap_messages:,}",
+            "–" if median is None else ShownNumber(f"{1000 * median:.3g}", 1000 * median) + " ms",
+            ShownNumber(f"{link.gap_messages:,}", link.gap_messages),
         )
     return table
 
@@ -85,6 +88,8 @@ def wire_sentences(summary: WireSummary) -> Iterator[str]:
         if undecided and link.rate is not None:
             reasons = " and ".join(reason.replace("_", " ") for reason in undecided)
             yield f"{name}: rate, model and within leave out the messages by {reasons}, on which its models did not decide"
+    if not summary.heard:
+        yield NOTHING_HEARD
     yield from unlinked_sentence(summary)
     yield from (judged.sentence for judged in summary.expectations if judged.held)
 
@@ -99,6 +104,15 @@ def wire_failures(summary: WireSummary) -> Iterator[str]:
     """What went wrong: faults, as below, and expectations that failed."""
     yield from wire_faults(summary)
     yield from (judged.sentence for judged in failed(summary.expectations))
+
+
+def expectation_failures(summary: WireSummary, subjects: Sequence[str]) -> Iterator[str]:
+    """The expectations that failed, each with what its link lost by which reasons. subjects: the link of each expectation."""
+    for judged, name in zip(summary.expectations, subjects, strict=True):
+        if judged.held is not True:
+            link = summary.links[name]
+            lost = _counted({**link.lost_by, **link.dropped_by}) or "none"
+            yield f"{judged.sentence}; {name} lost {lost}, of {link.heard:,} heard"
 
 
 def wire_faults(summary: WireSummary) -> Iterator[str]:
