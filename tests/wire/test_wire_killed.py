@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import fcntl
 import json
 import os
@@ -11,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 
 from evedrop.cli.main import main
@@ -20,7 +22,7 @@ from evedrop.system.files import is_locked
 from evedrop.wire import journal as journal_module
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal import WireJournal, recover
+from evedrop.wire.journal import WireJournal, journal_tables, recover
 from evedrop.wire.on_disk import summary_of_wire
 from evedrop.wire.records import HELD, Kind, WireFate
 from evedrop.wire.run import _begin_results, run_wire
@@ -74,6 +76,17 @@ def test_a_wire_without_a_summary_is_summed_up_from_its_journal(
     printed = capfd.readouterr().out
     assert sentence in printed
     assert "robot-base lost 3 by loss" in printed
+    exported = folder / "journal.csv"
+    assert main(["export", str(folder), str(exported)]) == 0
+    with exported.open(encoding="utf-8", newline="") as text:
+        rows = [*csv.DictReader(text)]
+    assert capfd.readouterr().out == f"{len(rows)} messages are in {exported}\n"
+    every = pa.concat_tables(journal_tables(folder)).to_pylist()
+    assert [(row["key"], int(row["n"]), row["fate"], row["reason"] or None) for row in rows] == [
+        (row["key"], row["n"], row["fate"], row["reason"]) for row in every
+    ]
+    assert [float(row["time"]) for row in rows] == [row["time"] for row in every]
+    exported.unlink()
     assert main(["report", str(folder)]) == 0
     assert capfd.readouterr().out == f"{folder / 'report.html'}\n"
     texts = checked(folder).texts

@@ -31,7 +31,7 @@ _LONGEST = 3600.0  # seconds per slot, as for pace
 
 
 def export(options: argparse.Namespace) -> int:
-    """Write the results of a run as an MCAP file, or the picture or the tables of any study; the file's ending decides."""
+    """Write a run as MCAP, a wire's journal as CSV, or the picture or tables of a study; the file's ending decides."""
     if (kind := options.file.suffix.lower()) in {*_PICTURES, *_TABLES}:
         return _export_study(options, kind)
     if options.width != "page":
@@ -61,9 +61,7 @@ def _export_study(options: argparse.Namespace, kind: str) -> int:
     from evedrop.results.wire_summary import is_wire
 
     if is_wire(options.run):
-        raise UsageError(
-            f"{options.run} is the folder of a wire; its report has its pictures: evedrop report {options.run}"
-        )
+        return _export_wire(options, kind)
     study = study_in(options.run)
     if kind in _TABLES:
         files = study.to_csv(options.file) if kind == ".csv" else [study.to_latex(options.file)]
@@ -81,6 +79,22 @@ def _export_study(options: argparse.Namespace, kind: str) -> int:
     except OSError as error:
         raise UsageError(f"{options.file} cannot be written ({error.strerror}); give another file") from error
     print(options.file)
+    return 0
+
+
+def _export_wire(options: argparse.Namespace, kind: str) -> int:
+    """Write the journal of a wire as CSV."""
+    if kind != ".csv":
+        use = (
+            f"its report has its pictures: evedrop report {options.run}"
+            if kind in _PICTURES
+            else f"its table is written by: evedrop view {options.run} --table --latex {options.file}"
+        )
+        raise UsageError(f"{options.run} is the folder of a wire; {use}")
+    from evedrop.wire.journal_csv import write_journal_csv
+
+    rows = write_journal_csv(options.run, options.file)
+    print(f"{rows:,} messages are in {options.file}")
     return 0
 
 
@@ -127,7 +141,7 @@ COMMANDS = (
     Command(
         "export",
         export,
-        "write a run as an MCAP file, or any study's picture or tables",
+        "write a run as MCAP, a wire's journal as CSV, or any study's picture or tables",
         (argument("run", "FOLDER"), _written),
         section="inspect",
         example="export runs/vehicle vehicle.mcap",
