@@ -72,8 +72,13 @@ def test_a_wire_is_opened_steered_read_and_judged(tmp_path: Path) -> None:
     expectation = {"metric": "scan.delivery", "above": 0.9}
     got: list[int] = []
     running = wire(side=["robot", "base"], link=[LINK], expect=[expectation], seed=7, out=tmp_path / "wire")
-    with pytest.raises(ExpectationFailed, match=r"expected scan\.delivery above 0\.9: FAILED"), running:
+    with pytest.raises(ExpectationFailed) as caught, running:
         used(running, got)
+    expected, last = str(caught.value).splitlines()
+    lost = running.typed_summary().links["scan"].lost_by["loss"]
+    assert expected.startswith("expected scan.delivery above 0.9: FAILED, found 0.")
+    assert expected.endswith(f"; scan lost {lost} by loss, 2 by cut, of 404 heard")
+    assert last == f"results: {tmp_path / 'wire'}"
     assert not running.is_running
     summary = json.loads((tmp_path / "wire" / "summary.json").read_text())
     assert running.summary() == summary
@@ -123,7 +128,10 @@ def used(running: RunningWire, got: list[int]) -> None:
     assert (scan["heard"], scan["delivered"], scan["lost_by"]["cut"]) == (404, len(got), 2)
     running.expect("scan.delivery", above=0.5, below=0.7)
     running.expect(link="scan")
-    with pytest.raises(ExpectationFailed, match=r"expected 0\.5 quantile of scan\.latency above 1: FAILED, found 0"):
+    late = (
+        r"(?s)expected 0\.5 quantile of scan\.latency above 1: FAILED, found 0.*scan lost .* by loss.*results: .*wire"
+    )
+    with pytest.raises(ExpectationFailed, match=late):
         running.expect("scan.latency", quantile=0.5, above=1.0)
     with pytest.raises(ScenarioError, match="there is no link scam"):
         running.expect("scam.delivery", above=0.5)
@@ -144,10 +152,10 @@ def test_the_fixture_ends_the_wires_of_a_test_that_fails(tmp_path: Path) -> None
         "evedrop.cli.pytest_plugin",
         "-p",
         "no:cacheprovider",
-        "--basetemp",
-        "kept",
         "--junitxml",
         "report.xml",
+        "--evedrop-out",
+        "art",
     ]
     command = [sys.executable, "-m", "pytest", *options, "."]
     environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
@@ -160,7 +168,10 @@ def test_the_fixture_ends_the_wires_of_a_test_that_fails(tmp_path: Path) -> None
     report = (tmp_path / "report.xml").read_text()
     assert "test_that_is_passed_by" in report
     assert "at side robot is in mode peer" in report
-    folders = [tmp_path / "kept" / name / "wire-1" for name in ("test_that_fails0", "test_that_expects0")]
+    assert re.search(r"; scan lost \d+ by loss, of \d+ heard", report)
+    folders = [tmp_path / "art" / name / "wire-1" for name in ("test_that_fails", "test_that_expects")]
+    assert 'name="evedrop_results" value="art/test_that_expects/wire-1"' in report
+    assert "results: art/test_that_expects/wire-1" in done.stdout
     for folder in folders:
         assert (folder / "summary.json").is_file()
         assert not (folder / "control.json").exists()

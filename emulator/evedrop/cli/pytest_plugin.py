@@ -10,6 +10,7 @@ Source: docs/testing.md.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from itertools import count
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from evedrop.studies.scenario_tests import Finding
     from evedrop.wire.running import RunningWire
 
+_LONGEST_NAME = 100
 _PRELOADED = pytest.StashKey[ExitStack]()
 
 
@@ -34,7 +36,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--evedrop-out",
         type=Path,
         metavar="DIR",
-        help="folder for the results, a folder for each scenario; default runs/",
+        help="folder for the results, a folder for each scenario or test with wires; default runs/, for wires tmp_path",
     )
     group.addoption(
         "--evedrop-scheduler",
@@ -61,18 +63,24 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 
 @pytest.fixture
-def evedrop_wire(tmp_path: Path) -> Iterator[Callable[..., RunningWire]]:
-    """A function that opens a wire for this test: its arguments are those of `evedrop.wire`, its results in `tmp_path`.
+def evedrop_wire(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[..., RunningWire]]:
+    """A function that opens a wire for this test: its arguments are those of `evedrop.wire`.
 
-    The test fails if an expectation of a wire failed.
+    Its results are in a folder of the test below that of `--evedrop-out`, or in `tmp_path`. The test fails if an expectation of
+    a wire failed.
     """
-    from evedrop.wire.running import wire  # needed only by tests that open a wire
+    from evedrop.results.folder import claimed  # needed only by tests that open a wire
+    from evedrop.wire.running import wire  # the same
 
+    out: Path | None = request.config.option.evedrop_out
     with ExitStack() as stack:
-        folders = (tmp_path / f"wire-{number}" for number in count(1))
+        place = tmp_path if out is None else claimed(out / re.sub(r"\W", "_", request.node.name)[:_LONGEST_NAME])
+        folders = (place / f"wire-{number}" for number in count(1))
 
         def opened(*arguments: Any, **entries: Any) -> RunningWire:
-            return stack.enter_context(wire(*arguments, **{"out": next(folders), **entries}))
+            running = stack.enter_context(wire(*arguments, **{"out": next(folders), **entries}))
+            request.node.user_properties.append(("evedrop_results", str(running.folder)))
+            return running
 
         yield opened
 

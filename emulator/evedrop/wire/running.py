@@ -14,7 +14,7 @@ import tempfile
 import threading
 import time
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -30,8 +30,7 @@ from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusR
 from evedrop.results.folder import claimed, default_folder, write_private
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
 from evedrop.scenario.words import listed
-from evedrop.score.summary import failed
-from evedrop.show.report.wire import wire_failures
+from evedrop.show.report.wire import expectation_failures, wire_faults
 from evedrop.system.processes import kill, wait_for
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.journal import journal_tables
@@ -132,7 +131,7 @@ class RunningWire:
         with suppress(UsageError):
             summary = self.typed_summary()
             if summary.failed_expectations or summary.bypasses:
-                raise ExpectationFailed("\n".join(wire_failures(summary)))
+                raise self._failed(summary, self.plan, wire_faults(summary))
         raise self._failure(status)
 
     @property
@@ -201,9 +200,13 @@ class RunningWire:
         table = {"metric": metric, **bounds} if metric is not None else bounds
         plan = wire_of({**tomllib.loads(resolved_wire(self.plan)), "expect": [table]})
         summary = scorekeeper_on_disk(self.folder, plan).summary()
-        if failures := failed(summary.expectations):
-            lines = [*(judged.sentence for judged in failures), *(bypass.event for bypass in summary.bypasses)]
-            raise ExpectationFailed("\n".join(lines))
+        if summary.failed_expectations:
+            raise self._failed(summary, plan, (bypass.event for bypass in summary.bypasses))
+
+    def _failed(self, summary: WireSummary, plan: WirePlan, faults: Iterable[str]) -> ExpectationFailed:
+        """What failed, why, and where the results are."""
+        failures = expectation_failures(summary, [table.subject for table in plan.expectations])
+        return ExpectationFailed("\n".join([*failures, *faults, f"results: {self.folder}"]))
 
     def _endpoints_of(self, side: str) -> Sequence[str]:
         places = self._endpoints.get(side, ())
