@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -12,10 +13,14 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.theory.covariances import Outcomes
-from evedrop.scenario.theory import Expectation
+from evedrop.scenario.estimates import warnings_of
+from evedrop.scenario.loading import load
+from evedrop.scenario.theory import Expectation, expectations_of
 from evedrop.score.rare_events import rare_events_of
+from evedrop.score.scorekeeper import verdicts
 from evedrop.score.secrecy import Claim, Secrecy, rejected, secrecy
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
+from tests.score.test_verdict_calibration import tally_of
 
 STABLE = Process(np.diag([1.0, 0.9]), np.eye(2) * 1e-3, np.eye(2))
 SLOTS, TRIALS = 81, 60
@@ -141,7 +146,51 @@ def test_without_a_closed_form_an_event_that_no_trial_met_may_still_be_there(tri
         [Claim.HELD, Claim.FAILED] if enough else [Claim.UNDECIDED] * 2
     )
     for name, verdict in zip(("legitimate", "eve"), verdicts, strict=True):
-        assert ("no closed form bounds the error of " + name in verdict.sentence) != enough
+        assert (
+            f": too few trials lose the first packet of {name}, of 2,000 enough would;" in verdict.sentence
+        ) != enough
+
+
+@pytest.mark.parametrize(
+    ("first_loss", "relative"), [(0.5, Claim.HELD), (0.0, Claim.HELD), (math.nan, Claim.UNDECIDED)]
+)
+def test_a_recorded_link_is_judged_by_its_own_fraction_of_losses(first_loss: float, relative: Claim) -> None:
+    """Enough trials lose the first packet of an unstable process; where nobody knows how many, none are enough."""
+    process = Process(np.array([[1.5]]), np.array([[1.0]]), np.array([[1.0]]))
+    recorded = Expectation(process, None, None, recorded_loss=first_loss)
+    known = expectation(good(0.9), 0.5)
+    result = secrecy((tally(around(0.1)), recorded), ("eve", tally(around(50.0)), known))
+    assert result.relative is relative
+    never = "no theory bounds the error of legitimate in them, however many trials there are;"
+    assert (never in result.sentence) == math.isnan(first_loss)
+
+
+def test_the_first_loss_of_a_recording() -> None:
+    """A start at random loses as many first packets as the recording has losses; a link that also delays is not known."""
+    trace = {"model": "trace", "outcomes": "0111", "random_start": True}
+    losses = {
+        0.25: {"loss": trace},
+        0.125: {"quality": 0.875},
+        math.nan: {"loss": trace, "delay": {"model": "constant", "value": 1.0}},
+    }
+    for expected, link in losses.items():
+        scenario = load("vehicle", {"legitimate": {"link": link}})
+        first = expectations_of(scenario)["legitimate"].first_loss
+        assert first == pytest.approx(expected, nan_ok=True)
+
+
+def test_a_replayed_recording_is_in_the_verdict_and_warned_of() -> None:
+    """Intervals of trials with the same losses hold for these; a random start has neither, nor a single trial."""
+    trace = {"model": "trace", "outcomes": "0111" * 100}
+    for random_start, trials, replayed in ((False, 30, True), (True, 30, False), (False, 1, False)):
+        link = {"loss": {**trace, "random_start": random_start}}
+        scenario = load("vehicle", {"slots": 100, "trials": trials, "legitimate": {"link": link}})
+        _, verdict = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
+        assert verdict is not None
+        assert (", given this recording of losses" in verdict.sentence) == replayed
+        warned = "the first 100 of 400 recorded outcomes" in " ".join(warnings_of(scenario))
+        assert warned == replayed
+        assert ("400 recorded" in " ".join(warnings_of(scenario, several=True))) == (not random_start)
 
 
 def test_one_trial_decides_nothing() -> None:

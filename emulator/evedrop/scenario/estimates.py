@@ -14,15 +14,17 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario.plugins import sources_of
 from evedrop.scenario.process_noise import is_singular
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.theory import expectations_of
+from evedrop.scenario.theory import expectations_of, replays_a_recording
 
 _LARGE_BYTES = 1e9
 _SHOWN_STATES = 3  # the largest matrix that is written out
 _NEAR = 0.01  # relative to a covariance's largest entry
 
 
-def warnings_of(scenario: Scenario) -> list[str]:
+def warnings_of(scenario: Scenario, several: bool = False) -> list[str]:
     """Warnings that the user should read before the run; the run starts regardless.
+
+    several: warn of what concerns only several trials, even if the scenario has one.
 
     Source: docs/mathematics/secrecy.md, secrecy and design (stability bound).
     """
@@ -47,6 +49,7 @@ def warnings_of(scenario: Scenario) -> list[str]:
         )
     warnings += _reference_warnings(scenario, mu)
     warnings += [*_filter_warnings(scenario), *scheme_of(process, scenario.encoding.spec).warnings()]
+    warnings += _recording_warnings(scenario) if several or scenario.trials > 1 else []
     size = written_bytes(scenario)
     if size > _LARGE_BYTES:
         warnings.append(
@@ -101,6 +104,19 @@ def _filter_warnings(scenario: Scenario) -> list[str]:
             "within its range, so anybody who knows A and Q recognises, with certainty, two states in a row, and an "
             "innovation after a state"
         )
+    return warnings
+
+
+def _recording_warnings(scenario: Scenario) -> list[str]:
+    """A warning for each link whose trials all replay the same part of a recording."""
+    warnings = []
+    for receiver in scenario.receivers:
+        outcomes = len(scenario.schedule(receiver).settings["loss"].get("outcomes", ""))
+        if replays_a_recording(scenario, receiver) and scenario.slots < outcomes:
+            warnings.append(
+                f"all trials have the same losses on the link of {receiver}, the first {scenario.slots:,} of {outcomes:,} "
+                f"recorded outcomes, and results hold for these alone; random_start = true uses all of them"
+            )
     return warnings
 
 

@@ -16,6 +16,8 @@ import numpy as np
 
 from evedrop.model import modulated
 from evedrop.model.acknowledgements import FORGING, heed_rule_of, rates_of
+from evedrop.model.links import loss_of
+from evedrop.model.links.trace import RecordedLoss
 from evedrop.model.modulated import modulated_streaks
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes, uses_of
 from evedrop.model.process import Floats, Process, parts_of
@@ -193,11 +195,18 @@ class Expectation:
     """Whether the process is only a model of what moves the states: then it is not the errors of a run that theory expects."""
     assumed: bool = False
     """Whether it is only what receivers assume: then theory expects nothing."""
+    recorded_loss: float = math.nan
+    """Of a link that theory does not cover, but whose losses are recorded: the probability that it loses the first packet."""
 
     @property
     def known(self) -> bool:
         """Whether there is a theory for the link and for the receiver's actions."""
         return self.closed is not None or self._known is not None
+
+    @property
+    def first_loss(self) -> float:
+        """The probability that the packet of slot 0 is not delivered; NaN if it is not known."""
+        return self.recorded_loss if self.link is None else 1.0 - float(self.link.rates(range(1))[0])
 
     @property
     def _known(self) -> tuple[LinkDistribution, OutcomesAt] | None:
@@ -376,8 +385,27 @@ def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
             slots_at=None if mu_d is None else _in_slots(mu_d, partial(_known_in_slot, scenario, name, scheme)),
             bound_slots_at=None if mu_d is None else lambda k: partial(_bound, scheme.in_slot(k)),
             of_model=scenario.of_model,
+            recorded_loss=_recorded_loss(scenario, name),
         )
     return expectations
+
+
+def _recorded_loss(scenario: Scenario, receiver: str) -> float:
+    """The probability that a link which only replays a recording loses the first packet; NaN for others.
+
+    Source: docs/mathematics/verdicts.md, verdicts.
+    """
+    schedule = scenario.schedule(receiver)
+    if set(schedule.settings) != {"loss"} or schedule.changes or schedule.outages:
+        return math.nan
+    loss = loss_of(schedule.settings["loss"])
+    return 1.0 - float(loss.quality_at(range(1))[0]) if isinstance(loss, RecordedLoss) else math.nan
+
+
+def replays_a_recording(scenario: Scenario, receiver: str) -> bool:
+    """Whether all trials replay the same losses of a recording, so that results hold for these losses only."""
+    loss = loss_of(scenario.schedule(receiver).settings["loss"])
+    return isinstance(loss, RecordedLoss) and loss.memoryless
 
 
 def error_floor_of(scenario: Scenario, receiver: str) -> tuple[Floats, bool] | None:

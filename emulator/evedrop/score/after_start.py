@@ -81,7 +81,7 @@ def ratio_interval(ratio: float, error: float | None, trials: int) -> tuple[floa
 
     None without a standard error, and for a ratio, or a limit, that is 0 or cannot be written.
 
-    Source: docs/mathematics/verdicts.md, after the start.
+    Source: docs/mathematics/verdicts.md, verdicts.
     """
     if error is None or not 0.0 < ratio < math.inf:
         return None

@@ -21,7 +21,13 @@ from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.theory import Expectation, TheoreticalTraceStream, error_floor_of, expectations_of
+from evedrop.scenario.theory import (
+    Expectation,
+    TheoreticalTraceStream,
+    error_floor_of,
+    expectations_of,
+    replays_a_recording,
+)
 from evedrop.score.after_start import AfterStart
 from evedrop.score.directions import directions_of
 from evedrop.score.expectations_held import Evidence
@@ -165,9 +171,18 @@ def verdicts(
         for name in tallies
         if name != LEGITIMATE
     ]
-    if sends_an_estimate(scenario):
-        true, unknown = true or {}, AfterStart(math.nan)
-        each = [entry.against_truth(true.get(entry.eavesdropper, unknown), unit) for entry in each]
+    replayed = {name for name in tallies if replays_a_recording(scenario, name)}
+    against = dict(true or {}) if sends_an_estimate(scenario) else None
+    if replayed or against is not None:
+        unknown = AfterStart(math.nan)
+        each = [
+            entry.with_circumstances(
+                None if against is None else against.get(entry.eavesdropper, unknown),
+                not replayed.isdisjoint({LEGITIMATE, entry.eavesdropper}),
+                unit,
+            )
+            for entry in each
+        ]
     return each, verdict_of([entry.compared for entry in each if entry.compared is not None], unit)
 
 

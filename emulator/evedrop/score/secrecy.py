@@ -74,11 +74,11 @@ class Secrecy:
     verdict: Verdict | None = None
     """None in results of an older version."""
 
-    def against_truth(self, true: AfterStart, unit: str) -> Secrecy:
-        """The same with the comparison of errors against the true state, for a sensor that sends an estimate."""
+    def with_circumstances(self, true: AfterStart | None, replayed: bool, unit: str) -> Secrecy:
+        """The same with what its verdict also says; true, replayed: as attributes of `Compared`."""
         if self.compared is None:
             return self
-        compared = replace(self.compared, true=true)
+        compared = replace(self.compared, true=true, replayed=replayed)
         return replace(self, compared=compared, verdict=verdict_on(compared, unit))
 
     @property
@@ -429,7 +429,7 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
         rare = 1.0 if streaks is None else streaks.fraction(trials)
         return np.asarray(means.mean(axis=1, keepdims=True) + rare * expected)
     heaviest = means.max(axis=1, keepdims=True)
-    lost = math.nan if theory.link is None else 1.0 - float(theory.link.rates(range(1))[0])
+    lost = theory.first_loss
     if math.isnan(lost) or 0.0 < lost * trials < RARE:
         heaviest = np.maximum(heaviest, _window_averages(TheoreticalCovariance(theory.process, NOBODY), slots))
     return np.asarray(means.mean(axis=1, keepdims=True) - math.log(ERROR_RATE) / trials * heaviest)
@@ -454,7 +454,11 @@ def _window_averages(stream: TheoreticalTraceStream, slots: int) -> Floats:
 def _missing(name: str, tally: Tally, theory: Expectation) -> str:
     """What the trials lack for a verdict that they would otherwise support, as the end of a sentence."""
     if not theory.known:
-        return f": no closed form bounds the error of {name} in events that none of them met"
+        if 0.0 < theory.first_loss * tally.trials < RARE:
+            return f": too few trials lose the first packet of {name}, of {count_text(RARE / theory.first_loss)} enough would"
+        ever = math.isnan(theory.first_loss) and theory.process.spectral_radius >= 1.0
+        more = ", however many trials there are" if ever else ""
+        return f": losses that no trial met could change this, and no theory bounds the error of {name} in them{more}"
     rare = rare_events_of(theory, tally)
     ways = "montecarlo --rare estimates its mean"
     if rare is not None and rare.fraction > RARE_FRACTION and math.isfinite(rare.trials):

@@ -88,6 +88,8 @@ class Compared:
     """Whether theory says that its error is not larger in the long run."""
     true: AfterStart | None = None
     """The same for errors against the true state, if the sensor sends an estimate; its ratio is NaN if that is unknown."""
+    replayed: bool = False
+    """Whether all trials replay the same recording of losses, so that intervals hold for this recording only."""
 
     @property
     def outcome(self) -> SecrecyOutcome:
@@ -117,6 +119,8 @@ def verdict_on(compared: Compared, unit: str = "", *, best: bool = False) -> Ver
         numbers += f", {times_text(compared.true.ratio, compared.true.interval)} against the true state"
     if values.in_one_trial:
         numbers += ", in this trial"
+    elif compared.replayed:
+        numbers += ", given this recording of losses"
     match outcome:
         case SecrecyOutcome.BROKEN:
             knows = "more than" if values.ratio < _SMALLER else "as much as"

@@ -66,7 +66,7 @@ def check(options: argparse.Namespace) -> int:
             status = error.exit_status
             continue
         tell(f"{name}: {scenario.title}: {scenario.slots} slots, {', '.join(scenario.receivers)}: no mistakes")
-        for warning in warnings_of(scenario):
+        for warning in warnings_of(scenario, several=True):
             tell(f"  warning: {warning}", "warning:", YELLOW)
     return status
 
