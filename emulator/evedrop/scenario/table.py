@@ -199,7 +199,8 @@ def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
     if kind == "missing":
         return f"is missing; expected {name}" + (f" = {example.removeprefix(', such as ')}" if example else "")
     if kind == "extra_forbidden":
-        return _unknown_entry(name, table, _places(root, name) if table is root else [])
+        places = _places(root, name) if table is root and not near(name, table.entries()) else []
+        return no_entry(name, table.entries(), places[:_MOST_PLACES])
     if kind == "expected":
         ending = context.get("ending") or f"; expected {context['expected']}{context['hint'] or example}"
         return f"is {as_toml(value)}{ending}"
@@ -214,13 +215,6 @@ def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
         return f"has {limit} {things}; expected {'at least' if few else 'at most'} that many"
     expected = _EXPECTED.get(kind, detail["msg"])
     return f"is {as_toml(value)}; expected {expected}{example}"
-
-
-def _unknown_entry(name: str, table: type[Table], places: Sequence[str]) -> str:
-    """places: the dotted keys of other tables that end in this name."""
-    if places and not near(name, table.entries()):
-        return f"is not an entry of this table; did you mean {listed(places[:_MOST_PLACES])}?"
-    return no_entry(name, table.entries())
 
 
 def _places(table: type[Table], name: str, within: str = "") -> list[str]:

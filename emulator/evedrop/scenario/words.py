@@ -18,9 +18,10 @@ from evedrop.system.hints import near
 __all__ = ["as_toml", "dotted", "listed", "no_entry", "toml_text"]
 
 
-def no_entry(name: str, names: Sequence[str]) -> str:
-    """The message about an entry that a table does not have."""
-    choice = near(name, names) or f"; expected one of {', '.join(names)}"
+def no_entry(name: str, names: Sequence[str], places: Sequence[str] = ()) -> str:
+    """The message about an entry that a table does not have; places: the dotted keys that may be meant, if any."""
+    hint = near(name, names) or (f"; did you mean {listed(places)}?" if places else "")
+    choice = hint or f"; expected one of {', '.join(names)}"
     return f"is not an entry of this table{choice}"
 
 

@@ -608,3 +608,11 @@ def test_a_sweep_begins_with_the_verdict_at_its_points() -> None:
     ]
     assert begins([[None, secret]], 3) == ["✓ secret at 1", "1 of 3 points were done"]
     assert begins([[None], [None]], 2) == ["All 2 points were done"]
+
+
+def test_a_verdict_of_secret_says_what_theory_promises_beyond_it() -> None:
+    """Perfect secrecy against smart, which no trial of `numerical` shows; and ratios of means of infinite variance say so."""
+    summary = montecarlo("numerical", trials=200).typed_summary
+    lines = {line.split()[2]: line for _, line in closing.verdict_lines(summary) if line.startswith("✓")}
+    assert lines["smart"].endswith("(by means of infinite variance); perfect by theory, which trials may never show")
+    assert lines["equal"].endswith("its squared error (by means of infinite variance)")

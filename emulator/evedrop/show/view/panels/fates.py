@@ -93,7 +93,7 @@ class WhoKnowsWhat(ViewPanel):
 
     def views(self) -> Iterator[PlacedView]:
         """One view, at the top."""
-        title = "Who knows what   number: how far off · light: uncertain · dark: overconfident"
+        title = "Who knows what   how far off · red: eavesdropper follows · light: uncertain · dark: overconfident"
         view = rrb.StateTimelineView(name=title, origin=_KNOWLEDGE_PATH, time_view=recent_slots(self.scene))
         yield PlacedView(view, "top", 1.2, lanes_height(len(self.scene.receivers)))
 
