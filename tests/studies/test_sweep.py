@@ -198,6 +198,16 @@ def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> Non
     assert inks & {*page.values("style")}, "there are no error bars"
 
 
+def test_an_application_that_the_mode_leaves_out_is_not_drawn(tmp_path: Path) -> None:
+    """Without states a house has no energies: the sweep of docs/errata.md, microgrid."""
+    grid: dict[str, list[Any]] = {"encoding.state_probability": [0.1, 0.5]}
+    changes = {"trials": 2, "slots": 20, "eavesdroppers.bayesian.strategy": "smart"}
+    plan = Plan(Mode.COVARIANCE_ONLY, workers=1)
+    table = sweep_over("microgrid", changes, grid, tmp_path / "run", lambda _: None, plan)
+    assert "bought_energy" not in table.column_names
+    assert {path.name for path in (tmp_path / "run").glob("*.png")} == {"sweep.png"}
+
+
 def test_the_page_of_a_sweep_over_a_file_has_the_file(tmp_path: Path) -> None:
     """A reader can repeat the sweep with it; the page says which files of the scenario are missing."""
     text = shipped()["eavesdroppers"].read_text()

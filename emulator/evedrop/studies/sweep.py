@@ -102,6 +102,7 @@ def sweep_over(
     scenarios = _checked(source, changes, grid, plan)
     total = sum(scenario.trials * scenario.slots for _, scenario in scenarios)
     rows: list[dict[str, Any]] = []
+    applications: dict[str, None] = {}  # those that the mode computes
     strategies = {name: given.strategy for name, given in scenarios[0][1].eavesdroppers.items()}
     failure: RunError | None = None
     done = 0
@@ -130,6 +131,7 @@ def sweep_over(
                         if summary is None:
                             break
                         rows += _rows(point, scenario, summary)
+                        applications |= dict.fromkeys(summary.applications)
                         done += 1
                         if time.monotonic() - written > _WRITE_SECONDS:
                             _write_table(folder, rows, strategies)
@@ -140,8 +142,7 @@ def sweep_over(
                 finished.remove_unless_any()
                 raise failure or finished.interrupted("a point was done")
             table = _write_table(folder, rows, strategies)
-            used = dict.fromkeys(name for _, scenario in scenarios for name in scenario.applications)
-            _draw(folder, table, grid, used)
+            _draw(folder, table, grid, applications)
         if failure is not None:
             raise failure
         if done < len(scenarios):
