@@ -93,13 +93,22 @@ def test_quantiles_of_delays_are_right_within_three_per_cent(fraction: float) ->
     rows["delay"][rows["link"] == 1] = 0.0
     rows["fate"][rows["link"] == 2] = WireFate.LOST
     rows["delay"][rows["link"] == 3] = rng.normal(0.02, 0.005, 5000)
-    delays = counted([rows], 4)[0].delays[0]
-    shown = quantile(delays, fraction)
+    first = counted([rows], 4)[0]
+    shown = quantile(first.delays[0], first.middles, fraction)
     assert shown[1] == 0.0
     assert np.isnan(shown[[2, 4]]).all()
     for link in (0, 3):
         expected = np.quantile(rows["delay"][rows["link"] == link], fraction)
         np.testing.assert_allclose(shown[link], expected, rtol=0.04)
+
+
+def test_a_constant_delay_is_shown_as_it_is() -> None:
+    """80 ms and no other number: a bucket stands for the delays that are in it."""
+    rows = np.zeros(100, RECORD)
+    rows["time"], rows["delay"] = START, 0.08
+    first = counted([rows], 1)[0]
+    assert quantile(first.delays, first.middles, 0.5)[0, 0] == 0.08
+    assert quantile(first.delays, first.middles, 0.99)[0, 0] == 0.08
 
 
 def test_a_fate_may_change_afterwards() -> None:

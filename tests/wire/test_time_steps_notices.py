@@ -27,7 +27,7 @@ def steps_of(*counts: dict[WireFate, int]) -> WireSteps:
     for k, count in enumerate(counts):
         for fate, number in count.items():
             made[k, 0, OUTCOMES.index(fate)] = number
-    return WireSteps(0, made, np.zeros((len(counts), 2, 3), np.int64))
+    return WireSteps(0, made, np.zeros((len(counts), 2, 3), np.int64), np.zeros((2, 3)))
 
 
 def test_losses_of_the_wire_itself_are_told_once() -> None:

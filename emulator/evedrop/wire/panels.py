@@ -184,7 +184,7 @@ class WirePanels:
         ends = ends[-len(counts) :]
         rates = np.maximum(np.concatenate([counts[:, :-1, DELIVERED], counts[:, :-1].sum(2)], 1), 0) / seconds
         _send_series(to, _RATES, ends, rates)
-        quantiles = [quantile(delays[:, :-1], fraction) for fraction in (0.5, 0.99)]
+        quantiles = [quantile(delays[:, :-1], steps.middles[:-1], fraction) for fraction in (0.5, 0.99)]
         _send_series(to, _DELAYS, ends, 1e3 * np.concatenate(quantiles, 1))
 
     def _send_lanes(self, counts: Counts, begins: Floats, to: rr.RecordingStream) -> None:

@@ -50,6 +50,8 @@ class WireSteps:
     """Messages by link and outcome, (c, links + 1, outcomes). Below 0 where a fate was changed after its step was closed."""
     delays: Counts
     """Delivered messages by link and bucket of delay, (c, links + 1, buckets)."""
+    middles: NDArray[np.float64]
+    """Of the delays so far in each bucket, in seconds: exactly the delay where it is constant, (links + 1, buckets)."""
 
     @property
     def heard(self) -> Counts:
@@ -75,6 +77,7 @@ class StepCounter:
         self._first = 0
         self._counts = np.zeros((_SPAN, links + 1, len(OUTCOMES)), np.int64)
         self._delays = np.zeros((_SPAN, links + 1, _BUCKETS), np.int64)
+        self._least, self._most = np.full((2, (links + 1) * _BUCKETS), [[np.inf], [-np.inf]])
 
     def add(self, rows: NDArray[Any]) -> Iterator[WireSteps]:
         """Count the rows of a block, a `RECORD` array; gives the steps that are closed to make room; of a silence, only a few."""
@@ -122,11 +125,17 @@ class StepCounter:
         with np.errstate(divide="ignore"):
             decades = np.log10(delays[there] / _SHORTEST)
         buckets = np.clip(np.floor(decades * _PER_DECADE) + 1, 0, _BUCKETS - 1).astype(np.int64)
+        of_links = where[there] % (self._links + 1) * _BUCKETS + buckets
+        np.minimum.at(self._least, of_links, delays[there])
+        np.maximum.at(self._most, of_links, delays[there])
         cells = np.bincount(where[there] * _BUCKETS + buckets, minlength=self._delays.size)
         self._delays += cells.reshape(self._delays.shape)
 
     def _closed(self, steps: int) -> WireSteps:
-        closed = WireSteps(self._first, self._counts[:steps].copy(), self._delays[:steps].copy())
+        middles = np.full(self._least.shape, np.nan)
+        np.add(self._least / 2.0, self._most / 2.0, out=middles, where=self._least <= self._most)
+        middles = middles.reshape(self._links + 1, _BUCKETS)
+        closed = WireSteps(self._first, self._counts[:steps].copy(), self._delays[:steps].copy(), middles)
         for counts in (self._counts, self._delays):
             counts[: _SPAN - steps] = counts[steps:]
             counts[_SPAN - steps :] = 0
@@ -134,11 +143,14 @@ class StepCounter:
         return closed
 
 
-def quantile(delays: Counts, fraction: float) -> NDArray[np.float64]:
-    """The delay in seconds that a fraction of the messages does not exceed, by buckets (…, buckets); NaN without a message."""
+def quantile(delays: Counts, middles: NDArray[np.float64], fraction: float) -> NDArray[np.float64]:
+    """The delay in seconds that a fraction of the messages does not exceed; NaN without a message.
+
+    delays: by buckets, (…, links, buckets); middles: as in `WireSteps`, for these links.
+    """
     total = delays.cumsum(-1)
     bucket = (total >= np.maximum(fraction * total[..., -1:], 1e-9)).argmax(-1)
-    middle = _SHORTEST * 10.0 ** ((bucket - 0.5) / _PER_DECADE)
+    middle = middles[np.arange(len(middles)), bucket]
     return np.where(total[..., -1] == 0, np.nan, np.where(bucket == 0, 0.0, middle))
 
 

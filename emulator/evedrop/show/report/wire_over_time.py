@@ -56,6 +56,7 @@ class LinkOverTime:
         """Begin with no message."""
         self.heard, self.lost, self.cut = np.zeros((3, self.steps))
         self._delays = np.zeros((self.steps, _BUCKETS), np.int64)
+        self._least, self._most = np.full((2, _BUCKETS), [[np.inf], [-np.inf]])
 
     def add(self, step: np.ndarray[tuple[int], np.dtype[np.int64]], reasons: pa.ChunkedArray, delays: Floats) -> None:
         """Count messages by the step in which they came; reasons: why they were not delivered, null if they were."""
@@ -67,6 +68,8 @@ class LinkOverTime:
         with np.errstate(all="ignore"):
             places = np.nan_to_num(1 + _PER_DECADE * np.log10(delays[~lost] / _LEAST_DELAY), nan=0.0, neginf=0.0)
         buckets = np.clip(places, 0, _BUCKETS - 1).astype(np.int64)
+        np.minimum.at(self._least, buckets, delays[~lost])
+        np.maximum.at(self._most, buckets, delays[~lost])
         cells = step[~lost] * _BUCKETS + buckets
         self._delays += np.bincount(cells, minlength=self._delays.size).reshape(self._delays.shape)
 
@@ -76,6 +79,7 @@ class LinkOverTime:
         for name in ("heard", "lost", "cut", "_delays"):
             counts = getattr(self, name)
             setattr(link, name, counts.reshape(link.steps, factor, *counts.shape[1:]).sum(1))
+        link._least, link._most = self._least, self._most
         return link
 
     @property
@@ -102,8 +106,10 @@ class LinkOverTime:
         counts = np.cumsum(self._delays, axis=1)
         total = counts[:, -1]
         bucket = (counts < fraction * total[:, None]).sum(1)
-        delays = np.where(bucket == 0, 0.0, _LEAST_DELAY * 10.0 ** ((bucket - 0.5) / _PER_DECADE))
-        return np.where(total > 0, delays, np.nan)
+        there, delays = (total > 0) & (bucket > 0), np.where(total > 0, 0.0, np.nan)
+        of_bucket = bucket[there]  # stands for the delays that are in it, so that a constant delay is shown as it is
+        delays[there] = (self._least[of_bucket] + self._most[of_bucket]) / 2.0
+        return delays
 
 
 @dataclass(frozen=True)
