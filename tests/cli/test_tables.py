@@ -130,7 +130,7 @@ def test_numbers_are_at_full_precision(evedrop: Evedrop) -> None:
 
 def by_hand() -> TextTable:
     """A table with everything that may be in one."""
-    table = TextTable.headed(["receiver"], ["mean |x − x̂|²", "μ_d", "z"], ["digest"], "The title")
+    table = TextTable.headed(["receiver"], ["mean |x − x̂|²", "μ_d", "z"], ["words"], "The title")
     table.add("a_b & c", estimate(0.0123456789, 0.0004) + "*", finite_text(float("inf")), number_text(None), "–")
     table.add("", estimate(2.5e-7, None), number_text(0.1), number_text(-1.25, "+.2f"), "50 % {x}")
     return table
@@ -139,7 +139,7 @@ def by_hand() -> TextTable:
 def test_csv_is_as_written_by_hand() -> None:
     """The whole text."""
     assert csv_text(by_hand()) == (
-        "receiver,mean |x − x̂|²,mean |x − x̂|² standard error,mean |x − x̂|² unit,μ_d,z,digest\n"
+        "receiver,mean |x − x̂|²,mean |x − x̂|² standard error,mean |x − x̂|² unit,μ_d,z,words\n"
         "a_b & c,0.0123456789,0.0004,*,inf,,\n"
         "a_b & c,2.5e-07,,,0.1,-1.25,50 % {x}\n"
     )
@@ -151,7 +151,7 @@ def test_latex_is_as_written_by_hand() -> None:
         "% The title\n"
         "\\begin{tabular}{lrrrl}\n"
         "\\hline\n"
-        "receiver & mean $|$x $-$ $\\hat{x}|^{2}$ & $\\mu$\\_d & z & digest \\\\\n"
+        "receiver & mean $|$x $-$ $\\hat{x}|^{2}$ & $\\mu$\\_d & z & words \\\\\n"
         "\\hline\n"
         "a\\_b \\& c & 0.0123 $\\pm$ 0.0004* & $\\infty$ & -- & -- \\\\\n"
         " & 2.5e-07 & 0.1 & -1.25 & 50 \\% \\{x\\} \\\\\n"
@@ -190,6 +190,23 @@ def test_a_verdict_is_a_word_in_latex() -> None:
         "not secret",
         "what? it",
     ]
+
+
+def test_the_table_of_a_run_has_verdicts_and_ratios_but_no_digests_in_latex(tmp_path: Path) -> None:
+    """As that of a sweep; the legitimate estimator has neither, and a sensor that measures has a second ratio."""
+    for scenario, ratios in (
+        ("eavesdroppers", ["times the error"]),
+        ("measured", ["times the error", "times the true error"]),
+    ):
+        results = montecarlo(scenario, trials=20, slots=40, expect=[])
+        (path,) = results.to_csv(tmp_path / f"{scenario}.csv")
+        rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+        assert list(rows[0])[-2 - len(ratios) :] == ["verdict", *ratios, "digest"]
+        for row in rows:
+            found = results.secrecy.get(row["receiver"])
+            assert row["times the error"] == ("" if found is None or found.verdict is None else found.verdict.times)
+        heads = results.to_latex(tmp_path / f"{scenario}.tex").read_text().splitlines()[3]
+        assert heads.endswith(" & ".join(["verdict", *ratios]) + r" \\")
 
 
 def test_a_narrow_terminal_changes_no_file(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,7 +61,7 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None, verb
         console.say(f"{summary.ended.splitlines()[0]}; the results so far:", _WARNING)
     wide = console.width >= _DIGEST_WIDTH
     shown = closing.receivers_table(summary, wide)
-    console.show(closing.receivers_table(summary), shown, tight=not wide, heads="" if wide else "short")
+    console.show(closing.receivers_table(summary, judged=True), shown, tight=not wide, heads="" if wide else "short")
     if summary.verdict is not None:
         console.say(summary.verdict.sentence, f"bold {_STYLES.get(SecrecyOutcome(summary.verdict.outcome), '')}")
         for outcome, line in closing.verdict_lines(summary):

@@ -99,8 +99,10 @@ def _filter_warnings(scenario: Scenario) -> list[str]:
                 f'process.Q = "filter" uses that; inputs and disturbances are not in it'
             )
     if process.singular_noise and is_singular(process.Q):
+        measures = driven is not None and driven.output_matrix is not None and len(driven.output_matrix) < process.n
+        usual = ", as always with fewer measurements than states" if measures else ""
         warnings.append(
-            "process.Q is singular: apart from A, inputs and disturbances, consecutive states differ only "
+            f"process.Q is singular{usual}: apart from A, inputs and disturbances, consecutive states differ only "
             "within its range, so anybody who knows A and Q recognises, with certainty, two states in a row, and an "
             "innovation after a state"
         )

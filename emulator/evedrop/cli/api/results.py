@@ -177,7 +177,7 @@ class RunResults(Results, ReportedResults):
     def _tables(self) -> list[TextTable]:
         directions = self._typed.directions
         return [
-            closing.receivers_table(self._typed),
+            closing.receivers_table(self._typed, judged=True),
             *([closing.directions_table(directions)] if directions else []),
         ]
 

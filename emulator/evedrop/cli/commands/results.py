@@ -34,6 +34,8 @@ def export(options: argparse.Namespace) -> int:
     """Write a run as MCAP, a wire's journal as CSV, or the picture or tables of a study; the file's ending decides."""
     if (kind := options.file.suffix.lower()) in {*_PICTURES, *_TABLES}:
         return _export_study(options, kind)
+    if options.panel is not None:
+        raise UsageError(f"--panel is for pictures, whose files end in {', '.join(_PICTURES)}; leave it out")
     if options.width != "page":
         raise UsageError(f"--width is for pictures, whose files end in {', '.join(_PICTURES)}; leave it out")
     from evedrop.results.mcap_export import export_mcap
@@ -69,7 +71,9 @@ def _export_study(options: argparse.Namespace, kind: str) -> int:
         return 0
     if isinstance(study, RunResults):
         panels = ("errors",) if study.typed_summary.mode in {"covariance-only", "error-coordinates"} else ()
-        picture = study.plot(*panels, width=options.width)
+        picture = study.plot(*(panels if options.panel is None else (options.panel,)), width=options.width)
+    elif options.panel is not None:
+        raise UsageError(f"--panel {options.panel} is for the picture of a run; {options.run} is another study")
     elif options.width != "page":
         raise UsageError(f"--width {options.width} is for the picture of a run; {options.run} is another study")
     else:
@@ -102,6 +106,9 @@ def _written(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help=".mcap, .pdf, .png, .svg, .csv or .tex")
     parser.add_argument(
         "--width", choices=("page", "column"), default="page", help="of the picture of a run; column: that of a journal"
+    )
+    parser.add_argument(
+        "--panel", choices=("errors", "lanes", "plane"), help="draw only one part of the picture of a run"
     )
     parser.add_argument(
         "--period",

@@ -76,14 +76,17 @@ def expectations_outcome(expectations: Sequence[Judged], of: str) -> tuple[str, 
     return f"all {len(expectations)} expectations held" if len(expectations) > 1 else "the expectation held", True
 
 
-def receivers_table(summary: Summary, wide: bool = True) -> TextTable:
-    """The table of the receivers: their metrics; if `wide`, with all standard errors, and the digests."""
+def receivers_table(summary: Summary, wide: bool = True, judged: bool = False) -> TextTable:
+    """The table of the receivers: their metrics; if `wide`, with all standard errors, and the digests.
+
+    judged: with each eavesdropper's verdict and ratio of errors, which the terminal has below the table.
+    """
     shown = columns("column", summary.mode)
     compared = {metric: z for peer in summary.peers.values() for metric, z in peer.z.items() if z is not None}
     table = TextTable.headed(
         ["receiver"],
         [*(column.heading for column in shown), *(["z"] if compared else [])],
-        ["digest"] if wide else [],
+        [*(_JUDGED if judged else []), *([_TRUE] if judged and summary.filter else []), *(["digest"] if wide else [])],
         heading(summary),
     )
     for name, peer in summary.peers.items():
@@ -100,9 +103,24 @@ def receivers_table(summary: Summary, wide: bool = True) -> TextTable:
                 for column, names in shown.items()
             ),
             *([_z_text(shown_metric(z, list(compared)), marked)] if compared else []),
+            *(_judged(summary, name) if judged else []),
             *([(peer.digest or "–")[:12]] if wide else []),
         )
     return table
+
+
+_JUDGED, _TRUE = ("verdict", "times the error"), "times the true error"
+
+
+def _judged(summary: Summary, name: str) -> Iterator[str]:
+    """The cells about an eavesdropper's verdict; dashes for the legitimate estimator."""
+    secrecy = summary.secrecy.get(name)
+    verdict = None if secrecy is None else secrecy.verdict
+    yield "–" if verdict is None else verdict.headline
+    yield "–" if verdict is None else verdict.times or "–"
+    if summary.filter is not None:
+        true = summary.filter.true_ratios.get(name)
+        yield "–" if true is None else times_text(true.ratio, true.interval)
 
 
 _Metrics = Mapping[str, float | None]
@@ -295,10 +313,10 @@ def sweep_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> TextT
     metrics = columns("sweep_column")
     compared = [z_column(name) for name in all_metrics() if rows and z_column(name) in rows[0]]
     filtered = any("true_times" in row for row in rows)
-    true = ["times the true error"] if filtered else []
-    heads = [*keys, "peer", *(column.heading for column in metrics), "z", "verdict", "times the error", *true]
+    true = [_TRUE] if filtered else []
+    heads = [*keys, "peer", *(column.heading for column in metrics), "z", *_JUDGED, *true]
     least = ["z", *(column.heading for column in list(metrics)[:0:-1]), "times the error"]
-    words = {"peer", "verdict", "times the error", *true}
+    words = {"peer", *_JUDGED, *true}
     table = TextTable([TextColumn(head, head not in words) for head in heads], least=least)
     for row in rows:
         table.add(

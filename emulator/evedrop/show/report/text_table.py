@@ -161,7 +161,11 @@ def _distinct(heads: Sequence[str]) -> list[str]:
 
 
 def latex_text(table: TextTable) -> str:
-    r"""The table as a `tabular` of LaTeX, which needs no package; \hline above, below its heads, and at its end."""
+    r"""The table as a `tabular` of LaTeX, which needs no package; \hline above, below its heads, and at its end.
+
+    It has no digests, which mean nothing on paper.
+    """
+    table = _without(table, "digest")
     kinds = "".join("r" if column.number else "l" for column in table.columns)
     lines = [
         *([f"% {' '.join(table.title.split())}"] if table.title else []),
@@ -174,6 +178,13 @@ def latex_text(table: TextTable) -> str:
         r"\end{tabular}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _without(table: TextTable, heading: str) -> TextTable:
+    """The table without the column of this heading, if it has one."""
+    kept = [i for i, column in enumerate(table.columns) if column.heading != heading]
+    rows = [tuple(row[i] for i in kept) for row in table.rows]
+    return replace(table, columns=[table.columns[i] for i in kept], rows=rows)
 
 
 def _row(cells: Sequence[str]) -> str:
