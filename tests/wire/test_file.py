@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from evedrop import wire
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.plan import Side, WireEvent
@@ -187,7 +188,8 @@ def test_an_unknown_link_and_a_mistake_in_a_change_are_named(tmp_path: Path) -> 
     path = tmp_path / "radio.toml"
     path.write_text(RADIO)
     with pytest.raises(
-        UsageError, match=r"link\.telemetry\.quality: is .*telemetry.*expected robot-base or tele-metry"
+        UsageError,
+        match=r"link\.telemetry\.quality: is .*telemetry.*expected robot-base, tele-metry or a number from 0",
     ):
         load_wire(path, {"link.telemetry.quality": 0.9})
     with pytest.raises(ScenarioError) as caught:
@@ -210,7 +212,7 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 def test_all_mistakes_of_tables_at_once() -> None:
-    """They are in one message; those that only show across tables wait until every table is valid."""
+    """They are in one message, with those that only show across tables."""
     mistakes = mistakes_of(
         of,
         """
@@ -240,6 +242,8 @@ def test_all_mistakes_of_tables_at_once() -> None:
         'largest: is "64 Mb"; expected bytes, or a text such as "256 kB"; the units are B, kB, MB, GB, KiB, MiB, GiB, such as '
         '"64 MB"',
         "lossles: is not an entry of this table; did you mean lossless?",
+        'link.0.from: is "robto"; expected robot or base; did you mean robot?',
+        'event.0.partition.1: is "bsae"; expected robot or base; did you mean base?',
     ]
 
 
@@ -269,6 +273,52 @@ def test_all_mistakes_across_tables_at_once() -> None:
         'expect.0.link: is "scan", but there is no link scan; expected a metric or the name of robto-base',
         'event.0.partition.1: is "bsae"; expected robot or base; did you mean base?',
     ]
+
+
+def test_mistakes_across_tables_are_told_with_those_within_them() -> None:
+    """Names of sides and links, too, in tables that are wrong otherwise; no hint proposes a name that is made of a mistake."""
+    mistakes = mistakes_of(
+        of,
+        """
+    [side.robot]
+    listen = "tcp/127.0.0.1:7448"
+    [side.base]
+    listne = "tcp/127.0.0.1:7449"
+    [[link]]
+    from = "robot"
+    to = "base"
+    quality = 2
+    [[link]]
+    from = "base"
+    to = "robots"
+    [[event]]
+    at = "soon"
+    cut = "robot-bse"
+    [[event]]
+    at = "1 s"
+    cut = "base-robot"
+    [[expect]]
+    link = "robot-bsae"
+    """,
+    )
+    assert [mistake.partition(":")[0] for mistake in mistakes] == [
+        "side.base.listne", "link.0.quality", "event.0.at",
+        "link.1.to", "expect.0.link", "event.0.cut", "event.1.cut",
+    ]  # fmt: skip
+    assert [mistake for mistake in mistakes if "robots" in mistake.partition("; ")[2]] == []
+    assert 'event.0.cut: is "robot-bse"; expected robot-base; did you mean robot-base?' in mistakes
+
+
+def test_a_change_of_a_link_that_is_not_there_is_a_mistake_of_the_wire(tmp_path: Path) -> None:
+    """From Python, too, and its sentence ends with the hint."""
+    (tmp_path / "radio.toml").write_text(BASE)
+    with pytest.raises(ScenarioError) as caught:
+        wire(tmp_path / "radio.toml", link__robot_bse__quality=0.5)
+    (mistake,) = caught.value.mistakes
+    assert (
+        mistake
+        == 'link.robot_bse.quality: is "robot_bse"; expected robot-base or a number from 0; did you mean robot-base?'
+    )
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from evedrop.cli.main import main
+from evedrop.errors import UsageError
 from evedrop.wire.file import example_wire, key_lines, warnings_of_wire, wire_lines, wire_of
 from evedrop.wire.plan import WirePlan
 from tests.golden.pages import Golden
@@ -41,7 +42,8 @@ def test_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         "  side  base      tcp/127.0.0.1:7449",
         "  side  listener  tcp/127.0.0.1:7450",
         '  link  scan      robot → base  robot/scan/**  loss = { model = "gilbert-elliott", p = 0.01, r = 0.2 }, '
-        'rate = 2000000.0, queue = 256000, delay = { model = "normal", mean = 0.02, standard_deviation = 0.005 }',
+        'rate = 2000000.0, queue = 256000, delay = { model = "normal", mean = 0.02, standard_deviation = 0.005 }, '
+        "loses 4.76 % on average, in bursts of 5 messages",
         '  link  radio     robot → base  **  loss = { model = "bernoulli", quality = 0.5 }, '
         'delay = { model = "constant", value = 0.01 }',
         '  link  orders    base → robot  **  loss = { model = "bernoulli", quality = 0.99 }',
@@ -196,3 +198,21 @@ def test_keys_may_follow_the_option(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "key  robot/stop" in shown[0]
     assert main(["wire", str(path), "--check", "robot/stop", "--chekc"]) == 2
     assert "unknown option --chekc" in capsys.readouterr().err
+
+
+def test_one_of_a_kind_is_not_several(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And a link that loses in bursts says how much, as its parameters do not."""
+    path = tmp_path / "radio.toml"
+    path.write_text(
+        """
+        side = { robot = {}, base = {} }
+        link = [{ from = "robot", to = "base", loss = { model = "gilbert-elliott", p = 0.0278, r = 0.25 } }]
+        event = [{ at = "1 s", note = "the lift" }]
+        """
+    )
+    assert main(["wire", "--check", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"{path}: 2 sides, 1 link, 1 event: no mistakes\n")
+    assert ", loses 10 % on average, in bursts of 4 messages\n" in printed
+    assert main(["wire", "--check", str(path), "/robot/scan"]) == UsageError.exit_status
+    assert "; the ROS 2 topic /robot/scan has the keys */robot/scan/**" in capsys.readouterr().err

@@ -9,7 +9,7 @@ Source: docs/wire/file.md, the file, and which link a key takes.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import resources
 from itertools import permutations
 from pathlib import Path
@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.model.checks import as_toml
+from evedrop.model.links import loss_of
 from evedrop.scenario.input_files import locate_recordings, read_recordings
 from evedrop.scenario.line_numbers import with_line_numbers
 from evedrop.scenario.loading import set_entry, tables_in
@@ -60,7 +61,7 @@ def load_wire(path: str | Path, changes: Mapping[str, Any] | None = None) -> Wir
         example = "a wire file is a TOML file; `evedrop wire --example` prints one"
         raise UsageError(f"{shown(path)} cannot be read ({error}); {example}") from error
     tables = tables_in(text, shown(path))
-    numbered = {_by_number(key, tables): value for key, value in (changes or {}).items()}
+    numbered = {_by_number(key, tables, shown(path)): value for key, value in (changes or {}).items()}
     with with_line_numbers(text, numbered):
         return wire_of(tables, shown(path), numbered, folder=path.parent)
 
@@ -87,7 +88,10 @@ def wire_of(
     try:
         file = WireFile.model_validate(made)
     except ValidationError as error:
-        raise ScenarioError(source, [*sentences(error, WireFile), *recordings]) from None
+        wrong = [*sentences(error, WireFile), *recordings]
+        known = {line.partition(":")[0] for line in wrong}
+        beside = (line for line in _mistakes_beside(made, error) if line.partition(":")[0] not in known)
+        raise ScenarioError(source, [*wrong, *beside]) from None
     if mistakes := recordings or list(mistakes_across(file, made["side"])):
         raise ScenarioError(source, mistakes)
     return _plan(file)
@@ -111,8 +115,8 @@ def resolved_wire(plan: WirePlan) -> str:
     )
 
 
-def _by_number(key: str, tables: Mapping[str, Any]) -> str:
-    """The dotted key of a change, with a link's number in place of its name. Raises UsageError for another name."""
+def _by_number(key: str, tables: Mapping[str, Any], source: str) -> str:
+    """The dotted key of a change, with a link's number in place of its name. Raises ScenarioError for another name."""
     table, _, rest = key.partition(".")
     name, dot, entry = rest.partition(".")
     links = tables.get("link")
@@ -121,7 +125,8 @@ def _by_number(key: str, tables: Mapping[str, Any]) -> str:
     named = [link if isinstance(link, Mapping) else {} for link in links]
     names = link_names((link.get("name"), link.get("from"), link.get("to")) for link in named)
     if name not in names:
-        raise UsageError(f"{key}: {unknown(name, names, 'link')}, or a number from 0")
+        choice = f"expected {listed([*names, 'a number from 0'])}"
+        raise ScenarioError(source, [f"{key}: is {as_toml(name)}; {choice}{near(name, names)}"])
     return f"link.{names.index(name)}{dot}{entry}"
 
 
@@ -224,12 +229,61 @@ def mistakes_across(file: WireFile, sides: Mapping[str, Mapping[str, Any]]) -> I
     yield from _side_mistakes([*file.side], file.link)
     yield from _name_mistakes(file.link)
     yield from _correlation_mistakes(names, file.link)
-    yield from expectation_mistakes(file.expect, names)
     links = {
-        name: (link.wire_settings(), link.correlation is not None) for name, link in zip(names, file.link, strict=True)
+        name: (link.wire_settings(), link.correlation is not None)
+        for name, link in zip(names, file.link, strict=True)
+        if link.name is not None or {link.source, link.target} <= {*file.side}  # otherwise the name is mistaken, too
     }
+    yield from expectation_mistakes(file.expect, [*links] or names)
     for i, event in enumerate(file.event):
         yield from (f"event.{i}.{line}" for line in event_mistakes(event, [*file.side], links))
+
+
+def _mistakes_beside(made: Mapping[str, Any], error: ValidationError) -> Iterator[str]:
+    """Mistakes across tables in a file some of whose tables are wrong by themselves: others with their names stand in."""
+    tables = copy.deepcopy({**made})
+    replaced: set[str] = set()
+    for place in {mistake["loc"][:2] for mistake in error.errors(include_url=False, include_input=False)}:
+        name, at = str(place[0]), place[-1]
+        within = tables.get(name)
+        if name in _STAND_IN and isinstance(within, list) and isinstance(at, int):
+            entries = within[at] if isinstance(within[at], Mapping) else {}
+            within[at] = _STAND_IN[name](entries)
+            replaced.add(f"{name}.{at}")
+        elif name == "side" and isinstance(within, dict) and isinstance(within.get(at), Mapping):
+            within[at] = {}
+        else:
+            tables.pop(name, None)
+    try:
+        lines = [*mistakes_across(WireFile.model_validate(tables), tables["side"])]
+    except ValidationError:
+        return
+    for line in lines:
+        table, number, entry, *_ = [*line.partition(":")[0].split("."), "", ""]
+        if f"{table}.{number}" not in replaced or (entry in _NAMES and ': is "";' not in line):
+            yield line
+
+
+_NAMES = {"name", "from", "to", "cut", "partition"}
+
+
+def _link_stand_in(entries: Mapping[str, Any]) -> dict[str, Any]:
+    names = {name: entries[name] for name in ("name", "from", "to") if isinstance(entries.get(name), str)}
+    return {"from": "", "to": "", **names}
+
+
+def _event_stand_in(entries: Mapping[str, Any]) -> dict[str, Any]:
+    pair, link = entries.get("partition"), entries.get("cut")
+    if isinstance(pair, list) and len(pair) == 2 and all(isinstance(side, str) for side in pair):
+        return {"at": 0.0, "partition": pair}
+    return {"at": 0.0, "cut": link} if isinstance(link, str) else {"at": 0.0, "note": "…"}
+
+
+_STAND_IN: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
+    "link": _link_stand_in,
+    "event": _event_stand_in,
+    "expect": lambda _entries: {"link": ""},
+}
 
 
 def link_names(links: Iterable[tuple[Any, Any, Any]]) -> list[str]:
@@ -378,7 +432,11 @@ def wire_lines(plan: WirePlan) -> Iterator[str]:
 
 def key_lines(plan: WirePlan, keys: Sequence[str]) -> Iterator[str]:
     """Which link each key takes, in each direction that has a link. Raises UsageError for all keys that Zenoh refuses."""
-    wrong = [f"key {as_toml(key)}{why}" for key in keys if (why := key_expression_mistake(key)) is not None]
+    wrong = [
+        f"key {as_toml(key)}{why}{f'; the ROS 2 topic {key} has the keys */{key[1:]}/**' if key[:1] == '/' else ''}"
+        for key in keys
+        if (why := key_expression_mistake(key)) is not None
+    ]
     if wrong:
         raise UsageError("\n".join(wrong))
     ways = [way for way in permutations(plan.sides, 2) if any((link.source, link.target) == way for link in plan.links)]
@@ -418,10 +476,23 @@ def _taken(link: WireLink, key: zenoh.KeyExpr) -> str:
     return f"{link.name} ({'; '.join(notes)})" if notes else link.name
 
 
+def _losses(spec: Mapping[str, Any]) -> Iterator[str]:
+    """How much a link with a memory loses on average, and how many messages in a row."""
+    chain = loss_of(spec).chain
+    if chain is None or chain.independent:
+        return
+    lost = 1.0 - chain.quality
+    average = float(chain.stationary @ lost)
+    beginning = float((chain.stationary * chain.quality) @ chain.transitions @ lost)
+    if beginning > 0.0:
+        yield f"loses {100.0 * average:.3g} % on average, in bursts of {average / beginning:.3g} messages"
+
+
 def _effects(link: WireLink) -> str:
     """The settings of a link, without those that do nothing."""
     settings: Mapping[str, Any] = link.settings
     told = [f"{name} = {as_toml(value)}" for name, value in settings.items() if (name, value) != ("loss", NOTHING_LOST)]
+    told += _losses(settings["loss"])
     if link.ordered:
         told.append("in order")
     if link.correlation is not None:

@@ -34,8 +34,9 @@ def wire(options: argparse.Namespace) -> int:
     plan = load_wire(options.file, changes_of(options))
     if options.check:
         lines = [*wire_lines(plan), *key_lines(plan, options.keys)]
-        links, events = len(plan.links), len(plan.events)
-        tell(f"{options.file}: {len(plan.sides)} sides, {links} links, {events} events: no mistakes")
+        counts = (("side", plan.sides), ("link", plan.links), ("event", plan.events))
+        counted = ", ".join(f"{len(some)} {noun}{'' if len(some) == 1 else 's'}" for noun, some in counts)
+        tell(f"{options.file}: {counted}: no mistakes")
         tell("\n".join(f"  {line}" for line in lines))
     for warning in warnings_of_wire(plan):
         warn(warning)
