@@ -24,7 +24,7 @@ from evedrop.scenario.loading import checked, load
 from evedrop.scenario.receivers import LinkTable
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
-from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.montecarlo import Plan, check_mode
 from evedrop.simulate.simulation import Mode, Simulation
 from tests.builders import MICROGRID, process_table, scenario_of
 from tests.conftest import Evedrop
@@ -373,3 +373,15 @@ def test_the_table_of_the_microgrid(tmp_path: Path) -> None:
         peers = montecarlo(of, trials=1000, out=out, plan=plan, encoding__state_probability=mu_d).summary["peers"]
         assert peers["legitimate"]["mean_actual_trace_covariance"] == pytest.approx(legitimate, rel=0.02)
         assert peers["smart"]["mean_actual_trace_covariance"] == pytest.approx(smart, rel=0.02)
+
+
+def test_a_mode_that_cannot_follow_a_long_run_names_the_slots_without_it() -> None:
+    """Beyond the horizon, leaving the mode out is no way out by itself; before it, it is."""
+    likelihood = {"strategy": "likelihood", "link": {"quality": 0.9}}
+    for slots, beyond in ((2000, True), (20, False)):
+        scenario = studied(UNSTABLE, slots, eve=likelihood)
+        with pytest.raises(UsageError, match="leave --covariance-only out") as refused:
+            check_mode(scenario, Mode.COVARIANCE_ONLY)
+        assert (
+            re.search(r"out and give at most [0-9,]+ slots, or remove eve", str(refused.value)) is not None
+        ) == beyond

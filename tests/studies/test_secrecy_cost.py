@@ -102,7 +102,10 @@ def test_the_command_prints_the_table_and_json(evedrop: Evedrop) -> None:
     (line,) = (line for line in shown.out.splitlines() if "summed: innovation from plain" in line)
     assert f" {100.0 * fraction:.3g} %" in line
     for words, message in (
-        (("cost", "vehicle"), "there is no household with a controller; try the scenario microgrid"),
+        (
+            ("cost", "vehicle"),
+            "there is no household with a controller; try the scenario microgrid, or evedrop compare for",
+        ),
         (("cost", "microgrid", "--trials", "1"), "--trials 1: expected 2 or more"),
     ):
         refused = evedrop(*words)

@@ -19,6 +19,7 @@ from evedrop.model.digest import RunDigest, block_starts
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.outcomes import eavesdropper_outcomes
 from evedrop.model.schemes import scheme_of
+from evedrop.model.theory.horizon import horizon
 from evedrop.results.folder import HeldFolder, disk_errors
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import write_summary
@@ -238,7 +239,7 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
         why = "the plant's inputs and disturbances depend on states" if scenario.driven else "the states are given"
         raise UsageError(
             f"--{mode.value} follows errors, not states, and {why}; leave "
-            f"--{mode.value} out, or give --{Mode.COVARIANCE_ONLY.value} instead, for the covariances alone"
+            f"--{mode.value} out{_shorter(scenario)}, or give --{Mode.COVARIANCE_ONLY.value} instead, for the covariances alone"
         )
     _check_scheme(scenario, mode)
     for name in scenario.receivers:
@@ -251,7 +252,7 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
         if not STRATEGIES[table.strategy].follows_gamma(table.parameters):
             raise UsageError(
                 f"--{mode.value} follows events, not packets, and the actions of {name} (strategy {table.strategy}) "
-                f"depend on more; leave --{mode.value} out, or remove {name} from the scenario"
+                f"depend on more; leave --{mode.value} out{_shorter(scenario)}, or remove {name} from the scenario"
             )
     for name, expected in theoretical_traces_of(scenario).items():
         beyond = np.flatnonzero(np.isinf(expected))
@@ -260,6 +261,12 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
                 f"{name}'s expected error leaves double precision at slot {beyond[0]}; "
                 f"give {beyond[0]} slots or fewer, or remove {name} from the scenario"
             )
+
+
+def _shorter(scenario: Scenario) -> str:
+    """What the exact mode asks for besides, in words: as many slots as float64 can follow; empty if it can follow all."""
+    last = horizon(scenario.process.process, scenario.slots)
+    return "" if last is None or last < 0 else f" and give at most {last + 1:,} slots"
 
 
 def _split_mode(scenario: Scenario) -> Mode:

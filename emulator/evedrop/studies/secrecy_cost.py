@@ -173,4 +173,4 @@ def _lacking() -> str:
     }
     examples = [application.example for application in able.values() if application.example is not None]
     hint = f"; try the scenario {' or '.join(examples)}" if examples else ""
-    return f"there is no {' or '.join(able)} with a controller{hint}"
+    return f"there is no {' or '.join(able)} with a controller{hint}, or evedrop compare for the price of a scheme"
