@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 
 import pytest
 
@@ -24,8 +25,8 @@ def test_the_tutorial_has_short_classes_and_a_scenario() -> None:
     blocks = dict(BLOCK.findall(TEXT))
     modules = {
         "flipped.py",
+        "gate.py",
         "tracker.py",
-        "thirds.py",
         "shifts.py",
         "platooning.py",
         "ratio.py",
@@ -41,7 +42,7 @@ def test_the_tutorial_has_short_classes_and_a_scenario() -> None:
 def test_the_tutorial_works_as_it_is_typed(tutorial: Evedrop) -> None:
     """Its classes are checked, and run live, in memory and again from the results, with the same digests."""
     lines = TEXT.splitlines()
-    commands = [line.split()[2:] for line in lines if line.startswith("$ evedrop ")]
+    commands = [shlex.split(line)[2:] for line in lines if line.startswith("$ evedrop ")]
     assert {words[0] for words in commands} == {"check", "run", "montecarlo", "diff"}
     for words in [*commands, ["check", "--scheme", "flipped:Flipped"]]:
         done = tutorial(*words)
