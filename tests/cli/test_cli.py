@@ -371,11 +371,11 @@ def test_absurd_arguments_are_refused(evedrop: Evedrop, arguments: tuple[str, ..
 
 
 ENDING = """
-import atexit, sys, threading, time
+import atexit, sys, threading
 from evedrop.__main__ import program
 atexit.register(lambda: print("callbacks have run"))
 if sys.argv.pop() == "thread":
-    threading.Thread(target=lambda: [time.sleep(0.2), print("the thread has ended")]).start()
+    threading.Thread(target=lambda: [threading.main_thread().join(), print("the thread has ended")]).start()
 program()
 """
 
