@@ -21,7 +21,6 @@ NOT_RUN = {
     "docs/install.md": 3,
     "docs/integrity.md": 1,
     "docs/links.md": 1,
-    "docs/maintainers/tests.md": 1,
     "docs/microgrid.md": 3,
     "docs/montecarlo.md": 1,
     "docs/papers.md": 1,

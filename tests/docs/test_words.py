@@ -17,7 +17,7 @@ def test_words_have_a_letter_or_a_digit(tmp_path: Path) -> None:
     """In README and below docs/, code included, and nowhere else."""
     (tmp_path / "docs" / "wire").mkdir(parents=True)
     (tmp_path / "README.md").write_text("# One two\n")
-    (tmp_path / "docs" / "a.md").write_text("a `b c`\n\n```console\n$ d\n```\n")
+    (tmp_path / "docs" / "a.md").write_text("a `b c`\n\n```console\n$ d\n```\n\n```golden x\n00 ff\n```\n")
     (tmp_path / "docs" / "wire" / "b.md").write_text("x\n")
     (tmp_path / "CHANGELOG.md").write_text("not counted\n")
     assert site_tool("words").words(tmp_path) == {"docs/a.md": 5, "README.md": 2, "docs/wire/b.md": 1}

@@ -2,8 +2,8 @@
 
     python tools/site/words.py
 
-A word has a letter or a digit: bars of tables and signs by themselves are none. Commands and their output are counted; pages that
-the site generates are not.
+A word has a letter or a digit: bars of tables and signs by themselves are none. Commands and their output are counted, golden
+bytes and generated pages are not.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 LIMIT = 60_000
+_BYTES = re.compile(r"^```golden .*?^```", re.DOTALL | re.MULTILINE)
 _WORD = re.compile(r"(?<!\S)\S*\w\S*")
 
 
@@ -22,7 +23,8 @@ def words(root: Path = ROOT) -> dict[str, int]:
     """Page → its words, the longest page first."""
     pages = [root / "README.md", *(root / "docs").rglob("*.md")]
     counted = {
-        page.relative_to(root).as_posix(): len(_WORD.findall(page.read_text(encoding="utf-8"))) for page in pages
+        page.relative_to(root).as_posix(): len(_WORD.findall(_BYTES.sub("", page.read_text(encoding="utf-8"))))
+        for page in pages
     }
     return dict(sorted(counted.items(), key=lambda item: (-item[1], item[0])))
 
