@@ -41,7 +41,7 @@ def test_the_ci_jobs_test_and_keep_the_report() -> None:
         (script, [gitlab["scenarios"]["artifacts"]["reports"]["junit"], *gitlab["scenarios"]["artifacts"]["paths"]]),
     ):
         install, test = commands
-        assert install == "pip install evedrop"
+        assert install == "pip install ./evedrop"
         options = cli.parser_of().parse_args(shlex.split(test)[1:])
         assert options.places == ["scenarios/"]
         assert kept == [str(options.junit), f"{options.out}/"]

@@ -240,15 +240,15 @@ def mistakes_across(file: WireFile, sides: Mapping[str, Mapping[str, Any]]) -> I
 
 
 def _mistakes_beside(made: Mapping[str, Any], error: ValidationError) -> Iterator[str]:
-    """Mistakes across tables, where some tables are wrong by themselves and substitutes with their names take their place."""
+    """Mistakes across tables in a file some of whose tables are wrong by themselves: others with their names replace them."""
     tables = copy.deepcopy({**made})
     replaced: set[str] = set()
     for place in {mistake["loc"][:2] for mistake in error.errors(include_url=False, include_input=False)}:
         name, at = str(place[0]), place[-1]
         within = tables.get(name)
-        if name in _SUBSTITUTES and isinstance(within, list) and isinstance(at, int):
+        if name in _PLACEHOLDERS and isinstance(within, list) and isinstance(at, int):
             entries = within[at] if isinstance(within[at], Mapping) else {}
-            within[at] = _SUBSTITUTES[name](entries)
+            within[at] = _PLACEHOLDERS[name](entries)
             replaced.add(f"{name}.{at}")
         elif name == "side" and isinstance(within, dict) and isinstance(within.get(at), Mapping):
             within[at] = {}
@@ -267,21 +267,21 @@ def _mistakes_beside(made: Mapping[str, Any], error: ValidationError) -> Iterato
 _NAMES = {"name", "from", "to", "cut", "partition"}
 
 
-def _link_substitute(entries: Mapping[str, Any]) -> dict[str, Any]:
+def _link_placeholder(entries: Mapping[str, Any]) -> dict[str, Any]:
     names = {name: entries[name] for name in ("name", "from", "to") if isinstance(entries.get(name), str)}
     return {"from": "", "to": "", **names}
 
 
-def _event_substitute(entries: Mapping[str, Any]) -> dict[str, Any]:
+def _event_placeholder(entries: Mapping[str, Any]) -> dict[str, Any]:
     pair, link = entries.get("partition"), entries.get("cut")
     if isinstance(pair, list) and len(pair) == 2 and all(isinstance(side, str) for side in pair):
         return {"at": 0.0, "partition": pair}
     return {"at": 0.0, "cut": link} if isinstance(link, str) else {"at": 0.0, "note": "…"}
 
 
-_SUBSTITUTES: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
-    "link": _link_substitute,
-    "event": _event_substitute,
+_PLACEHOLDERS: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
+    "link": _link_placeholder,
+    "event": _event_placeholder,
     "expect": lambda _entries: {"link": ""},
 }
 

@@ -132,10 +132,11 @@ class StepCounter:
         self._delays += cells.reshape(self._delays.shape)
 
     def _closed(self, steps: int) -> WireSteps:
-        middles: NDArray[np.float64] = np.full(self._least.shape, np.nan)
+        middles: NDArray[np.float64] = np.full(len(self._least), np.nan)
         np.add(self._least / 2.0, self._most / 2.0, out=middles, where=self._least <= self._most)
-        of_links = middles.reshape(self._links + 1, _BUCKETS)
-        closed = WireSteps(self._first, self._counts[:steps].copy(), self._delays[:steps].copy(), of_links)
+        closed = WireSteps(
+            self._first, self._counts[:steps].copy(), self._delays[:steps].copy(), middles.reshape(-1, _BUCKETS)
+        )
         for counts in (self._counts, self._delays):
             counts[: _SPAN - steps] = counts[steps:]
             counts[_SPAN - steps :] = 0
