@@ -203,8 +203,10 @@ def test_the_table_of_a_run_has_verdicts_and_ratios_but_no_digests_in_latex(tmp_
         rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
         assert list(rows[0])[-2 - len(ratios) :] == ["verdict", *ratios, "digest"]
         for row in rows:
-            found = results.secrecy.get(row["receiver"])
-            assert row["times the error"] == ("" if found is None or found.verdict is None else found.verdict.times)
+            secrecy = results.secrecy.get(row["receiver"])
+            assert row["times the error"] == (
+                "" if secrecy is None or secrecy.verdict is None else secrecy.verdict.times
+            )
         heads = results.to_latex(tmp_path / f"{scenario}.tex").read_text().splitlines()[3]
         assert heads.endswith(" & ".join(["verdict", *ratios]) + r" \\")
 

@@ -31,7 +31,7 @@ def test_cards_lead_to_pages_and_belong_to_what_they_are_about() -> None:
     page = gallery.gallery_page()
     for name in shipped():
         assert f'href="gallery/{name}.html"' in page
-    kinds = {one.name: set(one.kinds) for one in gallery.shown()}
+    kinds = {entry.name: set(entry.kinds) for entry in gallery.entries()}
     assert kinds["acknowledged"] == {"attack"}
     assert kinds["replay-attack-before"] == {"attack", "closed-loop"}
     assert kinds["nemesis"] == {"faults"}

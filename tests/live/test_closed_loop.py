@@ -13,10 +13,11 @@ import pyarrow.compute as pc
 import pytest
 import tomli_w
 
-from evedrop.cli.api import run
+from evedrop.cli.api import compare, montecarlo, run, sweep
 from evedrop.cli.api.results import RunResults
 from evedrop.errors import UsageError
 from evedrop.model.metrics.standard_error import ratio_error, z_of
+from evedrop.results.comparison import read_comparison
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load
@@ -25,10 +26,14 @@ from evedrop.score.after_start import ratio_interval
 from evedrop.score.filtering import FilterTally
 from evedrop.score.verdict import times_text
 from evedrop.show.report import closing
+from evedrop.show.report.closing import sweep_table
+from evedrop.show.report.comparison import comparison_heading
+from evedrop.show.view.scene_slots import replay
 from evedrop.simulate.montecarlo import Plan, simulate
 from evedrop.simulate.simulation import Mode
 from tests.builders import changed, digests_of
 from tests.conftest import Evedrop
+from tests.show.view.read_back import rows
 
 TITLE = "A tank that is steered over a lossy network"
 
@@ -180,6 +185,27 @@ def test_a_verdict_says_what_errors_are_measured_against(tmp_path: Path) -> None
     assert true.interval[0] < true.ratio < true.interval[1]
     shown = list(closing.remarks(results.typed_summary))
     assert any(line.startswith("the sensor sends its filter's estimate") and "legitimate " in line for line in shown)
+
+
+def test_sweeps_comparisons_and_views_say_it_too(tmp_path: Path) -> None:
+    """A sweep has a column with the ratio against the truth, a comparison a heading, the view the verdict so far."""
+    small: dict[str, Any] = {"slots": 60, "trials": 6, "expect": []}
+    swept = sweep(
+        "measured", {"legitimate.link.quality": [0.7, 0.9]}, out=tmp_path / "sweep", **small
+    ).table.to_pylist()
+    table = sweep_table(swept, ["legitimate.link.quality"])
+    at = [column.heading for column in table.columns].index("times the true error")
+    assert [row[at] == "–" for row in table.rows] == [row["peer"] == "legitimate" for row in swept]
+    compared = compare("measured", schemes=["plain"], adversaries=["smart"], out=tmp_path / "compare", **small)
+    for comparison in (compared, read_comparison(tmp_path / "compare")):
+        assert comparison_heading(comparison).endswith(" · errors against the sensor's estimate")
+    run_ = montecarlo("measured", out=tmp_path / "run", **{**small, "slots": 300, "trials": 1}).folder
+    texts = [text for (text,) in rows(replay(run_, tmp_path / "view.rrd"), "title", "TextDocument:text").values()]
+    assert any("off the sensor's estimate" in text and "so far" in text for text in map(_unescaped, texts))
+
+
+def _unescaped(markdown: str) -> str:
+    return markdown.replace("\\", "")
 
 
 def test_the_ratio_against_the_truth_counts_the_second_half_of_all_trials() -> None:

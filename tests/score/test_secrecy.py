@@ -193,6 +193,15 @@ def test_a_replayed_recording_is_in_the_verdict_and_warned_of() -> None:
         assert ("400 recorded" in " ".join(warnings_of(scenario, several=True))) == (not random_start)
 
 
+def test_a_recording_on_the_link_of_an_eavesdropper_is_in_its_own_verdict() -> None:
+    """And not in those on others."""
+    link = {"loss": {"model": "trace", "outcomes": "0111" * 100}}
+    scenario = load("vehicle", {"slots": 100, "trials": 30, "eavesdroppers.smart.link": link})
+    each, _ = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
+    replaying = {entry.eavesdropper for entry in each if entry.compared is not None and entry.compared.replayed}
+    assert replaying == {"smart"}
+
+
 def test_one_trial_decides_nothing() -> None:
     """However far apart the errors are."""
     verdict = judged(tally(around(0.001, trials=1)), tally(around(9.0, trials=1)))

@@ -223,3 +223,7 @@ def test_a_single_trial_has_a_verdict_and_its_batches_are_those_of_the_view() ->
     assert verdict is not None
     assert verdict.outcome == SecrecyOutcome.RELATIVE
     assert verdict.reason.endswith("in this trial")
+    assert "sensor's estimate" not in verdict.reason
+    of_estimate = verdict_so_far(ours, theirs, "m", of_estimate=True)
+    assert of_estimate is not None
+    assert " off the sensor's estimate, the best eavesdropper (smart) " in of_estimate.reason

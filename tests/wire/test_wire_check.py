@@ -156,7 +156,7 @@ def test_the_history_of_a_key() -> None:
 
 
 def test_the_page_shows_what_the_command_prints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The example file, and what --check says of keys, are in docs/wire/file.md as they are printed."""
+    """docs/wire/file.md shows the example file, and the answer of `--check` about a key, as they are printed."""
     page = (Path(__file__).parents[2] / "docs" / "wire" / "file.md").read_text(encoding="utf-8")
     assert f"```toml\n{example_wire()}```" in page
     path = tmp_path / "robot.toml"

@@ -275,7 +275,7 @@ def test_a_journal_with_two_fates_of_a_message_is_refused(tmp_path: Path) -> Non
 
 
 def test_the_tutorial_shows_the_programs_of_the_examples() -> None:
-    """Whoever copies either has the same."""
+    """The copies in the repository and on the page are equal."""
     docs = Path(__file__).parents[2] / "docs"
     tutorial = (docs / "wire" / "tutorial.md").read_text(encoding="utf-8")
     for program in ("talker.py", "listener.py"):

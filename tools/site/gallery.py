@@ -1,6 +1,6 @@
 """The gallery: a card for each built-in scenario, a page for each, and the list of them in the reference.
 
-Cards are filtered by style sheets alone: each has classes, and radio buttons hide those without the chosen one.
+Cards are filtered by style sheets alone: each has classes, and radio buttons hide those without the chosen entry.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _LOSSES_AS_USUAL = "bernoulli"
 
 
 @dataclass(frozen=True)
-class Shown:
+class Entry:
     """A built-in scenario in the gallery."""
 
     name: str
@@ -57,13 +57,13 @@ class Shown:
 
 
 @cache
-def shown() -> tuple[Shown, ...]:
+def entries() -> tuple[Entry, ...]:
     """All of them, by name."""
-    found = []
+    made = []
     for name in sorted(shipped()):
         scenario = Scenario.load(name)
-        found.append(Shown(name, scenario.title, learned(name), scenario.encoding.scheme, tuple(_kinds(scenario))))
-    return tuple(found)
+        made.append(Entry(name, scenario.title, learned(name), scenario.encoding.scheme, tuple(_kinds(scenario))))
+    return tuple(made)
 
 
 def learned(name: str) -> str:
@@ -90,12 +90,12 @@ def _kinds(scenario: Scenario) -> Iterator[str]:
 
 def gallery_page() -> str:
     """The page of cards in Markdown."""
-    schemes = sorted({one.scheme for one in shown()})
+    schemes = sorted({entry.scheme for entry in entries()})
     parts = [_HEAD, '<div class="gallery">', *_choice("kind", _FILTERS)]
     parts += _choice("scheme", {"all": "all", **{scheme: scheme for scheme in schemes}})
     parts += [
         '<div class="cards">',
-        *map(_card, sorted(shown(), key=_place)),
+        *map(_card, sorted(entries(), key=_place)),
         _WIRE,
         "</div>",
         "</div>\n",
@@ -104,9 +104,9 @@ def gallery_page() -> str:
     return "\n".join(parts)
 
 
-def _place(one: Shown) -> tuple[int, bool, str]:
+def _place(entry: Entry) -> tuple[int, bool, str]:
     """The order of cards: secrecy as such, beginning with the demo, then by kind in the order of the filters."""
-    return (list(_FILTERS).index((*one.kinds, "all")[0]), one.name != "vehicle", one.name)
+    return (list(_FILTERS).index((*entry.kinds, "all")[0]), entry.name != "vehicle", entry.name)
 
 
 def _choice(group: str, choices: dict[str, str]) -> Iterator[str]:
@@ -126,13 +126,13 @@ def _rules(schemes: list[str]) -> str:
     )
 
 
-def _card(one: Shown) -> str:
-    pictures = "".join(_moving(one.name, theme) for theme in ("dark", "light"))
-    tags = " · ".join([one.scheme, *(_FILTERS[kind] for kind in one.kinds)])
+def _card(entry: Entry) -> str:
+    pictures = "".join(_moving(entry.name, theme) for theme in ("dark", "light"))
+    tags = " · ".join([entry.scheme, *(_FILTERS[kind] for kind in entry.kinds)])
     return (
-        f'<a class="card {" ".join(one.kinds)} scheme-{one.scheme}" href="gallery/{one.name}.html">{pictures}\n'
-        f'<span class="card-title">{html.escape(one.title)}</span>\n'
-        f'<span class="card-learned">{_spoken(one.learned)}</span>\n<span class="card-tags">{tags}</span></a>'
+        f'<a class="card {" ".join(entry.kinds)} scheme-{entry.scheme}" href="gallery/{entry.name}.html">{pictures}\n'
+        f'<span class="card-title">{html.escape(entry.title)}</span>\n'
+        f'<span class="card-learned">{_spoken(entry.learned)}</span>\n<span class="card-tags">{tags}</span></a>'
     )
 
 
@@ -151,11 +151,11 @@ def _spoken(text: str) -> str:
 
 def scenario_pages() -> Iterator[tuple[str, str]]:
     """The path of each scenario's page, and the page in Markdown."""
-    for one in shown():
-        yield f"gallery/{one.name}.md", _page(one, kept(one.name))
+    for entry in entries():
+        yield f"gallery/{entry.name}.md", _page(entry, kept(entry.name))
 
 
-def _page(one: Shown, made: Kept) -> str:
+def _page(entry: Entry, made: Kept) -> str:
     trials = "1 trial" if made.trials == 1 else f"{made.trials} trials"
     verdict = f"> {made.verdict}" if made.verdict else "> No eavesdropper listens: there is no verdict on secrecy."
     size = (made.folder / "recording.rrd").stat().st_size / 1e6
@@ -165,59 +165,59 @@ hide: [navigation, toc]
 
 [Gallery](../gallery.md)
 
-# {one.title}
+# {entry.title}
 
-**{one.learned}**
+**{entry.learned}**
 
 {verdict}
 
 {made.slots:,} slots, {trials}, in memory. Live, with the view:
 
 ```text
-evedrop run {one.name}
+evedrop run {entry.name}
 ```
 
-![Pictures of a run of {one.name}]({one.name}-run.png)
+![Pictures of a run of {entry.name}]({entry.name}-run.png)
 
-[Recording of the view]({one.name}.rrd) ({size:.1f} MB). Open it with Rerun's viewer, which is installed with Evedrop:
+[Recording of the view]({entry.name}.rrd) ({size:.1f} MB). Open it with Rerun's viewer, which is installed with Evedrop:
 
 ```text
-rerun {one.name}.rrd
+rerun {entry.name}.rrd
 ```
 
 ## The scenario
 
-`evedrop show {one.name}` prints it, and `evedrop new mine.toml --from {one.name}` copies it.
+`evedrop show {entry.name}` prints it, and `evedrop new mine.toml --from {entry.name}` copies it.
 [Scenario keys](../reference/scenario-keys.md) describes each key.
 
 ```toml
-{built_in_text(one.name).rstrip()}
+{built_in_text(entry.name).rstrip()}
 ```
 """
 
 
 def scenario_files() -> Iterator[tuple[str, Path]]:
     """The address of each picture and recording on the site, and its file."""
-    for one in shown():
-        folder = kept(one.name).folder
+    for entry in entries():
+        folder = kept(entry.name).folder
         for theme in ("", "-light"):
-            yield f"gallery/{one.name}{theme}.svg", folder / f"card{theme}.svg"
-            yield f"gallery/{one.name}-still{theme}.svg", folder / f"card-still{theme}.svg"
-            yield f"gallery/{one.name}-run{theme}.png", folder / f"run{theme}.png"
-        yield f"gallery/{one.name}.rrd", folder / "recording.rrd"
+            yield f"gallery/{entry.name}{theme}.svg", folder / f"card{theme}.svg"
+            yield f"gallery/{entry.name}-still{theme}.svg", folder / f"card-still{theme}.svg"
+            yield f"gallery/{entry.name}-run{theme}.png", folder / f"run{theme}.png"
+        yield f"gallery/{entry.name}.rrd", folder / "recording.rrd"
 
 
 def scenarios_page() -> str:
     """The list of built-in scenarios for the reference, in Markdown."""
     rows = [
-        f"| [`{one.name}`](../gallery/{one.name}.md) | {one.title} | {one.learned} | `{one.scheme}` |"
-        for one in shown()
+        f"| [`{entry.name}`](../gallery/{entry.name}.md) | {entry.title} | {entry.learned} | `{entry.scheme}` |"
+        for entry in entries()
     ]
     return "\n".join([
         "# Built-in scenarios",
         "",
         "`evedrop list` prints their names, `evedrop show NAME` a scenario with comments that say what to look for, and",
-        "`evedrop run NAME` runs one. The [gallery](../gallery.md) shows them.",
+        "`evedrop run NAME` runs entry. The [gallery](../gallery.md) shows them.",
         "",
         "| name | title | what you learn | scheme |",
         "|---|---|---|---|",

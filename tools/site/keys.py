@@ -75,8 +75,8 @@ def keys_page() -> str:
 
 def inner_tables(table: type[Table]) -> list[type[Table]]:
     """The tables inside a table, each followed by those inside it; that of events with the entries of all kinds."""
-    inner = [found for entry in table.entries() if (found := table.inner(entry)) is not None]
-    return list(dict.fromkeys(found for one in inner for found in (one, *inner_tables(one))))
+    direct = [inner for entry in table.entries() if (inner := table.inner(entry)) is not None]
+    return list(dict.fromkeys(below for inner in direct for below in (inner, *inner_tables(inner))))
 
 
 def descriptions(table: type[Table]) -> dict[str, str]:
@@ -84,11 +84,11 @@ def descriptions(table: type[Table]) -> dict[str, str]:
     classes = [*reversed(table.__mro__)]
     if issubclass(table, EventTable):  # it is made from its kinds
         classes += table.kinds.values()
-    found = {}
+    described: dict[str, str] = {}
     for class_ in classes:
         if issubclass(class_, Table) and class_.__module__.startswith("evedrop."):
-            found |= _described(class_)
-    return {field.alias or name: found.get(name, "") for name, field in table.model_fields.items()}
+            described |= _described(class_)
+    return {field.alias or name: described.get(name, "") for name, field in table.model_fields.items()}
 
 
 def _described(class_: type[Table]) -> dict[str, str]:

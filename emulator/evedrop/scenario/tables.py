@@ -403,6 +403,11 @@ class Scenario(Table):
         return None if self.plant is None else plant_of(self.plant, self.process.around)
 
     @property
+    def measures(self) -> bool:
+        """Whether the sensor measures and sends the estimate of its filter: then errors are against this estimate."""
+        return self.plant is not None and self.plant.output_matrix is not None
+
+    @property
     def assignment(self) -> Assignment | None:
         """The controller's assignment; None without a controller."""
         if self.driven is None or self.controller is None:

@@ -29,14 +29,9 @@ def local_filter_of(
 ) -> LocalFilter | None:
     """The sensor's filter; None if the sensor knows the state. spoofing: as for `LocalFilter`."""
     driven = scenario.driven
-    if driven is None or not sends_an_estimate(scenario):
+    if driven is None or not scenario.measures:
         return None
     return LocalFilter(scenario.process.process, driven, key, batch, spoofing)
-
-
-def sends_an_estimate(scenario: Scenario) -> bool:
-    """Whether the sensor measures and sends the estimate of its filter: then errors are against this estimate."""
-    return scenario.driven is not None and scenario.driven.output_matrix is not None
 
 
 def true_errors(true: Floats, x: Floats, x_hats: Mapping[str, Floats]) -> dict[str, Floats]:
@@ -65,7 +60,7 @@ class FilterTally:
     @classmethod
     def from_scenario(cls, scenario: Scenario, trials: int) -> FilterTally | None:
         """A tally of some trials of a scenario; None if its sensor knows the state."""
-        return cls(scenario.slots, trials) if sends_an_estimate(scenario) else None
+        return cls(scenario.slots, trials) if scenario.measures else None
 
     def add_errors(self, errors: Mapping[str, Floats]) -> None:
         """Add the next slots, errors as from `true_errors`, (c, R) each."""
@@ -92,10 +87,8 @@ class FilterTally:
             whole.count += part.count
             for name, value in part.sums.items():
                 whole.sums[name] = whole.sums.get(name, 0.0) + value
-        whole.of_trials, whole._later = (
-            {name: np.concatenate([getattr(part, kept)[name] for part in tallies]) for name in tallies[0].of_trials}
-            for kept in ("of_trials", "_later")
-        )
+        whole.of_trials = _concatenated([part.of_trials for part in tallies])
+        whole._later = _concatenated([part._later for part in tallies])
         whole._alone = whole._alone and len(tallies) == 1
         return whole
 
@@ -146,3 +139,8 @@ class FilterTally:
             if math.isfinite(values.ratio)
         }
         return FilterSummary(mean_trace, own, errors, of_mean, z, ratios)
+
+
+def _concatenated(of_parts: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
+    """Values of trials by name, of parts that have the same names."""
+    return {name: np.concatenate([values[name] for values in of_parts]) for name in of_parts[0]}

@@ -31,7 +31,7 @@ from evedrop.scenario.theory import (
 from evedrop.score.after_start import AfterStart
 from evedrop.score.directions import directions_of
 from evedrop.score.expectations_held import Evidence
-from evedrop.score.filtering import sends_an_estimate, true_errors
+from evedrop.score.filtering import true_errors
 from evedrop.score.leak import HeardBitsStream
 from evedrop.score.links import link_summary_of
 from evedrop.score.rare_events import rare_events_of, z_of_error
@@ -166,23 +166,21 @@ def verdicts(
     true: eavesdropper → the comparison of errors against the true state, for a sensor that sends an estimate.
     """
     legitimate, unit = (tallies[LEGITIMATE], expected[LEGITIMATE]), unit_of(scenario)
+    true = true or {}
+    unmeasured = AfterStart(math.nan) if scenario.measures else None
+    replaying = {name for name in tallies if replays_a_recording(scenario, name)}
     each = [
-        secrecy(legitimate, (name, tallies[name], expected[name]), unit, partial(_floor_grows, scenario, name))
+        secrecy(
+            legitimate,
+            (name, tallies[name], expected[name]),
+            unit,
+            partial(_floor_grows, scenario, name),
+            true.get(name, unmeasured),
+            not replaying.isdisjoint({LEGITIMATE, name}),
+        )
         for name in tallies
         if name != LEGITIMATE
     ]
-    replayed = {name for name in tallies if replays_a_recording(scenario, name)}
-    against = dict(true or {}) if sends_an_estimate(scenario) else None
-    if replayed or against is not None:
-        unknown = AfterStart(math.nan)
-        each = [
-            entry.with_circumstances(
-                None if against is None else against.get(entry.eavesdropper, unknown),
-                not replayed.isdisjoint({LEGITIMATE, entry.eavesdropper}),
-                unit,
-            )
-            for entry in each
-        ]
     return each, verdict_of([entry.compared for entry in each if entry.compared is not None], unit)
 
 

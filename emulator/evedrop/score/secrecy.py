@@ -74,13 +74,6 @@ class Secrecy:
     verdict: Verdict | None = None
     """None in results of an older version."""
 
-    def with_circumstances(self, true: AfterStart | None, replayed: bool, unit: str) -> Secrecy:
-        """The same with what its verdict also says; true, replayed: as attributes of `Compared`."""
-        if self.compared is None:
-            return self
-        compared = replace(self.compared, true=true, replayed=replayed)
-        return replace(self, compared=compared, verdict=verdict_on(compared, unit))
-
     @property
     def summary(self) -> SecrecySummary:
         """The entry of the summary."""
@@ -232,10 +225,13 @@ def secrecy(
     of_eavesdropper: tuple[str, Tally, Expectation],
     unit: str = "",
     floor_grows: Callable[[], bool] = lambda: False,
+    true: AfterStart | None = None,
+    replayed: bool = False,
 ) -> Secrecy:
     """Secrecy against one eavesdropper, from both tallies and what theory expects of both receivers.
 
-    unit: of the distances; floor_grows: returns whether another lower bound on the eavesdropper's error grows without bound.
+    unit: of the distances; floor_grows: returns whether another lower bound on the eavesdropper's error grows without bound;
+    true, replayed: as in `Compared`.
     """
     (legitimate, legitimate_theory), (name, other, other_theory) = of_legitimate, of_eavesdropper
     # A lower bound can support a promise, but cannot deny one.
@@ -294,6 +290,8 @@ def secrecy(
         and not perfect_by_theory
         and holds_from is None
         and legitimate.slots > WINDOWS,
+        true=true,
+        replayed=replayed,
     )
     return Secrecy(
         name,

@@ -146,13 +146,23 @@ def verdict_of(compared: Iterable[Compared], unit: str = "") -> Verdict | None:
 
 
 def verdict_so_far(
-    ours: BatchMeans, theirs: Sequence[tuple[str, BatchMeans]], unit: str = "", noise: float = 0.0, trials: int = 1
+    ours: BatchMeans,
+    theirs: Sequence[tuple[str, BatchMeans]],
+    unit: str = "",
+    noise: float = 0.0,
+    trials: int = 1,
+    *,
+    of_estimate: bool = False,
 ) -> Verdict | None:
-    """The verdict on the slots of a run so far, from the mean errors of their batches, over all trials; noise: tr Q."""
+    """The verdict on the slots of a run so far, from the mean errors of their batches, over all trials.
+
+    noise: tr Q; of_estimate: whether errors are against the estimate that the sensor sends.
+    """
     compared = [
         Compared(
             name,
             replace(AfterStart.of_batches(ours, batches, noise), in_one_trial=trials == 1, why_open="too early"),
+            true=AfterStart(math.nan) if of_estimate else None,
         )
         for name, batches in theirs
     ]

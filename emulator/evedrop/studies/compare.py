@@ -34,7 +34,6 @@ from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import Expectation, error_floor_of, expectations_of
-from evedrop.score.filtering import sends_an_estimate
 from evedrop.score.leak import revealed_by_packets
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.run_tally import RunTally
@@ -151,7 +150,7 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
         matchups.adversaries,
         schemes,
         matchups.left_out,
-        sends_an_estimate(some),
+        some.measures,
     )
 
 

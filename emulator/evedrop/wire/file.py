@@ -89,8 +89,8 @@ def wire_of(
         file = WireFile.model_validate(made)
     except ValidationError as error:
         wrong = [*sentences(error, WireFile), *recordings]
-        known = {line.partition(":")[0] for line in wrong}
-        beside = (line for line in _mistakes_beside(made, error) if line.partition(":")[0] not in known)
+        mistaken = {line.partition(":")[0] for line in wrong}
+        beside = (line for line in _mistakes_beside(made, error) if line.partition(":")[0] not in mistaken)
         raise ScenarioError(source, [*wrong, *beside]) from None
     if mistakes := recordings or list(mistakes_across(file, made["side"])):
         raise ScenarioError(source, mistakes)

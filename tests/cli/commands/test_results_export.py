@@ -37,6 +37,25 @@ def test_the_picture_and_the_tables_of_any_study(study: str, evedrop: Evedrop) -
             assert picture.width == 1050
 
 
+def test_a_panel_is_drawn_alone(evedrop: Evedrop) -> None:
+    """The errors of a run are lower than the whole picture, and as wide; other studies have no such panel."""
+    assert evedrop(*STUDIES["run"]).status in {0, 1}
+    sizes = []
+    for name, panel in (("whole", ()), ("errors", ("--panel", "errors"))):
+        assert evedrop("export", "study", f"{name}.png", *panel).status == 0
+        with Image.open(evedrop.folder / f"{name}.png") as picture:
+            sizes.append(picture.size)
+    (wide, high), (alone_wide, alone_high) = sizes
+    assert alone_wide == wide
+    assert alone_high < 0.8 * high
+    for name in ("out.csv", "out.tex", "out.mcap"):
+        for option in (("--panel", "errors"), ("--width", "column")):
+            done = evedrop("export", "study", name, *option)
+            assert done.status == 2
+            assert f"{option[0]} is for pictures" in done.err
+            assert not (evedrop.folder / name).exists()
+
+
 def test_what_cannot_be_exported(evedrop: Evedrop) -> None:
     """A width without a picture, a folder without results, a file that cannot be written."""
     assert evedrop(*STUDIES["run"]).status in {0, 1}

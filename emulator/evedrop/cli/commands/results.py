@@ -32,12 +32,12 @@ _LONGEST = 3600.0  # seconds per slot, as for pace
 
 def export(options: argparse.Namespace) -> int:
     """Write a run as MCAP, a wire's journal as CSV, or the picture or tables of a study; the file's ending decides."""
-    if (kind := options.file.suffix.lower()) in {*_PICTURES, *_TABLES}:
+    kind = options.file.suffix.lower()
+    for option, is_given in (("--panel", options.panel is not None), ("--width", options.width != "page")):
+        if is_given and kind not in _PICTURES:
+            raise UsageError(f"{option} is for pictures, whose files end in {', '.join(_PICTURES)}; leave it out")
+    if kind in {*_PICTURES, *_TABLES}:
         return _export_study(options, kind)
-    if options.panel is not None:
-        raise UsageError(f"--panel is for pictures, whose files end in {', '.join(_PICTURES)}; leave it out")
-    if options.width != "page":
-        raise UsageError(f"--width is for pictures, whose files end in {', '.join(_PICTURES)}; leave it out")
     from evedrop.results.mcap_export import export_mcap
     from evedrop.results.reading import Results
     from evedrop.results.wire_summary import is_wire

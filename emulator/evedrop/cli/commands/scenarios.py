@@ -78,8 +78,8 @@ def _check_classes(names: dict[str, str], parameters: dict[str, Any]) -> int:
     for examination in examined(names, parameters):
         broken = [verdict for verdict in examination.verdicts if verdict.broken is not None]
         rules = len(examination.verdicts)
-        found = f"{len(broken)} of {rules} rules are broken" if broken else f"all {rules} rules hold"
-        print(f"{examination.title}: {found}")
+        result = f"{len(broken)} of {rules} rules are broken" if broken else f"all {rules} rules hold"
+        print(f"{examination.title}: {result}")
         for verdict in examination.verdicts:
             tell(f"  {'ok' if verdict.broken is None else 'BROKEN':<8}{verdict.rule}", "BROKEN")
             if verdict.broken is not None:

@@ -338,10 +338,9 @@ class LoopBriefs:
 
     def sensor_keys(self, keys: StreamKeys) -> dict[str, bytes]:
         """Stream → key, for the sensor's own streams, without those of the secret."""
-        driven = self._scenario.driven
-        measures = driven is not None and driven.output_matrix is not None
+        measurement = {"measurement": keys.measurement} if self._scenario.measures else {}
         monitors = {} if self.monitor is None else {"watermark": keys.watermark, "spoofing": keys.spoofing}
-        return {"process": keys.process, **({"measurement": keys.measurement} if measures else {}), **monitors}
+        return {"process": keys.process, **measurement, **monitors}
 
     @property
     def of_legitimate(self) -> EstimatorLoopPart | None:

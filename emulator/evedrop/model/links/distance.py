@@ -161,13 +161,13 @@ class Distance(LossModel):
         which = np.repeat(np.arange(len(parts)), [len(some) for some, _ in parts])
         needed = self._needed(slots.astype(np.float64))
         spectrum = np.ones(points, np.complex128)
-        known: dict[Any, Spectrum] = {}
+        of_blocks: dict[Any, Spectrum] = {}
         for block in _groups(slots // outer):
             fading = [
                 block.start + np.r_[part] for part in _groups(slots[block.start : block.stop] // self._fading_block)
             ]
             name = tuple((needed[some].tobytes(), which[some].tobytes()) for some in fading)
-            if name not in known:
+            if name not in of_blocks:
                 given = np.ones((len(nodes), points), np.complex128)
                 for some in fading:
                     order = some[np.argsort(needed[some], kind="stable")]
@@ -176,8 +176,8 @@ class Distance(LossModel):
                         -np.append(0.0, needed[order]) * nodes[:, None]
                     )  # that at least so many are delivered
                     given *= (above - np.append(above[:, 1:], np.zeros((len(nodes), 1)), axis=1)) @ factors
-                known[name] = weights @ given
-            spectrum *= known[name]
+                of_blocks[name] = weights @ given
+            spectrum *= of_blocks[name]
         return spectrum
 
     def _count_variance(self, slots: range, outer: int) -> float:

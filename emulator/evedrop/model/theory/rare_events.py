@@ -127,21 +127,20 @@ def rare_in_slots(process: Process, outcomes: Outcomes, slots: int, trials: int)
     within = begun.copy()  # the probability of being in a streak of this kind
     for k in range(1, slots):
         within[:, k] += kept * within[:, k - 1]
-    misled = 2.0 * NoiseCovariances(process).next(slots) if outcomes.misled else np.zeros((slots, *process.A.shape))
+    misled = 2.0 * NoiseCovariances(process).next(slots) if outcomes.misled else None
     met, F, noise = np.zeros(slots), np.eye(process.n), 0.0
     for length in range(lengths):
-        weight, first = kept**length, slots - length
-        from_loss = float(np.trace(F @ process.Q @ F.T)) + noise
-        from_start = float(np.trace(F @ process.initial_covariance @ F.T)) + noise
-        # begun[:, j] streaks are in their slot `length` in slot j + length; F and noise contain the factor kept**length
-        carried = [
-            begun[0, :first] * from_loss,
-            begun[1, :first] * (np.einsum("ij,kjl,il->k", F, misled[:first], F) + noise),
-            begun[2, :first] * from_start,
-        ]
-        frequent = weight * within[:, :first] * trials >= RARE
-        met[length:] += np.where(frequent, carried, 0.0).sum(axis=0)
-        noise = kept * noise + outcomes.predicted * float(np.trace(F @ process.Q @ F.T))
+        # Streaks that began in slot j are in their slot `length` in slot j + length. F and noise contain the factor kept**length.
+        last = slots - length
+        losses, deceptions, starts = kept**length * within[:, :last] * trials >= RARE
+        from_loss = float(np.trace(F @ process.Q @ F.T))
+        met[length:] += np.where(losses, begun[0, :last] * (from_loss + noise), 0.0)
+        if misled is not None:
+            errors = np.einsum("ij,kjl,il->k", F, misled[:last], F) + noise
+            met[length:] += np.where(deceptions, begun[1, :last] * errors, 0.0)
+        if starts[0]:
+            met[length] += outcomes.initial * (float(np.trace(F @ process.initial_covariance @ F.T)) + noise)
+        noise = kept * noise + outcomes.predicted * from_loss
         F = math.sqrt(kept) * process.A @ F
     fraction = np.where(expected > 0.0, 1.0 - met / expected, 0.0)
     return np.where(fraction > REST, np.minimum(fraction, 1.0), 0.0)

@@ -102,6 +102,8 @@ class Scene:
     """Powers of ten by which the error of an estimate without packets grows over the run, of an unstable process."""
     slot_seconds: float | None = None
     """What a slot lasts in the scenario; None if it is a number only."""
+    of_estimate: bool = False
+    """Whether the sensor measures, so that errors are against the estimate that it sends."""
 
     @property
     def unit(self) -> str:

@@ -210,6 +210,7 @@ def open_recording(
         ways={name: ways for name, ways in ways.items() if ways is not None},
         growth=_growth(scenario),
         slot_seconds=scenario.slot_seconds,
+        of_estimate=scenario.measures,
         **driven_scene(scenario),
         **attacked_scene(scenario, unknown_links),
     )

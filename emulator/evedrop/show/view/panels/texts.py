@@ -66,7 +66,8 @@ class VerdictLine(ViewPanel):
 
     def _so_far(self, k: int) -> Iterator[Column]:
         (_, ours), *theirs = self._batches.items()
-        verdict = verdict_so_far(ours, theirs, self.scene.unit, self.scene.noise, self.scene.trials)
+        scene = self.scene
+        verdict = verdict_so_far(ours, theirs, scene.unit, scene.noise, scene.trials, of_estimate=scene.of_estimate)
         yield from self._text(k, "" if verdict is None else f"{verdict.sentence}, so far")
 
     def conclusion(self, k: int, verdict: Verdict) -> Iterator[Column]:
