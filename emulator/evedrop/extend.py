@@ -18,7 +18,8 @@ from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge, Pa
 from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.model.kernels import elementary
 from evedrop.model.links import loss_of
-from evedrop.model.links.loss_model import Bernoulli, Chain, Fate, LossModel, fates_of
+from evedrop.model.links.chain import Chain
+from evedrop.model.links.loss_model import Bernoulli, Fate, LossModel, fates_of
 from evedrop.model.metrics.metric import MeanMetric, Metric, MetricColumn, MetricTally, ScoredSlots
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, prior, trace_of

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.model.links import loss_of
-from evedrop.model.links.loss_model import Chain
+from evedrop.model.links.chain import Chain
 from evedrop.model.modulated import ModulatedCovariance, limit_of, limit_trace, tail_outcomes
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link_distribution import LinkDistribution, Segment

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from evedrop.model import modulated as module
-from evedrop.model.links.loss_model import Chain
+from evedrop.model.links.chain import Chain
 from evedrop.model.modulated import ModulatedCovariance, modulated_streaks
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link_distribution import LinkDistribution, Segment

@@ -14,7 +14,7 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.links.loss_model import Chain
+from evedrop.model.links.chain import Chain
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link_distribution import LinkDistribution, Segment
 from evedrop.model.theory.covariances import (

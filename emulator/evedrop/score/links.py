@@ -22,7 +22,8 @@ from evedrop.model.delays import delay_of
 from evedrop.model.detection import Chart, chart_for
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.links import loss_of
-from evedrop.model.links.loss_model import Chain, LossModel
+from evedrop.model.links.chain import Chain
+from evedrop.model.links.loss_model import LossModel
 from evedrop.model.metrics.built_in import LinkAccount
 from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.process import parts_of

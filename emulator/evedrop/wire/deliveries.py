@@ -20,8 +20,9 @@ import numpy as np
 
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.links import loss_of
+from evedrop.model.links.chain import Chain
 from evedrop.model.links.counts import Counted, Spectrum
-from evedrop.model.links.loss_model import Chain, LossModel, count_variance
+from evedrop.model.links.loss_model import LossModel, count_variance
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule
 from evedrop.model.slot.link_distribution import stretches

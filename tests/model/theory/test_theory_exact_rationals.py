@@ -14,7 +14,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from evedrop.model.links.loss_model import Chain
+from evedrop.model.links.chain import Chain
 from evedrop.model.modulated import ModulatedCovariance
 from evedrop.model.modulated import limit_trace as limit_behind
 from evedrop.model.process import Process, mistakes_of

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import reduce
 from math import prod
@@ -19,7 +18,8 @@ import numpy as np
 
 from evedrop.model.checks import probability_mistakes
 from evedrop.model.kernels.elementary import sum_in_order
-from evedrop.model.links.counts import Counted, Spectrum, chain_spectrum
+from evedrop.model.links.chain import Chain
+from evedrop.model.links.counts import Counted, Spectrum
 from evedrop.model.links.way import Way
 from evedrop.model.process import Floats, parts_of
 from evedrop.model.receiver import Codes, Flags
@@ -59,23 +59,6 @@ def fates_of(lost: Flags) -> Codes:
     """`Fate` codes from flags of losses."""
     codes: Codes = lost.view(np.uint8)
     return codes
-
-
-@dataclass(frozen=True)
-class Chain:
-    """A Markov chain of link states, which at slot 0 is in its stationary distribution."""
-
-    transitions: Floats
-    """Row: from, column: to, (states, states)."""
-    stationary: Floats
-    """The stationary distribution, (states,)."""
-    quality: Floats
-    """Probability that a packet is delivered in each state, (states,)."""
-
-    @property
-    def independent(self) -> bool:
-        """Whether the fates of all packets are independent and identically distributed: a single state, as in the paper."""
-        return len(self.stationary) == 1
 
 
 class LossModel(ABC):
@@ -125,7 +108,7 @@ class LossModel(ABC):
         parts: in ascending order. From the chain, or from independence.
         """
         if self.chain is not None:
-            return chain_spectrum(self.chain, parts)
+            return self.chain.count_spectrum(parts)
         if not self.memoryless or sum(len(slots) for slots, _ in parts) > _MOST_COUNTED:
             return None
         spectrum = np.ones(len(parts[0].w), np.complex128)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from evedrop.model.checks import as_toml, is_probability, probability_mistakes
 from evedrop.model.kernels.elementary import sum_in_order
-from evedrop.model.links.loss_model import Chain, LossModel, fates_of
+from evedrop.model.links.chain import Chain
+from evedrop.model.links.loss_model import LossModel, fates_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 

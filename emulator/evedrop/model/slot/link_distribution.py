@@ -13,7 +13,7 @@ import numpy as np
 
 from evedrop.model.delays import delay_of
 from evedrop.model.links import loss_of
-from evedrop.model.links.loss_model import Chain
+from evedrop.model.links.chain import Chain
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import LinkSchedule
 

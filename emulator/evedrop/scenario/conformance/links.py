@@ -14,7 +14,8 @@ from typing import final
 import numpy as np
 
 from evedrop.model.delays import DelayModel
-from evedrop.model.links.loss_model import Chain, Fate, LossModel
+from evedrop.model.links.chain import Chain
+from evedrop.model.links.loss_model import Fate, LossModel
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 from evedrop.model.streams import BlockReader
