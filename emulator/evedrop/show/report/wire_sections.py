@@ -123,7 +123,7 @@ def _over_time(of: WireSource) -> Iterator[Markup]:
     steps = f"in steps of {history.step:.3g} s"
     inks = {name: hexadecimal(on_paper(of_link)) for name, of_link in zip(links, series(len(links)), strict=True)}
     curves = [Curve(name, inks[name], history.seconds, link.loss) for name, link in links.items()]
-    ends = (0.0, of.summary.seconds)
+    ends = (0.0, max(of.summary.seconds, float(history.seconds[-1])))  # labels outside would leave the axes no room
     yield (
         LogChart(
             f"The fraction of the messages of every link that were not delivered, {steps}",
