@@ -1,0 +1,136 @@
+"""The process that a program runs in: its id, its end, the signals that it gets, its standard files.
+
+Source: docs/architecture.md, the simulated world.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import select
+import signal
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import suppress
+from typing import NoReturn, TextIO, cast, final
+
+from evedrop.system.output import Output
+from evedrop.system.processes import continue_when_parent_dies
+from evedrop.system.signals import SHOW_STACKS, heeded, leave_on_signals
+
+
+class ThisProcess(ABC):
+    """What a program can do to its own process, and ask about it."""
+
+    @property
+    @abstractmethod
+    def pid(self) -> int:
+        """Its id."""
+
+    @abstractmethod
+    def exit(self, status: int) -> NoReturn:
+        """End it at once: no handler runs, and nothing is flushed."""
+
+    @abstractmethod
+    def interrupt(self) -> None:
+        """Send it SIGTERM."""
+
+    @abstractmethod
+    def on_signals(self, handle: Callable[[], object]) -> None:
+        """Call this at Ctrl-C, SIGTERM and SIGHUP, unless they are ignored from the start."""
+
+    @abstractmethod
+    def leave_on_signals(self) -> None:
+        """Let these signals end it at once, with status 130."""
+
+    @abstractmethod
+    def serve_launcher(self) -> None:
+        """Continue if it is suspended when its launcher dies; show the stacks of its threads when that asks for them."""
+
+    @abstractmethod
+    def read_input(self, most: int) -> bytes:
+        """Wait for what comes on standard input; empty at its end."""
+
+    @abstractmethod
+    def input_closed(self) -> bool:
+        """Whether nothing more can come there: the other end of the pipe is closed."""
+
+    @abstractmethod
+    def keep_events_apart(self, launched: bool) -> None:
+        """Redirect standard output to standard error: Zenoh logs to it, and would mix its lines into the events.
+
+        launched: whether a launcher reads the events, from the former standard output; `print` then writes to the log.
+        """
+
+    @abstractmethod
+    def send_event(self, line: bytes) -> None:
+        """Send a line to the launcher, or to standard output without one. Raises OSError or ValueError if nobody reads it."""
+
+
+@final
+class RealProcess(ThisProcess):
+    """The process of this interpreter."""
+
+    def __init__(self) -> None:
+        self._events: TextIO | None = None
+        """The stream for a launched process's events; None before `keep_events_apart`, and if it was started by hand."""
+
+    @property
+    def pid(self) -> int:
+        """Its id."""
+        return os.getpid()
+
+    def exit(self, status: int) -> NoReturn:
+        """End it at once."""
+        os._exit(status)
+
+    def interrupt(self) -> None:
+        """Send it SIGTERM."""
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    def on_signals(self, handle: Callable[[], object]) -> None:
+        """Call this at the signals that interrupt a command."""
+        for number in heeded():
+            signal.signal(number, lambda *_: handle())
+
+    def leave_on_signals(self) -> None:
+        """Let these signals end it at once."""
+        leave_on_signals()
+
+    def serve_launcher(self) -> None:
+        """Continue if the launcher dies, and show stacks."""
+        continue_when_parent_dies()
+        faulthandler.register(SHOW_STACKS, all_threads=True)
+
+    def read_input(self, most: int) -> bytes:
+        """Wait for what comes on standard input."""
+        # Not sys.stdin: a thread that waits in its lock makes the interpreter abort at exit.
+        return os.read(0, most)
+
+    def input_closed(self) -> bool:
+        """Ask the system, so that the answer depends on no thread."""
+        poll = select.poll()
+        poll.register(0, 0)
+        return bool(poll.poll(0))
+
+    def keep_events_apart(self, launched: bool) -> None:
+        """Redirect file descriptor 1 to standard error."""
+        sys.stdout.flush()
+        apart = os.fdopen(os.dup(1), "w", encoding="utf-8")
+        os.dup2(2, 1)
+        if launched:
+            self._events = apart
+        else:
+            sys.stdout = cast(TextIO, Output(apart))
+
+    def send_event(self, line: bytes) -> None:
+        """Write a line to where events go."""
+        left = memoryview(line)
+        with suppress(AttributeError):  # there is no standard output
+            to = (self._events or sys.stdout).fileno()
+            while left:
+                left = left[os.write(to, left) :]
+
+
+REAL_PROCESS: ThisProcess = RealProcess()

@@ -1,0 +1,471 @@
+"""Virtual time, and threads that take turns: a seed decides which goes on next, and everything that happens is an event.
+
+A thread is a greenlet: it goes on until it waits for something of the world, or until the seed interrupts it where it touches
+something that others share. While nobody can go on, time passes. A thread belongs to a process; a killed process's threads never
+go on, so that nothing of theirs is flushed, released or removed, as after SIGKILL.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import heapq
+import random
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from queue import Empty
+from types import TracebackType
+from typing import Any, TypeVar, final
+
+from greenlet import getcurrent, greenlet
+
+T = TypeVar("T")
+_INTERRUPTED = 0.1
+"""The share of the places where a thread touches something shared at which another one goes on first."""
+
+
+class Ended(BaseException):
+    """The process of this thread has ended by its own act, or is gone; only the scheduler catches it."""
+
+
+class Stuck(Exception):
+    """The simulated time is over, or every thread waits for another one, without a limit."""
+
+
+@dataclass(frozen=True)
+class Happening:
+    """Something that happened."""
+
+    at: float
+    """Virtual seconds."""
+    process: str
+    what: str
+    words: tuple[object, ...]
+
+
+@final
+@dataclass(eq=False)
+class Task:
+    """A process: its threads, and whether they may go on."""
+
+    name: str
+    number: int
+    """Its process id."""
+    alive: bool = True
+    stopped: bool = False
+    """Whether it is suspended, as by SIGSTOP."""
+    status: int | None = None
+    threads: list[VirtualThread] = field(default_factory=list)
+    held: list[Callable[[], object]] = field(default_factory=list)
+    """What its end releases, whatever ended it: connections, locks of files, pipes."""
+    waiting: list[Waiter] = field(default_factory=list)
+    """Threads that may go on once it is continued."""
+
+
+@final
+class Waiter:
+    """A thread that waits, until it is woken up by what it waits for or by time: by whichever is first."""
+
+    __slots__ = ("gone", "thread", "value")
+
+    def __init__(self, thread: VirtualThread) -> None:
+        self.thread, self.gone, self.value = thread, False, False
+
+
+@final
+class VirtualThread:
+    """A thread of a simulated process."""
+
+    def __init__(self, scheduler: Scheduler, task: Task, name: str, work: Callable[[], object]) -> None:
+        self.name, self.task, self._scheduler, self._work = name, task, scheduler, work
+        self.ident: int | None = None
+        self.over = False
+        self._joining: deque[Waiter] = deque()
+        self.greenlet: Any = None
+
+    def start(self) -> None:
+        """Start it."""
+        self.ident = self._scheduler.number()
+        self.task.threads.append(self)
+        self.greenlet = greenlet(self._run, parent=self._scheduler.hub)
+        self.greenlet.evedrop_thread = self
+        self._scheduler.make_ready(self)
+        self._scheduler.interruptible()
+
+    def _run(self, *_: object) -> None:
+        try:
+            self._work()
+        except Ended:
+            pass
+        except SystemExit:
+            pass
+        except BaseException as error:  # as an exception in a thread: it is told, and the others go on
+            self._scheduler.failed(self, error)
+        finally:
+            self.over = True
+        if self.task.alive:
+            self._scheduler.wake(self._joining)
+
+    def join(self, timeout: float | None = None) -> None:
+        """Wait until it has ended."""
+        if self.ident is not None and not self.over:
+            self._scheduler.wait(self._joining, timeout)
+
+    def is_alive(self) -> bool:
+        """Whether it runs."""
+        return self.ident is not None and not self.over
+
+
+@final
+class Scheduler:
+    """Lets threads go on in an order that a seed decides."""
+
+    def __init__(self, seed: int, keep: bool = False) -> None:
+        """keep: whether to keep what happened, to be shown; its hash is made in any case."""
+        self.random = random.Random(seed)  # noqa: S311 - to be repeated, not to be secret
+        self.now = 0.0
+        self.hub = getcurrent()
+        self.events = 0
+        self.happened: list[Happening] = []
+        self.errors: list[tuple[str, BaseException]] = []
+        """Thread → the exception that ended it without being caught."""
+        self._keep, self._hash = keep, hashlib.blake2b(digest_size=8)
+        self._ready: list[VirtualThread | Waiter] = []
+        self._timers: list[tuple[float, int, Waiter | Callable[[], object]]] = []
+        self._number = 1000
+        self.current: VirtualThread | None = None
+        self.tasks: list[Task] = []
+
+    def number(self) -> int:
+        """A number that nothing else has."""
+        self._number += 1
+        return self._number
+
+    @property
+    def digest(self) -> str:
+        """The hash of everything that happened so far."""
+        return self._hash.hexdigest()
+
+    def note(self, what: str, *words: object) -> None:
+        """Something happens: it is counted, hashed, and kept to be shown."""
+        self.events += 1
+        name = self.current.task.name if self.current is not None else "world"
+        self._hash.update(repr((round(self.now, 9), name, what, words)).encode())
+        if self._keep:
+            self.happened.append(Happening(self.now, name, what, words))
+
+    # Processes and threads
+
+    def process(self, name: str) -> Task:
+        """A new process without threads."""
+        task = Task(name, self.number())
+        self.tasks.append(task)
+        return task
+
+    def thread(self, name: str, work: Callable[[], object], task: Task | None = None) -> VirtualThread:
+        """A thread, not started yet, of this process or another."""
+        if task is None:
+            task = self._running.task
+        return VirtualThread(self, task, name, work)
+
+    @property
+    def _running(self) -> VirtualThread:
+        if self.current is None:
+            raise AssertionError("the world itself cannot wait")
+        return self.current
+
+    def end(self, task: Task, status: int) -> None:
+        """End a process where it is: no thread of it goes on. If it is the current one, this never returns."""
+        if not task.alive:
+            return
+        self.note("ends", task.name, status)
+        task.alive, task.status, task.stopped = False, status, False
+        for release in reversed(task.held):
+            release()
+        task.held.clear()
+        if self.current is not None and self.current.task is task:
+            self.hub.switch()
+            raise Ended  # when everything is taken down
+
+    def stop(self, task: Task) -> None:
+        """Suspend a process."""
+        if task.alive and not task.stopped:
+            self.note("is suspended", task.name)
+            task.stopped = True
+            if self.current is not None and self.current.task is task:
+                self.make_ready(self.current)
+                self.hub.switch()
+
+    def go_on(self, task: Task) -> None:
+        """Continue a suspended process."""
+        if task.alive and task.stopped:
+            self.note("goes on", task.name)
+            task.stopped = False
+            self._ready += task.waiting
+            task.waiting = []
+
+    def failed(self, thread: VirtualThread, error: BaseException) -> None:
+        """An exception has ended a thread."""
+        self.errors.append((f"{thread.task.name}: {thread.name}", error))
+
+    # Waiting
+
+    def make_ready(self, thread: VirtualThread | Waiter) -> None:
+        """Let a thread go on."""
+        self._ready.append(thread)
+
+    def interruptible(self) -> None:
+        """A place where another thread may go on first."""
+        current = self.current
+        if current is not None and self.random.random() < _INTERRUPTED:
+            self._ready.append(current)
+            self._switch(current)
+
+    def _switch(self, current: VirtualThread) -> None:
+        self.hub.switch()
+        if not current.task.alive:
+            raise Ended
+
+    def wait(self, place: deque[Waiter], timeout: float | None = None) -> bool:
+        """Wait until woken up at this place, or for `timeout` seconds; returns whether it was woken up."""
+        current = self._running
+        waiter = Waiter(current)
+        place.append(waiter)
+        if timeout is not None:
+            self.at(self.now + max(0.0, timeout), waiter)
+        self._switch(current)
+        return waiter.value
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        current = self._running
+        self.at(self.now + max(0.0, seconds), Waiter(current))
+        self._switch(current)
+
+    def wake(self, place: deque[Waiter], most: int | None = None) -> int:
+        """Wake up the threads that wait at a place, the first `most` of them; returns how many."""
+        woken = 0
+        while place and (most is None or woken < most):
+            waiter = place.popleft()
+            if not waiter.gone and waiter.thread.task.alive:
+                waiter.gone = waiter.value = True
+                self._ready.append(waiter)
+                woken += 1
+        return woken
+
+    def at(self, moment: float, what: Waiter | Callable[[], object]) -> None:
+        """At this moment, let a thread go on, or something happen to the world."""
+        heapq.heappush(self._timers, (moment, self.number(), what))
+
+    def run(self, until: float, done: Callable[[], bool]) -> None:
+        """Let everything happen until `done`. Raises Stuck if that is not before this moment, or cannot be any more."""
+        while not done():
+            if self._ready:
+                ready = self._ready
+                index = self.random.randrange(len(ready))
+                ready[index], ready[-1] = ready[-1], ready[index]
+                self._go_on(ready.pop())
+            elif self._timers:
+                moment, _, what = heapq.heappop(self._timers)
+                if isinstance(what, Waiter):
+                    if what.gone:
+                        continue
+                    what.gone = True
+                if moment > until:
+                    raise Stuck(f"not done after {until:.0f} virtual seconds")
+                self.now = max(self.now, moment)
+                if isinstance(what, Waiter):
+                    self._go_on(what)
+                else:
+                    what()
+            else:
+                raise Stuck("everybody waits for another, without a limit")
+
+    def _go_on(self, next_one: VirtualThread | Waiter) -> None:
+        thread = next_one.thread if isinstance(next_one, Waiter) else next_one
+        task = thread.task
+        if not task.alive or thread.over:
+            return
+        if task.stopped:
+            waiter = next_one if isinstance(next_one, Waiter) else Waiter(thread)
+            task.waiting.append(waiter)
+            return
+        self.current = thread
+        thread.greenlet.switch()
+        self.current = None
+
+    def take_down(self) -> None:
+        """Unwind what is left of all threads, once nobody looks at the world any more."""
+        for task in self.tasks:
+            task.alive = False
+        for task in self.tasks:
+            for thread in task.threads:
+                while thread.greenlet:
+                    self.current = thread
+                    thread.greenlet.throw(Ended)
+        self.current = None
+
+
+@final
+class VirtualLock:
+    """A lock; `again`: whether its holder can take it again."""
+
+    def __init__(self, scheduler: Scheduler, again: bool = False) -> None:
+        self._scheduler, self._again = scheduler, again
+        self._holder: VirtualThread | None = None
+        self._depth = 0
+        self.waiting: deque[Waiter] = deque()
+
+    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
+        """Take it."""
+        scheduler = self._scheduler
+        me = scheduler.current
+        if me is None:  # the world itself, between the turns of threads
+            return self._holder is None
+        scheduler.interruptible()
+        deadline = None if timeout < 0 else scheduler.now + timeout
+        while self._holder is not None and not (self._again and self._holder is me):
+            if not blocking:
+                return False
+            left = None if deadline is None else deadline - scheduler.now
+            if left is not None and left <= 0.0:
+                return False
+            scheduler.wait(self.waiting, left)
+        self._holder, self._depth = me, self._depth + 1
+        return True
+
+    def release(self) -> None:
+        """Give it back."""
+        if self._holder is None:
+            return
+        self._depth -= 1
+        if self._depth == 0:
+            self._holder = None
+            self._scheduler.wake(self.waiting, 1)
+            self._scheduler.interruptible()
+
+    def held_by_me(self) -> bool:
+        """Whether the current thread has it."""
+        return self._holder is not None and self._holder is self._scheduler.current
+
+    def __enter__(self) -> bool:
+        return self.acquire()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.release()
+
+
+@final
+class VirtualCondition:
+    """A condition with a lock."""
+
+    def __init__(self, scheduler: Scheduler) -> None:
+        self._scheduler, self._lock = scheduler, VirtualLock(scheduler, again=True)
+        self._waiting: deque[Waiter] = deque()
+        self.acquire, self.release = self._lock.acquire, self._lock.release
+
+    def __enter__(self) -> bool:
+        return self._lock.acquire()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._lock.release()
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until notified."""
+        self._lock.release()
+        try:
+            return self._scheduler.wait(self._waiting, timeout)
+        finally:
+            self._lock.acquire()
+
+    def wait_for(self, predicate: Callable[[], T], timeout: float | None = None) -> T:
+        """Wait until something is true."""
+        deadline = None if timeout is None else self._scheduler.now + timeout
+        while not (result := predicate()):
+            left = None if deadline is None else deadline - self._scheduler.now
+            if left is not None and left <= 0.0:
+                break
+            self.wait(left)
+        return result
+
+    def notify(self, n: int = 1) -> None:
+        """Wake up threads that wait."""
+        self._scheduler.wake(self._waiting, n)
+
+    def notify_all(self) -> None:
+        """Wake up all of them."""
+        self._scheduler.wake(self._waiting)
+
+
+@final
+class VirtualEvent:
+    """Something that happens once."""
+
+    def __init__(self, scheduler: Scheduler) -> None:
+        self._scheduler, self._set = scheduler, False
+        self._waiting: deque[Waiter] = deque()
+
+    def is_set(self) -> bool:
+        """Whether it has happened."""
+        return self._set
+
+    def set(self) -> None:
+        """It happens."""
+        self._set = True
+        self._scheduler.wake(self._waiting)
+        self._scheduler.interruptible()
+
+    def clear(self) -> None:
+        """It has not happened."""
+        self._set = False
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until it happens."""
+        if not self._set:
+            self._scheduler.wait(self._waiting, timeout)
+        return self._set
+
+
+@final
+class VirtualQueue:
+    """Items in order."""
+
+    def __init__(self, scheduler: Scheduler) -> None:
+        self._scheduler = scheduler
+        self._items: deque[Any] = deque()
+        self._waiting: deque[Waiter] = deque()
+
+    def put(self, item: Any) -> None:
+        """Add an item."""
+        self._items.append(item)
+        self._scheduler.wake(self._waiting, 1)
+        self._scheduler.interruptible()
+
+    def get(self, block: bool = True, timeout: float | None = None) -> Any:
+        """Take the next item."""
+        scheduler = self._scheduler
+        deadline = None if timeout is None else scheduler.now + timeout
+        while not self._items:
+            left = None if deadline is None else deadline - scheduler.now
+            if not block or (left is not None and left <= 0.0):
+                raise Empty
+            scheduler.wait(self._waiting, left)
+        return self._items.popleft()
+
+    def get_nowait(self) -> Any:
+        """Take the next item."""
+        return self.get(block=False)
+
+    def empty(self) -> bool:
+        """Whether there is none."""
+        return not self._items
+
+    def qsize(self) -> int:
+        """How many there are."""
+        return len(self._items)

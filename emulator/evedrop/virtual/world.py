@@ -1,0 +1,82 @@
+"""The simulated world, as the programs in it see it: `VirtualWorld` stands for the machine wherever they ask `world()`.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, final
+
+from evedrop.system.this_process import ThisProcess
+from evedrop.system.world import Condition, Event, Lock, Queue, Thread, World
+from evedrop.virtual.scheduler import (
+    Scheduler,
+    VirtualCondition,
+    VirtualEvent,
+    VirtualLock,
+    VirtualQueue,
+)
+
+EPOCH = 1_767_225_600.0
+"""The virtual clock of every machine at the beginning: 2026-01-01."""
+
+
+@final
+class VirtualWorld(World):
+    """A world whose scheduler decides who goes on, and whose time is virtual."""
+
+    def __init__(self, scheduler: Scheduler, zenoh: Any = None) -> None:
+        self.scheduler = scheduler
+        self._zenoh = zenoh
+
+    def monotonic(self) -> float:
+        """Virtual seconds."""
+        return self.scheduler.now
+
+    def time(self) -> float:
+        """Virtual seconds since 1970."""
+        return EPOCH + self.scheduler.now
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        self.scheduler.sleep(seconds)
+
+    def thread(self, work: Callable[..., object], *arguments: object, name: str, daemon: bool = True) -> Thread:
+        """A thread of the current process."""
+        del daemon
+        return self.scheduler.thread(name, lambda: work(*arguments))
+
+    def lock(self) -> Lock:
+        """A lock."""
+        return VirtualLock(self.scheduler)
+
+    def rlock(self) -> Lock:
+        """A lock that its holder can take again."""
+        return VirtualLock(self.scheduler, again=True)
+
+    def condition(self) -> Condition:
+        """A condition."""
+        return VirtualCondition(self.scheduler)
+
+    def event(self) -> Event:
+        """An event."""
+        return VirtualEvent(self.scheduler)
+
+    def queue(self) -> Queue[Any]:
+        """A queue."""
+        return VirtualQueue(self.scheduler)
+
+    def token(self, size: int) -> bytes:
+        """Bytes that the seed decides."""
+        return self.scheduler.random.randbytes(size)
+
+    @property
+    def process(self) -> ThisProcess:
+        """The process of the current thread."""
+        raise NotImplementedError
+
+    @property
+    def zenoh(self) -> Any:
+        """The simulated Zenoh."""
+        return self._zenoh
