@@ -1,4 +1,4 @@
-"""The world in which a program runs: its time, threads, locks and queues, its signals and standard files, its processes, and Zenoh.
+"""The world in which a program runs: time, threads, locks and queues, this process, and Zenoh.
 
 `world()` is the real one, unless a test has put the program into a simulated one (`evedrop.virtual`), where all programs of a run
 live in one interpreter, time is virtual, and a seed decides which of them goes on next. A program does not know which it is.
@@ -211,7 +211,7 @@ class RealWorld(World):
 
     @property
     def process(self) -> ThisProcess:
-        """This process."""
+        """The process of this interpreter."""
         return REAL_PROCESS
 
     @property
