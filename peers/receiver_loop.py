@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import final
@@ -21,6 +20,7 @@ from evedrop.live.protocol.telemetry import leaving
 from evedrop.model.receiver import Belief, Flags, Receiver
 from evedrop.model.slot.cores import ReceiverCore
 from evedrop.peers.closed_loop import Consultation
+from evedrop.system.world import world
 
 
 def follow(
@@ -153,7 +153,7 @@ class ReceiverReplies:
     def acknowledge_after_end(self, deliveries: Iterable[Reader]) -> None:
         """After the last slot, acknowledge deliveries that still arrive, on a thread of its own that ends with the session."""
         if self._acknowledge is not None:
-            threading.Thread(target=self._go_on, args=(deliveries,), name="acknowledges", daemon=True).start()
+            world().thread(self._go_on, deliveries, name="acknowledges").start()
 
     def _go_on(self, deliveries: Iterable[Reader]) -> None:
         for message in deliveries:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from queue import Empty, SimpleQueue
-from threading import Condition
+from queue import Empty
 from typing import TypeVar
+
+from evedrop.system.world import Condition, Queue
 
 T = TypeVar("T")
 
@@ -25,7 +26,7 @@ class TestClock:
         """Let time pass at once."""
         self.now += seconds
 
-    def next(self, queue: SimpleQueue[T], timeout: float | None) -> T:
+    def next(self, queue: Queue[T], timeout: float | None) -> T:
         """The next item; if the queue is empty, the time limit passes at once."""
         if queue.empty():
             self.now += 0.0 if timeout is None else timeout

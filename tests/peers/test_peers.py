@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
 import msgpack
@@ -28,6 +27,7 @@ from evedrop.model.process import Process
 from evedrop.peers.eavesdropper import eavesdrop
 from evedrop.peers.legitimate import estimate
 from evedrop.peers.sensor import Window, sense
+from evedrop.system.world import Queue
 from tests.builders import listener, part_of, scenario_of
 from tests.clock import T, TestClock
 from tests.conftest import LIMIT
@@ -339,7 +339,7 @@ class WouldWaitError(Exception):
 class Impatient(TestClock):
     """A clock that says so instead of waiting."""
 
-    def next(self, queue: SimpleQueue[T], timeout: float | None) -> T:
+    def next(self, queue: Queue[T], timeout: float | None) -> T:
         """The next item that is there."""
         if queue.empty():
             raise WouldWaitError

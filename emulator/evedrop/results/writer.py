@@ -6,7 +6,6 @@ Source: docs/results.md.
 from __future__ import annotations
 
 import errno
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -35,6 +34,7 @@ from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
 from evedrop.score.summary import Summary
 from evedrop.score.sums import LEVELS, SlotSums
+from evedrop.system.world import world
 
 _ROUND_SECONDS = 3.0  # the longest time between rounds, which a killed writer loses
 _ROUND_BYTES = (32 * 2**10, 4 * 2**20)  # the most that is held back, at the start of a run and later
@@ -88,7 +88,7 @@ class ResultsWriter:
         self._restarts = self._bytes = self._on_disk = self._slots = 0
         self._at = "slot 0"
         self._broken = self._metrics_before = False
-        self._round_due = self._metrics_due = time.monotonic() + _ROUND_SECONDS
+        self._round_due = self._metrics_due = world().monotonic() + _ROUND_SECONDS
         self._with_metrics: Callable[[], None] = lambda: None
         self._round()
 
@@ -145,7 +145,7 @@ class ResultsWriter:
         before: called before metrics. Raises OSError if the disk is full or the folder is gone.
         """
         self._at = at
-        began = time.monotonic()
+        began = world().monotonic()
         least, most = _ROUND_BYTES
         if began < self._round_due and self._bytes < min(most, max(least, self._on_disk // _ROUND_ONE_IN)):
             return
@@ -159,12 +159,12 @@ class ResultsWriter:
             self._metrics_before = True
         else:
             self._round()
-        self._round_due = time.monotonic() + _ROUND_SECONDS
+        self._round_due = world().monotonic() + _ROUND_SECONDS
         if due:
             self._metrics_due = self._round_due
         if due and not first:  # the first metrics import the theory, so their time says nothing about the next
             self.write_metrics(metrics())
-            now = time.monotonic()
+            now = world().monotonic()
             self._metrics_due = now + max(_ROUND_SECONDS, _METRICS_PAUSE * (now - began))
 
     def write_rows(self, at: str) -> None:

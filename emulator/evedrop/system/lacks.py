@@ -6,13 +6,14 @@ import errno
 import os
 import resource
 import sys
-import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import final
+
+from evedrop.system.world import world
 
 _SCIPY_BYTES, _THREAD_BYTES = 160_000_000, 45_000_000
 """The address space that scipy needs with one thread of OpenBLAS, and for each further one: measured were 86 and 41 MB."""
@@ -87,7 +88,7 @@ def preload_meanwhile() -> None:
         with suppress(Exception):  # the summary's own import says what is wrong
             import_module("scipy.special")
 
-    threading.Thread(target=load, name="preload", daemon=True).start()
+    world().thread(load, name="preload").start()
 
 
 def _limit() -> int | None:

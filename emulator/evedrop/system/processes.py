@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar, final
+
+from evedrop.system.world import world
 
 KILLED_SECONDS = 10.0
 """How long to wait for a killed process: the next turn of a busy processor ends it, unless it hangs in the system itself."""
 SUSPENDED_SECONDS = 60.0
 """How long a process that others wait for may be suspended."""
 _POLL_SECONDS = 1.0
-_PR_SET_PDEATHSIG = 1
 # The setting survives exec. A parent that died before it was made sends no signal any more. Python ignores SIGPIPE, and a program
 # that it becomes would, too.
 _SIGNALLED = """
@@ -54,11 +53,11 @@ def kill(*processes: KillableProcess) -> None:
 
 def wait_for(processes: Collection[P], seconds: float) -> list[P]:
     """Wait until processes have ended, for `seconds` at most; returns those that still run."""
-    deadline = time.monotonic() + seconds
+    deadline = world().monotonic() + seconds
     left = []
     for process in processes:
         try:
-            process.wait(max(0.0, deadline - time.monotonic()))
+            process.wait(max(0.0, deadline - world().monotonic()))
         except subprocess.TimeoutExpired:
             left.append(process)
     return left
@@ -78,24 +77,18 @@ class SuspensionWatch:
 
     def __init__(self) -> None:
         self._looks: dict[int, int] = {}
-        self._next = time.monotonic()
+        self._next = world().monotonic()
 
     def suspended_for_good(self, pids: Collection[int]) -> int | None:
         """The first of these processes that has been suspended for `SUSPENDED_SECONDS`; None without one.
 
         To be called often: it looks once a second.
         """
-        if time.monotonic() < self._next:
+        if world().monotonic() < self._next:
             return None
-        self._next = time.monotonic() + _POLL_SECONDS
+        self._next = world().monotonic() + _POLL_SECONDS
         self._looks = {pid: self._looks.get(pid, 0) + 1 for pid in pids if is_suspended(pid)}
         return next((pid for pid, looks in self._looks.items() if looks * _POLL_SECONDS > SUSPENDED_SECONDS), None)
-
-
-def continue_when_parent_dies() -> None:
-    """Let the system continue this process if it is suspended when its parent dies: it would not notice (Linux only)."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
 
 
 def signalled_when_parent_dies(command: Sequence[str], number: signal.Signals, first: str = "") -> list[str]:

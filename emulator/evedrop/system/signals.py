@@ -9,7 +9,6 @@ from __future__ import annotations
 # The C module under `signal`: `signal` imports enum and more, which takes about as long as the interpreter needs to start.
 import _signal as signal  # type: ignore[import-not-found]
 import _thread
-import faulthandler
 import os
 import time
 from contextlib import contextmanager
@@ -208,8 +207,3 @@ def leave_on_signals() -> None:
     import threading  # noqa: PLC0415 - the handlers come first
 
     threading.Thread(target=wait, name="signals", daemon=True).start()
-
-
-def show_stacks_on_request() -> None:
-    """Write the stack of every thread to standard error upon `SHOW_STACKS`, even while native code holds Python's lock."""
-    faulthandler.register(SHOW_STACKS, all_threads=True)

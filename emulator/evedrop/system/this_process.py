@@ -5,19 +5,23 @@ Source: docs/architecture.md, the simulated world.
 
 from __future__ import annotations
 
+import ctypes
 import faulthandler
 import os
 import select
 import signal
 import sys
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from typing import NoReturn, TextIO, cast, final
 
+from evedrop.system.native_log import native_log_apart
 from evedrop.system.output import Output
-from evedrop.system.processes import continue_when_parent_dies
 from evedrop.system.signals import SHOW_STACKS, heeded, leave_on_signals
+
+_PR_SET_PDEATHSIG = 1
 
 
 class ThisProcess(ABC):
@@ -45,8 +49,16 @@ class ThisProcess(ABC):
         """Let these signals end it at once, with status 130."""
 
     @abstractmethod
-    def serve_launcher(self) -> None:
-        """Continue if it is suspended when its launcher dies; show the stacks of its threads when that asks for them."""
+    def show_stacks(self) -> None:
+        """Write the stack of every thread to standard error upon `SHOW_STACKS`, even while native code holds Python's lock."""
+
+    @abstractmethod
+    def continue_when_parent_dies(self) -> None:
+        """Let the system continue it if it is suspended when its parent dies: it would not notice."""
+
+    @abstractmethod
+    def native_log_apart(self) -> AbstractContextManager[None]:
+        """While the block runs, pass what native code prints on to standard error, escaped and up to a limit."""
 
     @abstractmethod
     def read_input(self, most: int) -> bytes:
@@ -73,6 +85,7 @@ class RealProcess(ThisProcess):
     """The process of this interpreter."""
 
     def __init__(self) -> None:
+        self._line = threading.Lock()  # one line at a time
         self._events: TextIO | None = None
         """The stream for a launched process's events; None before `keep_events_apart`, and if it was started by hand."""
 
@@ -98,10 +111,17 @@ class RealProcess(ThisProcess):
         """Let these signals end it at once."""
         leave_on_signals()
 
-    def serve_launcher(self) -> None:
-        """Continue if the launcher dies, and show stacks."""
-        continue_when_parent_dies()
+    def show_stacks(self) -> None:
+        """Write the stack of every thread to standard error upon `SHOW_STACKS`."""
         faulthandler.register(SHOW_STACKS, all_threads=True)
+
+    def continue_when_parent_dies(self) -> None:
+        """Let the system continue it (Linux only)."""
+        continue_when_parent_dies()
+
+    def native_log_apart(self) -> AbstractContextManager[None]:
+        """Let file descriptor 1 lead to a file in memory while the block runs."""
+        return native_log_apart()
 
     def read_input(self, most: int) -> bytes:
         """Wait for what comes on standard input."""
@@ -127,10 +147,16 @@ class RealProcess(ThisProcess):
     def send_event(self, line: bytes) -> None:
         """Write a line to where events go."""
         left = memoryview(line)
-        with suppress(AttributeError):  # there is no standard output
+        with self._line, suppress(AttributeError):  # there is no standard output
             to = (self._events or sys.stdout).fileno()
             while left:
                 left = left[os.write(to, left) :]
+
+
+def continue_when_parent_dies() -> None:
+    """Let the system continue this process if it is suspended when its parent dies: it would not notice (Linux only)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
 
 
 REAL_PROCESS: ThisProcess = RealProcess()

@@ -5,18 +5,17 @@ Tests pass another clock, which does not let them wait.
 
 from __future__ import annotations
 
-import threading
-import time
-from queue import SimpleQueue
+from collections.abc import Callable
 from typing import Protocol, TypeVar, final
 
 from evedrop.errors import RunError
+from evedrop.system.world import Condition, Event, Queue, Thread, world
 
 THREAD_SECONDS = 600.0
 """How long to wait for a thread that was told to end. It ends within seconds, unless something that it calls hangs."""
 
 
-def wait_for_thread(thread: threading.Thread, seconds: float = THREAD_SECONDS) -> None:
+def wait_for_thread(thread: Thread, seconds: float = THREAD_SECONDS) -> None:
     """Wait until a thread has ended. Raises RunError if it still runs after `seconds`."""
     if thread.ident is None:  # it was never started, as on a machine that lacks threads: the reason is told elsewhere
         return
@@ -26,6 +25,27 @@ def wait_for_thread(thread: threading.Thread, seconds: float = THREAD_SECONDS) -
             f"the thread {thread.name} was told to end {seconds:g} s ago and still runs, because something that it called has "
             "hung; report this"
         )
+
+
+@final
+class Alarm:
+    """Does something once some time has passed, on a thread of its own, unless it is set again or put off before."""
+
+    def __init__(self, act: Callable[[], object]) -> None:
+        self._act, self._off = act, world().event()
+        self._lock = world().lock()
+
+    def set(self, seconds: float | None) -> None:
+        """Do it after `seconds`; None: do not do it."""
+        with self._lock:
+            self._off.set()
+            if seconds is not None:
+                self._off = world().event()
+                world().thread(self._wait, self._off, seconds, name="alarm").start()
+
+    def _wait(self, off: Event, seconds: float) -> None:
+        if not off.wait(seconds):
+            self._act()
 
 
 T = TypeVar("T")
@@ -40,10 +60,10 @@ class Clock(Protocol):
     def sleep(self, seconds: float) -> None:
         """Let time pass."""
 
-    def next(self, queue: SimpleQueue[T], timeout: float | None) -> T:
+    def next(self, queue: Queue[T], timeout: float | None) -> T:
         """Wait for the next item of a queue. Raises Empty after `timeout` seconds; None: waits as long as it takes."""
 
-    def wait(self, condition: threading.Condition, timeout: float | None) -> None:
+    def wait(self, condition: Condition, timeout: float | None) -> None:
         """Wait until a condition is notified, or for `timeout` seconds; None: waits as long as it takes."""
 
 
@@ -53,17 +73,17 @@ class SystemClock:
 
     def monotonic(self) -> float:
         """Seconds since some moment."""
-        return time.monotonic()
+        return world().monotonic()
 
     def sleep(self, seconds: float) -> None:
         """Let time pass."""
-        time.sleep(seconds)
+        world().sleep(seconds)
 
-    def next(self, queue: SimpleQueue[T], timeout: float | None) -> T:
+    def next(self, queue: Queue[T], timeout: float | None) -> T:
         """Wait for the next item of a queue. Raises Empty."""
         return queue.get(timeout=timeout)
 
-    def wait(self, condition: threading.Condition, timeout: float | None) -> None:
+    def wait(self, condition: Condition, timeout: float | None) -> None:
         """Wait until a condition is notified, or for some seconds."""
         condition.wait(timeout)
 

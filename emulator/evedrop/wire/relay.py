@@ -15,7 +15,7 @@ from typing import Self, final
 
 import zenoh
 
-from evedrop.live.network.zenoh_log import LOGGED
+from evedrop.live.network.connecting import LOGGED
 from evedrop.system.output import warn
 from evedrop.system.waiting import wait_for_thread
 from evedrop.wire.departures import Departures

@@ -25,12 +25,12 @@ import zenoh
 from evedrop.errors import EvedropError, RunError, UsageError
 from evedrop.live.network.control_file import no_run, read_control
 from evedrop.live.network.operator import Answer, ask
-from evedrop.live.network.zenoh_log import MARK
 from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest, WireStatus
 from evedrop.results.folder import claimed, default_folder, write_private
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
 from evedrop.scenario.words import listed
 from evedrop.show.report.wire import expectation_failures, wire_faults
+from evedrop.system.native_log import MARK
 from evedrop.system.processes import kill, wait_for
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.journal import journal_tables

@@ -74,22 +74,19 @@ def process(options: argparse.Namespace) -> int:
     """Run one process of a run."""
     from evedrop.live.protocol.brief import ImportingPart, RecorderPart, RoutingPart, read_brief
     from evedrop.scenario.plugins import look_in
-    from evedrop.system.processes import continue_when_parent_dies
 
     os.umask(0o077)  # only this user may read its files
-    from evedrop.system.signals import leave_on_signals, show_stacks_on_request
+    from evedrop.system.world import world
 
-    show_stacks_on_request()
+    world().process.show_stacks()
     if options.role != "recorder":  # the recorder ends the run in order
-        leave_on_signals()
+        world().process.leave_on_signals()
     brief = read_brief(options.brief, options.role)
     if brief.ends_with_stdin:  # started by a launcher, which writes another brief if it restarts the process
         options.brief.unlink(missing_ok=True)  # its keys should not stay on disk
-        continue_when_parent_dies()
+        world().process.continue_when_parent_dies()
         if isinstance(brief.part, RoutingPart):
-            from evedrop.live.network.launcher_pipe import keep_events_apart
-
-            keep_events_apart(launched=True)  # before the modules of link classes print anything
+            world().process.keep_events_apart(launched=True)  # before the modules of link classes print anything
     if isinstance(brief.part, RecorderPart) and getattr(options, "out", None) is not None:
         brief = replace(brief, part=replace(brief.part, results=str(options.out)))
     if isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
@@ -119,9 +116,9 @@ def _play(brief: AnyBrief, serve: str | None) -> int:
         with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
             return _record(brief, serve)
     brief.expect_usable()
-    from evedrop.live.network.zenoh_log import zenoh_log_apart
+    from evedrop.system.world import world
 
-    with classes_known(), zenoh_log_apart() if _listens(brief) else contextlib.nullcontext():
+    with classes_known(), world().process.native_log_apart() if _listens(brief) else contextlib.nullcontext():
         _take_part(brief)
     return 0
 

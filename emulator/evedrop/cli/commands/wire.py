@@ -43,15 +43,15 @@ def wire(options: argparse.Namespace) -> int:
     if options.check:
         return 0
     from evedrop.cli.report import report_page
-    from evedrop.live.network.zenoh_log import zenoh_log_apart
     from evedrop.results.folder import results_folder
+    from evedrop.system.world import world
     from evedrop.wire.run import run_wire
 
     gc.freeze()  # imported modules stay: the collections that new keys cause need not look at them
     with results_folder(options.out, f"wire-{options.file.stem}") as folder:
         options.out = folder
         speaking = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}
-        with zenoh_log_apart():
+        with world().process.native_log_apart():
             status = run_wire(plan, folder, seconds=seconds, view=options.view, **speaking)
         report_page(folder, options.quiet)
         return status

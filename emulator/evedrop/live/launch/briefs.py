@@ -47,6 +47,7 @@ from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
 from evedrop.score.links import ack_channel_of, chart_of
+from evedrop.system.world import world
 
 _WINDOW_BYTES = 64 * 2**20
 _MOST_SLOTS_AHEAD = 4096
@@ -144,7 +145,7 @@ def briefs_of(
     endpoints: a string is the endpoint of one router, both to listen on and to connect to. Raises UsageError if their number
     differs from the scenario's number of routers.
     """
-    run = f"r{secrets.token_hex(4)}"
+    run = f"r{world().token(4).hex()}"
     if isinstance(endpoints, str):
         endpoints = endpoints_at(endpoints)
     endpoints.check(scenario.relayed)

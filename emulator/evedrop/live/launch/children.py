@@ -6,11 +6,9 @@ import contextlib
 import re
 import signal
 import subprocess
-import threading
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import Empty
 from typing import final
 
 from evedrop.errors import RunError
@@ -39,6 +37,7 @@ from evedrop.scenario.progress_events import OnEvent, ProgressEvent, RunEnded, S
 from evedrop.system.environment import SINGLE_THREADED, check_zenoh_runtime, lock_step_environment, own_environment
 from evedrop.system.processes import wait_for
 from evedrop.system.signals import INTERRUPTED
+from evedrop.system.world import Queue, world
 
 ROUTER_RESTARTS = 3  # how often routers that were ended by a signal are restarted in a run
 SILENCE_SECONDS = 30.0  # after which the launcher gives up on a silent recorder, which sends a heartbeat every second
@@ -88,7 +87,7 @@ class Children:
         self._lock_step = lock_step
         self._private = private
         self._processes: dict[str, StartedProcess] = {}
-        self._events: SimpleQueue[ProgressEvent | ProcessExit] = SimpleQueue()
+        self._events: Queue[ProgressEvent | ProcessExit] = world().queue()
         self.silent_seconds = 0.0
         """How many seconds the recorder has been silent for."""
         self.started = False
@@ -144,7 +143,7 @@ class Children:
             before.stdin.close()
         self._processes[brief.process] = process
         try:
-            threading.Thread(target=self._follow, args=(brief.process, process), daemon=True).start()
+            world().thread(self._follow, brief.process, process, name=f"follows {brief.process}").start()
         except RuntimeError:  # no thread can be started: nobody will read what the process tells
             if process.stdout is not None:
                 process.stdout.close()
@@ -197,7 +196,7 @@ class Children:
         if request.do == ProcessAction.END:
             self._killed.add(process.pid)
             process.kill()
-            threading.Thread(target=self._confirm_end, args=(process, request), daemon=True).start()
+            world().thread(self._confirm_end, process, request, name="confirms an end").start()
             return
         if request.do == ProcessAction.START:
             self.start(replace(self._briefs[name], first=request.first), again=True)
@@ -240,7 +239,7 @@ class Children:
                 self._listening.add(process)
             case ProcessRequest(ProcessAction.START) if not all(self.listens(name) for name in (ROUTER, RELAY)):
                 self._events.put(event)
-                time.sleep(_AGAIN_SECONDS)
+                world().sleep(_AGAIN_SECONDS)
             case ProcessRequest():
                 self.act(event)
             case SlotsDone():
@@ -255,10 +254,10 @@ class Children:
         Once it has begun to write the results, it may take `_FINISH_SECONDS`, as long as it sends heartbeats.
         """
         self.terminate(RECORDER, patience)
-        begun = time.monotonic()
+        begun = world().monotonic()
         ending: RunEnded | None = None
         while self.silent_seconds < SILENCE_SECONDS and (
-            time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else _BEGIN_SECONDS)
+            world().monotonic() - begun < (_FINISH_SECONDS if self._finishing else _BEGIN_SECONDS)
         ):
             event = self.next_event(0.05)
             if isinstance(event, ProcessExit):
@@ -324,7 +323,7 @@ class Children:
 
     def _first_failure(self, suspects: list[str]) -> ProcessExit | None:
         """A child that failed or left too early, other than the recorder. Waits a moment for missing processes to end."""
-        deadline = time.monotonic() + (_GONE_SECONDS if suspects else 0.0)
+        deadline = world().monotonic() + (_GONE_SECONDS if suspects else 0.0)
         while True:
             ended = {
                 name: process.poll()
@@ -339,9 +338,9 @@ class Children:
                     return ProcessExit(name, status)
             if suspects and all(ended.get(name) == 0 for name in suspects):
                 return ProcessExit(suspects[0], 0)
-            if time.monotonic() > deadline:
+            if world().monotonic() > deadline:
                 return None
-            time.sleep(0.01)
+            world().sleep(0.01)
 
     def _missed_recorder(self, name: str) -> bool:
         """Whether a process ended because the recorder did not appear."""
@@ -361,11 +360,11 @@ class Children:
             return missed
         place = self._briefs[name].router
         others = [process for process, brief in self._briefs.items() if brief.router == place and process not in _HUBS]
-        deadline = time.monotonic() + (_GONE_SECONDS if len(others) > 1 and not suspects else 0.0)
-        while time.monotonic() < deadline:
+        deadline = world().monotonic() + (_GONE_SECONDS if len(others) > 1 and not suspects else 0.0)
+        while world().monotonic() < deadline:
             if all(self._lost_router(process) for process in others):
                 return RELAY if RELAY in self._processes and name != SENSOR else ROUTER
-            time.sleep(0.05)
+            world().sleep(0.05)
         return None
 
     def _lack(self, ended: ProcessExit) -> str:

@@ -16,7 +16,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -51,6 +50,7 @@ from evedrop.score.expectations_held import replay_of
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
+from evedrop.system.world import world
 
 SHARDS_FOLDER = "shards"  # in the results folder, until the shards are merged
 
@@ -115,7 +115,7 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
         digests = {name: _digest(scenario, name, shards, writer) for name in scenario.digested}
     for name, gathered in _tables(scenario, shards).items():
         gathered.write([shard.folder / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")
-    wall = 0.0 if started is None else time.monotonic() - started
+    wall = 0.0 if started is None else world().monotonic() - started
     scores = [load_score(shard.folder, shard.scenario) for shard in shards]
     run_tally = RunTally.merged(scores)
     replay = replay_of(folder, scenario)

@@ -6,7 +6,6 @@ It imports neither zenoh nor rerun. It alone decides how the run ended.
 from __future__ import annotations
 
 import shlex
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +18,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import choose
 from evedrop.system.output import say
 from evedrop.system.signals import stop_on_signals, told_when_suspended
+from evedrop.system.world import Event
 
 if TYPE_CHECKING:
     from evedrop.live.launch.hosts_file import HostsPlan
@@ -81,7 +81,7 @@ def _on_hosts(
     folder: Path,
     view: str,
     on_event: OnEvent,
-    stop: threading.Event,
+    stop: Event,
     here: Starter,
     hosts: HostsPlan,
     paused: bool,

@@ -11,7 +11,6 @@ from __future__ import annotations
 import ipaddress
 import re
 import socket
-import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -34,6 +33,7 @@ from evedrop.scenario.progress_events import (
 )
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.bounded_http import BoundedServer, QuietHandler
+from evedrop.system.world import world
 
 _REQUEST_SECONDS = 2.0
 _FORM = re.compile(r"(?:\[([0-9a-fA-F:.%]+)\]|([^\[\]:]+)):([0-9]{1,5})")
@@ -87,7 +87,7 @@ class RunMetrics:
     def __init__(self, scenario: Scenario, folder: Path, on_event: OnEvent) -> None:
         """folder: of the results; on_event: gets all events after this object."""
         self._scenario, self._folder, self._on_event = scenario, folder, on_event
-        self._lock = threading.Lock()
+        self._lock = world().lock()
         self._progress: RunProgress | None = None
         self._running = self._held = False
         self._losses: Counter[str] = Counter()

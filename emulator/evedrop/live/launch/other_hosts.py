@@ -24,8 +24,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -50,8 +48,11 @@ from evedrop.live.protocol.brief import AnyBrief, ImportingPart, ReceiverPart, b
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 from evedrop.system.environment import own_environment
 from evedrop.system.fields import NotNegative, Slot
-from evedrop.system.processes import continue_when_parent_dies, kill, signalled_when_parent_dies, wait_for
+from evedrop.system.processes import kill, signalled_when_parent_dies, wait_for
 from evedrop.system.signals import raise_on_signals
+from evedrop.system.this_process import continue_when_parent_dies
+from evedrop.system.waiting import Alarm
+from evedrop.system.world import Event, world
 
 MOST_NOISE = 200
 """The most lines that the login shell of a host may print before the program begins."""
@@ -230,10 +231,10 @@ class SshHost:
         longest_outage: seconds for which a process of the run may be cut off. beat_seconds: between two heartbeats.
         """
         self.name, self._table, self._beat_seconds = name, table, beat_seconds
-        self._sending, self._guard = threading.Lock(), threading.Lock()
+        self._sending, self._guard = world().lock(), world().lock()
         self._processes: dict[int, HostedProcess] = {}
         self._version = ""
-        self._answered, self._lost = threading.Event(), threading.Event()
+        self._answered, self._lost = world().event(), world().event()
         self._output_file = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the connection
         try:
             self._ssh = subprocess.Popen(
@@ -246,9 +247,9 @@ class SshHost:
         except OSError as error:
             self._output_file.close()
             raise UsageError(f"ssh cannot be started ({error.strerror}); install OpenSSH's client") from error
-        self._reader = threading.Thread(target=self._follow, name=f"host {name}", daemon=True)
+        self._reader = world().thread(self._follow, name=f"host {name}")
         self._reader.start()
-        threading.Thread(target=self._beat, name=f"heartbeat of {name}", daemon=True).start()
+        world().thread(self._beat, name=f"heartbeat of {name}").start()
 
     def _beat(self) -> None:
         """Tell the host from time to time that this launcher is still there."""
@@ -256,14 +257,14 @@ class SshHost:
             if self._answered.is_set():
                 self.send(LauncherHeartbeat(_SILENCE_SECONDS))
 
-    def wait_until_ready(self, deadline: float, stop: threading.Event) -> None:
+    def wait_until_ready(self, deadline: float, stop: Event) -> None:
         """Wait until Evedrop answers there. Raises UsageError if it does not, or has another version; Interrupted if stopped."""
         while not self._answered.wait(_POLL_SECONDS):
             if stop.is_set():
                 raise Interrupted("interrupted before the run began; nothing was started")
             if self._lost.is_set():
                 raise UsageError(f"{self._named}: {self._reason()}; {self._remedy()}")
-            if time.monotonic() > deadline:
+            if world().monotonic() > deadline:
                 raise UsageError(
                     f"{self._named}: evedrop did not answer there within {ANSWER_SECONDS:.0f} s ({self._reason()}); "
                     f"{self._remedy()}"
@@ -314,7 +315,7 @@ class SshHost:
     def close(self, deadline: float) -> None:
         """Wait until ssh has ended, and end it at the deadline."""
         self.hang_up()
-        kill(*wait_for([self._ssh], deadline - time.monotonic()))
+        kill(*wait_for([self._ssh], deadline - world().monotonic()))
         self._reader.join(_END_SECONDS)  # it reads the end of the connection at once, and may then wait for ssh as long
         self._output_file.close()
 
@@ -429,7 +430,7 @@ class SshStarter:
 
 
 @contextmanager
-def ssh_starter(plan: HostsPlan, here: Starter, stop: threading.Event, longest_outage: float) -> Iterator[Starter]:
+def ssh_starter(plan: HostsPlan, here: Starter, stop: Event, longest_outage: float) -> Iterator[Starter]:
     """A starter that is connected to all of these hosts; ends all processes on them at the end of the block.
 
     longest_outage: as for `SshHost`. Raises UsageError if a host cannot be used, Interrupted if stopped meanwhile.
@@ -438,7 +439,7 @@ def ssh_starter(plan: HostsPlan, here: Starter, stop: threading.Event, longest_o
         hosts: dict[str, SshHost] = {}
 
         def close() -> None:
-            deadline = time.monotonic() + _END_SECONDS
+            deadline = world().monotonic() + _END_SECONDS
             for host in hosts.values():
                 host.hang_up()
             for host in hosts.values():
@@ -447,7 +448,7 @@ def ssh_starter(plan: HostsPlan, here: Starter, stop: threading.Event, longest_o
         stack.callback(close)
         for name, table in plan.hosts.items():
             hosts[name] = SshHost(name, table, plan.ssh_config, longest_outage)
-        deadline = time.monotonic() + ANSWER_SECONDS
+        deadline = world().monotonic() + ANSWER_SECONDS
         for host in hosts.values():
             host.wait_until_ready(deadline, stop)
         yield SshStarter(plan, hosts, here)
@@ -490,19 +491,14 @@ class _Silence:
     """Ends this program when the launcher has been silent for long: its host may be gone, and the connection seem open."""
 
     def __init__(self) -> None:
-        self._timer: threading.Timer | None = None
+        self._alarm = Alarm(world().process.interrupt)
         self._seconds = 0.0
 
     def heard(self, order: Order) -> None:
         """Note that an order came. A heartbeat says how long the launcher may be silent from now on."""
         if isinstance(order, LauncherHeartbeat):
             self._seconds = order.silence
-        if self._timer is not None:
-            self._timer.cancel()
-        if self._seconds:
-            self._timer = threading.Timer(self._seconds, os.kill, (os.getpid(), signal.SIGTERM))
-            self._timer.daemon = True
-            self._timer.start()
+        self._alarm.set(self._seconds or None)
 
 
 @final
@@ -514,7 +510,7 @@ class HostProcesses:
 
     def __init__(self, private: Path, start: Starter, send: Any) -> None:
         self._private, self._start, self._send = private, start, send
-        self._sending = threading.Lock()
+        self._sending = world().lock()
         self._ending = False
         self._processes: dict[int, StartedProcess] = {}
 
@@ -560,7 +556,7 @@ class HostProcesses:
         events = self._processes[number].stdout
         if events is not None:
             events.close()  # the launcher waits for no router on another host
-        threading.Thread(target=self._follow, args=(number, brief.process, read), daemon=True).start()
+        world().thread(self._follow, number, brief.process, read, name=f"log of {brief.process}").start()
 
     def _with_local_files(self, brief: AnyBrief) -> AnyBrief:
         """The same brief with the files of the process in the private folder of this host."""
@@ -573,7 +569,7 @@ class HostProcesses:
 
     def _follow(self, number: int, name: str, log: int) -> None:
         """Send what a process writes to its log, and how it ended."""
-        reader = threading.Thread(target=self._read, args=(number, log), daemon=True)
+        reader = world().thread(self._read, number, log, name="log")
         reader.start()
         process = self._processes[number]
         status = process.wait()  # without a limit: nobody waits for this thread

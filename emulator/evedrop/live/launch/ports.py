@@ -18,6 +18,7 @@ from evedrop.live.protocol.brief import Identity
 from evedrop.names import RELAY, ROUTER, SENSOR
 from evedrop.system.output import warn
 from evedrop.system.ports import free_port
+from evedrop.system.world import world
 
 _EXAMPLE = "give one such as tls/router.lan:7447"
 
@@ -205,7 +206,7 @@ class Routers:
         near = {**{user: users[user] for user in (ROUTER, SENSOR)}, RELAY: secrets.token_urlsafe(24)}
         far = {**{user: password for user, password in users.items() if user not in near}, RELAY: near[RELAY]}
         # Zenoh takes ids of up to 16 bytes, in hexadecimal without zeros at the ends.
-        zid = f"e{secrets.token_hex(15)}e"
+        zid = f"e{world().token(15).hex()}e"
         return cls(endpoints, near, far, zid)
 
     def endpoint(self, process: str) -> str:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import secrets
 import shutil
 import signal
 import subprocess
@@ -23,6 +22,7 @@ from evedrop.live.network.endpoint import can_be_socket
 from evedrop.names import ROUTER
 from evedrop.system.environment import own_environment
 from evedrop.system.processes import kill, signalled_when_parent_dies
+from evedrop.system.world import world
 
 _PREFIX = "evedrop-"
 _LOCK = "lock"
@@ -45,7 +45,7 @@ def private_folder(where: Path | None = None) -> Iterator[Path]:
     try:
         where = (where or Path(tempfile.gettempdir())).absolute()
         _sweep(where)
-        folder = where / f"{_PREFIX}{secrets.token_hex(8)}"
+        folder = where / f"{_PREFIX}{world().token(8).hex()}"
         guard = _guard(folder)
     except OSError as error:
         raise _unmade(error) from error

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import threading
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +26,7 @@ from evedrop.scenario.progress_events import FolderMoved, OnEvent, RunEnded, Vie
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS, INTERRUPTED
+from evedrop.system.world import Event, world
 
 _POLL_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
@@ -51,7 +50,7 @@ def launch_one(
     view: str,
     endpoints: RouterEndpoints | None,
     on_event: OnEvent,
-    stop: threading.Event,
+    stop: Event,
     starter: Starter,
     *,
     shard: bool = False,
@@ -124,19 +123,19 @@ def _endpoints(given: RouterEndpoints | None, private: Path) -> Iterator[RouterE
         yield socket_endpoints(folder)
 
 
-def _wait_until_listening(children: Children, router: str, stop: threading.Event, patience: float) -> None:
+def _wait_until_listening(children: Children, router: str, stop: Event, patience: float) -> None:
     """Wait until a router says that it listens: a process that is started earlier might connect to another program there.
 
     Raises RunError if the router ends, or is silent for `patience` seconds; Interrupted if stopped meanwhile.
     """
-    deadline = time.monotonic() + patience
+    deadline = world().monotonic() + patience
     while not children.listens(router):
         if stop.is_set():
             raise Interrupted
         event = children.next_event(_POLL_SECONDS)
         if isinstance(event, ProcessExit) and not _meant_us_too(event, stop) and not children.restart_router(event):
             raise RunError(children.failure_report(event, None))
-        if time.monotonic() > deadline:
+        if world().monotonic() > deadline:
             raise RunError(
                 f"{router} did not listen within {patience:.0f} s of its start, so no other process was started; run again, and "
                 f"look at logs/{router}.log if it happens again"
@@ -157,12 +156,12 @@ def _forget(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-def follow_to_end(children: Children, stop: threading.Event, on_event: OnEvent) -> int:
+def follow_to_end(children: Children, stop: Event, on_event: OnEvent) -> int:
     """Follow the run to its end; returns the exit status that the recorder gives it."""
     early: tuple[ProcessExit, float] | None = None
     ending: RunEnded | None
     while True:
-        if early is not None and not children.over and time.monotonic() - early[1] > _EARLY_SECONDS:
+        if early is not None and not children.over and world().monotonic() - early[1] > _EARLY_SECONDS:
             raise RunError(children.failure_report(early[0], children.conclude(on_event)))
         if stop.is_set():
             ending = _stopped(children, on_event)
@@ -176,7 +175,7 @@ def follow_to_end(children: Children, stop: threading.Event, on_event: OnEvent) 
                 event.process != RECORDER and (event.status == 0 or children.restart_router(event))
             ):
                 # A process that leaves at the end may be faster than the event that the run is over.
-                early = early or ((event, time.monotonic()) if event.status == 0 else None)
+                early = early or ((event, world().monotonic()) if event.status == 0 else None)
                 continue
             if event.process != RECORDER:
                 # A recorder that has just ended may still report so; a running one would wait for the lost process in vain.
@@ -204,6 +203,6 @@ def _stopped(children: Children, on_event: OnEvent) -> RunEnded:
     return ending
 
 
-def _meant_us_too(ended: ProcessExit, stop: threading.Event) -> bool:
+def _meant_us_too(ended: ProcessExit, stop: Event) -> bool:
     """Whether the signal that ended a child soon reaches the launcher, too, as when a closing terminal hangs up on all."""
     return ended.status == INTERRUPTED and stop.wait(AFTERTHOUGHT_SECONDS)

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import threading
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -39,6 +37,7 @@ from evedrop.scenario.progress_events import (
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
 from evedrop.system.waiting import wait_for_thread
+from evedrop.system.world import Event, world
 
 _POLL_SECONDS = 0.25
 
@@ -51,7 +50,7 @@ class OneProgress:
         self._trials = {shard.number: shard.scenario.trials for shard in shards}
         self._slots = shards[0].scenario.slots
         self._on_event = on_event
-        self._lock = threading.Lock()
+        self._lock = world().lock()
         self._latest: dict[int, RunProgress] = {}
         self._waited_for = set(self._trials)
         self.started: float | None = None
@@ -69,7 +68,7 @@ class OneProgress:
     def _take(self, number: int, event: ProgressEvent) -> None:
         match event:
             case Started():
-                self.started = time.monotonic() if self.started is None else self.started
+                self.started = world().monotonic() if self.started is None else self.started
                 self._waited_for.discard(number)
                 if not self._waited_for:
                     self._on_event(event)
@@ -116,7 +115,7 @@ class _ShardsState:
         at: RouterEndpoints | None,
         on_event: OnEvent,
         view: str,
-        stop: threading.Event,
+        stop: Event,
         starter: Starter,
     ) -> None:
         """Run one shard to its end, its routers at these endpoints, or at a socket; if it ends early, all shards end."""
@@ -140,7 +139,7 @@ def launch_shards(
     folder: Path,
     view: str,
     on_event: OnEvent,
-    stop: threading.Event,
+    stop: Event,
     starter: Starter,
 ) -> FinishedRun:
     """Run a scenario in its shards, all at the same time, into one results folder; raises as `launch` does.
@@ -155,8 +154,7 @@ def launch_shards(
     progress, state = OneProgress(shards, on_event), _ShardsState()
     first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, endpoints, strict=True)]
     threads = [
-        threading.Thread(target=state.launched, args=(*shard_and_folder, "off", stop, starter))
-        for shard_and_folder in others
+        world().thread(state.launched, *shard, "off", stop, starter, name="shard", daemon=False) for shard in others
     ]
     for thread in threads:
         thread.start()

@@ -19,14 +19,12 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import Empty
 from typing import IO, Protocol, final
 
 from evedrop.errors import Interrupted
@@ -34,6 +32,7 @@ from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.system.environment import SINGLE_THREADED, own_environment
 from evedrop.system.processes import KILLED_SECONDS, KillableProcess, kill, wait_for
 from evedrop.system.signals import SHOW_STACKS, held_back
+from evedrop.system.world import Event, Queue, world
 
 TELLING = frozenset({RECORDER, ROUTER, RELAY})
 """The roles whose processes send the launcher events on their standard output."""
@@ -85,7 +84,7 @@ class ReportedProcess(ABC):
     def __init__(self, pid: int) -> None:
         self.pid = pid
         self._status: int | None = None
-        self._lock, self._over = threading.Lock(), threading.Event()
+        self._lock, self._over = world().lock(), world().event()
 
     @abstractmethod
     def _close(self) -> None:
@@ -249,10 +248,10 @@ class ForkServer:
         channel.settimeout(_POLL_SECONDS)
         self._channel = channel
         self._forks: dict[int, Fork] = {}
-        self._asking = threading.Lock()
-        self._begun: SimpleQueue[Fork | OSError] = SimpleQueue()
+        self._asking = world().lock()
+        self._begun: Queue[Fork | OSError] = world().queue()
         """The process that was asked for, or why it could not be started."""
-        self._follower = threading.Thread(target=self._follow, name="fork server", daemon=True)
+        self._follower = world().thread(self._follow, name="fork server")
         self._follower.start()
 
     @property
@@ -277,7 +276,7 @@ class ForkServer:
         brief: Path,
         log: IO[bytes],
         environment: Mapping[str, str],
-        stop: threading.Event | None = None,
+        stop: Event | None = None,
     ) -> StartedProcess:
         """Start `evedrop ROLE BRIEF`, whose files only this user may read. Raises OSError, Interrupted once `stop` is set."""
         read_stdin, write_stdin = os.pipe()
@@ -306,7 +305,7 @@ class ForkServer:
         environment: Mapping[str, str],
         folder: str | None,
         umask: int,
-        stop: threading.Event | None = None,
+        stop: Event | None = None,
     ) -> Fork:
         """Run `evedrop WORDS` in a fork of the server, with these standard files, in this folder.
 
@@ -323,10 +322,10 @@ class ForkServer:
             raise begun
         return begun
 
-    def _answer(self, stop: threading.Event | None) -> Fork | OSError:
+    def _answer(self, stop: Event | None) -> Fork | OSError:
         """The answer to a request. A server that does not answer in time is given up, for a late answer would confuse."""
-        deadline = time.monotonic() + _START_SECONDS
-        while time.monotonic() < deadline:
+        deadline = world().monotonic() + _START_SECONDS
+        while world().monotonic() < deadline:
             with suppress(Empty):
                 return self._begun.get(timeout=_POLL_SECONDS)
             if stop is not None and stop.is_set():
@@ -396,10 +395,10 @@ class PreloadedStarter:
     stop: once it is set, no fork server is waited for.
     """
 
-    def __init__(self, servers: Sequence[ForkServer], stop: threading.Event | None = None) -> None:
+    def __init__(self, servers: Sequence[ForkServer], stop: Event | None = None) -> None:
         self._servers, self._stop = servers, stop
 
-    def until(self, stop: threading.Event) -> PreloadedStarter:
+    def until(self, stop: Event) -> PreloadedStarter:
         """The same for a run that ends once this is set."""
         return PreloadedStarter(self._servers, stop)
 
@@ -429,7 +428,7 @@ _preloaded: list[_Preloaded] = []
 
 
 @contextmanager
-def process_starter(stop: threading.Event | None = None) -> Iterator[Starter]:
+def process_starter(stop: Event | None = None) -> Iterator[Starter]:
     """The fastest way to start processes on this system, until the block ends. Raises OSError.
 
     stop: once it is set, the starter waits for nothing, and raises Interrupted. Outside a `preloaded` block, a summary's own
@@ -467,7 +466,7 @@ def preloaded_without_recorder() -> Iterator[Starter]:
 def _waiting_servers(*modules: Sequence[str]) -> Iterator[Starter]:
     """Fork servers that import these modules, for all runs in the block. Raises OSError."""
     try:
-        os.close(os.pidfd_open(os.getpid()))
+        os.close(os.pidfd_open(world().process.pid))
     except (AttributeError, OSError):  # not Linux, or a sandbox that forbids it
         yield start_process
         return

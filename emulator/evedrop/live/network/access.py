@@ -15,7 +15,6 @@ Source: docs/protocol.md, keys and two routers.
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from pathlib import Path
 from evedrop.live.protocol.brief import Wiring
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig
 from evedrop.names import CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, RELAY, ROUTER, SENSOR
+from evedrop.system.world import world
 
 
 @dataclass(frozen=True)
@@ -230,6 +230,6 @@ def until_all_left(present: Mapping[str, bool], linked: Callable[[], bool] = lam
 
     Two routers that close their link at the same time fail in Zenoh 1.10, so one must leave first.
     """
-    deadline = time.monotonic() + _FAREWELL_SECONDS
-    while (any(present.values()) or linked()) and time.monotonic() < deadline:
-        time.sleep(0.005)
+    deadline = world().monotonic() + _FAREWELL_SECONDS
+    while (any(present.values()) or linked()) and world().monotonic() < deadline:
+        world().sleep(0.005)

@@ -12,7 +12,6 @@ import json
 import socket
 import ssl
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, final
@@ -26,6 +25,7 @@ from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.system.environment import check_zenoh_runtime
 from evedrop.system.lacks import lack_of
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
+from evedrop.system.world import world
 
 
 def open_session(config: zenoh.Config) -> zenoh.Session:
@@ -35,15 +35,18 @@ def open_session(config: zenoh.Config) -> zenoh.Session:
     """
     check_zenoh_runtime()
     try:
-        return zenoh.open(config)
+        session: zenoh.Session = world().zenoh.open(config)
     except zenoh.ZError:
         raise
     except BaseException as error:
         if (lack := lack_of(error)) is None:
             raise
         raise RunError(lack) from error
+    return session
 
 
+LOGGED = "error,zenoh_codec::common::extension=off"
+"""What Zenoh logs by default; it would log an error for every stranger's frame that it cannot read."""
 _WAITING_SECONDS = 3.0  # how often a process says that it still waits for its router
 _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
 _ATTEMPT_SECONDS = 3.0
@@ -226,7 +229,7 @@ def cut_off(endpoint: AnyEndpoint) -> bool:
     """
     longest = 0.0
     for _ in range(3):
-        began = time.monotonic()
+        began = world().monotonic()
         try:
             link = endpoint.dial(_ATTEMPT_SECONDS)
         except OSError:
@@ -240,7 +243,7 @@ def cut_off(endpoint: AnyEndpoint) -> bool:
                 return False
             except OSError:
                 pass
-        longest = max(longest, time.monotonic() - began)
+        longest = max(longest, world().monotonic() - began)
     return longest > _AT_ONCE_SECONDS
 
 

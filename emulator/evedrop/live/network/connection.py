@@ -15,16 +15,12 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Protocol, TypeVar, final
 
 import zenoh
-from zenoh.handlers import FifoChannel
 
 from evedrop.errors import EvedropError, RunError
 from evedrop.live.protocol.brief import AnyBrief
@@ -32,6 +28,8 @@ from evedrop.live.protocol.codec import Dropped, head_of
 from evedrop.live.protocol.commands import StatusReporter
 from evedrop.live.protocol.last_word import Cause, LastWord
 from evedrop.system.output import say
+from evedrop.system.waiting import Alarm
+from evedrop.system.world import Queue, Thread, world
 
 
 class Declared(Protocol):
@@ -54,12 +52,12 @@ class Subscription:
         self._room = room
         self._key, self._head, self._dropped, self._status = key, head_of(key), dropped, status
         self._waits = (key,)
-        self._subscribers: SimpleQueue[zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None] = SimpleQueue()
+        self._subscribers: Queue[zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None] = world().queue()
         self._subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
 
     def declare(self, session: zenoh.Session) -> None:
         """Subscribe; messages that arrived on earlier sessions are read first."""
-        self._subscribers.put(session.declare_subscriber(self._key, FifoChannel(self._room)))
+        self._subscribers.put(session.declare_subscriber(self._key, world().zenoh.handlers.FifoChannel(self._room)))
 
     def close(self) -> None:
         """End the subscription: there will be no other session."""
@@ -207,7 +205,7 @@ class Watch:
 
     def __init__(self, key: str, changed: Callable[[bool], None]) -> None:
         self._key, self._changed = key, changed
-        self._lock = threading.Lock()
+        self._lock = world().lock()
         self._session = 0
         """Number of the session that it listens to: messages of an earlier session are out of date."""
         self._there = False
@@ -259,21 +257,21 @@ class Connection:
         changed: Callable[[bool], None] = lambda _: None,
     ) -> None:
         self._again, self._changed = again, changed
-        self._lock = threading.RLock()
+        self._lock = world().rlock()
         self._declared: list[Declared] = []
         self._token_key: str | None = None
         self._token: zenoh.LivelinessToken | None = None
-        self._losses: SimpleQueue[zenoh.Session | None] = SimpleQueue()
-        self._over = threading.Event()
-        self._keeper: threading.Thread | None = None
+        self._losses: Queue[zenoh.Session | None] = world().queue()
+        self._over = world().event()
+        self._keeper: Thread | None = None
         self.session = first
         """The current session, which is closed while another one is opened."""
-        self._opened = time.monotonic()
+        self._opened = world().monotonic()
         self.openings = 1
         """How many sessions there have been."""
         if again is not None:
             self._listen(first)
-            self._keeper = threading.Thread(target=self._keep_open, name="keeps-open", daemon=True)
+            self._keeper = world().thread(self._keep_open, name="keeps-open")
             self._keeper.start()
 
     def declare(self, declaration: One) -> One:
@@ -299,15 +297,16 @@ class Connection:
 
     def renew(self) -> None:
         """Open another session, since this one confuses keys; at most once per second."""
-        if self._again is not None and time.monotonic() - self._opened > _RENEW_SECONDS:
+        if self._again is not None and world().monotonic() - self._opened > _RENEW_SECONDS:
             self._losses.put(self.session)
 
     def close(self) -> None:
         """Close the connection for good."""
         self._over.set()
         self._losses.put(None)
-        if self._keeper is not None and self._keeper is not threading.current_thread():
-            self._keeper.join(_LINGER_SECONDS)  # it may be opening a session that nobody needs any more
+        if self._keeper is not None:
+            with suppress(RuntimeError):  # this is its thread
+                self._keeper.join(_LINGER_SECONDS)  # it may be opening a session that nobody needs any more
         _close(self.session)
         for declaration in self._declared:
             if isinstance(declaration, Subscription):
@@ -359,7 +358,7 @@ class Connection:
     def _adopt(self, session: zenoh.Session) -> None:
         """Declare everything on another session, in the same order; the token of this process comes last."""
         with self._lock:
-            self.session, self._opened = session, time.monotonic()
+            self.session, self._opened = session, world().monotonic()
             self.openings += 1
             self._listen(session)
             for declaration in self._declared:
@@ -376,15 +375,15 @@ class Connection:
 
         The router may find out later than this process: until then it has the previous token, and a new one would not show.
         """
-        deadline = time.monotonic() + _LINGER_SECONDS
+        deadline = world().monotonic() + _LINGER_SECONDS
         with suppress(zenoh.ZError):
             while (
                 not self._over.is_set()
                 and session.info.routers_zid()
-                and time.monotonic() < deadline
+                and world().monotonic() < deadline
                 and any(answer.ok is not None for answer in session.liveliness().get(key, timeout=_ANSWER_SECONDS))
             ):
-                time.sleep(_POLL_SECONDS)
+                world().sleep(_POLL_SECONDS)
 
 
 def _close(session: zenoh.Session) -> None:
@@ -399,28 +398,17 @@ class ConnectionWatchdog:
 
     def __init__(self, brief: AnyBrief) -> None:
         self._brief = brief
-        self._lock = threading.Lock()
-        self._timer: threading.Timer | None = None
+        self._alarm = Alarm(self._give_up)
         self._released = False
 
     def changed(self, connected: bool) -> None:
         """Handle the loss or the return of the connection."""
-        self._set(lost=not connected)
+        self._alarm.set(None if connected or self._released else self._brief.flow.longest_outage)
 
     def release(self) -> None:
         """Stop watching: the process closes its connection itself."""
         self._released = True
-        self._set(lost=False)
-
-    def _set(self, lost: bool) -> None:
-        with self._lock:
-            if self._timer is not None:
-                self._timer.cancel()
-            self._timer = None
-            if lost and not self._released:
-                self._timer = threading.Timer(self._brief.flow.longest_outage, self._give_up)
-                self._timer.daemon = True
-                self._timer.start()
+        self._alarm.set(None)
 
     def _give_up(self) -> None:
         sentence = (
@@ -430,7 +418,7 @@ class ConnectionWatchdog:
         say(sentence)
         sys.stderr.flush()
         LastWord(Cause.NO_CONNECTION, sentence).leave(self._brief.last_word)
-        os._exit(RunError.exit_status)
+        world().process.exit(RunError.exit_status)
 
 
 VARIABLE = "EVEDROP_HEARTBEAT"
@@ -445,14 +433,14 @@ class HeartbeatFile:
         """connected: whether the process is on its network; seconds: between two checks."""
         self._connected = connected
         self._seconds = seconds
-        self._over = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._over = world().event()
+        self._thread: Thread | None = None
 
     def start(self) -> None:
         """Start to touch the file. Does nothing if already started."""
         path = os.environ.get(VARIABLE)
         if path and self._thread is None:
-            self._thread = threading.Thread(target=self._keep, args=(Path(path),), name="heartbeat", daemon=True)
+            self._thread = world().thread(self._keep, Path(path), name="heartbeat")
             self._thread.start()
 
     def stop(self) -> None:

@@ -7,48 +7,22 @@ however long that takes on a busy machine.
 
 from __future__ import annotations
 
-import os
-import select
-import sys
-import threading
 from collections.abc import Callable
 from contextlib import suppress
 from types import TracebackType
-from typing import Self, TextIO, cast, final
+from typing import Self, final
 
 from evedrop.live.protocol.launcher_events import Alive
 from evedrop.scenario.progress_events import ProgressEvent
-from evedrop.system.output import Output
+from evedrop.system.world import world
 
 _BEAT_SECONDS = 1.0
-_LINE = threading.Lock()  # one line at a time
-
-
-_TO: list[TextIO] = []
-"""The stream for a launched process's events; empty before `keep_events_apart`, and in a process that was started by hand."""
-
-
-def keep_events_apart(launched: bool) -> None:
-    """Redirect file descriptor 1 to standard error: Zenoh logs to it, and would mix its lines into the events.
-
-    launched: whether a launcher reads the events, from the former standard output; `print` then writes to the log.
-    """
-    sys.stdout.flush()
-    apart = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-    if launched:
-        _TO.append(apart)
-    else:
-        sys.stdout = cast(TextIO, Output(apart))
 
 
 def emit(event: ProgressEvent) -> None:
     """Send an event to the launcher, or to standard output if there is none; harmless if nobody reads it."""
-    left = memoryview(event.line)
-    with _LINE, suppress(OSError, ValueError, AttributeError):  # the launcher is gone, or there is no standard output
-        to = _TO[0] if _TO else sys.stdout
-        while left:
-            left = left[os.write(to.fileno(), left) :]
+    with suppress(OSError, ValueError):
+        world().process.send_event(event.line)
 
 
 @final
@@ -57,8 +31,8 @@ class Heartbeat:
 
     def __init__(self, seconds: float = _BEAT_SECONDS) -> None:
         self._seconds = seconds
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self._over = world().event()
+        self._thread = world().thread(self._beat, name="heartbeat")
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -82,19 +56,16 @@ def when_launcher_is_gone(then: Callable[[], None], hear: Callable[[bytes], None
     """
 
     def wait() -> None:
-        # Not sys.stdin: a thread that waits in its lock makes the interpreter abort at exit.
         rest = b""
-        while read := os.read(0, 4096):
+        while read := world().process.read_input(4096):
             *lines, rest = (rest + read).split(b"\n")
             for line in lines:
                 hear(line)
         then()
 
-    threading.Thread(target=wait, name="launcher-watchdog", daemon=True).start()
+    world().thread(wait, name="launcher-watchdog").start()
 
 
 def launcher_is_gone() -> bool:
     """Whether the other end of standard input, a pipe, is closed; asks the system, so it does not depend on a thread."""
-    poll = select.poll()
-    poll.register(0, 0)
-    return bool(poll.poll(0))
+    return world().process.input_closed()

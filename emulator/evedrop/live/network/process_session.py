@@ -10,10 +10,8 @@ Source: docs/protocol.md, lost connections.
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
-from queue import SimpleQueue
 from types import TracebackType
 from typing import Protocol, Self, final
 
@@ -22,6 +20,7 @@ from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import ControlCommand, StatusReporter
 from evedrop.live.protocol.keys import RunKeys, writer_of
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
+from evedrop.system.world import Queue, world
 
 
 class Received(Protocol):
@@ -127,9 +126,9 @@ class Mailbox:
     def __init__(self, keys: Mapping[str, str], most: int, clock: Clock = SYSTEM_CLOCK) -> None:
         """keys: sender → the key on which it sends; most: how many bytes of one sender may wait."""
         self._keys, self._most, self._clock = keys, most, clock
-        self._queue: SimpleQueue[tuple[str, bytes | bool]] = SimpleQueue()
+        self._queue: Queue[tuple[str, bytes | bool]] = world().queue()
         self._waiting = dict.fromkeys(keys, 0)
-        self._lock = threading.Lock()
+        self._lock = world().lock()
         self._flooded: tuple[str, bytes] | None = None
 
     def put(self, sender: str, item: bytes | bool) -> None:
@@ -187,7 +186,7 @@ class ReplayBuffer:
         self._messages: deque[tuple[int, int, bytes]] = deque()
         """First slot, last slot, and the message."""
         self._forgotten = 0
-        self._lock = threading.Lock()
+        self._lock = world().lock()
 
     def __call__(self, k: int, payload: bytes, first: int | None = None) -> None:
         """Send a message that ends with slot k, and keep it; first: the slot with which it begins, if not with k."""

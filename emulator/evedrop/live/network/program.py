@@ -6,7 +6,6 @@ Source: docs/programs.md.
 from __future__ import annotations
 
 import json
-import threading
 from collections import deque
 from types import TracebackType
 from typing import Self, final
@@ -20,6 +19,7 @@ from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.live.protocol.state_message import MOST_BYTES, read_state
 from evedrop.model.process import Floats
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
+from evedrop.system.world import world
 
 LEAST_SECONDS = 5.0
 """The least time for which a program may be silent, as for a process of the run."""
@@ -56,7 +56,7 @@ class ProgramStates:
         self._patience = max(patience, LEAST_SECONDS)
         self._clock = clock
         self._heard: deque[bytes] = deque(maxlen=1 if newest else _MOST_WAITING + 1)
-        self._changed = threading.Condition()
+        self._changed = world().condition()
         self._waited = 0.0
         where = entry.listen or entry.connect
         try:

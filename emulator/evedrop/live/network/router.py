@@ -20,11 +20,8 @@ from __future__ import annotations
 
 import heapq
 import itertools
-import threading
-import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
-from queue import SimpleQueue
 from typing import final
 
 import numpy as np
@@ -56,6 +53,7 @@ from evedrop.model.slot.link import COUNTED_BURSTS, Account, Accountant, Change,
 from evedrop.model.slot.link_core import Arrivals, Late, LinkCore
 from evedrop.model.slot.records import PacketSlots
 from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE, ROUTER
+from evedrop.system.world import Queue, world
 
 
 @final
@@ -171,7 +169,7 @@ class AckLink:
         self._trials, self._status = brief.trials, session.status
         self._key = session.keys.acknowledged
         self._due = GapDetector(self._key, brief.flow.longest_outage)
-        self.sent: SimpleQueue[bytes | None] = SimpleQueue()
+        self.sent: Queue[bytes | None] = world().queue()
         """The legitimate estimator's acknowledgements; None: the conductor sent a command that may end the waiting."""
         session.subscribe_with(self._key, self.sent.put)
         self._put = session.publisher(session.keys.acknowledgements)
@@ -412,7 +410,7 @@ class Commands:
         session: ProcessSession,
         receivers: Collection[str],
         knock: Callable[[], None],
-        waiting: Iterable[SimpleQueue[bytes | None]],
+        waiting: Iterable[Queue[bytes | None]],
         patience: float,
     ) -> None:
         """receivers: those that a command may name.
@@ -421,13 +419,13 @@ class Commands:
         """
         self._session, self._receivers, self._knock, self._waiting = session, receivers, knock, tuple(waiting)
         self._patience = patience
-        self._orders: SimpleQueue[tuple[int, ControlCommand] | None] = SimpleQueue()
-        self._changed = threading.Condition()
+        self._orders: Queue[tuple[int, ControlCommand] | None] = world().queue()
+        self._changed = world().condition()
         self._asked = Again(0, 0)
         self._heeded = 0
         self._ended = False
         self._failure: EvedropError | None = None
-        threading.Thread(target=self._listen, name="commands", daemon=True).start()
+        world().thread(self._listen, name="commands").start()
 
     def _listen(self) -> None:
         try:
@@ -502,8 +500,8 @@ class DelayedSender:
     def __init__(self) -> None:
         self._due: list[tuple[float, int, Put, bytes]] = []
         self._numbers = itertools.count()
-        self._changed = threading.Condition()
-        threading.Thread(target=self._go_round, name="delayed-sender", daemon=True).start()
+        self._changed = world().condition()
+        world().thread(self._go_round, name="delayed-sender").start()
 
     def round(self, put: Put) -> Callable[[bytes, float], None]:
         """A publisher that sends each message the given seconds later, but never before the previous message."""
@@ -511,7 +509,7 @@ class DelayedSender:
 
         def send(payload: bytes, seconds: float) -> None:
             nonlocal last
-            last = max(last, time.monotonic() + seconds)
+            last = max(last, world().monotonic() + seconds)
             with self._changed:
                 heapq.heappush(self._due, (last, next(self._numbers), put, payload))
                 self._changed.notify()
@@ -521,7 +519,7 @@ class DelayedSender:
     def _go_round(self) -> None:
         while True:
             with self._changed:
-                while not self._due or (wait := self._due[0][0] - time.monotonic()) > 0.0:
+                while not self._due or (wait := self._due[0][0] - world().monotonic()) > 0.0:
                     self._changed.wait(wait if self._due else None)
                 _, _, put, payload = heapq.heappop(self._due)
             put(payload)

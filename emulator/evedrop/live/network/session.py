@@ -10,22 +10,27 @@ from __future__ import annotations
 
 import gc
 import json
-import os
 import sys
-import threading
-import time
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from queue import Empty, SimpleQueue
+from queue import Empty
 from types import TracebackType
 from typing import Self, final
 
 import zenoh
 
 from evedrop.errors import Gap, MalformedMessage, MissingProcesses, RunError
-from evedrop.live.network.connecting import Credentials, RouterAddress, WaitReporter, connected, listening, open_session
+from evedrop.live.network.connecting import (
+    LOGGED,
+    Credentials,
+    RouterAddress,
+    WaitReporter,
+    connected,
+    listening,
+    open_session,
+)
 from evedrop.live.network.connection import (
     CallbackSubscription,
     Connection,
@@ -39,7 +44,6 @@ from evedrop.live.network.connection import (
 )
 from evedrop.live.network.launcher_pipe import emit, when_launcher_is_gone
 from evedrop.live.network.process_session import ReplayBuffer, allowance
-from evedrop.live.network.zenoh_log import LOGGED
 from evedrop.live.protocol.brief import AnyBrief, Brief, Identity, RouterPart, RoutingPart
 from evedrop.live.protocol.codec import Dropped, Reader
 from evedrop.live.protocol.commands import (
@@ -58,6 +62,7 @@ from evedrop.live.protocol.notices import EndReport, RefusalNotice
 from evedrop.names import RECORDER, ROUTER
 from evedrop.system.allocator import keep_for_messages
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
+from evedrop.system.world import Queue, world
 
 READY_SECONDS = 30.0
 _POLL_SECONDS = 0.004
@@ -170,9 +175,9 @@ class Session:
 
         opened: opens a session with the router, the first one and those after a lost connection.
         """
-        zenoh.init_log_from_env_or(_LOGGED)
+        world().zenoh.init_log_from_env_or(_LOGGED)
         if brief.ends_with_stdin:
-            when_launcher_is_gone(lambda: os._exit(3))
+            when_launcher_is_gone(lambda: world().process.exit(3))
         keep_for_messages(brief.flow.largest_message)
         gc.freeze()  # imported modules stay: a collection that looks at them holds up packets
         self.keys = RunKeys(brief.run)
@@ -198,8 +203,8 @@ class Session:
                 emit(RouterListens(brief.process))
         self._publishers: dict[str, Publisher] = {}
         self._replays: list[ReplayBuffer] = []
-        self._commands: SimpleQueue[bytes] = SimpleQueue()
-        self._rounds: SimpleQueue[Again] = SimpleQueue()
+        self._commands: Queue[bytes] = world().queue()
+        self._rounds: Queue[Again] = world().queue()
         self._slots = brief.slots
         self._control = self.keys.control(self._process)
         self._by_hand = not brief.ends_with_stdin
@@ -300,15 +305,15 @@ class Session:
 
     def wait_for_link(self) -> None:
         """Wait until there is a link with another router. Raises RunError after the brief's patience."""
-        deadline = time.monotonic() + self.patience
+        deadline = world().monotonic() + self.patience
         self._wait.begin()
         while not self.linked():
             self._wait.poll("no link yet")
-            if time.monotonic() > deadline:
+            if world().monotonic() > deadline:
                 raise RunError(
                     f"{self._process}: no link with the router within {self.patience:.0f} s; look at its log"
                 )
-            time.sleep(_POLL_SECONDS)
+            world().sleep(_POLL_SECONDS)
 
     def ready(self) -> None:
         """Wait until every publisher has a reader, then show that this process is present.
@@ -316,18 +321,18 @@ class Session:
         Raises MissingProcesses after the brief's patience, naming them and the keys without a reader. While the
         recorder is present, this process waits on: the recorder reports the missing processes.
         """
-        deadline = time.monotonic() + self.patience
+        deadline = world().monotonic() + self.patience
         while unread := self._unread():
             missing = dict.fromkeys(reader_of(key) for key in unread)
             if RECORDER not in missing and self._process != RECORDER:
-                deadline = time.monotonic() + self.patience
-            if time.monotonic() > deadline:
+                deadline = world().monotonic() + self.patience
+            if world().monotonic() > deadline:
                 raise MissingProcesses(
                     self._process,
                     tuple(missing),
                     f"within {self.patience:.0f} s, and nobody reads {', '.join(unread)}; start them, or look at their logs",
                 )
-            time.sleep(_POLL_SECONDS)
+            world().sleep(_POLL_SECONDS)
         self.appear()
 
     def appear(self) -> None:
@@ -336,7 +341,7 @@ class Session:
         if publisher is not None:
             self.status.answer(publisher)
         if self._replays:
-            threading.Thread(target=self._send_again, name="sends-again", daemon=True).start()
+            world().thread(self._send_again, name="sends-again").start()
         self.connection.appear(self.keys.alive(self._process))
         self._heartbeat.start()
 
@@ -359,9 +364,9 @@ class Session:
         """Send messages again as asked; on a thread of its own, since the working thread may be waiting for the effect."""
         while True:
             asked = self._rounds.get()
-            deadline = time.monotonic() + _HEARD_SECONDS
-            while self._unread() and time.monotonic() < deadline:
-                time.sleep(_POLL_SECONDS)
+            deadline = world().monotonic() + _HEARD_SECONDS
+            while self._unread() and world().monotonic() < deadline:
+                world().sleep(_POLL_SECONDS)
             for replay in self._replays:
                 replay.again(asked.round, asked.slot)
 
@@ -373,7 +378,7 @@ class Session:
                     # Its messages will not come, and there is no launcher to end it.
                     sys.stderr.write(f"evedrop: {self._process}: the recorder gave the run up: {why}\n")
                     sys.stderr.flush()
-                    os._exit(RunError.exit_status)
+                    world().process.exit(RunError.exit_status)
                 case ReportStatus():
                     self.status.request()
                     return

@@ -24,6 +24,7 @@ from evedrop.errors import Gap, MalformedMessage
 from evedrop.live.protocol.keys import MOST_PARTS, writer_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags, flags_of
+from evedrop.system.world import world
 
 _LARGEST = 2**62  # the default bound of integers: slots can be added to it without leaving 64 bits
 _SMALL_BYTES = 1 << 16  # objects that msgpack unpacks from this few bytes take some megabytes at most
@@ -248,7 +249,7 @@ class Dropped:
 
     def __init__(self, process: str, mistaken: Callable[[], None] = lambda: None) -> None:
         self._process, self._mistaken = process, mistaken
-        self._lock = threading.Lock()
+        self._lock = world().lock()
         self.count = 0
 
     def add(self, key: str, message: bytes) -> None:

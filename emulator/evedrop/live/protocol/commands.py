@@ -8,11 +8,9 @@ Source: docs/protocol.md, control and silence.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from queue import SimpleQueue
 from typing import Annotated, Any, final
 
 from msgspec import Meta, Struct, field, to_builtins
@@ -22,6 +20,7 @@ from evedrop.live.protocol.keys import reader_of
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
 from evedrop.system.fields import Slot
+from evedrop.system.world import Queue, world
 
 
 @dataclass(frozen=True)
@@ -195,7 +194,7 @@ class StatusReporter:
         """The slot that it is at."""
         self.waits: tuple[str, ...] = ()
         """As in `ProcessStatus`."""
-        self._requests: SimpleQueue[None] = SimpleQueue()
+        self._requests: Queue[None] = world().queue()
 
     @contextmanager
     def waiting(self, *keys: str) -> Iterator[None]:
@@ -218,4 +217,4 @@ class StatusReporter:
                 self._requests.get()
                 put(ProcessStatus(self.slot, self.waits).pack())
 
-        threading.Thread(target=go_on, name="status", daemon=True).start()
+        world().thread(go_on, name="status").start()

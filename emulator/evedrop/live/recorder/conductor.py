@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection
 from functools import partial
-from queue import Empty, SimpleQueue
+from queue import Empty
 from typing import NoReturn, final
 
 from evedrop.errors import Interrupted, RunError
@@ -18,6 +18,7 @@ from evedrop.live.protocol.notices import EndReport, Progress
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
+from evedrop.system.world import Queue, world
 
 _ABANDON_SECONDS = 2.0  # for processes to leave when told to
 _POLL_SECONDS = 0.05  # how soon a signal is noticed
@@ -34,6 +35,10 @@ class Stop:
         """orphaned: whether the launcher is gone, which ends the run, too."""
         self._orphaned, self._clock = orphaned, clock
         self.wanted = False
+
+    def want(self) -> None:
+        """The run must end."""
+        self.wanted = True
 
     def check(self, patience: float = 0.0) -> None:
         """Raise Interrupted if the run was told to end, or is told within `patience` seconds."""
@@ -77,7 +82,7 @@ class Conductor:
         """Process that has confirmed its end → how many messages it dropped because they name another key."""
         self.absent: set[str] = set()
         """Processes that are away because the scenario says so; they do not count as missing."""
-        self.questions: SimpleQueue[Question] = SimpleQueue()
+        self.questions: Queue[Question] = world().queue()
         """The operator's questions."""
         session.asked(keys.control(RECORDER), self.questions.put)
         self._commands = {name: session.publisher(keys.control(name)) for name in self._present}

@@ -7,7 +7,6 @@ run.
 from __future__ import annotations
 
 from contextlib import suppress
-from queue import SimpleQueue
 from typing import final
 
 from evedrop.live.network.connection import Question
@@ -25,6 +24,7 @@ from evedrop.live.recorder.recovery import Recovery, Stall, patience_of
 from evedrop.live.recorder.steering import Steering, status_of
 from evedrop.names import CONTROLLER, OPERATOR
 from evedrop.scenario.progress_events import Started
+from evedrop.system.world import Queue
 
 
 @final
@@ -32,7 +32,7 @@ class Direction:
     """Directs the processes of a run, whose slots `run` takes."""
 
     def __init__(
-        self, conductor: Conductor, brief: Brief[RecorderPart], run: RecordedRun, confirmations: SimpleQueue[bytes]
+        self, conductor: Conductor, brief: Brief[RecorderPart], run: RecordedRun, confirmations: Queue[bytes]
     ) -> None:
         """confirmations: the launcher's, each with the number of an event."""
         scenario, flow = run.score.scenario, brief.flow

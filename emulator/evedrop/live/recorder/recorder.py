@@ -12,17 +12,13 @@ then prints the same table and verdict as `evedrop run`.
 
 from __future__ import annotations
 
-import os
-import signal
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from queue import SimpleQueue
 
 from evedrop.errors import EvedropError, RunError
-from evedrop.live.network.launcher_pipe import emit, keep_events_apart, launcher_is_gone, when_launcher_is_gone
+from evedrop.live.network.launcher_pipe import emit, launcher_is_gone, when_launcher_is_gone
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief, RecorderPart
 from evedrop.live.protocol.launcher_events import SaveStarted, SlotsDone
@@ -36,7 +32,7 @@ from evedrop.scenario.progress_events import ViewOpened
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer, WebAddress
 from evedrop.system.lacks import preload_meanwhile, preload_within_limit
-from evedrop.system.signals import heeded
+from evedrop.system.world import Queue, world
 
 _ORPHAN_SECONDS = 30.0  # to write the results once the launcher is gone
 
@@ -51,12 +47,11 @@ def record(brief: Brief[RecorderPart], report: EndPrinter, serve: str | None = N
     Raises UsageError, BriefError, RunError or Interrupted only before the run has begun, and if started by hand.
     """
     web_address = None if serve is None else WebAddress.of(serve)
-    stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
-    for number in heeded():
-        signal.signal(number, lambda *_: setattr(stop, "wanted", True))
+    stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), world().queue()
+    world().process.on_signals(stop.want)
     preload_within_limit()
     by_hand = not brief.ends_with_stdin
-    keep_events_apart(launched=not by_hand)
+    world().process.keep_events_apart(launched=not by_hand)
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
@@ -84,7 +79,7 @@ def record(brief: Brief[RecorderPart], report: EndPrinter, serve: str | None = N
         with suppress(FileNotFoundError):
             report(run.folder.now, end.status, end.how)
     if not usual_end:  # a thread of the view hangs
-        os._exit(end.status)
+        world().process.exit(end.status)
     if viewer is not None:
         viewer.stop()
     return end.status
@@ -94,7 +89,7 @@ def _conduct(
     run: RecordedRun,
     brief: Brief[RecorderPart],
     stop: Stop,
-    confirmations: SimpleQueue[bytes],
+    confirmations: Queue[bytes],
     end: RunEnd,
     *,
     by_hand: bool,
@@ -139,6 +134,6 @@ def _serve(web_address: WebAddress, folder: Path) -> Viewer:
 
 def _end_orphaned() -> None:
     """Write the results so far, and exit."""
-    os.kill(os.getpid(), signal.SIGTERM)
-    time.sleep(_ORPHAN_SECONDS)
-    os._exit(RunError.exit_status)
+    world().process.interrupt()
+    world().sleep(_ORPHAN_SECONDS)
+    world().process.exit(RunError.exit_status)

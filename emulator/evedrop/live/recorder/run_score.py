@@ -5,7 +5,6 @@ Source: docs/results.md, summary.json.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from evedrop.score.expectations_held import replay_of
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, digest_of, summary_of
 from evedrop.score.summary import Summary
+from evedrop.system.world import world
 
 
 @final
@@ -40,11 +40,11 @@ class Course:
 
     def start(self) -> None:
         """Note that all processes are there."""
-        self.started = self.ended = time.monotonic()
+        self.started = self.ended = world().monotonic()
 
     def end(self) -> None:
         """Note that this is the end of the run so far."""
-        self.ended = time.monotonic()
+        self.ended = world().monotonic()
 
 
 @final

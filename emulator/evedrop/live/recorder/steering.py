@@ -9,7 +9,6 @@ Source: docs/control.md.
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from evedrop.scenario.loading import with_event
 from evedrop.scenario.progress_events import Held, OnEvent, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.run_tally import RunTally
+from evedrop.system.world import world
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Steering:
             return
         self.at, self._last, self._asked = k, k, False
         self._pending = list(self._due.pop(k, []))
-        self._since = time.monotonic()
+        self._since = world().monotonic()
         if self.paused:  # only a run that began paused is paused here: all later pauses take effect at a hold
             self._pause(k, "pause the run")
 
@@ -179,7 +179,7 @@ class Steering:
 
     def _fail(self, problem: str) -> None:
         """Raise RunError if the run has been waiting for too long; problem: the missing condition."""
-        if time.monotonic() - self._since > READY_SECONDS:
+        if world().monotonic() - self._since > READY_SECONDS:
             raise RunError(
                 f"{READY_SECONDS:.0f} s after the run was held before slot {self.at}, {problem}; look at the logs"
             )
@@ -194,7 +194,7 @@ class Steering:
             self._conductor.absent |= set(act.names)
         action = act.effect.action
         if action is not None:
-            self._waiting, self._confirmed, self._since = (act, action), False, time.monotonic()
+            self._waiting, self._confirmed, self._since = (act, action), False, world().monotonic()
             self._on_event(ProcessRequest(action, act.names[0], k, len(self.events)))
 
     def _obey(self, k: int, order: Order) -> None:
@@ -281,7 +281,7 @@ class Steering:
 
         The last `Go` is sent even if the sensor holds again: a router that was restarted may still wait at the previous hold.
         """
-        self._since = time.monotonic()
+        self._since = world().monotonic()
         self._go()
         if self._asked:
             self._conductor.send_to(SENSOR, Hold())

@@ -20,8 +20,6 @@ from collections.abc import Iterator
 
 from evedrop.system.output import Output, escaped
 
-LOGGED = "error,zenoh_codec::common::extension=off"
-"""What Zenoh logs by default; it would log an error for every stranger's frame that it cannot read."""
 MARK = "zenoh: "
 """What each line of it begins with where it is passed on."""
 _MOST_BYTES = 2**17
@@ -33,7 +31,7 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 @contextlib.contextmanager
-def zenoh_log_apart() -> Iterator[None]:
+def native_log_apart() -> Iterator[None]:
     """While the block runs, pass Zenoh's log on to standard error, each line with "zenoh: " before it and escaped.
 
     After 128 KiB, further lines are dropped, and a line says so. Raises OSError without descriptors.

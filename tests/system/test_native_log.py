@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.live.network import zenoh_log
-from evedrop.live.network.zenoh_log import zenoh_log_apart
+from evedrop.system import native_log
+from evedrop.system.native_log import native_log_apart
 from evedrop.system.output import Output, escaped
 from evedrop.system.ports import free_port
 from tests.conftest import Evedrop, wait_until
@@ -25,12 +25,12 @@ MOST = 140_000
 END = "evedrop: Zenoh has logged 128 KiB; its further lines are left out"
 PROGRAM = r"""
 import os, sys
-from evedrop.live.network import zenoh_log
-from evedrop.live.network.zenoh_log import zenoh_log_apart
+from evedrop.system import native_log
+from evedrop.system.native_log import native_log_apart
 from evedrop.system.output import standard_streams
 with standard_streams():
     print("before")
-    with zenoh_log_apart():
+    with native_log_apart():
         print("within")
         os.write(1, b"\x1b[31mERROR\x1b[0m \x1b]0;OWNED\x07 \xe2\x80\xae evedrop: not ours\n")
         for _ in range(int(sys.argv[1])):
@@ -85,8 +85,8 @@ def test_a_log_can_be_written_while_nobody_reads_it(monkeypatch: pytest.MonkeyPa
         assert goes_on.wait(60)
         passed_on.append(text)
 
-    monkeypatch.setattr(zenoh_log, "_write", write)
-    with zenoh_log.zenoh_log_apart():
+    monkeypatch.setattr(native_log, "_write", write)
+    with native_log.native_log_apart():
         for _ in range(100):
             assert os.write(1, b"x" * 9_999 + b"\n") == 10_000
         goes_on.set()
@@ -96,7 +96,7 @@ def test_a_log_can_be_written_while_nobody_reads_it(monkeypatch: pytest.MonkeyPa
 
 def test_without_a_stream_of_ours_nothing_is_moved(capfd: pytest.CaptureFixture[str]) -> None:
     """A standard output that is not at descriptor 1, or not ours, stays as it is; the log goes to standard error."""
-    with zenoh_log_apart():
+    with native_log_apart():
         os.write(1, b"a line\n")
     assert capfd.readouterr().err == "zenoh: a line\n"
 
