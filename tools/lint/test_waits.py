@@ -12,7 +12,11 @@ ROOT = Path(__file__).parents[2]
 WORK = "a daemon thread that waits for its next work; nobody waits for the thread without a limit"
 PROCESS = "a process of a run: SIGTERM ends it at once, and so do the recorder, the launcher's end and a lost router"
 END = "a daemon thread that waits for the end of a process; nobody waits for the thread"
+VIRTUAL = "a simulation in which everybody waits ends with `Stuck`"
 EXCEPTIONS = {
+    "emulator/evedrop/virtual/scheduler.py wait self._lock.acquire": VIRTUAL,
+    "emulator/evedrop/virtual/scheduler.py __enter__ self.acquire": VIRTUAL,
+    "emulator/evedrop/virtual/scheduler.py __enter__ self._lock.acquire": VIRTUAL,
     "emulator/evedrop/fork_server.py serve select.select": (
         "the end of its channel wakes it, and the launcher's end closes the channel"
     ),

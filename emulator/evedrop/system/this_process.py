@@ -1,6 +1,6 @@
 """The process that a program runs in: its id, its end, the signals that it gets, its standard files.
 
-Source: docs/architecture.md, the simulated world.
+Source: docs/maintainers/simulated-world.md.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Protocol, TypeVar, final
 
 from evedrop.errors import RunError
-from evedrop.system.world import Condition, Event, Queue, Thread, world
+from evedrop.system.world import Condition, Queue, Thread, ThreadEvent, world
 
 THREAD_SECONDS = 600.0
 """How long to wait for a thread that was told to end. It ends within seconds, unless something that it calls hangs."""
@@ -43,7 +43,7 @@ class Alarm:
                 self._off = world().event()
                 world().thread(self._wait, self._off, seconds, name="alarm").start()
 
-    def _wait(self, off: Event, seconds: float) -> None:
+    def _wait(self, off: ThreadEvent, seconds: float) -> None:
         if not off.wait(seconds):
             self._act()
 

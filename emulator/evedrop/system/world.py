@@ -76,7 +76,7 @@ class Condition(Lock, Protocol):
         """Wake up all of them."""
 
 
-class Event(Protocol):
+class ThreadEvent(Protocol):
     """Something that happens once."""
 
     def is_set(self) -> bool:
@@ -143,7 +143,7 @@ class World(ABC):
         """A condition with a lock of its own."""
 
     @abstractmethod
-    def event(self) -> Event:
+    def event(self) -> ThreadEvent:
         """An event."""
 
     @abstractmethod
@@ -197,7 +197,7 @@ class RealWorld(World):
         """A condition."""
         return threading.Condition()
 
-    def event(self) -> Event:
+    def event(self) -> ThreadEvent:
         """An event."""
         return threading.Event()
 

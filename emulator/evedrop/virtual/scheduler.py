@@ -23,7 +23,7 @@ from greenlet import getcurrent, greenlet
 
 T = TypeVar("T")
 _INTERRUPTED = 0.1
-"""The share of the places where a thread touches something shared at which another one goes on first."""
+"""The fraction of the places where a thread touches something shared at which another one goes on first."""
 
 
 class Ended(BaseException):
@@ -35,7 +35,7 @@ class Stuck(Exception):
 
 
 @dataclass(frozen=True)
-class Happening:
+class Occurrence:
     """Something that happened."""
 
     at: float
@@ -47,7 +47,7 @@ class Happening:
 
 @final
 @dataclass(eq=False)
-class Task:
+class VirtualTask:
     """A process: its threads, and whether they may go on."""
 
     name: str
@@ -78,7 +78,7 @@ class Waiter:
 class VirtualThread:
     """A thread of a simulated process."""
 
-    def __init__(self, scheduler: Scheduler, task: Task, name: str, work: Callable[[], object]) -> None:
+    def __init__(self, scheduler: VirtualScheduler, task: VirtualTask, name: str, work: Callable[[], object]) -> None:
         self.name, self.task, self._scheduler, self._work = name, task, scheduler, work
         self.ident: int | None = None
         self.over = False
@@ -119,7 +119,7 @@ class VirtualThread:
 
 
 @final
-class Scheduler:
+class VirtualScheduler:
     """Lets threads go on in an order that a seed decides."""
 
     def __init__(self, seed: int, keep: bool = False) -> None:
@@ -128,7 +128,7 @@ class Scheduler:
         self.now = 0.0
         self.hub = getcurrent()
         self.events = 0
-        self.happened: list[Happening] = []
+        self.happened: list[Occurrence] = []
         self.errors: list[tuple[str, BaseException]] = []
         """Thread → the exception that ended it without being caught."""
         self._keep, self._hash = keep, hashlib.blake2b(digest_size=8)
@@ -136,7 +136,7 @@ class Scheduler:
         self._timers: list[tuple[float, int, Waiter | Callable[[], object]]] = []
         self._number = 1000
         self.current: VirtualThread | None = None
-        self.tasks: list[Task] = []
+        self.tasks: list[VirtualTask] = []
 
     def number(self) -> int:
         """A number that nothing else has."""
@@ -154,17 +154,17 @@ class Scheduler:
         name = self.current.task.name if self.current is not None else "world"
         self._hash.update(repr((round(self.now, 9), name, what, words)).encode())
         if self._keep:
-            self.happened.append(Happening(self.now, name, what, words))
+            self.happened.append(Occurrence(self.now, name, what, words))
 
     # Processes and threads
 
-    def process(self, name: str) -> Task:
+    def process(self, name: str) -> VirtualTask:
         """A new process without threads."""
-        task = Task(name, self.number())
+        task = VirtualTask(name, self.number())
         self.tasks.append(task)
         return task
 
-    def thread(self, name: str, work: Callable[[], object], task: Task | None = None) -> VirtualThread:
+    def thread(self, name: str, work: Callable[[], object], task: VirtualTask | None = None) -> VirtualThread:
         """A thread, not started yet, of this process or another."""
         if task is None:
             task = self._running.task
@@ -176,7 +176,7 @@ class Scheduler:
             raise AssertionError("the world itself cannot wait")
         return self.current
 
-    def end(self, task: Task, status: int) -> None:
+    def end(self, task: VirtualTask, status: int) -> None:
         """End a process where it is: no thread of it goes on. If it is the current one, this never returns."""
         if not task.alive:
             return
@@ -189,7 +189,7 @@ class Scheduler:
             self.hub.switch()
             raise Ended  # when everything is taken down
 
-    def stop(self, task: Task) -> None:
+    def stop(self, task: VirtualTask) -> None:
         """Suspend a process."""
         if task.alive and not task.stopped:
             self.note("is suspended", task.name)
@@ -198,7 +198,7 @@ class Scheduler:
                 self.make_ready(self.current)
                 self.hub.switch()
 
-    def go_on(self, task: Task) -> None:
+    def go_on(self, task: VirtualTask) -> None:
         """Continue a suspended process."""
         if task.alive and task.stopped:
             self.note("goes on", task.name)
@@ -312,7 +312,7 @@ class Scheduler:
 class VirtualLock:
     """A lock; `again`: whether its holder can take it again."""
 
-    def __init__(self, scheduler: Scheduler, again: bool = False) -> None:
+    def __init__(self, scheduler: VirtualScheduler, again: bool = False) -> None:
         self._scheduler, self._again = scheduler, again
         self._holder: VirtualThread | None = None
         self._depth = 0
@@ -363,7 +363,7 @@ class VirtualLock:
 class VirtualCondition:
     """A condition with a lock."""
 
-    def __init__(self, scheduler: Scheduler) -> None:
+    def __init__(self, scheduler: VirtualScheduler) -> None:
         self._scheduler, self._lock = scheduler, VirtualLock(scheduler, again=True)
         self._waiting: deque[Waiter] = deque()
         self.acquire, self.release = self._lock.acquire, self._lock.release
@@ -407,7 +407,7 @@ class VirtualCondition:
 class VirtualEvent:
     """Something that happens once."""
 
-    def __init__(self, scheduler: Scheduler) -> None:
+    def __init__(self, scheduler: VirtualScheduler) -> None:
         self._scheduler, self._set = scheduler, False
         self._waiting: deque[Waiter] = deque()
 
@@ -436,7 +436,7 @@ class VirtualEvent:
 class VirtualQueue:
     """Items in order."""
 
-    def __init__(self, scheduler: Scheduler) -> None:
+    def __init__(self, scheduler: VirtualScheduler) -> None:
         self._scheduler = scheduler
         self._items: deque[Any] = deque()
         self._waiting: deque[Waiter] = deque()

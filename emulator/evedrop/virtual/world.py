@@ -9,13 +9,13 @@ from collections.abc import Callable
 from typing import Any, final
 
 from evedrop.system.this_process import ThisProcess
-from evedrop.system.world import Condition, Event, Lock, Queue, Thread, World
+from evedrop.system.world import Condition, Lock, Queue, Thread, ThreadEvent, World
 from evedrop.virtual.scheduler import (
-    Scheduler,
     VirtualCondition,
     VirtualEvent,
     VirtualLock,
     VirtualQueue,
+    VirtualScheduler,
 )
 
 EPOCH = 1_767_225_600.0
@@ -26,7 +26,7 @@ EPOCH = 1_767_225_600.0
 class VirtualWorld(World):
     """A world whose scheduler decides who goes on, and whose time is virtual."""
 
-    def __init__(self, scheduler: Scheduler, zenoh: Any = None) -> None:
+    def __init__(self, scheduler: VirtualScheduler, zenoh: Any = None) -> None:
         self.scheduler = scheduler
         self._zenoh = zenoh
 
@@ -59,7 +59,7 @@ class VirtualWorld(World):
         """A condition."""
         return VirtualCondition(self.scheduler)
 
-    def event(self) -> Event:
+    def event(self) -> ThreadEvent:
         """An event."""
         return VirtualEvent(self.scheduler)
 

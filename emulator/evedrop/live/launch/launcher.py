@@ -18,7 +18,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import choose
 from evedrop.system.output import say
 from evedrop.system.signals import stop_on_signals, told_when_suspended
-from evedrop.system.world import Event
+from evedrop.system.world import ThreadEvent
 
 if TYPE_CHECKING:
     from evedrop.live.launch.hosts_file import HostsPlan
@@ -81,7 +81,7 @@ def _on_hosts(
     folder: Path,
     view: str,
     on_event: OnEvent,
-    stop: Event,
+    stop: ThreadEvent,
     here: Starter,
     hosts: HostsPlan,
     paused: bool,

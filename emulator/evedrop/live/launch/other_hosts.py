@@ -52,7 +52,7 @@ from evedrop.system.processes import kill, signalled_when_parent_dies, wait_for
 from evedrop.system.signals import raise_on_signals
 from evedrop.system.this_process import continue_when_parent_dies
 from evedrop.system.waiting import Alarm
-from evedrop.system.world import Event, world
+from evedrop.system.world import ThreadEvent, world
 
 MOST_NOISE = 200
 """The most lines that the login shell of a host may print before the program begins."""
@@ -257,7 +257,7 @@ class SshHost:
             if self._answered.is_set():
                 self.send(LauncherHeartbeat(_SILENCE_SECONDS))
 
-    def wait_until_ready(self, deadline: float, stop: Event) -> None:
+    def wait_until_ready(self, deadline: float, stop: ThreadEvent) -> None:
         """Wait until Evedrop answers there. Raises UsageError if it does not, or has another version; Interrupted if stopped."""
         while not self._answered.wait(_POLL_SECONDS):
             if stop.is_set():
@@ -430,7 +430,7 @@ class SshStarter:
 
 
 @contextmanager
-def ssh_starter(plan: HostsPlan, here: Starter, stop: Event, longest_outage: float) -> Iterator[Starter]:
+def ssh_starter(plan: HostsPlan, here: Starter, stop: ThreadEvent, longest_outage: float) -> Iterator[Starter]:
     """A starter that is connected to all of these hosts; ends all processes on them at the end of the block.
 
     longest_outage: as for `SshHost`. Raises UsageError if a host cannot be used, Interrupted if stopped meanwhile.

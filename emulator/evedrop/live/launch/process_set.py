@@ -26,7 +26,7 @@ from evedrop.scenario.progress_events import FolderMoved, OnEvent, RunEnded, Vie
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS, INTERRUPTED
-from evedrop.system.world import Event, world
+from evedrop.system.world import ThreadEvent, world
 
 _POLL_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
@@ -50,7 +50,7 @@ def launch_one(
     view: str,
     endpoints: RouterEndpoints | None,
     on_event: OnEvent,
-    stop: Event,
+    stop: ThreadEvent,
     starter: Starter,
     *,
     shard: bool = False,
@@ -123,7 +123,7 @@ def _endpoints(given: RouterEndpoints | None, private: Path) -> Iterator[RouterE
         yield socket_endpoints(folder)
 
 
-def _wait_until_listening(children: Children, router: str, stop: Event, patience: float) -> None:
+def _wait_until_listening(children: Children, router: str, stop: ThreadEvent, patience: float) -> None:
     """Wait until a router says that it listens: a process that is started earlier might connect to another program there.
 
     Raises RunError if the router ends, or is silent for `patience` seconds; Interrupted if stopped meanwhile.
@@ -156,7 +156,7 @@ def _forget(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-def follow_to_end(children: Children, stop: Event, on_event: OnEvent) -> int:
+def follow_to_end(children: Children, stop: ThreadEvent, on_event: OnEvent) -> int:
     """Follow the run to its end; returns the exit status that the recorder gives it."""
     early: tuple[ProcessExit, float] | None = None
     ending: RunEnded | None
@@ -203,6 +203,6 @@ def _stopped(children: Children, on_event: OnEvent) -> RunEnded:
     return ending
 
 
-def _meant_us_too(ended: ProcessExit, stop: Event) -> bool:
+def _meant_us_too(ended: ProcessExit, stop: ThreadEvent) -> bool:
     """Whether the signal that ended a child soon reaches the launcher, too, as when a closing terminal hangs up on all."""
     return ended.status == INTERRUPTED and stop.wait(AFTERTHOUGHT_SECONDS)

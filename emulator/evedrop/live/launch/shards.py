@@ -37,7 +37,7 @@ from evedrop.scenario.progress_events import (
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
 from evedrop.system.waiting import wait_for_thread
-from evedrop.system.world import Event, world
+from evedrop.system.world import ThreadEvent, world
 
 _POLL_SECONDS = 0.25
 
@@ -115,7 +115,7 @@ class _ShardsState:
         at: RouterEndpoints | None,
         on_event: OnEvent,
         view: str,
-        stop: Event,
+        stop: ThreadEvent,
         starter: Starter,
     ) -> None:
         """Run one shard to its end, its routers at these endpoints, or at a socket; if it ends early, all shards end."""
@@ -139,7 +139,7 @@ def launch_shards(
     folder: Path,
     view: str,
     on_event: OnEvent,
-    stop: Event,
+    stop: ThreadEvent,
     starter: Starter,
 ) -> FinishedRun:
     """Run a scenario in its shards, all at the same time, into one results folder; raises as `launch` does.

@@ -32,7 +32,7 @@ from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.system.environment import SINGLE_THREADED, own_environment
 from evedrop.system.processes import KILLED_SECONDS, KillableProcess, kill, wait_for
 from evedrop.system.signals import SHOW_STACKS, held_back
-from evedrop.system.world import Event, Queue, world
+from evedrop.system.world import Queue, ThreadEvent, world
 
 TELLING = frozenset({RECORDER, ROUTER, RELAY})
 """The roles whose processes send the launcher events on their standard output."""
@@ -276,7 +276,7 @@ class ForkServer:
         brief: Path,
         log: IO[bytes],
         environment: Mapping[str, str],
-        stop: Event | None = None,
+        stop: ThreadEvent | None = None,
     ) -> StartedProcess:
         """Start `evedrop ROLE BRIEF`, whose files only this user may read. Raises OSError, Interrupted once `stop` is set."""
         read_stdin, write_stdin = os.pipe()
@@ -305,7 +305,7 @@ class ForkServer:
         environment: Mapping[str, str],
         folder: str | None,
         umask: int,
-        stop: Event | None = None,
+        stop: ThreadEvent | None = None,
     ) -> Fork:
         """Run `evedrop WORDS` in a fork of the server, with these standard files, in this folder.
 
@@ -322,7 +322,7 @@ class ForkServer:
             raise begun
         return begun
 
-    def _answer(self, stop: Event | None) -> Fork | OSError:
+    def _answer(self, stop: ThreadEvent | None) -> Fork | OSError:
         """The answer to a request. A server that does not answer in time is given up, for a late answer would confuse."""
         deadline = world().monotonic() + _START_SECONDS
         while world().monotonic() < deadline:
@@ -395,10 +395,10 @@ class PreloadedStarter:
     stop: once it is set, no fork server is waited for.
     """
 
-    def __init__(self, servers: Sequence[ForkServer], stop: Event | None = None) -> None:
+    def __init__(self, servers: Sequence[ForkServer], stop: ThreadEvent | None = None) -> None:
         self._servers, self._stop = servers, stop
 
-    def until(self, stop: Event) -> PreloadedStarter:
+    def until(self, stop: ThreadEvent) -> PreloadedStarter:
         """The same for a run that ends once this is set."""
         return PreloadedStarter(self._servers, stop)
 
@@ -428,7 +428,7 @@ _preloaded: list[_Preloaded] = []
 
 
 @contextmanager
-def process_starter(stop: Event | None = None) -> Iterator[Starter]:
+def process_starter(stop: ThreadEvent | None = None) -> Iterator[Starter]:
     """The fastest way to start processes on this system, until the block ends. Raises OSError.
 
     stop: once it is set, the starter waits for nothing, and raises Interrupted. Outside a `preloaded` block, a summary's own
