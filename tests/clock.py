@@ -5,7 +5,7 @@ from __future__ import annotations
 from queue import Empty
 from typing import TypeVar
 
-from evedrop.system.world import Condition, Queue
+from evedrop.system.threads import Condition, Queue
 
 T = TypeVar("T")
 

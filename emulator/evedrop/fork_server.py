@@ -23,8 +23,8 @@ from typing import NoReturn
 from setproctitle import setproctitle
 
 from evedrop.system.lacks import refuse_scipy_without_room
+from evedrop.system.parents import continue_when_parent_dies
 from evedrop.system.signals import SIGNALS, heed_signals
-from evedrop.system.this_process import continue_when_parent_dies
 
 _MOST_BYTES = 1 << 17
 _FILES = 3

@@ -27,7 +27,7 @@ from evedrop.model.process import Process
 from evedrop.peers.eavesdropper import eavesdrop
 from evedrop.peers.legitimate import estimate
 from evedrop.peers.sensor import Window, sense
-from evedrop.system.world import Queue
+from evedrop.system.threads import Queue
 from tests.builders import listener, part_of, scenario_of
 from tests.clock import T, TestClock
 from tests.conftest import LIMIT

@@ -28,9 +28,9 @@ from evedrop.scenario.dry_run import foreign
 from evedrop.simulate.tasks import OnProgress, R, Result, Stopped, Task
 from evedrop.system.environment import SINGLE_THREADED, own_environment
 from evedrop.system.lacks import lack_of
+from evedrop.system.parents import continue_when_parent_dies
 from evedrop.system.processes import KILLED_SECONDS, SUSPENDED_SECONDS, SuspensionWatch, kill
 from evedrop.system.signals import SIGNALS
-from evedrop.system.this_process import continue_when_parent_dies
 
 _POLL_SECONDS = 0.1
 _LAST_SECONDS = 30.0  # after a stop, for the current chunk of slots; only a worker that hangs needs them all

@@ -37,9 +37,9 @@ from evedrop.score.summary import Judged, failed
 from evedrop.show.report.writing import has_results, try_report
 from evedrop.simulate.finished_tasks import TASKS
 from evedrop.simulate.montecarlo import Plan, simulate
+from evedrop.system.parents import continue_when_parent_dies
 from evedrop.system.processes import SUSPENDED_SECONDS, SuspensionWatch, kill, wait_for
 from evedrop.system.signals import stop_on_signals
-from evedrop.system.this_process import continue_when_parent_dies
 
 
 class Outcome(Enum):

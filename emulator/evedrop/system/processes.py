@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
-import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Protocol, TypeVar, final
 
@@ -17,18 +14,6 @@ KILLED_SECONDS = 10.0
 SUSPENDED_SECONDS = 60.0
 """How long a process that others wait for may be suspended."""
 _POLL_SECONDS = 1.0
-# The setting survives exec. A parent that died before it was made sends no signal any more. Python ignores SIGPIPE, and a program
-# that it becomes would, too.
-_SIGNALLED = """
-import ctypes, os, signal, sys
-{first}
-number, parent = int(sys.argv[1]), int(sys.argv[2])
-ctypes.CDLL(None).prctl(1, number, 0, 0, 0)
-if os.getppid() != parent:
-    os.kill(os.getpid(), number)
-signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-os.execv(sys.argv[3], sys.argv[3:])
-"""
 
 
 class KillableProcess(Protocol):
@@ -89,14 +74,3 @@ class SuspensionWatch:
         self._next = world().monotonic() + _POLL_SECONDS
         self._looks = {pid: self._looks.get(pid, 0) + 1 for pid in pids if is_suspended(pid)}
         return next((pid for pid, looks in self._looks.items() if looks * _POLL_SECONDS > SUSPENDED_SECONDS), None)
-
-
-def signalled_when_parent_dies(command: Sequence[str], number: signal.Signals, first: str = "") -> list[str]:
-    """A command whose process gets a signal when this process dies, however it dies; the same command outside Linux.
-
-    command: begins with the path of a file; first: Python code that runs before it, with `ctypes` and `os` imported.
-    """
-    if sys.platform != "linux":
-        return [*command]
-    code = _SIGNALLED.format(first=first)
-    return [sys.executable, "-I", "-S", "-c", code, str(int(number)), str(os.getpid()), *command]

@@ -5,23 +5,26 @@ Source: docs/maintainers/simulated-world.md.
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
+import gc
 import os
 import select
 import signal
 import sys
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
 from typing import NoReturn, TextIO, cast, final
 
+from evedrop.system.allocator import keep_for_messages
+from evedrop.system.guard import dismiss, guard_of
 from evedrop.system.native_log import native_log_apart
 from evedrop.system.output import Output
-from evedrop.system.signals import SHOW_STACKS, heeded, leave_on_signals
-
-_PR_SET_PDEATHSIG = 1
+from evedrop.system.parents import continue_when_parent_dies
+from evedrop.system.signals import SHOW_STACKS, heeded, leave_on_signals, stop_on_signals, told_when_suspended
+from evedrop.system.threads import ThreadEvent
 
 
 class ThisProcess(ABC):
@@ -47,6 +50,22 @@ class ThisProcess(ABC):
     @abstractmethod
     def leave_on_signals(self) -> None:
         """Let these signals end it at once, with status 130."""
+
+    @abstractmethod
+    def stop_on_signals(self) -> AbstractContextManager[ThreadEvent]:
+        """An event that these signals set while the block runs."""
+
+    @abstractmethod
+    def told_when_suspended(self, tell: Callable[[], object]) -> AbstractContextManager[None]:
+        """Call `tell` before Ctrl-Z suspends it while the block runs."""
+
+    @abstractmethod
+    def removed_with_it(self, folder: Path) -> AbstractContextManager[None]:
+        """Have a folder, which is made in the block, removed should this process die, however it dies. Raises OSError."""
+
+    @abstractmethod
+    def prepare_for_messages(self, largest: int) -> None:
+        """Keep memory for messages of up to `largest` bytes, and let no collection of garbage look at imported modules."""
 
     @abstractmethod
     def show_stacks(self) -> None:
@@ -111,6 +130,28 @@ class RealProcess(ThisProcess):
         """Let these signals end it at once."""
         leave_on_signals()
 
+    def stop_on_signals(self) -> AbstractContextManager[ThreadEvent]:
+        """An event that these signals set; has no effect outside the main thread."""
+        return stop_on_signals()
+
+    def told_when_suspended(self, tell: Callable[[], object]) -> AbstractContextManager[None]:
+        """Call `tell` before Ctrl-Z suspends it; has no effect outside the main thread."""
+        return told_when_suspended(tell)
+
+    @contextmanager
+    def removed_with_it(self, folder: Path) -> Iterator[None]:
+        """Start a shell that holds the other end of a pipe to this process; dismiss it after the block."""
+        guard = guard_of(folder)
+        try:
+            yield
+        finally:
+            dismiss(guard)
+
+    def prepare_for_messages(self, largest: int) -> None:
+        """Keep memory, and modules: a collection that looks at them holds up packets."""
+        keep_for_messages(largest)
+        gc.freeze()
+
     def show_stacks(self) -> None:
         """Write the stack of every thread to standard error upon `SHOW_STACKS`."""
         faulthandler.register(SHOW_STACKS, all_threads=True)
@@ -151,12 +192,6 @@ class RealProcess(ThisProcess):
             to = (self._events or sys.stdout).fileno()
             while left:
                 left = left[os.write(to, left) :]
-
-
-def continue_when_parent_dies() -> None:
-    """Let the system continue this process if it is suspended when its parent dies: it would not notice (Linux only)."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
 
 
 REAL_PROCESS: ThisProcess = RealProcess()

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from typing import Protocol, TypeVar, final
 
 from evedrop.errors import RunError
-from evedrop.system.world import Condition, Queue, Thread, ThreadEvent, world
+from evedrop.system.threads import Condition, Queue, Thread, ThreadEvent
+from evedrop.system.world import world
 
 THREAD_SECONDS = 600.0
 """How long to wait for a thread that was told to end. It ends within seconds, unless something that it calls hangs."""

@@ -9,106 +9,22 @@ So `threading`, `queue`, `time`, `signal` and the ends of processes are used her
 from __future__ import annotations
 
 import secrets
+import socket
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from queue import SimpleQueue
-from types import TracebackType
-from typing import Any, Protocol, TypeVar, final
+from typing import Any, TypeVar, final
 
 from evedrop.system.this_process import REAL_PROCESS, ThisProcess
+from evedrop.system.threads import Condition, Lock, Queue, Thread, ThreadEvent
 
 T = TypeVar("T")
-
-
-class Thread(Protocol):
-    """A thread that has been made, and perhaps started."""
-
-    @property
-    def name(self) -> str:
-        """What it does."""
-
-    @property
-    def ident(self) -> int | None:
-        """Its number; None before its start."""
-
-    def start(self) -> None:
-        """Start it. Raises RuntimeError if the machine lacks threads."""
-
-    def join(self, timeout: float | None = None) -> None:
-        """Wait until it has ended, or for `timeout` seconds."""
-
-    def is_alive(self) -> bool:
-        """Whether it runs."""
-
-
-class Lock(Protocol):
-    """A lock that one thread holds at a time."""
-
-    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
-        """Take it; returns whether this thread has it."""
-
-    def release(self) -> None:
-        """Give it back."""
-
-    def __enter__(self) -> bool: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
-
-
-class Condition(Lock, Protocol):
-    """A lock whose holder can wait for another thread to change something."""
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait until notified; returns whether that was before `timeout` seconds."""
-
-    def wait_for(self, predicate: Callable[[], T], timeout: float | None = None) -> T:
-        """Wait until something is true, or for `timeout` seconds; returns it."""
-
-    def notify(self, n: int = 1) -> None:
-        """Wake up threads that wait."""
-
-    def notify_all(self) -> None:
-        """Wake up all of them."""
-
-
-class ThreadEvent(Protocol):
-    """Something that happens once."""
-
-    def is_set(self) -> bool:
-        """Whether it has happened."""
-
-    def set(self) -> None:
-        """It happens."""
-
-    def clear(self) -> None:
-        """It has not happened."""
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it happens, or for `timeout` seconds; returns whether it has happened."""
-
-
-class Queue(Protocol[T]):
-    """Items in order, put and taken by any thread."""
-
-    def put(self, item: T) -> None:
-        """Add an item."""
-
-    def get(self, block: bool = True, timeout: float | None = None) -> T:
-        """Take the next item. Raises queue.Empty if there is none: at once if not `block`, otherwise after `timeout` seconds."""
-
-    def get_nowait(self) -> T:
-        """Take the next item. Raises queue.Empty if there is none."""
-
-    def empty(self) -> bool:
-        """Whether there is none."""
-
-    def qsize(self) -> int:
-        """How many there are."""
+Address = tuple[str, int] | Path
+"""Host and port, or the path of a Unix socket."""
 
 
 class World(ABC):
@@ -153,6 +69,14 @@ class World(ABC):
     @abstractmethod
     def token(self, size: int) -> bytes:
         """Bytes that nobody can guess."""
+
+    @abstractmethod
+    def dial(self, address: Address, seconds: float) -> socket.socket:
+        """Connect to the program that listens at an address, within this time. Raises OSError."""
+
+    @abstractmethod
+    def expect_free(self, host: str, port: int) -> None:
+        """Raise OSError unless this machine can listen at this port."""
 
     @property
     @abstractmethod
@@ -208,6 +132,27 @@ class RealWorld(World):
     def token(self, size: int) -> bytes:
         """Bytes that nobody can guess."""
         return secrets.token_bytes(size)
+
+    def dial(self, address: Address, seconds: float) -> socket.socket:
+        """Connect to the program that listens there."""
+        if isinstance(address, tuple):
+            return socket.create_connection(address, seconds)
+        link = socket.socket(socket.AF_UNIX)
+        try:
+            link.settimeout(seconds)
+            link.connect(str(address))
+        except BaseException:
+            link.close()
+            raise
+        return link
+
+    def expect_free(self, host: str, port: int) -> None:
+        """Raise OSError unless this machine can listen there."""
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        family, kind, protocol, _, address = addresses[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
 
     @property
     def process(self) -> ThisProcess:

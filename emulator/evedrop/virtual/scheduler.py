@@ -102,7 +102,7 @@ class VirtualThread:
         except SystemExit:
             pass
         except BaseException as error:  # as an exception in a thread: it is told, and the others go on
-            self._scheduler.failed(self, error)
+            self._scheduler.failed(f"{self.task.name}: {self.name}", error)
         finally:
             self.over = True
         if self.task.alive:
@@ -206,9 +206,9 @@ class VirtualScheduler:
             self._ready += task.waiting
             task.waiting = []
 
-    def failed(self, thread: VirtualThread, error: BaseException) -> None:
-        """An exception has ended a thread."""
-        self.errors.append((f"{thread.task.name}: {thread.name}", error))
+    def failed(self, thread: str, error: BaseException) -> None:
+        """An exception that nobody caught has ended a thread."""
+        self.errors.append((thread, error))
 
     # Waiting
 

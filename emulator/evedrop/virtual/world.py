@@ -5,11 +5,14 @@ Source: docs/maintainers/simulated-world.md.
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, cast, final
 
 from evedrop.system.this_process import ThisProcess
-from evedrop.system.world import Condition, Lock, Queue, Thread, ThreadEvent, World
+from evedrop.system.threads import Condition, Lock, Queue, Thread, ThreadEvent
+from evedrop.system.world import Address, World
+from evedrop.virtual.processes import VirtualMachine
 from evedrop.virtual.scheduler import (
     VirtualCondition,
     VirtualEvent,
@@ -26,8 +29,8 @@ EPOCH = 1_767_225_600.0
 class VirtualWorld(World):
     """A world whose scheduler decides who goes on, and whose time is virtual."""
 
-    def __init__(self, scheduler: VirtualScheduler, zenoh: Any = None) -> None:
-        self.scheduler = scheduler
+    def __init__(self, scheduler: VirtualScheduler, machine: VirtualMachine, zenoh: Any) -> None:
+        self.scheduler, self.machine = scheduler, machine
         self._zenoh = zenoh
 
     def monotonic(self) -> float:
@@ -71,10 +74,19 @@ class VirtualWorld(World):
         """Bytes that the seed decides."""
         return self.scheduler.random.randbytes(size)
 
+    def dial(self, address: Address, seconds: float) -> socket.socket:
+        """Connect to the router that listens there."""
+        del seconds
+        return cast("socket.socket", self._zenoh.dial(address))
+
+    def expect_free(self, host: str, port: int) -> None:
+        """Raise OSError if a router listens there."""
+        self._zenoh.expect_free((host, port))
+
     @property
     def process(self) -> ThisProcess:
         """The process of the current thread."""
-        raise NotImplementedError
+        return self.machine.current
 
     @property
     def zenoh(self) -> Any:

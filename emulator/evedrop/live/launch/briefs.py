@@ -7,7 +7,6 @@ Source: docs/protocol.md, the brief.
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -152,7 +151,7 @@ def briefs_of(
     keys = StreamKeys.from_scenario(scenario)
     steered = () if scenario.controller is None else (CONTROLLER,)
     users = {
-        name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, *steered, RECORDER, OPERATOR)
+        name: world().token(16).hex() for name in (ROUTER, SENSOR, *scenario.receivers, *steered, RECORDER, OPERATOR)
     }
     routers = Routers.for_users(users, endpoints)
     spec = scenario.encoding.spec

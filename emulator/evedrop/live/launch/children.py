@@ -37,7 +37,8 @@ from evedrop.scenario.progress_events import OnEvent, ProgressEvent, RunEnded, S
 from evedrop.system.environment import SINGLE_THREADED, check_zenoh_runtime, lock_step_environment, own_environment
 from evedrop.system.processes import wait_for
 from evedrop.system.signals import INTERRUPTED
-from evedrop.system.world import Queue, world
+from evedrop.system.threads import Queue
+from evedrop.system.world import world
 
 ROUTER_RESTARTS = 3  # how often routers that were ended by a signal are restarted in a run
 SILENCE_SECONDS = 30.0  # after which the launcher gives up on a silent recorder, which sends a heartbeat every second

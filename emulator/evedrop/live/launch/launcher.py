@@ -6,6 +6,8 @@ It imports neither zenoh nor rerun. It alone decides how the run ended.
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,8 +19,8 @@ from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import choose
 from evedrop.system.output import say
-from evedrop.system.signals import stop_on_signals, told_when_suspended
-from evedrop.system.world import ThreadEvent
+from evedrop.system.threads import ThreadEvent
+from evedrop.system.world import world
 
 if TYPE_CHECKING:
     from evedrop.live.launch.hosts_file import HostsPlan
@@ -37,12 +39,14 @@ def launch(
     *,
     paused: bool = False,
     hosts: HostsPlan | None = None,
+    starters: Callable[[ThreadEvent], AbstractContextManager[Starter]] = process_starter,
 ) -> FinishedRun:
     """Run a scenario live into a results folder; `on_event` gets the recorder's events as they come.
 
     view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; by default no
     port, or free ports for two routers; paused: whether the run is held before slot 0, until the operator lets it continue;
-    hosts: the hosts of processes that are not on this machine, and the endpoints of the routers then.
+    hosts: the hosts of processes that are not on this machine, and the endpoints of the routers then; starters: gives what starts
+    processes.
 
     Raises UsageError before any process is started, RunError if the run failed, Interrupted on Ctrl-C or SIGTERM; in the
     last two cases the results so far are in the folder and no process is left.
@@ -53,7 +57,8 @@ def launch(
     def suspended() -> None:
         say(f"the processes of the run go on, and only this command stops{pausing}; `fg` continues the command")
 
-    with stop_on_signals() as stop, told_when_suspended(suspended), process_starter(stop) as start:
+    this = world().process
+    with this.stop_on_signals() as stop, this.told_when_suspended(suspended), starters(stop) as start:
         if hosts is not None:
             return _on_hosts(scenario, folder, view, on_event, stop, start, hosts, paused)
         if scenario.shards == 1:

@@ -48,11 +48,12 @@ from evedrop.live.protocol.brief import AnyBrief, ImportingPart, ReceiverPart, b
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 from evedrop.system.environment import own_environment
 from evedrop.system.fields import NotNegative, Slot
-from evedrop.system.processes import kill, signalled_when_parent_dies, wait_for
+from evedrop.system.parents import continue_when_parent_dies, signalled_when_parent_dies
+from evedrop.system.processes import kill, wait_for
 from evedrop.system.signals import raise_on_signals
-from evedrop.system.this_process import continue_when_parent_dies
+from evedrop.system.threads import ThreadEvent
 from evedrop.system.waiting import Alarm
-from evedrop.system.world import ThreadEvent, world
+from evedrop.system.world import world
 
 MOST_NOISE = 200
 """The most lines that the login shell of a host may print before the program begins."""

@@ -7,7 +7,6 @@ passwords, certificates, and the id by which two routers recognise each other.
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -203,7 +202,7 @@ class Routers:
         if endpoints.relay is None:
             return cls(endpoints, users, {}, None)
         # Router and relay are users, too: each asks itself whether it is present.
-        near = {**{user: users[user] for user in (ROUTER, SENSOR)}, RELAY: secrets.token_urlsafe(24)}
+        near = {**{user: users[user] for user in (ROUTER, SENSOR)}, RELAY: world().token(16).hex()}
         far = {**{user: password for user, password in users.items() if user not in near}, RELAY: near[RELAY]}
         # Zenoh takes ids of up to 16 bytes, in hexadecimal without zeros at the ends.
         zid = f"e{world().token(15).hex()}e"

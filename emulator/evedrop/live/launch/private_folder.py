@@ -11,8 +11,6 @@ import contextlib
 import fcntl
 import os
 import shutil
-import signal
-import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,20 +18,12 @@ from pathlib import Path
 from evedrop.errors import UsageError
 from evedrop.live.network.endpoint import can_be_socket
 from evedrop.names import ROUTER
-from evedrop.system.environment import own_environment
-from evedrop.system.processes import kill, signalled_when_parent_dies
 from evedrop.system.world import world
 
 _PREFIX = "evedrop-"
 _LOCK = "lock"
 _SHORT = Path("/tmp")  # noqa: S108 - the folder in it is as private as one elsewhere
 """Where sockets are if the paths in the folder for temporary files cannot be those of sockets."""
-_GUARD_SECONDS = 5.0
-# A process that is still starting may write into the folder while it is being removed, so try again.
-_GUARD = (
-    "while read -r _; do :; done; tries=0; "
-    'while [ -e "$1" ] && [ $tries -lt 50 ]; do rm -rf -- "$1" 2>/dev/null || sleep 0.2; tries=$((tries + 1)); done'
-)
 
 
 @contextlib.contextmanager
@@ -46,7 +36,8 @@ def private_folder(where: Path | None = None) -> Iterator[Path]:
         where = (where or Path(tempfile.gettempdir())).absolute()
         _sweep(where)
         folder = where / f"{_PREFIX}{world().token(8).hex()}"
-        guard = _guard(folder)
+        guard = world().process.removed_with_it(folder)
+        guard.__enter__()
     except OSError as error:
         raise _unmade(error) from error
     try:
@@ -54,7 +45,7 @@ def private_folder(where: Path | None = None) -> Iterator[Path]:
             yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        _dismiss(guard)
+        guard.__exit__(None, None, None)
 
 
 @contextlib.contextmanager
@@ -84,30 +75,6 @@ def _locked(folder: Path) -> Iterator[None]:
 
 def _unmade(error: OSError) -> UsageError:
     return UsageError(f"cannot make a temporary folder ({error.strerror}); set TMPDIR to a folder that can be written")
-
-
-def _guard(folder: Path) -> subprocess.Popen[bytes]:
-    """Start the shell that removes the folder when the launcher is dead; called before the folder is made."""
-    # A suspended shell would not notice that the launcher is dead.
-    return subprocess.Popen(
-        signalled_when_parent_dies(["/bin/sh", "-c", _GUARD, "sh", str(folder)], signal.SIGCONT),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-        env=own_environment(),
-    )
-
-
-def _dismiss(guard: subprocess.Popen[bytes]) -> None:
-    """End the shell, which finds nothing to remove."""
-    assert guard.stdin is not None  # noqa: S101 - it was started with a pipe
-    guard.stdin.close()
-    guard.send_signal(signal.SIGCONT)
-    try:
-        guard.wait(_GUARD_SECONDS)
-    except subprocess.TimeoutExpired:
-        kill(guard)
 
 
 def _sweep(where: Path) -> None:

@@ -26,7 +26,8 @@ from evedrop.scenario.progress_events import FolderMoved, OnEvent, RunEnded, Vie
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS, INTERRUPTED
-from evedrop.system.world import ThreadEvent, world
+from evedrop.system.threads import ThreadEvent
+from evedrop.system.world import world
 
 _POLL_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0

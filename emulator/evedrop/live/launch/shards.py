@@ -36,8 +36,9 @@ from evedrop.scenario.progress_events import (
 )
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
+from evedrop.system.threads import ThreadEvent
 from evedrop.system.waiting import wait_for_thread
-from evedrop.system.world import ThreadEvent, world
+from evedrop.system.world import world
 
 _POLL_SECONDS = 0.25
 

@@ -32,7 +32,8 @@ from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.system.environment import SINGLE_THREADED, own_environment
 from evedrop.system.processes import KILLED_SECONDS, KillableProcess, kill, wait_for
 from evedrop.system.signals import SHOW_STACKS, held_back
-from evedrop.system.world import Queue, ThreadEvent, world
+from evedrop.system.threads import Queue, ThreadEvent
+from evedrop.system.world import world
 
 TELLING = frozenset({RECORDER, ROUTER, RELAY})
 """The roles whose processes send the launcher events on their standard output."""

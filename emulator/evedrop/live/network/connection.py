@@ -28,8 +28,9 @@ from evedrop.live.protocol.codec import Dropped, head_of
 from evedrop.live.protocol.commands import StatusReporter
 from evedrop.live.protocol.last_word import Cause, LastWord
 from evedrop.system.output import say
+from evedrop.system.threads import Queue, Thread
 from evedrop.system.waiting import Alarm
-from evedrop.system.world import Queue, Thread, world
+from evedrop.system.world import world
 
 
 class Declared(Protocol):

@@ -13,6 +13,8 @@ import socket
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from evedrop.system.world import world
+
 _FORM = re.compile(r"(tcp|tls)/(?:\[([0-9A-Fa-f:.]+)\]|([A-Za-z0-9_.-]+)):([0-9]{1,5})")
 _MOST_LABEL = 63
 _SOCKET = "unixsock-stream"
@@ -82,15 +84,11 @@ class Endpoint:
 
     def try_to_listen(self) -> None:
         """Raise OSError unless this host can listen there."""
-        addresses = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)
-        family, kind, protocol, _, address = addresses[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
+        world().expect_free(self.host, self.port)
 
     def dial(self, seconds: float) -> socket.socket:
         """Connect to the program that listens there, within this time. Raises OSError."""
-        return socket.create_connection((self.host, self.port), seconds)
+        return world().dial((self.host, self.port), seconds)
 
 
 @dataclass(frozen=True)
@@ -123,14 +121,7 @@ class SocketEndpoint:
 
     def dial(self, seconds: float) -> socket.socket:
         """Connect to the program that listens there, within this time. Raises OSError."""
-        link = socket.socket(socket.AF_UNIX)
-        try:
-            link.settimeout(seconds)
-            link.connect(str(self.path))
-        except BaseException:
-            link.close()
-            raise
-        return link
+        return world().dial(self.path, seconds)
 
 
 AnyEndpoint = Endpoint | SocketEndpoint

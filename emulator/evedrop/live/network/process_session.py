@@ -19,8 +19,9 @@ from evedrop.errors import Gap, MalformedMessage
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import ControlCommand, StatusReporter
 from evedrop.live.protocol.keys import RunKeys, writer_of
+from evedrop.system.threads import Queue
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
-from evedrop.system.world import Queue, world
+from evedrop.system.world import world
 
 
 class Received(Protocol):

@@ -53,7 +53,8 @@ from evedrop.model.slot.link import COUNTED_BURSTS, Account, Accountant, Change,
 from evedrop.model.slot.link_core import Arrivals, Late, LinkCore
 from evedrop.model.slot.records import PacketSlots
 from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE, ROUTER
-from evedrop.system.world import Queue, world
+from evedrop.system.threads import Queue
+from evedrop.system.world import world
 
 
 @final

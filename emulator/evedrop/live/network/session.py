@@ -8,7 +8,6 @@ dropped.
 
 from __future__ import annotations
 
-import gc
 import json
 import sys
 from collections.abc import Callable, Collection, Iterable
@@ -60,9 +59,9 @@ from evedrop.live.protocol.keys import RunKeys, ZenohConfig, low_pass, reader_of
 from evedrop.live.protocol.launcher_events import RouterListens
 from evedrop.live.protocol.notices import EndReport, RefusalNotice
 from evedrop.names import RECORDER, ROUTER
-from evedrop.system.allocator import keep_for_messages
+from evedrop.system.threads import Queue
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
-from evedrop.system.world import Queue, world
+from evedrop.system.world import world
 
 READY_SECONDS = 30.0
 _POLL_SECONDS = 0.004
@@ -178,8 +177,7 @@ class Session:
         world().zenoh.init_log_from_env_or(_LOGGED)
         if brief.ends_with_stdin:
             when_launcher_is_gone(lambda: world().process.exit(3))
-        keep_for_messages(brief.flow.largest_message)
-        gc.freeze()  # imported modules stay: a collection that looks at them holds up packets
+        world().process.prepare_for_messages(brief.flow.largest_message)
         self.keys = RunKeys(brief.run)
         self._process = brief.process
         self.patience = float(brief.patience)

@@ -20,7 +20,8 @@ from evedrop.live.protocol.keys import reader_of
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
 from evedrop.system.fields import Slot
-from evedrop.system.world import Queue, world
+from evedrop.system.threads import Queue
+from evedrop.system.world import world
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,9 @@ from evedrop.live.protocol.commands import Abandon, ControlCommand, EndRun, Star
 from evedrop.live.protocol.notices import EndReport, Progress
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS
+from evedrop.system.threads import Queue
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
-from evedrop.system.world import Queue, world
+from evedrop.system.world import world
 
 _ABANDON_SECONDS = 2.0  # for processes to leave when told to
 _POLL_SECONDS = 0.05  # how soon a signal is noticed

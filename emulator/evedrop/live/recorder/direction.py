@@ -24,7 +24,7 @@ from evedrop.live.recorder.recovery import Recovery, Stall, patience_of
 from evedrop.live.recorder.steering import Steering, status_of
 from evedrop.names import CONTROLLER, OPERATOR
 from evedrop.scenario.progress_events import Started
-from evedrop.system.world import Queue
+from evedrop.system.threads import Queue
 
 
 @final

@@ -32,7 +32,8 @@ from evedrop.scenario.progress_events import ViewOpened
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer, WebAddress
 from evedrop.system.lacks import preload_meanwhile, preload_within_limit
-from evedrop.system.world import Queue, world
+from evedrop.system.threads import Queue
+from evedrop.system.world import world
 
 _ORPHAN_SECONDS = 30.0  # to write the results once the launcher is gone
 

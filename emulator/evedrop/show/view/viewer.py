@@ -32,8 +32,9 @@ from urllib.parse import quote
 from evedrop.errors import UsageError
 from evedrop.results.folder import make_private, private_opener
 from evedrop.system.environment import viewer_environment
+from evedrop.system.parents import signalled_when_parent_dies
 from evedrop.system.ports import free_port
-from evedrop.system.processes import kill, signalled_when_parent_dies, wait_for
+from evedrop.system.processes import kill, wait_for
 
 if TYPE_CHECKING:
     from evedrop.show.view.serving import Followed, Served, WebPage

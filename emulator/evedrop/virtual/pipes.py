@@ -1,0 +1,105 @@
+"""Pipes between simulated processes, and between a process and its launcher.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Self, final
+
+from evedrop.virtual.scheduler import VirtualScheduler, Waiter
+
+_ROOM = 1 << 16
+"""How many bytes wait in a pipe before its writer has to."""
+
+
+@final
+class Pipe:
+    """Bytes from one process to another."""
+
+    def __init__(self, scheduler: VirtualScheduler) -> None:
+        self._scheduler = scheduler
+        self._held = bytearray()
+        self._readers: deque[Waiter] = deque()
+        self._writers: deque[Waiter] = deque()
+        self._written, self._read = True, True
+
+    def write(self, data: bytes) -> int:
+        """Write bytes, and wait while the pipe is full. Raises BrokenPipeError if nobody reads them."""
+        left = memoryview(data)
+        while left:
+            if not self._read:
+                raise BrokenPipeError(32, "Broken pipe")
+            room = _ROOM - len(self._held)
+            if room == 0:
+                self._scheduler.wait(self._writers)
+                continue
+            self._held += left[:room]
+            left = left[room:]
+            self._scheduler.wake(self._readers)
+        self._scheduler.interruptible()
+        return len(data)
+
+    def read(self, most: int) -> bytes:
+        """Wait for bytes; none at the end."""
+        while not self._held and self._written:
+            self._scheduler.wait(self._readers)
+        data = bytes(self._held[:most])
+        del self._held[:most]
+        self._scheduler.wake(self._writers)
+        return data
+
+    @property
+    def over(self) -> bool:
+        """Whether there is nothing more to read."""
+        return not self._written and not self._held
+
+    def close_writing(self) -> None:
+        """The writer's end is closed."""
+        self._written = False
+        self._scheduler.wake(self._readers)
+
+    def close_reading(self) -> None:
+        """The reader's end is closed."""
+        self._read = False
+        self._scheduler.wake(self._writers)
+
+
+@final
+class PipeFile:
+    """An end of a pipe as a file object."""
+
+    def __init__(self, pipe: Pipe) -> None:
+        self._pipe = pipe
+
+    def write(self, data: bytes) -> int:
+        """Write bytes."""
+        return self._pipe.write(data)
+
+    def flush(self) -> None:
+        """Everything is written already."""
+
+    def close(self) -> None:
+        """Close this end."""
+        self._pipe.close_writing()
+        self._pipe.close_reading()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[bytes]:
+        """The lines that come."""
+        rest = b""
+        while read := self._pipe.read(4096):
+            *lines, rest = (rest + read).split(b"\n")
+            yield from (line + b"\n" for line in lines)
+        if rest:
+            yield rest
