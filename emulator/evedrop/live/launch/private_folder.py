@@ -32,20 +32,19 @@ def private_folder(where: Path | None = None) -> Iterator[Path]:
 
     where: the folder to make it in; the one for temporary files by default.
     """
-    try:
-        where = (where or Path(tempfile.gettempdir())).absolute()
-        _sweep(where)
-        folder = where / f"{_PREFIX}{world().token(8).hex()}"
-        guard = world().process.removed_with_it(folder)
-        guard.__enter__()
-    except OSError as error:
-        raise _unmade(error) from error
-    try:
-        with _locked(folder):
-            yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        guard.__exit__(None, None, None)
+    with contextlib.ExitStack() as stack:
+        try:
+            where = (where or Path(tempfile.gettempdir())).absolute()
+            _sweep(where)
+            folder = where / f"{_PREFIX}{world().token(8).hex()}"
+            stack.enter_context(world().process.removed_with_it(folder))
+        except OSError as error:
+            raise _unmade(error) from error
+        try:
+            with _locked(folder):
+                yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextlib.contextmanager
