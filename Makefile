@@ -8,7 +8,7 @@ READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs-ready
 NOTEBOOKS_READY := $(VENV)/.notebooks-ready
 
-.PHONY: demo test test-wheel test-pictures pictures notebooks bench bench-against coverage test-long test-hosts test-compose test-fresh test-faults test-mutants docs lint lint-types lint-rest setup clean
+.PHONY: demo test test-wheel test-pictures pictures notebooks bench bench-against coverage test-long test-hosts test-compose test-fresh test-faults test-mutants test-simulated test-simulated-mutants docs lint lint-types lint-rest setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
@@ -78,11 +78,23 @@ COUNT ?= $(if $(SEED),1,60)
 test-faults: $(READY)
 	$(BIN)/python -m tests.faults.campaign --seed $(or $(SEED),1) --count $(COUNT)
 
-# Whether that campaign notices mistakes: each of tests/faults/mutants.toml is put into a copy of the package, and cases are run
+# Whether that campaign notices mistakes: each of tests/mutants.toml is put into a copy of the package, and cases are run
 # against it. Takes an hour or more. ONLY=wire: those whose file or description contains the word.
 ONLY ?=
 test-mutants: $(READY)
 	$(BIN)/python -m tests.faults.mutation --only "$(ONLY)"
+
+# Runs whose programs all live in one interpreter, in virtual time: COUNT seeds from SEED on. EXPLAIN=17 shrinks and shows the case of
+# that seed alone; VIEW=run.rrd also writes it as a recording for Rerun, and VIEW=window opens a viewer (docs/maintainers/simulated-world.md).
+EXPLAIN ?=
+VIEW ?=
+test-simulated: $(READY)
+	$(BIN)/python -m tests.virtual.simulated --seed $(or $(SEED),1) --count $(COUNT) $(if $(EXPLAIN),--explain $(EXPLAIN)) \
+		$(if $(VIEW),--view $(VIEW:window=))
+
+# The same for the simulated world, of the mistakes that it must notice.
+test-simulated-mutants: $(READY)
+	$(BIN)/python -m tests.virtual.mutation --only "$(ONLY)"
 
 # The pages as a site, in build/site. Prints how many words each page has, and fails on too many, on broken links, on pages that
 # the navigation does not have, and on commands that do not print what a page shows; BUILD_ONLY=1 leaves out the commands, which

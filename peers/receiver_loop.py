@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import final
@@ -170,8 +169,7 @@ def _save(brief: Brief[ReceiverPart], belief: Belief) -> None:
     """Save a belief for this process if it is restarted; does nothing if the brief names no state file."""
     if brief.part.state_file is None:
         return
-    path = Path(brief.part.state_file)
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+    with world().disk.writer(Path(brief.part.state_file)) as file:
         np.savez(file, belief.x_hat, belief.P, belief.action, *belief.memory)
 
 

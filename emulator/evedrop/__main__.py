@@ -21,8 +21,13 @@ _HIDDEN = "..."
 _COLLECT_AFTER = 50_000
 """New objects, before cycles among them are searched for: almost all that a command makes are its modules, and stay."""
 
-_LIGHT = {"ARROW_DEFAULT_MEMORY_POOL": "system", "PYDANTIC_DISABLE_PLUGINS": "__all__"}
-"""For this process alone: Arrow's own pool keeps 5 MB, and plugins of pydantic, which we do not use, are searched for."""
+_LIGHT = {
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+    "OPENBLAS_NUM_THREADS": "1",
+    "PYDANTIC_DISABLE_PLUGINS": "__all__",
+}
+"""For this process alone, unless they are set: Arrow's own pool keeps 5 MB; threads for linear algebra, which workers do without
+too, spin for a while even if they have nothing to do; plugins of pydantic, which we do not use, are searched for."""
 
 
 def without_values(words: Sequence[str]) -> list[str]:

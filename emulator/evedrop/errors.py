@@ -174,6 +174,10 @@ class Silence(RunError):
         super().__init__(f"{' and '.join(processes)}: {failure}")
 
 
+class NoRouter(RunError):
+    """No router answered a process for too long."""
+
+
 class MissingProcesses(RunError):
     """Processes that did not appear on the network: `missing`."""
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar, final
 
+from evedrop.virtual.reference import RunReference, in_memory
 from tests.faults import ours, studies, wires
 from tests.faults.cases import PATIENT_SECONDS, AnyCase, Case, case_of
 from tests.faults.disturbed import FORK_SERVERS, Disturbed, disturbed
@@ -29,7 +30,6 @@ from tests.faults.facilities import Facilities, facilities
 from tests.faults.judge import OUTCOMES, misses, outcome_of, status_of
 from tests.faults.kinds import KINDS, Fault
 from tests.faults.moments import Usual
-from tests.faults.reference import Reference, in_memory
 from tests.faults.studies import StudyFault, Undisturbed
 from tests.faults.variants import Variant
 from tests.faults.wires import WireCase, WireFault
@@ -79,7 +79,7 @@ class Campaign:
 
     folder: Path
     facilities: Facilities
-    _known: dict[str, tuple[Reference, Usual]] = field(default_factory=dict)
+    _known: dict[str, tuple[RunReference, Usual]] = field(default_factory=dict)
     _study: Undisturbed | None = None
 
     def carry_out(self, case: AnyCase) -> Verdict:
@@ -139,7 +139,7 @@ class Campaign:
     def _disk(self, case: Case) -> str | None:
         return case.disk if case.disk != "full" or self.facilities.small_disks else None
 
-    def known(self, variant: Variant) -> tuple[Reference, Usual]:
+    def known(self, variant: Variant) -> tuple[RunReference, Usual]:
         """The result of an undisturbed run of a variant, and how long it takes."""
         if variant.name not in self._known:
             folder = self.folder / variant.name
@@ -166,7 +166,7 @@ def _server(variant: Variant, folder: Path) -> Iterator[Sshd | None]:
         yield server
 
 
-def _usual(variant: Variant, folder: Path, reference: Reference, server: Sshd | None) -> Usual:
+def _usual(variant: Variant, folder: Path, reference: RunReference, server: Sshd | None) -> Usual:
     """How long an undisturbed run takes. Raises Refused if it does not keep what is promised."""
     before = frozenset(process.pid for process in ours.descendants())
     with disturbed(variant, folder, ["--set", f"longest_outage={PATIENT_SECONDS}"], server=server) as run:

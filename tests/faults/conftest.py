@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from evedrop import montecarlo
+from evedrop.virtual.reference import RunReference, in_memory
 from tests.faults import judge
 from tests.faults.ended import EARLY, Ended, copy_of, ended_run
-from tests.faults.reference import Reference, in_memory
 from tests.faults.variants import VARIANTS
 
 
@@ -20,13 +20,13 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def reference(memory: Path) -> Reference:
+def reference(memory: Path) -> RunReference:
     """The variant `plain` in memory."""
     return in_memory(VARIANTS["plain"].scenario(memory.parent), memory)
 
 
 @pytest.fixture(scope="module")
-def first_ended(tmp_path_factory: pytest.TempPathFactory, memory: Path, reference: Reference) -> Ended:
+def first_ended(tmp_path_factory: pytest.TempPathFactory, memory: Path, reference: RunReference) -> Ended:
     """A run for the judge, which ended as if nothing had happened; no test changes it."""
     del reference
     return ended_run(tmp_path_factory.mktemp("ended"), memory, 400, "complete")

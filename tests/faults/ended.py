@@ -13,11 +13,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from evedrop.results.tables import JOURNAL
+from evedrop.virtual.fates import journal_rows
+from evedrop.virtual.reference import RunReference
 from tests.faults import judge, ours
 from tests.faults.cases import PATIENT_SECONDS
-from tests.faults.fates import journal_rows
 from tests.faults.kinds import Fault
-from tests.faults.reference import Reference
 from tests.faults.variants import VARIANTS, Variant
 from tests.proxy import Cable
 
@@ -77,7 +77,7 @@ class Ended:
         change(summary)
         path.write_text(json.dumps(summary))
 
-    def misses(self, reference: Reference, *hits: Fault) -> list[str]:
+    def misses(self, reference: RunReference, *hits: Fault) -> list[str]:
         """The complaints of the judge about it, given that all of these faults struck at 1.0 s."""
         before = frozenset(process.pid for process in ours.descendants())
         return judge.misses(self, dict.fromkeys(hits, 1.0), PATIENT_SECONDS, reference, before)

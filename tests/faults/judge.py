@@ -11,17 +11,16 @@ import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
 from evedrop.results.reading import Results
+from evedrop.virtual.reference import RunReference, tables_of
+from evedrop.virtual.results import wrong_outages, wrong_summary, wrong_tables
 from tests.faults import ours
 from tests.faults.disturbed import CLEANER, CONFUSED_FILE, FORK_SERVERS
 from tests.faults.hosts import HOST_CLEANER, PROGRAM, host_of, target_on
 from tests.faults.kinds import KILLING, LIMITS, RESULTS, SIGNALS, Fault
 from tests.faults.looks import failed_looks
-from tests.faults.metrics import unlike_digests, unlike_rows
-from tests.faults.outages import wrong_outages
+from tests.faults.outages import unexplained_outages
 from tests.faults.over_ssh import ended_late, unlike_first_line, unlike_refusal
-from tests.faults.reference import Reference, tables_of, unlike
 from tests.faults.variants import Variant
-from tests.faults.whole import missing_rows
 from tests.proxy import Cable
 
 UNUSABLE, FAILED, INTERRUPTED, KILLED = 2, 3, 130, -9
@@ -110,7 +109,7 @@ class Run(Protocol):
 
 
 def misses(
-    run: Run, hits: Mapping[Fault, float], longest_outage: float, reference: Reference, before: frozenset[int]
+    run: Run, hits: Mapping[Fault, float], longest_outage: float, reference: RunReference, before: frozenset[int]
 ) -> list[str]:
     """The broken promises, now that the launcher has ended; hits: the faults that hit something, and when."""
     left = ours.none_left(before, _LEAVE_SECONDS, *run.temporaries.values())
@@ -238,25 +237,21 @@ def _folders(run: Run) -> list[Path]:
     return [shard for folder in folders for shard in (sorted((folder / "shards").glob("*")) or [folder])]
 
 
-def _of_results(status: int, run: Run, hits: Mapping[Fault, float], reference: Reference) -> Iterator[str]:
+def _of_results(status: int, run: Run, hits: Mapping[Fault, float], reference: RunReference) -> Iterator[str]:
     disk, limited = any(map(_of_disk, hits)), any(map(_of_limits, hits))
     folders = _folders(run)
     written = [folder for folder in folders if any(_has_rows(path) for path in folder.glob("**/*.parquet"))]
     for folder in folders:
         try:
             results = Results.read(folder)
-            tables = dict(tables_of(results))
+            dict(tables_of(results))
         except UsageError as error:
             # Where nothing was measured there is nothing to read.
             if folder in written or (run.done and len(folders) == 1) or (status != KILLED and not disk and not limited):
                 yield f"{folder.name} cannot be read: {error}"
             continue
         summary = results.summary
-        for name, table in tables.items():
-            yield from reference.wrong_rows(name, table, int(summary["slots"]) if len(folders) == 1 else 0)
-        yield from missing_rows(tables, summary, reference, status == 0)
-        yield from unlike_digests(summary, tables["digests"])
-        yield from unlike_rows(summary, tables, run.variant.shards if len(folders) == 1 else 1)
+        yield from wrong_tables(results, reference, status == 0, run.variant.shards if len(folders) == 1 else 1)
         if not disk:
             yield from _of_summary(status, run, hits, summary, reference)
         yield from failed_looks(folder, reference.folder if summary["slots"] else None)
@@ -265,17 +260,11 @@ def _of_results(status: int, run: Run, hits: Mapping[Fault, float], reference: R
 
 
 def _of_summary(
-    status: int, run: Run, hits: Mapping[Fault, float], summary: Mapping[str, Any], reference: Reference
+    status: int, run: Run, hits: Mapping[Fault, float], summary: Mapping[str, Any], reference: RunReference
 ) -> Iterator[str]:
     """Whether the summary says how the run ended and what it went through, and accounts for every packet."""
-    unexplained = [name for name, link in summary["links"].items() if link["unexplained"]]
-    if unexplained:
-        yield f"packets to {', '.join(unexplained)} are unexplained"
+    yield from wrong_summary(summary, reference, status == 0)
     if status == 0:
-        if summary["ended"] != "complete":
-            yield f"the run ended well, and its summary says {summary['ended']}"
-        yield from unlike(summary, reference)
-        yield from _of_verification(summary, reference)
         if (run.folder / CONFUSED_FILE).exists() and not summary["misdelivered"]:
             yield "messages came on keys that they do not name, and the summary lists none"
     # A signal may come when the run is complete, and end a launcher that prints its report.
@@ -287,15 +276,9 @@ def _of_summary(
         yield f"{run.done} slots were done, and the summary has {summary['slots']}"
     complete = summary["ended"] == "complete"
     slots = int(reference.summary["slots"])
-    yield from wrong_outages(summary["outages"], run.told, hits, slots, complete)
-
-
-def _of_verification(summary: Mapping[str, Any], reference: Reference) -> Iterator[str]:
-    """Whether a complete run says that it has computed the digests of every recorded trial again."""
-    recorded = len({key[2] for key in reference.tables["trials"]})
-    for name, verification in summary["verification"].items():
-        if verification["recomputed_trials"] != recorded:
-            yield f"{verification['recomputed_trials']} trials of {name} were verified, of {recorded} that are recorded"
+    reconnected = {(event["process"], event["slot"]) for event in run.told if event["event"] == "reconnected"}
+    yield from wrong_outages(summary, reference, frozenset(reconnected))
+    yield from unexplained_outages(summary["outages"], run.told, hits, slots, complete)
 
 
 def _of_disk(fault: Fault) -> bool:

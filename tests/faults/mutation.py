@@ -11,42 +11,19 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from tests.faults import ours
+from tests.mutants import Mutant, cell, copy_with, mutants
 
 _ROOT = Path(__file__).parents[2]
-_MUTANTS = Path(__file__).with_name("mutants.toml")
-_PACKAGE = _ROOT / "emulator" / "evedrop"
 _LIMIT_SECONDS = 900.0
-_SHOWN = 200
-
-
-@dataclass(frozen=True)
-class Mutant:
-    """A mistake: the text `old` of a file becomes `new`."""
-
-    breaks: str
-    """What it breaks, in words."""
-    file: str
-    """Below `emulator/evedrop/`."""
-    seeds: list[int]
-    """The campaign's cases that are run against it."""
-    old: str
-    new: str
-
-
-def mutants() -> list[Mutant]:
-    """All mutants."""
-    return [Mutant(**entry) for entry in tomllib.loads(_MUTANTS.read_text(encoding="utf-8"))["mutant"]]
 
 
 @dataclass(frozen=True)
@@ -63,24 +40,12 @@ class Outcome:
     seconds: float
 
     def __str__(self) -> str:
-        by = "NOT NOTICED" if self.noticed is None else self.noticed.replace("|", "\\|")
-        return f"| {self.mutant.breaks} | `{self.mutant.file}` | {by} | {self.cases} | {self.seconds:.0f} s |"
-
-
-def mutated(mutant: Mutant, text: str) -> str:
-    """The text of the mutant's file with its mistake. Raises ValueError unless the file has the old text exactly once."""
-    count = text.count(mutant.old)
-    if count != 1:
-        raise ValueError(f"{mutant.file} has the text of the mutant {mutant.breaks!r} {count} times, not once")
-    return text.replace(mutant.old, mutant.new)
+        return f"{self.mutant.row} {self.noticed or 'NOT NOTICED'} | {self.cases} | {self.seconds:.0f} s |"
 
 
 def tried(mutant: Mutant, folder: Path) -> Outcome:
     """Run the cases of a mutant until one notices it. folder: for the copy of the package."""
-    source = folder / "evedrop"
-    shutil.copytree(_PACKAGE, source, ignore=shutil.ignore_patterns("__pycache__"))
-    path = source / mutant.file
-    path.write_text(mutated(mutant, path.read_text(encoding="utf-8")), encoding="utf-8")
+    copy_with(mutant, folder)
     begun = time.monotonic()
     seeds = [str(seed) for seed in mutant.seeds]
     environment = {**os.environ, "PYTHONPATH": str(folder)}
@@ -120,8 +85,7 @@ def outcome_of(mutant: Mutant, output: str, seconds: float, folder: Path) -> Out
 
 
 def _short(line: str, folder: Path) -> str:
-    text = " ".join(line.replace(str(folder / "kept"), "").split())
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]} …"
+    return cell(line.replace(str(folder / "kept"), ""))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -129,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.faults.mutation", description=__doc__.partition("\n")[0])
     parser.add_argument("--only", default="", help="mutants whose description or file contains this")
     options = parser.parse_args(arguments)
-    chosen = [mutant for mutant in mutants() if options.only in f"{mutant.breaks} {mutant.file}"]
+    chosen = [mutant for mutant in mutants(options.only) if mutant.seeds]
     _say(f"| {len(chosen)} mutants | file | noticed by | cases | time |\n|---|---|---|---|---|")
     outcomes = []
     for mutant in chosen:

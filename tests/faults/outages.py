@@ -17,28 +17,20 @@ _LAG_SECONDS = 0.3
 """By which events of the run may be late: later events of slots to come prove that the run was not over when a fault struck."""
 
 
-def wrong_outages(
+def unexplained_outages(
     listed: Sequence[Mapping[str, Any]],
     told: Sequence[Mapping[str, Any]],
     struck: Mapping[Fault, float],
     slots: int,
     complete: bool,
 ) -> Iterator[str]:
-    """What is wrong with a summary's `outages`.
+    """The entries of a summary's `outages` that no fault explains, and a fault that has none.
 
     told: the run's events, each with the time `at` which it came; struck: when each fault hit something; slots: of the whole run.
     """
-    entries = {(entry["process"], entry["slot"]) for entry in listed}
-    for event in told:
-        if event["event"] == "reconnected" and (event["process"], event["slot"]) not in entries:
-            yield f"the run told of an outage of {event['process']} at slot {event['slot']}, and the summary lists none"
     for entry in listed:
         if not _explained(str(entry["process"]), struck, complete):
             yield f"an outage of {entry['process']} at slot {entry['slot']}, and no fault caused one"
-        if complete and (entry["until"] is None or not entry["slot"] <= entry["until"] <= slots):
-            yield f"an outage of {entry['process']} at slot {entry['slot']} until {entry['until']}, in a run that is complete"
-        if entry["seconds"] < 0.0:
-            yield f"an outage of {entry['seconds']} s"
     for fault, at in struck.items():
         killed = fault.kind == "kill" and fault.target == "router" and _went_on(told, at, slots)
         if complete and killed and not {entry["process"] for entry in listed} & {*_ROUTERS, "recorder"}:

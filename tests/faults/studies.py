@@ -21,9 +21,9 @@ from typing import Any, final
 from evedrop import montecarlo
 from evedrop.errors import UsageError
 from evedrop.results.reading import Results
+from evedrop.virtual.metrics import unlike_memory
 from tests.faults import ours
 from tests.faults.looks import failed_looks
-from tests.faults.metrics import unlike_memory
 
 TRIALS, SLOTS, WORKERS = 4500, 200, 2
 _SCENARIO = "eavesdroppers"

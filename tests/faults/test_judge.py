@@ -19,18 +19,18 @@ import pyarrow.parquet as pq
 import pytest
 
 from evedrop.results.reading import Results
+from evedrop.virtual.metrics import unlike_digests, unlike_memory, unlike_rows
+from evedrop.virtual.reference import RunReference, tables_of
+from evedrop.virtual.whole import missing_rows
 from tests.conftest import wait_until
 from tests.examples import mostly_long
 from tests.faults import ours
 from tests.faults.disturbed import CONFUSED_FILE
 from tests.faults.ended import Ended
 from tests.faults.kinds import CONFUSED, EVERYBODY, Fault
-from tests.faults.metrics import unlike_digests, unlike_rows
 from tests.faults.moments import Moment
-from tests.faults.outages import wrong_outages
-from tests.faults.reference import Reference, tables_of, unlike
+from tests.faults.outages import unexplained_outages
 from tests.faults.variants import VARIANTS
-from tests.faults.whole import missing_rows
 
 KILL = Fault("kill", "smart", Moment("run", 0.5))
 ROUTER = Fault("kill", "router", Moment("run", 0.5))
@@ -38,7 +38,7 @@ INTERRUPT = Fault("interrupt", "launcher", Moment("run", 0.5))
 FLAP = Fault("flap", "smart", Moment("run", 0.5), seconds=1.0, count=3)
 
 
-def test_wrong_rows_are_seen(reference: Reference, memory: Path) -> None:
+def test_wrong_rows_are_seen(reference: RunReference, memory: Path) -> None:
     """A number that is off in its last bit, a row that is another's, one that is there twice; and no other."""
     tables = dict(tables_of(Results.read(memory), journal=False))
     assert [line for name, table in tables.items() for line in reference.wrong_rows(name, table)] == []
@@ -52,7 +52,7 @@ def test_wrong_rows_are_seen(reference: Reference, memory: Path) -> None:
     assert "twice" in misses[2]
 
 
-def test_another_summary_is_seen(reference: Reference) -> None:
+def test_another_summary_is_seen(reference: RunReference) -> None:
     """Another digest, another account of a link, a slot that is missing, an entry that memory does not have."""
     summary: dict[str, Any] = {
         **reference.summary,
@@ -61,8 +61,8 @@ def test_another_summary_is_seen(reference: Reference) -> None:
         "links": {name: {**link, "delivered": 0} for name, link in reference.summary["links"].items()},
         "more": 1,
     }
-    assert list(unlike(reference.summary, reference)) == []
-    assert len(list(unlike(summary, reference))) == 2 + 2 * len(VARIANTS["plain"].receivers)
+    assert list(unlike_memory(reference.summary, reference.summary)) == []
+    assert len(list(unlike_memory(summary, reference.summary))) == 2 + 2 * len(VARIANTS["plain"].receivers)
 
 
 STATUSES: dict[str, tuple[int, str, list[Fault], str]] = {
@@ -75,7 +75,7 @@ STATUSES: dict[str, tuple[int, str, list[Fault], str]] = {
 
 
 @pytest.mark.parametrize("case", STATUSES)
-def test_the_judge_sees(case: str, ended: Ended, reference: Reference) -> None:
+def test_the_judge_sees(case: str, ended: Ended, reference: RunReference) -> None:
     """What a launcher must not do or say."""
     ended.launcher.returncode, stderr, hits, expected = STATUSES[case]
     (ended.folder / "stderr").write_text(stderr)
@@ -115,12 +115,12 @@ LACKING = {
 """What was missing in runs that ended early without being noticed."""
 
 
-def test_the_judge_has_nothing_to_say_of_runs_that_are_whole(ended: Ended, reference: Reference) -> None:
+def test_the_judge_has_nothing_to_say_of_runs_that_are_whole(ended: Ended, reference: RunReference) -> None:
     """A complete one."""
     assert ended.misses(reference) == []
 
 
-def test_the_judge_has_nothing_to_say_of_early_ends_that_are_whole(early: Ended, reference: Reference) -> None:
+def test_the_judge_has_nothing_to_say_of_early_ends_that_are_whole(early: Ended, reference: RunReference) -> None:
     """One that ended early, for which a fault is to blame."""
     assert early.misses(reference, KILL) == []
 
@@ -128,7 +128,7 @@ def test_the_judge_has_nothing_to_say_of_early_ends_that_are_whole(early: Ended,
 @pytest.mark.parametrize(
     "case", mostly_long(LACKING, ["one slot of the journal", "the last row of the trials", "one slot of the slots"])
 )
-def test_missing_rows_of_a_run_that_ended_early_are_seen(case: str, early: Ended, reference: Reference) -> None:
+def test_missing_rows_of_a_run_that_ended_early_are_seen(case: str, early: Ended, reference: RunReference) -> None:
     """All tables are counted up to the slot of the summary."""
     name, change = LACKING[case]
     early.change(name, change)
@@ -136,7 +136,7 @@ def test_missing_rows_of_a_run_that_ended_early_are_seen(case: str, early: Ended
     assert [line for line in misses if line.startswith(f"{name} lacks")], misses
 
 
-def test_a_closed_loop_needs_inputs_from_its_first_slot_on(memory: Path, reference: Reference) -> None:
+def test_a_closed_loop_needs_inputs_from_its_first_slot_on(memory: Path, reference: RunReference) -> None:
     """A run that ended before has no account of its controller."""
     loop = replace(reference, tables={**reference.tables, "inputs": {(0, 0): {}}})
     results = Results.read(memory)
@@ -150,7 +150,7 @@ def test_a_closed_loop_needs_inputs_from_its_first_slot_on(memory: Path, referen
     assert "there is no table inputs" in missing(1)
 
 
-def test_missing_digests_are_seen(ended: Ended, reference: Reference) -> None:
+def test_missing_digests_are_seen(ended: Ended, reference: RunReference) -> None:
     """Each block that has ended has one, for each receiver and trial."""
     ended.change("digests", without(-1))
     assert [line for line in ended.misses(reference) if line.startswith("digests lacks 1 of 8 rows")]
@@ -167,7 +167,9 @@ def test_missing_digests_are_seen(ended: Ended, reference: Reference) -> None:
         [("ended", "mean_trace_covariance"), ("early", "mean_squared_error")],
     ),
 )
-def test_swapped_metrics_are_seen(when: str, metric: str, request: pytest.FixtureRequest, reference: Reference) -> None:
+def test_swapped_metrics_are_seen(
+    when: str, metric: str, request: pytest.FixtureRequest, reference: RunReference
+) -> None:
     """Metrics of two receivers exchanged in the summary, of a complete run and of one that ended early."""
     run: Ended = request.getfixturevalue(when)
 
@@ -180,7 +182,7 @@ def test_swapped_metrics_are_seen(when: str, metric: str, request: pytest.Fixtur
     assert [line for line in misses if line.startswith(f"{metric} of smart is")], misses
 
 
-def test_another_account_of_a_run_that_ended_early_is_seen(early: Ended, reference: Reference) -> None:
+def test_another_account_of_a_run_that_ended_early_is_seen(early: Ended, reference: RunReference) -> None:
     """A loss of another reason, and one that is not counted."""
     early.edit(lambda summary: summary["links"]["smart"].update(lost_by={"cut": summary["links"]["smart"]["lost"]}))
     early.edit(lambda summary: summary["links"]["naive"].update(lost=0))
@@ -194,7 +196,7 @@ def progress(done: int, at: float) -> dict[str, Any]:
     return {"event": "progress", "done": done, "at": at}
 
 
-def test_an_outage_that_is_not_listed_is_seen(ended: Ended, reference: Reference) -> None:
+def test_an_outage_that_is_not_listed_is_seen(ended: Ended, reference: RunReference) -> None:
     """A router was killed at 1.0 s and slots came afterwards; and one that the run told of."""
     ended.told = [progress(100, 0.9), progress(200, 2.0)]
     assert [line for line in ended.misses(reference, ROUTER) if "the summary lists no outage" in line]
@@ -206,14 +208,14 @@ def test_an_outage_that_is_not_listed_is_seen(ended: Ended, reference: Reference
     assert [line for line in ended.misses(reference, ROUTER) if "told of an outage of router at slot 7" in line]
 
 
-def test_metrics_without_rows_are_seen(ended: Ended, reference: Reference) -> None:
+def test_metrics_without_rows_are_seen(ended: Ended, reference: RunReference) -> None:
     """Of a receiver that is in the summary and in no row of the journal."""
     table = pq.read_table(ended.out / "journal.parquet")
     pq.write_table(table.filter(pc.field("link") != "smart"), ended.out / "journal.parquet")
     assert [line for line in ended.misses(reference) if "the tables have no rows of smart" in line]
 
 
-def test_an_outage_without_a_cause_is_seen(ended: Ended, reference: Reference) -> None:
+def test_an_outage_without_a_cause_is_seen(ended: Ended, reference: RunReference) -> None:
     """Of a process that nobody cut off; of one that a fault did, it may be listed."""
     outage = {"process": "smart", "slot": 3, "until": 9, "seconds": 1.0}
     ended.edit(lambda summary: summary["outages"].append(outage))
@@ -221,7 +223,7 @@ def test_an_outage_without_a_cause_is_seen(ended: Ended, reference: Reference) -
     assert ended.misses(reference, FLAP) == []
 
 
-def test_the_judge_sees_what_is_left_and_what_cannot_be_read(ended: Ended, reference: Reference) -> None:
+def test_the_judge_sees_what_is_left_and_what_cannot_be_read(ended: Ended, reference: RunReference) -> None:
     """A private folder, and a table that is cut off."""
     (ended.temporaries[""] / "evedrop-x").mkdir()
     whole = (ended.out / "slots.parquet").read_bytes()
@@ -231,7 +233,7 @@ def test_the_judge_sees_what_is_left_and_what_cannot_be_read(ended: Ended, refer
     assert [line for line in lines if "slots.parquet cannot be read" in line]
 
 
-def test_a_launcher_that_heeds_no_signal_is_seen(ended: Ended, reference: Reference) -> None:
+def test_a_launcher_that_heeds_no_signal_is_seen(ended: Ended, reference: RunReference) -> None:
     """Slots are done a second after the signal, and all of them at the end; events of the end alone say nothing."""
     ended.told = [progress(399, 2.5), progress(400, 2.6)]
     assert [line for line in ended.misses(reference, INTERRUPT) if "the run went on to its end" in line]
@@ -240,7 +242,7 @@ def test_a_launcher_that_heeds_no_signal_is_seen(ended: Ended, reference: Refere
 
 
 def test_files_that_others_may_read_and_files_of_a_run_that_goes_on_are_seen(
-    ended: Ended, reference: Reference
+    ended: Ended, reference: RunReference
 ) -> None:
     """The results have the seed and the truth; a control file has a password."""
     (ended.out / "control.json").touch(mode=0o644)
@@ -249,7 +251,7 @@ def test_files_that_others_may_read_and_files_of_a_run_that_goes_on_are_seen(
     assert [line for line in misses if "run/control.json is left of the run" in line], misses
 
 
-def test_messages_on_wrong_keys_must_be_listed(ended: Ended, reference: Reference) -> None:
+def test_messages_on_wrong_keys_must_be_listed(ended: Ended, reference: RunReference) -> None:
     """A router has confused keys, and no process says that it dropped a message; one of few messages confuses none."""
     confused = Fault(CONFUSED, EVERYBODY, Moment("start", 0.0), count=30)
     assert ended.misses(reference, confused) == []
@@ -266,14 +268,14 @@ def test_an_outage_is_explained_by_a_fault_that_can_cause_it(complete: bool) -> 
     def unexplained(process: str, target: str) -> list[str]:
         listed = [{"process": process, "slot": 5, "until": 9, "seconds": 0.1}]
         flap = Fault("flap", target, Moment("run", 0.5), seconds=1.0, count=3)
-        return list(wrong_outages(listed, [], {flap: 1.0}, 400, complete))
+        return list(unexplained_outages(listed, [], {flap: 1.0}, 400, complete))
 
     assert unexplained("naive", "recorder") == unexplained("naive", "naive") == unexplained("router", "naive") == []
     assert unexplained("naive", "smart")
     assert bool(unexplained("relay", "connection of beta")) == complete
 
 
-def test_a_panic_of_zenoh_is_no_mistake_where_threads_are_few(ended: Ended, reference: Reference) -> None:
+def test_a_panic_of_zenoh_is_no_mistake_where_threads_are_few(ended: Ended, reference: RunReference) -> None:
     """Its own report cannot be helped; anywhere else it is one."""
     log = ended.out / "logs" / "smart.log"
     log.parent.mkdir(exist_ok=True, mode=0o700)
@@ -284,7 +286,7 @@ def test_a_panic_of_zenoh_is_no_mistake_where_threads_are_few(ended: Ended, refe
     assert [line for line in ended.misses(reference, KILL) if "smart.log has a traceback" in line]
 
 
-def test_a_launcher_may_be_ended_by_the_c_library_where_memory_is_short(ended: Ended, reference: Reference) -> None:
+def test_a_launcher_may_be_ended_by_the_c_library_where_memory_is_short(ended: Ended, reference: RunReference) -> None:
     """It counts as killed: no process may be left, and what was measured must be there. Elsewhere it is a mistake."""
     ended.launcher.returncode = 127
     short = Fault("little memory", "launcher", Moment("start", 0.0), count=490)
@@ -309,7 +311,7 @@ def test_digests_that_are_not_those_of_the_rows_are_seen(without: str, ended: En
     assert list(unlike_digests(results.summary, changed))
 
 
-def test_a_panic_in_zenohs_code_must_cost_nothing(ended: Ended, reference: Reference) -> None:
+def test_a_panic_in_zenohs_code_must_cost_nothing(ended: Ended, reference: RunReference) -> None:
     """If it ends the run, the run has not kept its promises; a panic in other code is a mistake of Evedrop's."""
     log = ended.out / "logs" / "relay.log"
     log.parent.mkdir(exist_ok=True, mode=0o700)
@@ -326,7 +328,7 @@ def test_a_panic_in_zenohs_code_must_cost_nothing(ended: Ended, reference: Refer
     assert complaints("src/kernels.rs", 0)
 
 
-def test_metrics_of_shards_cover_all_rows(ended: Ended, reference: Reference) -> None:
+def test_metrics_of_shards_cover_all_rows(ended: Ended, reference: RunReference) -> None:
     """However far each shard came; unless the run says that some are of an earlier slot."""
     results = Results.read(ended.out)
     tables = dict(tables_of(results))
@@ -339,7 +341,7 @@ def test_metrics_of_shards_cover_all_rows(ended: Ended, reference: Reference) ->
     assert list(unlike_rows(summary, tables, shards=2)) == []
 
 
-def test_a_folder_that_no_command_can_show_is_seen(ended: Ended, reference: Reference) -> None:
+def test_a_folder_that_no_command_can_show_is_seen(ended: Ended, reference: RunReference) -> None:
     """Its page cannot be written; and one that lacks a part says so."""
     (ended.out / "report.html").mkdir()
     assert [line for line in ended.misses(reference) if line.startswith("evedrop report ")]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from evedrop.virtual.reference import RunReference
 from tests.conftest import wait_until
 from tests.faults import judge
 from tests.faults.cases import PATIENT_SECONDS, Case, case_of
@@ -26,7 +27,6 @@ from tests.faults.hosts import (
 )
 from tests.faults.kinds import KILLING, NETWORK, SIGNALS, Fault
 from tests.faults.moments import PHASES, Moment
-from tests.faults.reference import Reference
 from tests.faults.variants import HOSTED
 from tests.privileged import CannotRun, skip
 from tests.processes import words_of
@@ -66,13 +66,15 @@ def says(words: str, misses: list[str]) -> None:
     assert words in misses[0], misses
 
 
-def test_the_judge_has_nothing_to_say_of_a_run_over_ssh_that_is_complete(spread: Ended, reference: Reference) -> None:
+def test_the_judge_has_nothing_to_say_of_a_run_over_ssh_that_is_complete(
+    spread: Ended, reference: RunReference
+) -> None:
     """Whatever struck it: it may have struck late."""
     assert spread.misses(reference, KILL, HANGS) == []
 
 
 def test_the_judge_has_nothing_to_say_of_a_run_that_its_connection_ended(
-    cut_short: Ended, reference: Reference
+    cut_short: Ended, reference: RunReference
 ) -> None:
     """Its first line names the host and a process there."""
     assert cut_short.misses(reference, KILL) == []
@@ -102,7 +104,7 @@ def test_the_judge_has_nothing_to_say_of_a_run_that_its_connection_ended(
     ],
 )
 def test_the_wrong_name_of_a_failure_is_seen(
-    told: str, hits: list[Fault], words: str, cut_short: Ended, reference: Reference
+    told: str, hits: list[Fault], words: str, cut_short: Ended, reference: RunReference
 ) -> None:
     """The host whose connection ended and a process on it are named, and only where something ended it."""
     (cut_short.folder / "stderr").write_text(told if told.startswith("evedrop: ") else f"evedrop: {told}\n")
@@ -110,12 +112,14 @@ def test_the_wrong_name_of_a_failure_is_seen(
 
 
 @pytest.mark.parametrize("part", [fault("cut", CONNECTION, seconds=0.1), fault("flap", CONNECTION, seconds=0.1)])
-def test_a_connection_that_is_closed_may_end_a_run(part: Fault, cut_short: Ended, reference: Reference) -> None:
+def test_a_connection_that_is_closed_may_end_a_run(part: Fault, cut_short: Ended, reference: RunReference) -> None:
     """Ssh does not connect again, however short the cut is."""
     assert cut_short.misses(reference, part) == []
 
 
-def test_a_host_that_is_used_no_more_at_the_start_is_named(spread: Ended, tmp_path: Path, reference: Reference) -> None:
+def test_a_host_that_is_used_no_more_at_the_start_is_named(
+    spread: Ended, tmp_path: Path, reference: RunReference
+) -> None:
     """With status 2, in the first line; and there are no results of a run that was not started."""
     (spread.folder / "stderr").write_text("evedrop: host beta: ssh ended with status 255; try `ssh ...`\n")
     spread.launcher.returncode = judge.UNUSABLE
@@ -128,7 +132,7 @@ def test_a_host_that_is_used_no_more_at_the_start_is_named(spread: Ended, tmp_pa
     says("status 2", spread.misses(reference, Fault("kill", "smart", Moment("start", 0.5))))
 
 
-def test_a_run_whose_host_hangs_and_that_ends_late_is_seen(spread: Ended, reference: Reference) -> None:
+def test_a_run_whose_host_hangs_and_that_ends_late_is_seen(spread: Ended, reference: RunReference) -> None:
     """Half a minute is promised, after the last slot and after a signal."""
     spread.told = [{"event": "progress", "done": 400, "at": 2.0}]
     spread.ended = 20.0
@@ -140,7 +144,7 @@ def test_a_run_whose_host_hangs_and_that_ends_late_is_seen(spread: Ended, refere
     assert [line for line in spread.misses(reference, HANGS, INTERRUPT) if "ended 59 s after" in line]
 
 
-def test_a_private_folder_on_a_host_is_seen(spread: Ended, reference: Reference) -> None:
+def test_a_private_folder_on_a_host_is_seen(spread: Ended, reference: RunReference) -> None:
     """Only where the program and its cleaner were killed, the next run there removes it."""
     (spread.folder / "beta" / "evedrop-x").mkdir()
     program, cleaner = fault("kill", PROGRAM), fault("kill", HOST_CLEANER)
@@ -149,19 +153,19 @@ def test_a_private_folder_on_a_host_is_seen(spread: Ended, reference: Reference)
     assert spread.misses(reference, program, cleaner) == []
 
 
-def test_a_traceback_on_a_host_is_seen(spread: Ended, reference: Reference) -> None:
+def test_a_traceback_on_a_host_is_seen(spread: Ended, reference: RunReference) -> None:
     """What ssh brings of its standard error."""
     (spread.folder / "beta.stderr").write_text("Traceback (most recent call last):\n  boom")
     says("beta.stderr has a traceback", spread.misses(reference))
 
 
-def test_nobody_interrupts_a_run_by_a_signal_to_a_host(cut_short: Ended, reference: Reference) -> None:
+def test_nobody_interrupts_a_run_by_a_signal_to_a_host(cut_short: Ended, reference: RunReference) -> None:
     """The launcher was told nothing."""
     cut_short.launcher.returncode = judge.INTERRUPTED
     says("no signal asked for the end", cut_short.misses(reference, fault("terminate", PROGRAM)))
 
 
-def test_a_connection_with_a_host_explains_no_outage(spread: Ended, reference: Reference) -> None:
+def test_a_connection_with_a_host_explains_no_outage(spread: Ended, reference: RunReference) -> None:
     """The processes there talk with their router directly."""
     outage = {"process": "router", "slot": 3, "until": 9, "seconds": 1.0}
     spread.edit(lambda summary: summary["outages"].append(outage))

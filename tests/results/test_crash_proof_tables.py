@@ -39,6 +39,7 @@ from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums
 from evedrop.show.view.scene_slots import replay
 from tests.conftest import Evedrop, Live, wait_until
+from tests.disks import simulated
 from tests.examples import examples, mostly_long
 from tests.rogue import with_rogue
 from tests.steps import stepping
@@ -364,16 +365,34 @@ def test_a_score_is_saved_only_with_rows(tmp_path: Path) -> None:
     assert events == ["metrics", "save"]
 
 
+def killed(folder: Path, work: Callable[[ResultsWriter], object]) -> Path:
+    """The results folder of a run whose recorder was killed after some work; folder: an empty one."""
+    with simulated(folder) as (scheduler, disk):
+        task = scheduler.process("recorder")
+
+        def record() -> None:
+            write_resolved(disk.root, microgrid())
+            writer = ResultsWriter.of(disk.root, microgrid())
+            work(writer)
+            scheduler.end(task, -9)
+
+        scheduler.thread("main", record, task).start()
+        scheduler.run(1.0, lambda: not task.alive)
+        return disk.root
+
+
 def test_the_end_of_a_run_without_metrics_keeps_its_rows(tmp_path: Path) -> None:
     """The launcher notes why the run ended, and takes nothing from what was measured."""
     scenario = microgrid()
-    write_resolved(tmp_path, scenario)
-    writer = ResultsWriter.of(tmp_path, scenario)
-    for receiver in scenario.receivers:
-        writer.slot_rows(0, receiver, sums(10), np.zeros(10))
-    writer.write_rows("slot 10")
-    note_end(tmp_path, scenario, "recorder was ended by signal 9")
-    results = Results.read(tmp_path)
+
+    def record(writer: ResultsWriter) -> None:
+        for receiver in scenario.receivers:
+            writer.slot_rows(0, receiver, sums(10), np.zeros(10))
+        writer.write_rows("slot 10")
+
+    folder = killed(tmp_path, record)
+    note_end(folder, scenario, "recorder was ended by signal 9")
+    results = Results.read(folder)
     why = "recorder was ended by signal 9 (the metrics are as of slot 0; the tables have more)"
     assert (results.summary["ended"], results.summary["slots"]) == (why, 10)
     assert results.slots.num_rows == 10 * len(scenario.receivers)
@@ -382,18 +401,19 @@ def test_the_end_of_a_run_without_metrics_keeps_its_rows(tmp_path: Path) -> None
 def test_the_end_of_a_killed_run_says_which_slot_its_metrics_are_of(tmp_path: Path) -> None:
     """They were written when fewer slots were done; an excerpt of a log follows in lines of its own."""
     scenario = microgrid()
-    write_resolved(tmp_path, scenario)
     empty = summary_of(scenario, RunTally.nothing(scenario, 1), dict.fromkeys(scenario.digested), RunOutcome(0.0, ""))
-    writer = ResultsWriter.of(tmp_path, scenario)
-    for first, at in ((0, "slot 10"), (10, "slot 30")):
+
+    def record(writer: ResultsWriter) -> None:
         for receiver in scenario.receivers:
-            writer.slot_rows(first, receiver, sums(10 if first == 0 else 20), np.zeros(10 if first == 0 else 20))
-        if first == 0:
-            writer.settle(at, replace(empty, slots=10))
-        else:
-            writer.write_rows(at)
-    note_end(tmp_path, scenario, "recorder was ended by signal 9\nits log:\n    nothing")
-    summary = Results.read(tmp_path).summary
+            writer.slot_rows(0, receiver, sums(10), np.zeros(10))
+        writer.settle("slot 10", replace(empty, slots=10))
+        for receiver in scenario.receivers:
+            writer.slot_rows(10, receiver, sums(20), np.zeros(20))
+        writer.write_rows("slot 30")
+
+    folder = killed(tmp_path, record)
+    note_end(folder, scenario, "recorder was ended by signal 9\nits log:\n    nothing")
+    summary = Results.read(folder).summary
     assert summary["slots"] == 30
     assert summary["ended"].splitlines() == [
         "recorder was ended by signal 9 (the metrics are as of slot 10; the tables have more)",

@@ -7,7 +7,9 @@ import pytest
 
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Codes
-from evedrop.score.conditional import ConditionalError
+from evedrop.scenario.loading import load
+from evedrop.score.conditional import ConditionalError, conditional_error_of
+from evedrop.simulate.simulation import Simulation
 from tests.builders import MARGINAL, UNSTABLE
 
 SLOTS, TRIALS = 40, 4000
@@ -81,3 +83,25 @@ def test_without_an_expected_error_there_is_no_probability() -> None:
     own.add_actions(np.full((5, 1), Action.STATE, np.uint8))
     assert own.expected == [0.0]
     assert np.isnan(own.probability(np.zeros(1))).all()
+
+
+@pytest.mark.parametrize("scenario", ["numerical", "eavesdroppers", "partial-encryption", "twin-track", "bursts"])
+def test_a_receiver_that_is_built_in_has_the_covariances_that_its_actions_imply(scenario: str) -> None:
+    """To the bit: so its own traces are as good as those that are computed from its actions."""
+    played = load(scenario, {"slots": 70, "trials": 5})
+    own = {name: conditional_error_of(played, name, 5) for name in played.receivers}
+    given = {name: conditional_error_of(played, name, 5) for name in played.receivers}
+    for chunk in Simulation(played, range(5)).chunks():
+        for name, values in chunk.receivers.items():
+            computed, told = own[name], given[name]
+            if computed is not None and told is not None:
+                computed.add_actions(values.action)
+                told.add_actions(values.action, values.trace)
+    compared = [name for name, error in own.items() if error is not None and error.slots == 70]
+    assert compared
+    for name in compared:
+        computed, told = own[name], given[name]
+        assert computed is not None
+        assert told is not None
+        assert np.array_equal(computed.expected, told.expected), name
+        assert np.array_equal(computed.variance, told.variance), name

@@ -63,7 +63,7 @@ def test_a_schedule_of_probabilities_leaks_slot_by_slot() -> None:
     encoding = {"scheme": "innovation", "state_probability": chances}
     scenario = load("eavesdroppers", {"slots": 4, "encoding": encoding, "expect": []})
     bits = LeakedBits(scenario.process.process).next(4)
-    expected = HeardBitsStream(scenario).next(4)["smart"].expected
+    expected = HeardBitsStream(scenario).of(range(4))["smart"].expected
     assert expected is not None
     np.testing.assert_allclose(expected, scenario.quality["smart"] * (1.0 - np.array(chances)) * bits, rtol=1e-12)
 
@@ -101,8 +101,8 @@ def test_where_it_is_not_known(tmp_path: Path) -> None:
     """The estimator, late packets, a plant, schemes whose packets depend on those before, and modes without packets."""
     assert not leak_is_known(load("eavesdroppers"), "legitimate")
     for scenario in ("heated-room", "acknowledged"):
-        assert HeardBitsStream(load(scenario)).next(3) == {}, scenario
-    assert list(HeardBitsStream(load("late")).next(3)) == ["hasty"]  # it accepts no late packets
+        assert HeardBitsStream(load(scenario)).of(range(3)) == {}, scenario
+    assert list(HeardBitsStream(load("late")).of(range(3))) == ["hasty"]  # it accepts no late packets
     assert not leak_is_known(load("late", {"eavesdroppers.hasty.window": 3}), "hasty")
     pattern = {"eve": {"strategy": "naive", "link": {"loss": {"model": "pattern", "outcomes": "110"}}}}
     leak = leak_of("eavesdroppers", tmp_path / "pattern", "eve", slots=60, trials=5, eavesdroppers=pattern)

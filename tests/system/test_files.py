@@ -6,6 +6,7 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.system.files import LineFile, lines_in, whole_file
+from tests.disks import simulated
 
 
 def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
@@ -28,30 +29,19 @@ def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("room", range(9))
-def test_a_line_for_which_the_disk_has_no_room_does_not_count(
-    room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_line_for_which_the_disk_has_no_room_does_not_count(room: int, tmp_path: Path) -> None:
     """Whatever part of it fits: the file stays as it was, and goes on when there is room again."""
-    write = os.write
-
-    def write_some(file: int, data: memoryview) -> int:
-        nonlocal room
-        if not room:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        written = write(file, data[: min(room, 3)])
-        room -= written
-        return written
-
-    path = tmp_path / "lines"
-    with LineFile(path) as file:
-        file.append(["first"])
-        with monkeypatch.context() as patched:
-            patched.setattr(os, "write", write_some)
+    with simulated(tmp_path) as (_, disk):
+        path = disk.root / "lines"
+        with LineFile(path) as file:
+            file.append(["first"])
+            disk.room = room
             with pytest.raises(OSError, match="No space left"):
                 file.append(["second"])
-        assert lines_in(path) == [b'["first"]']
-        file.append(["third"])
-    assert lines_in(path) == [b'["first"]', b'["third"]']
+            disk.make_room()
+            assert lines_in(path) == [b'["first"]']
+            file.append(["third"])
+        assert lines_in(path) == [b'["first"]', b'["third"]']
 
 
 @pytest.mark.parametrize("torn", ["", "[", '["second"'])

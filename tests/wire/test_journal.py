@@ -276,12 +276,22 @@ def test_a_record_that_is_torn_is_not_read(tmp_path: Path) -> None:
     """At whichever byte the process ended while it wrote the last record."""
     part = JournalPart(tmp_path / "001-0001.rows", 60)
     record = np.zeros(1, RECORD)
-    record["n"], record["fate"] = 5, WireFate.LOST + STORED
+    record["time"], record["n"], record["fate"] = 1000.0, 5, WireFate.LOST + STORED
     for size in range(RECORD.itemsize):
         part.buffer[: RECORD.itemsize] = record.tobytes()
         part.buffer[RECORD.itemsize : 2 * RECORD.itemsize] = record.tobytes()[:size] + bytes(RECORD.itemsize - size)
         assert records_in(tmp_path / "001-0001.rows")["n"].tolist() == [5]
     assert part.take()["n"].tolist() == [5]
+
+
+def test_a_record_whose_beginning_was_lost_is_not_read(tmp_path: Path) -> None:
+    """A power cut may leave the page with its end, and zeros in the page before."""
+    part = JournalPart(tmp_path / "001-0001.rows", 100)
+    record = np.zeros(100, RECORD)
+    record["time"], record["n"], record["fate"] = 1000.0, np.arange(100), STORED
+    part.buffer[:] = record.tobytes()
+    part.buffer[:4096] = bytes(4096)
+    assert records_in(tmp_path / "001-0001.rows")["n"].tolist() == [*range(86, 100)]
 
 
 def test_the_settings_that_each_message_had_are_known_after_a_restart(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from evedrop.wire.journal import JournalWords, words_in
 from evedrop.wire.records import Words
+from tests.disks import simulated
 
 KEYS, SOURCES, LINKS = ["scan", "örtlich/🤖", 'a "b"\n\\'], ["b1", "ﬀ"], ["up", "down"]
 
@@ -69,24 +70,19 @@ def test_words_of_any_length_and_number_are_kept(tmp_path: Path, monkeypatch: py
     assert (tmp_path / "001.words").read_bytes().endswith(b'"]\n')
 
 
-def test_a_word_for_which_the_disk_has_no_room_has_its_code_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_word_for_which_the_disk_has_no_room_has_its_code_all_the_same(tmp_path: Path) -> None:
     """The file lacks it, and goes on with those after it once there is room."""
     missed: list[OSError] = []
-    words = JournalWords(tmp_path, 1, missed.append)
-
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patched:
-        patched.setattr("evedrop.wire.journal.mapped_end", full)
+    with simulated(tmp_path) as (_, disk):
+        words = JournalWords(disk.root, 1, missed.append)
+        disk.room = 0
         assert [words.key_code(key) for key in ("a", "b", "a")] == [1, 2, 1]
-    assert [error.errno for error in missed] == [28, 28]
-    assert words.key_code("c") == 3
-    assert words_in(tmp_path, 1, LINKS) == Words(LINKS, {3: "c"}, {})
-    assert words.words(LINKS).keys == {0: "", 1: "a", 2: "b", 3: "c"}
-    words.close()
+        disk.make_room()
+        assert [error.errno for error in missed] == [28, 28]
+        assert words.key_code("c") == 3
+        assert words_in(disk.root, 1, LINKS) == Words(LINKS, {3: "c"}, {})
+        assert words.words(LINKS).keys == {0: "", 1: "a", 2: "b", 3: "c"}
+        words.close()
 
 
 def test_a_start_without_words_has_none(tmp_path: Path) -> None:

@@ -7,11 +7,11 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from evedrop.system.world import world
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.records import WireFate
 from evedrop.wire.running_link import Decision, KeyFates, RunningLink
@@ -160,7 +160,7 @@ def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
 ) -> None:
     """The losses, and the delays of messages that no earlier one holds up, are those of the same link without an order."""
     now = [100.0]
-    monkeypatch.setattr("evedrop.wire.running_link.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(world(), "monotonic", lambda: now[0])
     settings = {**LOSSY, "delay": {"model": "normal", "mean": 0.05, "standard_deviation": 0.02}}
     plan = plan_of(link("robot", "base", settings, ordered=True), link("base", "robot"))
     fates = KeyFates(plan.links[0], "scan", "put", plan.seed)
@@ -179,7 +179,7 @@ def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
 def test_an_order_is_kept_until_its_last_message_is_due(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Although the key is forgotten, and used again, meanwhile."""
     now = [100.0]
-    monkeypatch.setattr("evedrop.wire.running_link.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(world(), "monotonic", lambda: now[0])
     plan = plan_of(link("robot", "base", {**PERFECT, "delay": {"model": "constant", "value": 5.0}}, ordered=True))
     with WireJournal(tmp_path, plan) as journal:
         state = RunningLink(plan.links[0], plan, journal)

@@ -6,11 +6,11 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from evedrop.system.world import world
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.records import HELD, Kind, WireFate, records_in
 from evedrop.wire.send_queue import SendQueue
@@ -221,7 +221,10 @@ def test_the_end_is_not_missed_by_a_message_that_is_about_to_wait(queue: Queue) 
 
     class Room(threading.Event):
         def set(self) -> None:
-            safe.append(send_queue._lock.locked())
+            free = send_queue._lock.acquire(blocking=False)
+            if free:
+                send_queue._lock.release()
+            safe.append(not free)
             super().set()
 
     send_queue._room = Room()
@@ -278,7 +281,7 @@ def test_a_side_that_lets_others_wait_has_no_messages_past_the_queue(
 ) -> None:
     """A long wait of a sender that sends to no other side, or waits for more than a tenth of the time; None is a pause."""
     now = [1000.0]
-    monkeypatch.setattr("evedrop.wire.send_queue.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(world(), "monotonic", lambda: now[0])
     for seconds in waits:
         if seconds is None:
             now[0] += 10.0
@@ -291,7 +294,7 @@ def test_a_side_that_lets_others_wait_has_no_messages_past_the_queue(
 def test_a_side_that_was_slow_has_messages_past_the_queue_again(queue: Queue, monkeypatch: pytest.MonkeyPatch) -> None:
     """After some seconds, and each time after twice as many."""
     now = [1000.0]
-    monkeypatch.setattr("evedrop.wire.send_queue.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(world(), "monotonic", lambda: now[0])
 
     def is_free_after(seconds: float) -> bool:
         now[0] += seconds

@@ -19,6 +19,7 @@ from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WIRE_FILE
 from evedrop.system.files import is_locked
+from evedrop.system.world import world
 from evedrop.wire import journal as journal_module
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import WireHistory
@@ -162,14 +163,14 @@ def test_the_time_of_a_start_does_not_include_the_recovery_before_it(
 ) -> None:
     """A long recovery, during which the clock goes on by 1000 s."""
     late = [0.0]
-    monotonic = time.monotonic
+    monotonic = world().monotonic
 
     def slowly(journal: Path, history: WireHistory) -> int:
         late[0] += 1000.0
         return recover(journal, history)
 
     monkeypatch.setattr(journal_module, "recover", slowly)
-    monkeypatch.setattr(time, "monotonic", lambda: monotonic() + late[0])
+    monkeypatch.setattr(world(), "monotonic", lambda: monotonic() + late[0])
     with WireJournal(folders["killed"], both_ways(LOSSY)) as journal:
         assert late == [1000.0]
         assert 0.0 <= journal.seconds < 500.0

@@ -24,7 +24,7 @@ from evedrop.system.output import say, standard_streams, warn
 if TYPE_CHECKING:
     from evedrop.cli.options import Command
 
-__all__ = ["is_role", "main"]
+__all__ = ["is_role", "main", "parser_of", "status_of"]
 
 _Parsers: TypeAlias = "argparse._SubParsersAction[Parser]"
 
@@ -37,7 +37,7 @@ def is_role(arguments: Sequence[str]) -> bool:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns its exit status, which output that cannot be written makes 2 only if it would be 0."""
     with standard_streams() as output:
-        status = _status(sys.argv[1:] if arguments is None else list(arguments))
+        status = status_of(sys.argv[1:] if arguments is None else list(arguments))
         output.flush()
         if output.failed is not None and status in {0, 1}:  # otherwise an error has been reported
             say(f"standard output: {output.failed.strerror}; free some space, or check its permissions")
@@ -45,14 +45,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
 
 
-def _status(given: list[str]) -> int:
-    """Run the command line, and report its errors, and what the machine lacks."""
+def status_of(given: list[str], parser: Parser | None = None) -> int:
+    """Run the command line, and report its errors and what the machine lacks; parser: for its first word, if there is one."""
     if not given and "_ARGCOMPLETE" not in os.environ:
         print_start()
         return UsageError.exit_status
     refuse_scipy_without_room()
     try:
-        return _status_of(given)
+        return _status_of_command(given, parser)
     except BaseException as error:  # a panic of Zenoh is not an Exception
         if (lack := lack_of(error)) is None:
             raise
@@ -60,13 +60,13 @@ def _status(given: list[str]) -> int:
     return RunError.exit_status
 
 
-def _status_of(given: list[str]) -> int:
+def _status_of_command(given: list[str], parser: Parser | None) -> int:
     if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions
         import argcomplete
 
         argcomplete.autocomplete(parser_of())
     try:
-        options = parser_of(given[0] if given else "").parse_whole(given)
+        options = (parser or parser_of(given[0] if given else "")).parse_whole(given)
     except SystemExit as left:  # argparse has printed the help, or said what it expected
         return int(left.code or 0)
     command: Callable[[argparse.Namespace], int] = options.command

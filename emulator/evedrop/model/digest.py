@@ -106,9 +106,8 @@ class PartialDigests:
     def finished(self) -> Digests:
         """The digests of all slots since the last call, (R, 16); the next slot begins another block."""
         self._hash_held()
-        digests = _joined(digest.digest() for digest in self._hashes)
-        for digest in self._hashes:
-            digest.reset()
+        digests = _joined(map(xxh3_128.digest, self._hashes))
+        deque(map(xxh3_128.reset, self._hashes), maxlen=0)
         return digests
 
     def _hash_held(self) -> None:

@@ -227,14 +227,12 @@ class BlockReader:
         """Standard normals, shape (slots, per_trial, trials)."""
         return self._converted(slots, kernels.normals)
 
-    def _converted(self, slots: range, convert: Callable[[Words, int], Floats]) -> Floats:
+    def _converted(self, slots: range, convert: Callable[[Words, int, Floats], Floats]) -> Floats:
         """Convert a block at a time, so that intermediate arrays stay in the cache, and the allocator keeps its pages."""
-        if len(slots) <= self._length:
-            return convert(self._words(slots), self._per_trial)
         numbers = np.empty((len(slots), self._per_trial, self._batch.trials))
         for start in range(0, len(slots), self._length):
             some = slice(start, start + self._length)
-            numbers[some] = convert(self._words(slots[some]), self._per_trial)
+            convert(self._words(slots[some]), self._per_trial, numbers[some])
         return numbers
 
     def _words(self, slots: range) -> Words:

@@ -12,27 +12,30 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import shutil
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Self, final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from evedrop.results.folder import UNFINISHED, make_private, private_opener, replace_private
+from evedrop.results.folder import UNFINISHED, make_private, replace_private
 from evedrop.results.tables import NULLABLE
-from evedrop.system.files import LineFile, is_locked, lines_in, try_lock, write_all
+from evedrop.system.disk import write_all
+from evedrop.system.files import LineFile, is_locked, lines_in, try_lock
+from evedrop.system.world import world
 
 BATCH_BYTES = 16 * 2**20
 """The largest record batch and row group of a Parquet file, unless a single row is larger."""
 _GROUP_ROWS = 65_536
 _ROUNDS = "rounds"
 _SUMMARY = "summary.json"
+_CHECKED_AT_ONCE = 2**20
 _TAIL_BYTES = 65_536  # more than the longest line of the rounds
 
 
@@ -106,6 +109,11 @@ class TableStream:
             )
         return pa.array(values, column.type, from_pandas=column.name in NULLABLE)
 
+    @property
+    def end(self) -> tuple[str, int, int, int]:
+        """Its file, rows on disk, bytes on disk, and a checksum of these."""
+        return self.file, self.rows, self._sink.size, self._sink.check
+
     def close(self) -> None:
         """Close the file; rows held back are dropped."""
         self._sink.close()
@@ -116,22 +124,24 @@ class _Sink:
     """A file for Arrow that writes every byte or raises: Arrow does not notice a short write."""
 
     def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
+        self._file = world().disk.open(path, "xb")
         self._waiting: list[bytes] = []
         self.closed = False
+        self.size = self.check = 0
 
     def write(self, data: Any) -> int:
         self._waiting.append(bytes(data))
         return len(self._waiting[-1])
 
     def flush(self) -> None:
-        waiting, self._waiting = self._waiting, []
-        write_all(self._descriptor, b"".join(waiting))
+        data, self._waiting = b"".join(self._waiting), []
+        write_all(self._file, data)
+        self.size, self.check = self.size + len(data), zlib.crc32(data, self.check)
 
     def close(self) -> None:
         if not self.closed:
             self.closed = True
-            os.close(self._descriptor)
+            self._file.close()
 
 
 @dataclass(frozen=True)
@@ -144,6 +154,49 @@ class TableRound:
     """The number of slots that have rows."""
     tables: Mapping[str, tuple[str, int]] = field(default_factory=dict)
     """Table → its file and its number of valid rows."""
+    checks: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    """Table → the number of bytes of its file that have these rows, and a checksum of these bytes."""
+
+    @classmethod
+    def read(cls, line: bytes) -> Self:
+        """Read a line of the rounds. Raises an error if it is damaged."""
+        entry = json.loads(line)
+        tables, checks = {}, {}
+        for name, (file, rows, *check) in entry["tables"].items():
+            tables[str(name)] = (Path(str(file)).name, int(rows))
+            if check:  # an older version wrote none
+                size, checksum = check
+                checks[str(name)] = (int(size), int(checksum))
+        return cls(str(entry["at"]), int(entry["slots"]), tables, checks)
+
+    def survives(self, folder: Path) -> bool:
+        """Whether a power cut has left all of it in a results folder."""
+        for name, (size, checksum) in self.checks.items():
+            path = folder / UNFINISHED / self.tables[name][0]
+            try:
+                status = path.stat()
+            except OSError:
+                if not (folder / f"{name}.parquet").exists():
+                    return False
+            else:
+                state = (status.st_ino, status.st_size, status.st_mtime_ns)
+                if _checksum(path, size, state) != checksum:
+                    return False
+        return True
+
+
+@lru_cache(maxsize=64)
+def _checksum(path: Path, size: int, state: tuple[int, ...]) -> int | None:
+    """The checksum of the first bytes of a file; None if there are fewer. state: something that changes with the file."""
+    del state
+    checksum = 0
+    try:
+        with path.open("rb") as file:
+            while size and (data := file.read(min(size, _CHECKED_AT_ONCE))):
+                size, checksum = size - len(data), zlib.crc32(data, checksum)
+    except OSError:
+        return None
+    return None if size else checksum
 
 
 class Unfinished:
@@ -153,7 +206,7 @@ class Unfinished:
         """Create the folder in a results folder. Raises OSError on failure."""
         place = folder / UNFINISHED
         make_private(place, exist_ok=False)
-        self._descriptor = os.open(place, os.O_RDONLY)
+        self._descriptor = world().disk.hold(place)
         try_lock(self._descriptor)  # on a file system without locks, a run in progress looks killed
         self._rounds = LineFile(place / _ROUNDS)
 
@@ -167,13 +220,13 @@ class Unfinished:
         for stream in streams.values():
             stream.write()
         before()
-        tables = {name: (stream.file, stream.rows) for name, stream in streams.items()}
+        tables = {name: stream.end for name, stream in streams.items()}
         self._rounds.append({"at": at, "slots": slots, "tables": tables})
 
     def close(self) -> None:
         """Release the lock; the files stay."""
         self._rounds.close()
-        os.close(self._descriptor)
+        world().disk.let_go(self._descriptor)
 
 
 def is_unfinished(folder: Path) -> bool:
@@ -187,16 +240,21 @@ def goes_on(folder: Path) -> bool:
 
 
 def last_round(folder: Path) -> TableRound:
-    """The last round that was written completely; empty if there was none."""
+    """The last round that was written completely; empty if there was none.
+
+    A power cut may leave the line of a round and not its rows, so such a round counts only if its rows are on the disk, unless
+    its writer still runs.
+    """
     try:
         lines = lines_in(folder / UNFINISHED / _ROUNDS, last=_TAIL_BYTES)
     except OSError:
         return TableRound()
+    runs = goes_on(folder)
     for line in reversed(lines):
         with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, OverflowError):
-            entry = json.loads(line)
-            tables = {str(name): (Path(str(file)).name, int(rows)) for name, (file, rows) in entry["tables"].items()}
-            return TableRound(str(entry["at"]), int(entry["slots"]), tables)
+            latest = TableRound.read(line)
+            if runs or latest.survives(folder):
+                return latest
     return TableRound()
 
 
@@ -277,10 +335,11 @@ def finish(folder: Path) -> None:
                 for group in _groups(batches_of(folder, name)):
                     writer.write_table(pa.Table.from_batches(group, schema).combine_chunks())
         except (OSError, pa.ArrowException):
-            unfinished.unlink(missing_ok=True)
+            world().disk.remove(unfinished, missing_ok=True)
             raise
-        os.replace(unfinished, folder / f"{name}.parquet")
-        (folder / UNFINISHED / file).unlink()
+        world().disk.sync(unfinished)
+        world().disk.replace(unfinished, folder / f"{name}.parquet")
+        world().disk.remove(folder / UNFINISHED / file)
 
 
 @contextlib.contextmanager
@@ -289,7 +348,7 @@ def parquet_writer(path: Path, schema: pa.Schema) -> Iterator[pq.ParquetWriter]:
     # A dictionary of numbers, most of which differ, takes longer to make, and more room.
     names = [column.name for column in schema if pa.types.is_dictionary(column.type)]
     with (
-        open(path, "wb", opener=private_opener) as file,
+        world().disk.writer(path) as file,
         pq.ParquetWriter(file, schema, compression="zstd", compression_level=1, use_dictionary=names) as writer,
     ):
         yield writer
@@ -317,4 +376,4 @@ def _groups(batches: Iterator[pa.RecordBatch]) -> Iterator[list[pa.RecordBatch]]
 def forget(folder: Path) -> None:
     """Remove the folder `unfinished` if all its tables are Parquet files. Call this after the summary is written."""
     if not any((folder / UNFINISHED / file).exists() for file, _ in last_round(folder).tables.values()):
-        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+        world().disk.remove_tree(folder / UNFINISHED, ignore_errors=True)

@@ -6,7 +6,6 @@ Source: docs/results.md, while a run goes on.
 from __future__ import annotations
 
 import contextlib
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
+from evedrop.system.world import world
 
 
 def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
@@ -40,13 +40,13 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
         summary = replace(summary, slots=rows.slots)
         if not rows.at:
             left_behind = False
-            shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+            world().disk.remove_tree(folder / UNFINISHED, ignore_errors=True)
             if not any(folder.glob("*.parquet")):
                 with ResultsWriter.of(folder, scenario):
                     pass
     if left_behind:
         # The recording lacks its end; `evedrop view` makes another one from the tables.
-        (folder / "recording.rrd").unlink(missing_ok=True)
+        world().disk.remove(folder / "recording.rrd", missing_ok=True)
         with contextlib.suppress(OSError):  # the disk is full: the streams stay, and can be read
             finish(folder)
     write_summary(folder, summary)

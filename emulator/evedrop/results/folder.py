@@ -21,6 +21,7 @@ from typing import final
 from evedrop.errors import RunError, UsageError
 from evedrop.system.files import shown
 from evedrop.system.signals import leave_after
+from evedrop.system.world import world
 
 UNFINISHED = "unfinished"
 """The folder inside a results folder that contains what only a run in progress needs, such as unfinished tables."""
@@ -72,7 +73,7 @@ def _unusable(folder: Path, why: str) -> UsageError:
     return UsageError(f"{shown(folder)} cannot be written ({why}); give another folder")
 
 
-_FOLDER_MODE, _FILE_MODE = 0o700, 0o600
+_FOLDER_MODE = 0o700
 
 
 def new_folder(folder: Path) -> Path:
@@ -99,8 +100,8 @@ def new_folder(folder: Path) -> Path:
 def make_private(folder: Path, exist_ok: bool = True) -> None:
     """Create a folder and its missing parents, for this user only. Raises OSError as `Path.mkdir` does."""
     for missing in reversed([parent for parent in folder.parents if not parent.exists()]):
-        missing.mkdir(_FOLDER_MODE, exist_ok=True)
-    folder.mkdir(_FOLDER_MODE, exist_ok=exist_ok)
+        world().disk.make_folder(missing, _FOLDER_MODE, exist_ok=True)
+    world().disk.make_folder(folder, _FOLDER_MODE, exist_ok=exist_ok)
 
 
 def _narrow(folder: Path) -> None:
@@ -119,17 +120,9 @@ def _narrow(folder: Path) -> None:
         os.close(opened)
 
 
-def private_opener(path: str, flags: int) -> int:
-    """An `opener` for `open`: new and existing files become readable by this user only."""
-    opened = os.open(path, flags, _FILE_MODE)
-    with suppress(PermissionError):  # a file system without modes
-        os.fchmod(opened, _FILE_MODE)
-    return opened
-
-
 def private_file(path: Path) -> Path:
     """Create an empty file that only this user can read, for a library that opens it by name; returns its path."""
-    with open(path, "wb", opener=private_opener):
+    with world().disk.open(path, "wb"):
         return path
 
 
@@ -142,30 +135,34 @@ def private_pictures(path: Path) -> Path:
 
 def write_private(path: Path, text: str) -> None:
     """Write a text to a file that only this user can read."""
-    private_file(path).write_text(text, encoding="utf-8")
+    world().disk.write(path, text.encode())
 
 
 def replace_private(path: Path, text: str) -> None:
     """Write a text to a file that only this user can read; at any moment the file is the old or the new one. Raises OSError."""
     with private_replacement(path) as unfinished:
-        unfinished.write_text(text, encoding="utf-8")
+        world().disk.write(unfinished, text.encode())
 
 
 @contextlib.contextmanager
-def private_replacement(path: Path) -> Iterator[Path]:
+def private_replacement(path: Path, lasting: bool = True) -> Iterator[Path]:
     """The path of an empty file that only this user can read.
 
     The file replaces `path` when the block ends, and is removed if the block fails.
+
+    lasting: whether a power cut after this leaves the whole file; otherwise it may leave nothing behind the name.
 
     Raises OSError.
     """
     unfinished = path.with_name(f"{path.name}.new")
     try:
         yield private_file(unfinished)
-        os.replace(unfinished, path)
+        if lasting:
+            world().disk.sync(unfinished)
+        world().disk.replace(unfinished, path)
     except BaseException:
         with suppress(OSError):
-            unfinished.unlink()
+            world().disk.remove(unfinished)
         raise
 
 
@@ -191,7 +188,7 @@ class HeldFolder:
         """Open the folder. Raises OSError if it cannot be opened."""
         self.first = path
         """Its path when it was opened."""
-        self._descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        self._descriptor = world().disk.hold(path)
 
     @property
     def now(self) -> Path:
@@ -220,4 +217,4 @@ class HeldFolder:
 
     def close(self) -> None:
         """Close the folder."""
-        os.close(self._descriptor)
+        world().disk.let_go(self._descriptor)

@@ -14,12 +14,13 @@ from typing import Any, final
 import numpy as np
 
 from evedrop.model.process import Floats
-from evedrop.results.folder import private_opener, replace_private
+from evedrop.results.folder import replace_private
 from evedrop.scenario.plugins import sources_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.recordings.disturbance_file import number_lines, table_head, table_text
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import toml_text
+from evedrop.system.world import world
 
 STATES = "states.csv"
 """The file in a results folder if its states were given."""
@@ -32,7 +33,7 @@ class TakenStates:
     def __init__(self, folder: Path, process: ProcessTable) -> None:
         """Raises OSError if the file cannot be written."""
         self._around = np.array(process.around)
-        self._file = open(folder / STATES, "a", encoding="utf-8", opener=private_opener)  # noqa: SIM115 - closed by `close`
+        self._file = world().disk.text_writer(folder / STATES, "ab")
         self._held: list[str] = [] if self._file.tell() else [table_head(process.states or (), process.units)]
 
     def add(self, x: Floats) -> None:

@@ -20,6 +20,7 @@ from evedrop.errors import RunError
 from evedrop.results.folder import private_replacement
 from evedrop.scenario.tables import Scenario
 from evedrop.score.run_tally import RunTally
+from evedrop.system.world import world
 
 _ARRAY, _OBJECT, _TUPLE, _NUMBER, _FUNCTION, _SET = range(1, 7)
 """Types of msgpack's extensions."""
@@ -170,7 +171,7 @@ def dump_score(run_tally: RunTally, folder: Path, scenario: Scenario) -> None:
                     f"a shard cannot store its tally ({error}); docs/your-own/metric.md says what a tally may consist of"
                 )
     with private_replacement(folder / _NAME) as unfinished:
-        unfinished.write_bytes(packed(run_tally))
+        world().disk.write(unfinished, packed(run_tally))
 
 
 def load_score(folder: Path, scenario: Scenario) -> RunTally:

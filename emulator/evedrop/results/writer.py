@@ -201,7 +201,7 @@ class ResultsWriter:
         self._on_disk, self._bytes = self._on_disk + self._bytes, 0
         for stream in self._outdated:
             stream.close()
-            (self._held.now / UNFINISHED / stream.file).unlink()
+            world().disk.remove(self._held.now / UNFINISHED / stream.file)
         self._outdated = []
 
     def _add(self, table: str, columns: Sequence[NDArray[Any]]) -> None:

@@ -41,13 +41,17 @@ class ConditionalError:
         self.slots = 0
         """The number of slots so far; 0 in a mode without errors."""
 
-    def add_actions(self, action: Codes) -> None:
-        """Add the next slots: the actions (c, R)."""
-        process = self._process
-        covariances = kernels.follow_covariance(process.A, process.Q, self._P, action, self.slots == 0)
-        self._P = covariances[-1]
+    def add_actions(self, action: Codes, traces: Floats | None = None) -> None:
+        """Add the next slots: the actions (c, R).
+
+        traces: tr P_k, (c, R), as a receiver that is built in computes it itself; either always given or never.
+        """
+        if traces is None:
+            process = self._process
+            covariances = kernels.follow_covariance(process.A, process.Q, self._P, action, self.slots == 0)
+            self._P, traces = covariances[-1], kernels.traces(covariances)
         self.slots += len(action)
-        kernels.add_between(self._sums, action == _STATE, kernels.traces(covariances))
+        kernels.add_between(self._sums, action == _STATE, traces)
 
     @property
     def expected(self) -> Floats:

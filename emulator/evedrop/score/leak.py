@@ -124,23 +124,28 @@ def revealed_by_packets(scenario: Scenario) -> PacketBitsStream | None:
 
 @final
 class HeardBitsStream:
-    """What packets reveal to each receiver for which it is known, a number of slots at a time from slot 0 on."""
+    """What packets reveal to each receiver for which it is known, some slots at a time from slot 0 on.
+
+    Several keepers, each of some of the trials, may share it.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         names = [name for name in scenario.receivers if leak_is_known(scenario, name)]
         self._packets = revealed_by_packets(scenario) if names else None
         self._distributions = {name: distribution_of(scenario.schedule(name)) for name in names}
-        self._first = 0
+        self._slots = range(0)
+        self._heard: dict[str, HeardBits] = {}
 
-    def next(self, slots: int) -> dict[str, HeardBits]:
-        """Receiver → what the packets of the next slots reveal to it."""
-        if self._packets is None:
-            return {}
-        packets, some = self._packets.next(slots), range(self._first, self._first + slots)
-        self._first = some.stop
-        return {
+    def of(self, slots: range) -> dict[str, HeardBits]:
+        """Receiver → what the packets of these slots reveal to it: the next ones, or those of the last call again."""
+        if self._packets is None or slots == self._slots:
+            return self._heard
+        packets = self._packets.next(len(slots))
+        self._slots = slots
+        self._heard = {
             name: HeardBits(
-                packets.by_type, None if distribution is None else distribution.rates(some) * packets.hidden_bits
+                packets.by_type, None if distribution is None else distribution.rates(slots) * packets.hidden_bits
             )
             for name, distribution in self._distributions.items()
         }
+        return self._heard

@@ -19,6 +19,7 @@ from evedrop.model.metrics import metrics_of
 from evedrop.model.metrics.metric import COVARIANCE_ONLY, ScoredSlots
 from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
+from evedrop.scenario.dry_run import has_foreign
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import (
@@ -59,16 +60,21 @@ class Scored(NamedTuple):
 class Scorekeeper:
     """Scores the slots of a batch of trials, in order.
 
-    theory: receiver → its theoretical traces; computed if it is not given.
+    theory: receiver → its theoretical traces; revealed: what packets reveal; both are computed if they are not given.
     """
 
     def __init__(
-        self, scenario: Scenario, trials: int, theory: Mapping[str, TheoreticalTraceStream] | None = None
+        self,
+        scenario: Scenario,
+        trials: int,
+        theory: Mapping[str, TheoreticalTraceStream] | None = None,
+        revealed: HeardBitsStream | None = None,
     ) -> None:
         if theory is None:
             theory = {name: expectation.stream() for name, expectation in expectations_of(scenario).items()}
         self._theory = theory
-        self._revealed = HeardBitsStream(scenario)
+        self._revealed = HeardBitsStream(scenario) if revealed is None else revealed
+        self._built_in = not has_foreign(scenario)
         self.run_tally = RunTally.from_scenario(scenario, trials)
 
     def add_slots(
@@ -80,7 +86,7 @@ class Scorekeeper:
         """
         scored = {}
         self._add_plant(slots)
-        revealed = self._revealed.next(slots.count)
+        revealed = self._revealed.of(range(slots.first, slots.first + slots.count))
         sensor = slots.sensor
         for name, receiver in slots.receivers.items():
             link = slots.links[name]
@@ -96,7 +102,9 @@ class Scorekeeper:
             if tally.distance is not None:
                 tally.distance.add_slots(slots.first, errors, values.sums.error, sensor.x, receiver.x_hat)
             if tally.conditional is not None:
-                tally.conditional.add_actions(receiver.action)
+                # In memory, a receiver that is built in computes the covariances that its actions imply.
+                implied = errors_and_traces is not None and self._built_in
+                tally.conditional.add_actions(receiver.action, traces if implied else None)
             if tally.leak is not None:
                 tally.leak.add_slots(receiver.action, sensor.nu, revealed[name])
             for direction in tally.directions.values():

@@ -9,9 +9,9 @@ ones as infinite.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from itertools import pairwise
 from typing import Any, final
 
 import numpy as np
@@ -267,10 +267,10 @@ class Tally(ReceiverTally):
         self.theoretical_trace += float(expected.sum()) * self.trials
         self.received += int(sums.received.sum())
         self.used += int(sums.used.sum())
-        for window, bounds in enumerate(pairwise(self._bounds), -1):
-            start, stop = (max(bound - first, 0) for bound in bounds)
-            if start < min(stop, count):
-                self.window_errors[window] += error[start:stop].sum(axis=0)
+        bounds = self._bounds
+        for i in range(bisect_right(bounds, first) - 1, bisect_left(bounds, first + count)):
+            start, stop = max(bounds[i] - first, 0), bounds[i + 1] - first
+            self.window_errors[i - 1] += error[start:stop].sum(axis=0)
 
     def add_traces(self, first: int, traces: Floats | None) -> None:
         """Add tr P of the slots from `first` on and of every trial, (c, R); None if it is not known."""

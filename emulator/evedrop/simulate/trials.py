@@ -20,6 +20,7 @@ from evedrop.model.process import Floats
 from evedrop.model.slot.link import Account, Accountant
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import KnownTraces, theoretical_traces_of
+from evedrop.score.leak import HeardBitsStream
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import Scorekeeper
 from evedrop.score.slots import Slots
@@ -83,7 +84,7 @@ class TrialsTask(Task[BatchResult]):
         scenario = Scenario.read(self.scenario)
         expected = {name: np.zeros(scenario.slots) for name in scenario.receivers}
         histograms = {name: SlotHistograms(1, 1.0) for name in scenario.receivers}
-        (block, _) = _empty_block(scenario, self, self.start, expected)
+        (block, _) = _empty_block(scenario, self, self.start, expected, HeardBitsStream(scenario))
         block.run_tally.begin()
         return BatchResult(self.start, [block], histograms, histograms, [Slots.example(scenario.receivers)])
 
@@ -126,8 +127,9 @@ def carry_out(task: TrialsTask, on_progress: OnProgress, stopped: Stopped) -> Ba
     simulation = Simulation(scenario, trials, task.mode)
     scale = float(np.trace(scenario.process.process.Q))
     expected = theoretical_traces_of(scenario)
+    revealed = HeardBitsStream(scenario)
     blocks, keepers = zip(
-        *(_empty_block(scenario, task, start, expected) for start in trials[::BLOCK_TRIALS]), strict=True
+        *(_empty_block(scenario, task, start, expected, revealed) for start in trials[::BLOCK_TRIALS]), strict=True
     )
     result = BatchResult(
         task.start,
@@ -169,12 +171,16 @@ def carry_out(task: TrialsTask, on_progress: OnProgress, stopped: Stopped) -> Ba
 
 
 def _empty_block(
-    scenario: Scenario, task: TrialsTask, start: int, expected: Mapping[str, Floats]
+    scenario: Scenario, task: TrialsTask, start: int, expected: Mapping[str, Floats], revealed: HeardBitsStream
 ) -> tuple[TrialBlock, Scorekeeper]:
-    """A block that begins with this trial, and the keeper of its score; expected: receiver → its theoretical traces, (slots,)."""
+    """A block that begins with this trial, and the keeper of its score.
+
+    expected: receiver → its theoretical traces, (slots,); revealed: what packets reveal, for the keepers of all blocks.
+    """
     names = scenario.receivers
     trials = min(BLOCK_TRIALS, task.stop - start)
-    keeper = Scorekeeper(scenario, trials, {name: KnownTraces(traces) for name, traces in expected.items()})
+    theory = {name: KnownTraces(traces) for name, traces in expected.items()}
+    keeper = Scorekeeper(scenario, trials, theory, revealed)
     block = TrialBlock(
         start,
         trials,
@@ -194,16 +200,18 @@ def _score(block: TrialBlock, keeper: Scorekeeper, rows: slice, chunk: Chunk, sl
     The square of a naive receiver's error may leave double precision; then it is inf, as it should be.
     """
     part = slots.part(rows)
-    receivers, links = {}, {}
+    receivers, links, errors_and_traces = {}, {}, {}
     for name, values in part.receivers.items():
         account = _account(block, name, rows, chunk)
-        trace = chunk.receivers[name].trace[:, rows]
-        receivers[name] = replace(values, trace=kernels.sums(trace))
+        # In order, so that kernels need not copy them again and again.
+        measured = chunk.receivers[name]
+        error, trace, action = map(
+            np.ascontiguousarray, (measured.error[:, rows], measured.trace[:, rows], values.action)
+        )
+        errors_and_traces[name] = error, trace
+        receivers[name] = replace(values, action=action, trace=kernels.sums(trace))
         links[name] = account.slots
         keeper.run_tally.tallies[name].count(account)
-    errors_and_traces = {
-        name: (values.error[:, rows], values.trace[:, rows]) for name, values in chunk.receivers.items()
-    }
     for name, scored in keeper.add_slots(Slots(part.sensor, receivers, links), errors_and_traces).items():
         block.sums[name].add_trials(chunk.first, scored.sums)
 
@@ -234,5 +242,5 @@ def _add(block: TrialBlock, mode: Mode, rows: slice, chunk: Chunk, expected: Map
 
 def _account(block: TrialBlock, name: str, rows: slice, chunk: Chunk) -> Account:
     """The account of a receiver's link over a chunk, for a block's trials."""
-    fates = chunk.receivers[name].fates.part(trials=rows)
+    fates = chunk.receivers[name].fates.part(trials=rows).copied()
     return block.accountants[name].account(range(chunk.first, chunk.first + len(fates.codes)), fates)

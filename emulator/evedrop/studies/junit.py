@@ -63,4 +63,4 @@ def _add(suite: ET.Element, tested: Finding) -> None:
         kind = "failure" if tested.outcome is Outcome.FAILED else "error"
         message = tested.reasons[0] if tested.reasons else ""
         failure = ET.SubElement(case, kind, {"message": printable(message), "type": tested.outcome.name.lower()})
-        failure.text = printable("\n".join(tested.reasons))
+        failure.text = printable("\n".join((*tested.reasons, *tested.story.splitlines())))

@@ -37,6 +37,7 @@ from evedrop.score.summary import Judged, failed
 from evedrop.show.report.writing import has_results, try_report
 from evedrop.simulate.finished_tasks import TASKS
 from evedrop.simulate.montecarlo import Plan, simulate
+from evedrop.studies.simulated_tests import SeedsToPlay, check_simulated, play_seeds
 from evedrop.system.parents import continue_when_parent_dies
 from evedrop.system.processes import SUSPENDED_SECONDS, SuspensionWatch, kill, wait_for
 from evedrop.system.signals import stop_on_signals
@@ -75,6 +76,9 @@ class Manner:
     resume: bool = False
     """Whether to go on with tests in memory that were interrupted: those that ended keep their results."""
 
+    simulation: SeedsToPlay | None = None
+    """How to run scenarios in the simulated world; None: not there."""
+
     @property
     def resumable(self) -> str | None:
         """The folder from which interrupted tests can be resumed; None for live ones, and without a folder of their own."""
@@ -102,13 +106,18 @@ class Finding:
     """Its report.html; None if it has no report."""
     verdict: str | None = None
     """The sentence of the run's verdict; None without an eavesdropper, and if the scenario could not be run."""
+    told: str | None = None
+    """What is said about it even if it passed."""
+    story: str = ""
+    """What happened, as a diagram."""
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The lines to print if it did not pass."""
+        """The lines to print about it, most of them only if it did not pass."""
         kept = () if self.folder is None or self.outcome is Outcome.PASSED else (f"results: {self.folder}",)
         page = () if self.report is None or self.outcome is Outcome.PASSED else (f"report: {self.report}",)
-        return (*self.reasons, *kept, *page)
+        told = () if self.told is None else (self.told,)
+        return (*told, *self.reasons, *kept, *page, *self.story.splitlines())
 
 
 def scenarios_of(places: Sequence[str]) -> list[str]:
@@ -141,13 +150,18 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
 
     try:
         made = load(scenario, changes)
+        if manner.simulation is not None:
+            check_simulated(made)
         folder = _folder_for(scenario, made, manner)
     except ScenarioError as error:
         return ended(Outcome.MISTAKES, error.mistakes)
     except UsageError as error:
         return ended(Outcome.MISTAKES, [str(error)])
+    played = None
     try:
-        if not _has_ended(folder):
+        if manner.simulation is not None:
+            played = play_seeds(made, scenario, folder, manner.simulation, manner.trials)
+        elif not _has_ended(folder):
             folder = _run(made, folder, manner)
     except Interrupted as error:
         error.resumable = manner.resumable
@@ -162,7 +176,12 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
     reasons = list(_reasons(summary.expectations))
     if summary.verdict is not None:
         kept["verdict"] = summary.verdict.sentence
-    return ended(Outcome.FAILED if reasons else Outcome.PASSED, reasons, **kept)
+    outcome = Outcome.FAILED if reasons else Outcome.PASSED
+    if played is not None:
+        kept |= {"told": played.told, "story": played.story}
+        reasons += played.reasons
+        outcome = Outcome.BROKEN if played.reasons else outcome
+    return ended(outcome, reasons, **kept)
 
 
 def _folder_for(scenario: str, made: Scenario, manner: Manner) -> Path:
@@ -299,8 +318,9 @@ def work() -> None:
     when_launcher_is_gone(lambda: os.kill(os.getpid(), signal.SIGTERM))
     scenario, manner = json.loads(sys.argv[1])
     out = None if manner["out"] is None else Path(manner["out"])
+    simulation = None if manner["simulation"] is None else SeedsToPlay(**manner["simulation"])
     try:
-        tested = carry_out(scenario, Manner(**{**manner, "out": out}))
+        tested = carry_out(scenario, Manner(**{**manner, "out": out, "simulation": simulation}))
     except Interrupted as error:
         sys.exit(error.exit_status)
     sys.stdout.write(json.dumps({**asdict(tested), "outcome": tested.outcome.value}, default=str))

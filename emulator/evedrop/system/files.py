@@ -21,6 +21,8 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self, final
 
 from evedrop.errors import UsageError
+from evedrop.system.disk import write_all
+from evedrop.system.world import world
 
 LINE_CHARACTERS = 65_536
 """The longest line of a table."""
@@ -164,13 +166,6 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_all(file: int, data: bytes) -> None:
-    """Write bytes to an open file. Raises OSError, such as for a full disk; some of them may have been written then."""
-    left = memoryview(data)
-    while left:  # a disk with little room accepts a part, and says so only when it is asked again
-        left = left[os.write(file, left) :]
-
-
 @final
 class LineFile:
     """A file of JSON values, one a line, that grows. A line counts only if it is complete.
@@ -180,12 +175,13 @@ class LineFile:
 
     def __init__(self, path: Path) -> None:
         """Open the file, which is new or continues after its last complete line. Only this user can read it. Raises OSError."""
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+        self._file = world().disk.open(path, "a+b")
         try:
-            self._size = os.fstat(self._file).st_size
-            if self._size and os.pread(self._file, 1, self._size - 1) != b"\n":
-                self._size = os.pread(self._file, self._size, 0).rfind(b"\n") + 1
-                os.ftruncate(self._file, self._size)
+            descriptor = self._file.fileno()
+            self._size = os.fstat(descriptor).st_size
+            if self._size and os.pread(descriptor, 1, self._size - 1) != b"\n":
+                self._size = os.pread(descriptor, self._size, 0).rfind(b"\n") + 1
+                self._file.truncate(self._size)
         except BaseException:
             self.close()
             raise
@@ -197,14 +193,14 @@ class LineFile:
             write_all(self._file, line)
         except OSError:
             with suppress(OSError):
-                os.ftruncate(self._file, self._size)
+                self._file.truncate(self._size)
             raise
         self._size += len(line)
         return line
 
     def close(self) -> None:
         """Close the file."""
-        os.close(self._file)
+        self._file.close()
 
     def __enter__(self) -> Self:
         return self

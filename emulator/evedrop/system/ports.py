@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import secrets
 import socket
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from evedrop.errors import UsageError
+from evedrop.system.world import world
 
 
 def free_port() -> int:
     """A free TCP port on loopback, below the range that the system uses for outgoing connections."""
     for _ in range(200):
-        port = 10_000 + secrets.randbelow(22_000)
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
+        port = 10_000 + int.from_bytes(world().token(4), "big") % 22_000
+        with suppress(OSError):
+            world().expect_free("127.0.0.1", port)
             return port
     raise UsageError(
         "no free port between 10000 and 32000 on loopback; end some programs, or give the router's endpoint"

@@ -23,7 +23,14 @@ from evedrop.system.guard import dismiss, guard_of
 from evedrop.system.native_log import native_log_apart
 from evedrop.system.output import Output
 from evedrop.system.parents import continue_when_parent_dies
-from evedrop.system.signals import SHOW_STACKS, heeded, leave_on_signals, stop_on_signals, told_when_suspended
+from evedrop.system.signals import (
+    SHOW_STACKS,
+    heeded,
+    leave_on_signals,
+    stop_on_signals,
+    stop_or_leave_on_signals,
+    told_when_suspended,
+)
 from evedrop.system.threads import ThreadEvent
 
 
@@ -56,6 +63,10 @@ class ThisProcess(ABC):
         """An event that these signals set while the block runs."""
 
     @abstractmethod
+    def stop_or_leave_on_signals(self, leave: Callable[[], object]) -> AbstractContextManager[ThreadEvent]:
+        """An event that the first of these signals sets while the block runs; a second one calls `leave`, which exits."""
+
+    @abstractmethod
     def told_when_suspended(self, tell: Callable[[], object]) -> AbstractContextManager[None]:
         """Call `tell` before Ctrl-Z suspends it while the block runs."""
 
@@ -66,6 +77,10 @@ class ThisProcess(ABC):
     @abstractmethod
     def prepare_for_messages(self, largest: int) -> None:
         """Keep memory for messages of up to `largest` bytes, and let no collection of garbage look at imported modules."""
+
+    @abstractmethod
+    def keep_files_private(self) -> None:
+        """Let only this user read the files that it makes from now on."""
 
     @abstractmethod
     def show_stacks(self) -> None:
@@ -134,6 +149,10 @@ class RealProcess(ThisProcess):
         """An event that these signals set; has no effect outside the main thread."""
         return stop_on_signals()
 
+    def stop_or_leave_on_signals(self, leave: Callable[[], object]) -> AbstractContextManager[ThreadEvent]:
+        """An event that the first signal sets; has no effect outside the main thread."""
+        return stop_or_leave_on_signals(leave)
+
     def told_when_suspended(self, tell: Callable[[], object]) -> AbstractContextManager[None]:
         """Call `tell` before Ctrl-Z suspends it; has no effect outside the main thread."""
         return told_when_suspended(tell)
@@ -151,6 +170,10 @@ class RealProcess(ThisProcess):
         """Keep memory, and modules: a collection that looks at them holds up packets."""
         keep_for_messages(largest)
         gc.freeze()
+
+    def keep_files_private(self) -> None:
+        """Set the mask of the modes of files."""
+        os.umask(0o077)
 
     def show_stacks(self) -> None:
         """Write the stack of every thread to standard error upon `SHOW_STACKS`."""

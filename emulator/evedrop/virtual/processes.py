@@ -5,29 +5,34 @@ Source: docs/maintainers/simulated-world.md.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
-import subprocess
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
+from queue import Empty
 from typing import IO, BinaryIO, NoReturn, cast, final
 
-from evedrop.live.launch.starter import TELLING, StartedProcess, Starter
-from evedrop.system.signals import INTERRUPTED
+from evedrop.live.launch.starter import ForkServer, PreloadedStarter, ProcessHandle, StandardFiles, Starter
+from evedrop.system.signals import AGAIN_SECONDS, INTERRUPTED
 from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import ThreadEvent
+from evedrop.virtual import notes
 from evedrop.virtual.pipes import Pipe, PipeFile
-from evedrop.virtual.scheduler import Ended, VirtualEvent, VirtualScheduler, VirtualTask, Waiter
+from evedrop.virtual.scheduler import Ended, VirtualEvent, VirtualQueue, VirtualScheduler, VirtualTask, Waiter
 
 Program = Callable[[Sequence[str]], int]
 """Runs a command line, and returns its exit status."""
 _START_SECONDS = 0.05
 """The mean time until a process that is started begins its work."""
 _REMOVED_SECONDS = 0.01
+_POLL_SECONDS = 0.25
+FORK_SERVERS = ("fork server", "fork server of the recorder")
+"""The processes that start others."""
 
 
 @final
@@ -74,7 +79,7 @@ class VirtualProcess(ThisProcess):
         scheduler, task = self._scheduler, self.task
         if not task.alive:
             return
-        scheduler.note("signal", task.name, number)
+        scheduler.note(notes.SIGNAL, task.name, number)
         if number == signal.SIGKILL:
             scheduler.end(task, -number)
         elif number == signal.SIGSTOP:
@@ -116,6 +121,25 @@ class VirtualProcess(ThisProcess):
         finally:
             self._handle = before
 
+    @contextmanager
+    def stop_or_leave_on_signals(self, leave: Callable[[], object]) -> Iterator[ThreadEvent]:
+        """An event that the first of these signals sets; a later one, unless it comes at once, calls `leave`."""
+        stop, before, first = VirtualEvent(self._scheduler), self._handle, 0.0
+
+        def handle() -> None:
+            nonlocal first
+            if not stop.is_set():
+                first = self._scheduler.now
+                stop.set()
+            elif self._scheduler.now - first > AGAIN_SECONDS:
+                leave()
+
+        self._handle = handle
+        try:
+            yield stop
+        finally:
+            self._handle = before
+
     def told_when_suspended(self, tell: Callable[[], object]) -> AbstractContextManager[None]:
         """Nobody types Ctrl-Z."""
         del tell
@@ -139,6 +163,9 @@ class VirtualProcess(ThisProcess):
 
     def prepare_for_messages(self, largest: int) -> None:
         """Its memory is the interpreter's."""
+
+    def keep_files_private(self) -> None:
+        """The files of all simulated processes are private."""
 
     def show_stacks(self) -> None:
         """Nobody asks for them."""
@@ -170,53 +197,118 @@ class VirtualProcess(ThisProcess):
 
 
 @final
-class VirtualStarted(StartedProcess):
-    """A simulated process, as its launcher sees it."""
+class _Handle:
+    """Refers to a simulated process."""
 
-    def __init__(self, scheduler: VirtualScheduler, process: VirtualProcess, stdin: Pipe, stdout: Pipe | None) -> None:
-        self._scheduler, self.process = scheduler, process
-        self._stdin, self._stdout = PipeFile(stdin), None if stdout is None else PipeFile(stdout)
-
-    @property
-    def pid(self) -> int:
-        """Its process id."""
-        return self.process.pid
+    def __init__(self, process: VirtualProcess) -> None:
+        self._process = process
 
     @property
-    def stdin(self) -> IO[bytes] | None:
-        """The launcher's end of the pipe to its standard input."""
-        return cast("IO[bytes]", self._stdin)
-
-    @property
-    def stdout(self) -> IO[bytes] | None:
-        """The events that it sends."""
-        return cast("IO[bytes] | None", self._stdout)
-
-    def poll(self) -> int | None:
-        """Its exit status."""
-        return self.process.task.status
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end."""
-        deadline = None if timeout is None else self._scheduler.now + timeout
-        while (status := self.poll()) is None:
-            left = None if deadline is None else deadline - self._scheduler.now
-            if left is not None and left <= 0.0:
-                raise subprocess.TimeoutExpired("evedrop", timeout or 0.0)
-            self._scheduler.wait(self.process.ended, left)
-        return status
+    def over(self) -> bool:
+        """Whether it has ended."""
+        return not self._process.task.alive
 
     def send_signal(self, sig: int) -> None:
         """Send a signal to it."""
-        self.process.signal(sig)
+        self._process.signal(sig)
 
-    def terminate(self) -> None:
-        """Ask it to end."""
-        self.process.signal(signal.SIGTERM)
+    def close(self) -> None:
+        """Nothing is to be closed."""
 
-    def kill(self) -> None:
-        """End it."""
-        self.process.signal(signal.SIGKILL)
+
+@final
+class _Files:
+    """A pipe to a simulated process, its log, and perhaps a pipe from it."""
+
+    def __init__(self, scheduler: VirtualScheduler, log: IO[bytes], tells: bool, number: int) -> None:
+        self.log = os.fdopen(os.dup(log.fileno()), "ab", buffering=0)
+        self.to, self.back = Pipe(scheduler), Pipe(scheduler) if tells else None
+        self.stdin = cast("IO[bytes]", PipeFile(self.to))
+        self.stdout = None if self.back is None else cast("IO[bytes]", PipeFile(self.back))
+        self.descriptors = (number, number, number)
+
+    def close_theirs(self) -> None:
+        """The process has them."""
+
+
+@final
+class VirtualForkServer:
+    """A simulated process that starts others, and the launcher's end of the channel with it.
+
+    It can be suspended and killed as any other: then it starts nothing, and reports no end.
+    """
+
+    def __init__(self, machine: VirtualMachine, name: str) -> None:
+        self._machine, self._scheduler = machine, machine.scheduler
+        self._requests, self._reports = VirtualQueue(self._scheduler), VirtualQueue(self._scheduler)
+        self._files: dict[int, _Files] = {}
+        self._launcher = machine.current
+        self.process = machine.begin(name, self._serve)
+        self.process.task.held.append(lambda: self._reports.put((b"", [])))
+        self._launcher.task.held.append(self.shut)
+
+    def files(self, log: IO[bytes], tells: bool) -> StandardFiles:
+        """Simulated pipes."""
+        files = _Files(self._scheduler, log, tells, self._scheduler.number())
+        self._files[files.descriptors[0]] = files
+        return files
+
+    def send(self, request: bytes, descriptors: tuple[int, int, int]) -> None:
+        """Send a request."""
+        if not self.process.task.alive:
+            raise BrokenPipeError(32, "Broken pipe")
+        self._requests.put((json.loads(request)["words"], self._files[descriptors[0]]))
+
+    def receive(self) -> tuple[bytes, list[ProcessHandle]]:
+        """The next report."""
+        try:
+            report: tuple[bytes, list[ProcessHandle]] = self._reports.get(timeout=_POLL_SECONDS)
+        except Empty:
+            raise TimeoutError from None
+        return report
+
+    def shut(self) -> None:
+        """Let the server end, once it goes on."""
+        self._reports.put((b"", []))
+        self._requests.put(None)
+        self.process.signal(signal.SIGCONT) if not self._launcher.task.alive else None
+
+    def close(self) -> None:
+        """Nothing is to be closed."""
+
+    def _serve(self) -> int:
+        self._scheduler.sleep(self._scheduler.random.expovariate(1.0 / _START_SECONDS))
+        while (request := self._requests.get()) is not None:
+            self._start(*request)
+        return 0
+
+    def _start(self, words: Sequence[str], files: _Files) -> None:
+        scheduler, launcher = self._scheduler, self._launcher
+        name = Path(words[1]).stem
+        process = VirtualProcess(scheduler, scheduler.process(name), files.log, files.to, files.back)
+
+        def launcher_dies() -> None:
+            files.to.close_writing()
+            if files.back is not None:
+                files.back.close_reading()
+            scheduler.go_on(process.task)
+
+        launcher.task.held.append(launcher_dies)
+        if not launcher.task.alive:
+            launcher_dies()
+
+        def work() -> int:
+            scheduler.sleep(scheduler.random.expovariate(1.0 / _START_SECONDS))
+            return self._machine.program(words)
+
+        self._machine.begin(name, work, process)
+        self._reports.put((json.dumps({"pid": process.pid}).encode(), [_Handle(process)]))
+        scheduler.thread("waits", lambda: self._report(process)).start()
+
+    def _report(self, process: VirtualProcess) -> None:
+        while process.task.status is None:
+            self._scheduler.wait(process.ended)
+        self._reports.put((json.dumps({"pid": process.pid, "status": process.task.status}).encode(), []))
 
 
 @final
@@ -225,13 +317,13 @@ class VirtualMachine:
 
     def __init__(self, scheduler: VirtualScheduler, program: Program) -> None:
         """program: what `evedrop` is on this machine."""
-        self._scheduler, self._program = scheduler, program
+        self.scheduler, self.program = scheduler, program
         self._of: dict[VirtualTask, VirtualProcess] = {}
 
     @property
     def current(self) -> VirtualProcess:
         """The process of the current thread."""
-        thread = self._scheduler.current
+        thread = self.scheduler.current
         if thread is None:
             raise AssertionError("the world itself is no process")
         return self._of[thread.task]
@@ -243,11 +335,11 @@ class VirtualMachine:
 
     def begin(self, name: str, work: Callable[[], int], process: VirtualProcess | None = None) -> VirtualProcess:
         """Start a process that does this work, whose result is its exit status."""
-        scheduler = self._scheduler
+        scheduler = self.scheduler
         if process is None:
             process = VirtualProcess(scheduler, scheduler.process(name))
         self._of[process.task] = process
-        scheduler.note("starts", name)
+        scheduler.note(notes.STARTS, name)
 
         def run() -> None:
             try:
@@ -265,33 +357,14 @@ class VirtualMachine:
 
     @contextmanager
     def starter(self, stop: ThreadEvent | None = None) -> Iterator[Starter]:
-        """Starts processes, each of which continues and reads the end of its input when the current process dies."""
-        del stop
-        yield self._start
-
-    def _start(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
-        del environment
-        scheduler, parent = self._scheduler, self.current
-        stdin, stdout = Pipe(scheduler), Pipe(scheduler) if role in TELLING else None
-        task = scheduler.process(brief.stem)
-        own = os.fdopen(os.dup(log.fileno()), "ab", buffering=0)
-        process = VirtualProcess(scheduler, task, cast(BinaryIO, own), stdin, stdout)
-        started = VirtualStarted(scheduler, process, stdin, stdout)
-
-        def parent_dies() -> None:
-            stdin.close_writing()
-            if stdout is not None:
-                stdout.close_reading()
-            scheduler.go_on(task)
-
-        parent.task.held.append(parent_dies)
-
-        def work() -> int:
-            scheduler.sleep(scheduler.random.expovariate(1.0 / _START_SECONDS))
-            return self._program([role, str(brief)])
-
-        self.begin(brief.stem, work, process)
-        return started
+        """Starts processes by two fork servers, as on a real machine: one for recorders, one for all others."""
+        with ExitStack() as stack:
+            servers = []
+            for name in FORK_SERVERS:
+                server = ForkServer(VirtualForkServer(self, name))
+                stack.callback(server.close)
+                servers.append(server)
+            yield PreloadedStarter(servers, stop)
 
 
 @final
@@ -303,7 +376,7 @@ class ProcessOutput:
 
     def __init__(self, machine: VirtualMachine, outside: IO[str]) -> None:
         """outside: for what is written between the turns of processes."""
-        self._machine, self._outside, self._scheduler = machine, outside, machine._scheduler
+        self._machine, self._outside, self._scheduler = machine, outside, machine.scheduler
 
     def write(self, text: str) -> int:
         """Write text."""

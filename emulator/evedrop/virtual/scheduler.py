@@ -21,6 +21,8 @@ from typing import Any, TypeVar, final
 
 from greenlet import getcurrent, greenlet
 
+from evedrop.virtual import notes
+
 T = TypeVar("T")
 _INTERRUPTED = 0.1
 """The fraction of the places where a thread touches something shared at which another one goes on first."""
@@ -56,12 +58,18 @@ class VirtualTask:
     alive: bool = True
     stopped: bool = False
     """Whether it is suspended, as by SIGSTOP."""
+    since: float = 0.0
+    """When it was suspended."""
     status: int | None = None
     threads: list[VirtualThread] = field(default_factory=list)
     held: list[Callable[[], object]] = field(default_factory=list)
     """What its end releases, whatever ended it: connections, locks of files, pipes."""
     waiting: list[Waiter] = field(default_factory=list)
     """Threads that may go on once it is continued."""
+
+    def suspended_for(self, now: float) -> float:
+        """For how many seconds it has been suspended; 0 if it is not."""
+        return now - self.since if self.stopped else 0.0
 
 
 @final
@@ -137,6 +145,10 @@ class VirtualScheduler:
         self._number = 1000
         self.current: VirtualThread | None = None
         self.tasks: list[VirtualTask] = []
+        self.on_stop: Callable[[VirtualTask], object] = lambda _: None
+        """What else happens when a process is suspended."""
+        self._plans: list[tuple[int, int, Callable[[], object]]] = []
+        """After how many events something is to happen to the world."""
 
     def number(self) -> int:
         """A number that nothing else has."""
@@ -180,7 +192,7 @@ class VirtualScheduler:
         """End a process where it is: no thread of it goes on. If it is the current one, this never returns."""
         if not task.alive:
             return
-        self.note("ends", task.name, status)
+        self.note(notes.ENDS, task.name, status)
         task.alive, task.status, task.stopped = False, status, False
         for release in reversed(task.held):
             release()
@@ -192,8 +204,9 @@ class VirtualScheduler:
     def stop(self, task: VirtualTask) -> None:
         """Suspend a process."""
         if task.alive and not task.stopped:
-            self.note("is suspended", task.name)
-            task.stopped = True
+            self.note(notes.SUSPENDED, task.name)
+            task.stopped, task.since = True, self.now
+            self.on_stop(task)
             if self.current is not None and self.current.task is task:
                 self.make_ready(self.current)
                 self.hub.switch()
@@ -201,7 +214,7 @@ class VirtualScheduler:
     def go_on(self, task: VirtualTask) -> None:
         """Continue a suspended process."""
         if task.alive and task.stopped:
-            self.note("goes on", task.name)
+            self.note(notes.GOES_ON, task.name)
             task.stopped = False
             self._ready += task.waiting
             task.waiting = []
@@ -219,7 +232,7 @@ class VirtualScheduler:
     def interruptible(self) -> None:
         """A place where another thread may go on first."""
         current = self.current
-        if current is not None and self.random.random() < _INTERRUPTED:
+        if current is not None and current.task.alive and self.random.random() < _INTERRUPTED:
             self._ready.append(current)
             self._switch(current)
 
@@ -259,9 +272,15 @@ class VirtualScheduler:
         """At this moment, let a thread go on, or something happen to the world."""
         heapq.heappush(self._timers, (moment, self.number(), what))
 
+    def after(self, events: int, act: Callable[[], object]) -> None:
+        """Once this many events have happened, do something to the world, between the turns of threads."""
+        heapq.heappush(self._plans, (events, self.number(), act))
+
     def run(self, until: float, done: Callable[[], bool]) -> None:
         """Let everything happen until `done`. Raises Stuck if that is not before this moment, or cannot be any more."""
         while not done():
+            while self._plans and self.events >= self._plans[0][0]:
+                heapq.heappop(self._plans)[2]()
             if self._ready:
                 ready = self._ready
                 index = self.random.randrange(len(ready))

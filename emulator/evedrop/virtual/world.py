@@ -9,6 +9,7 @@ import socket
 from collections.abc import Callable
 from typing import Any, cast, final
 
+from evedrop.system.disk import Disk
 from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import Condition, Lock, Queue, Thread, ThreadEvent
 from evedrop.system.world import Address, World
@@ -29,8 +30,8 @@ EPOCH = 1_767_225_600.0
 class VirtualWorld(World):
     """A world whose scheduler decides who goes on, and whose time is virtual."""
 
-    def __init__(self, scheduler: VirtualScheduler, machine: VirtualMachine, zenoh: Any) -> None:
-        self.scheduler, self.machine = scheduler, machine
+    def __init__(self, scheduler: VirtualScheduler, machine: VirtualMachine, zenoh: Any, disk: Disk) -> None:
+        self.scheduler, self.machine, self._disk = scheduler, machine, disk
         self._zenoh = zenoh
 
     def monotonic(self) -> float:
@@ -87,6 +88,11 @@ class VirtualWorld(World):
     def process(self) -> ThisProcess:
         """The process of the current thread."""
         return self.machine.current
+
+    @property
+    def disk(self) -> Disk:
+        """The disk, simulated or not."""
+        return self._disk
 
     @property
     def zenoh(self) -> Any:

@@ -13,7 +13,6 @@ Source: docs/wire/semantics.md, what Zenoh drops by itself, and what programs ne
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final, final
@@ -21,6 +20,7 @@ from typing import Any, Final, final
 import zenoh
 
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
+from evedrop.system.world import world
 from evedrop.wire.side import SideSession
 from evedrop.wire.watchdog import Duty
 
@@ -36,7 +36,7 @@ class FewLines:
         """tell: for each line; subject: the matter, in the plural, such as "ways past the wire"."""
         self._tell, self._what = tell, subject
         self._told = 0
-        self._lock = threading.Lock()
+        self._lock = world().lock()
 
     @property
     def is_full(self) -> bool:
@@ -74,7 +74,7 @@ class Backlog:
         self._handler, self._most = handler, most
         self._counts: list[_Count] = []
         self._is_empty = False
-        self._lock = threading.Lock()
+        self._lock = world().lock()
 
     def ask(self, answer: Callable[[int], None]) -> None:
         """Let `answer` have the number of messages that wait now: at once if there is none, or else when they are taken."""
@@ -176,7 +176,7 @@ class Departures:
         self._links: dict[tuple[str, str], str] = {}  # side and program → from where it is connected
         self._here: set[tuple[str, str]] = set()
         self._gone: dict[tuple[str, str], _Gone] = {}
-        self._lock = threading.Lock()
+        self._lock = world().lock()
         self._ended = False
         self._listeners: list[object] = []  # Zenoh undeclares those that nobody holds
 

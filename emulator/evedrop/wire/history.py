@@ -9,7 +9,6 @@ Source: docs/wire/results.md, a wire that starts again.
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from evedrop.model.links import LOSS_MODELS
 from evedrop.model.slot.link import NEVER, Change
 from evedrop.scenario.table import model_mistakes
 from evedrop.system.files import LineFile, lines_in
+from evedrop.system.world import world
 from evedrop.wire.plan import WirePlan, numbered_as
 
 Numbered = tuple[str, str, str]
@@ -73,7 +73,7 @@ class WireHistory:
     _settings: dict[str, list[_Settings]] = field(default_factory=dict)
     _of_new_keys: dict[str, tuple[Change, ...]] = field(default_factory=dict)
     """Link → the changes of all streams that had no message at any of them."""
-    _lock: AbstractContextManager[bool] = field(default_factory=threading.Lock, repr=False, compare=False)
+    _lock: AbstractContextManager[bool] = field(default_factory=lambda: world().lock(), repr=False, compare=False)
 
     @classmethod
     def read(cls, folder: Path) -> WireHistory:
@@ -87,6 +87,8 @@ class WireHistory:
         except OSError as error:
             raise UsageError(f"{path} cannot be read ({error.strerror}); give another folder") from error
         for at, line in enumerate(lines, start=1):
+            if b"\0" in line:  # a power cut left a page without its contents
+                continue
             try:
                 history._take(json.loads(line))
             except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
@@ -160,9 +162,12 @@ class WireHistory:
 
     def _write(self, entry: Mapping[str, Any]) -> None:
         with self._lock:
-            with LineFile(self.folder / _FILE) as file:
+            path = self.folder / _FILE
+            with LineFile(path) as file:
                 line = file.append(entry)
             self._take(json.loads(line))
+            if "start" in entry or "end" in entry:  # records after a start are nothing without it
+                world().disk.sync(path)
 
     def _take(self, entry: Mapping[str, Any]) -> None:
         if "start" in entry:

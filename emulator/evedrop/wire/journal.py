@@ -25,12 +25,11 @@ import math
 import mmap
 import os
 import re
-import shutil
 import struct
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from io import FileIO
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, final
 
@@ -48,6 +47,7 @@ from evedrop.results.wire_summary import JournalState, JournalSummary
 from evedrop.system.files import is_locked, lines_in, try_lock
 from evedrop.system.output import warn
 from evedrop.system.waiting import wait_for_thread
+from evedrop.system.world import world
 from evedrop.wire.history import Numbered, WireHistory, highest
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import (
@@ -61,7 +61,6 @@ from evedrop.wire.records import (
     Records,
     WireFate,
     Words,
-    mapped_end,
     next_numbers,
     records_in,
     records_of,
@@ -120,8 +119,8 @@ class WireJournal:
         """They get the time of an event, in seconds since 1970, and a line about it."""
         self._tell = tell
         self._links = [link.name for link in plan.links]
-        self._handing = threading.RLock()  # so that listeners get blocks in order
-        self._ended = threading.Event()
+        self._handing = world().rlock()  # so that listeners get blocks in order
+        self._ended = world().event()
         self._stopped = math.inf
         try:
             self.place = JournalPlace(folder / JOURNAL_FOLDER, tell)
@@ -134,7 +133,7 @@ class WireJournal:
             raise UsageError(
                 f"{folder} cannot be written ({error.strerror}); make room, or give another folder"
             ) from error
-        self._thread = threading.Thread(target=self._tend, name="journal", daemon=True)
+        self._thread = world().thread(self._tend, name="journal")
         self._thread.start()
 
     def _begin(self, plan: WirePlan, part_rows: int) -> None:
@@ -145,8 +144,8 @@ class WireJournal:
         """The number of records that an earlier start left behind, because it was killed or the disk was full."""
         self.counts: dict[Numbered, int] = dict(self.history.counts)
         """(link, key, kind of stream) → the number of its next message, as of the records handed to the listeners."""
-        self.history.begin(plan, time.time())
-        self._began = time.monotonic()  # the recovery of an earlier start does not count
+        self.history.begin(plan, world().time())
+        self._began = world().monotonic()  # the recovery of an earlier start does not count
         admits = KeyLimit(plan.links, self.counts, self._tell).admits
         self.words = JournalWords(self.place.unfinished, self.history.start, self.place.miss, admits)
         self.place.begin()
@@ -156,7 +155,7 @@ class WireJournal:
     @property
     def seconds(self) -> float:
         """How long this start has lasted."""
-        return min(time.monotonic(), self._stopped) - self._began
+        return min(world().monotonic(), self._stopped) - self._began
 
     @property
     def state(self) -> JournalState:
@@ -180,11 +179,11 @@ class WireJournal:
     def change(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int]) -> None:
         """Note other settings of a link. since: (key, kind of stream) → the number of its first message that has them."""
         with self.place.noting_errors():
-            self.history.change(link, settings, since, time.time())
+            self.history.change(link, settings, since, world().time())
 
     def note(self, line: str, *, bypass: bool = False) -> None:
         """Note an event that happens now, and tell the listeners. bypass: whether it tells a way past the wire."""
-        now = time.time()
+        now = world().time()
         with self.place.noting_errors():
             self.history.note(line, now, bypass)
         self.event_listeners.hear(now, line)
@@ -209,7 +208,7 @@ class WireJournal:
             return
         self._ended.set()
         wait_for_thread(self._thread)
-        self._stopped = time.monotonic()
+        self._stopped = world().monotonic()
         self.records.end()
         self.flush()
         self.place.poll()
@@ -223,8 +222,8 @@ class WireJournal:
     def _finish(self) -> None:
         try:
             self.records.write_all()
-            self.history.end(self.counts, time.time(), self.records.missing)
-            shutil.rmtree(self.place.unfinished)
+            self.history.end(self.counts, world().time(), self.records.missing)
+            world().disk.remove_tree(self.place.unfinished)
         except OSError as error:
             self._tell(
                 f"the journal's last Parquet files cannot be written ({error.strerror}); its records stay in "
@@ -245,7 +244,7 @@ class WireJournal:
             with contextlib.suppress(OSError):  # only a killed wire needs to have noted it
                 self.place.beat()
             self.place.poll()
-            self.records.tend(time.time())
+            self.records.tend(world().time())
 
 
 @final
@@ -265,7 +264,7 @@ class JournalRecords:
         self.missing = 0
         """The number of records that are not on the disk, because it had no room for them; listeners still got them."""
         self._files, self._rows, self._miss = files, part_rows, miss
-        self._lock = threading.RLock()  # guards the parts
+        self._lock = world().rlock()  # guards the parts
         self._parts: dict[int, JournalPart] = {}
         self._buffers: dict[int, Any] = {}
         self._number = itertools.count()
@@ -445,12 +444,12 @@ class JournalWords:
 
         admits: whether there is room for a new key of a side, as `KeyLimit`. Raises OSError.
         """
-        self._file = os.open(_path(unfinished, start), os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
-        self._size = os.fstat(self._file).st_size
+        self._file = world().disk.open(_path(unfinished, start), "a+b")
+        self._size = os.fstat(self._file.fileno()).st_size
         self._map: mmap.mmap | None = None
         self._start = self._end = 0  # of the bytes of the file that are mapped
         self._miss, self._admits = miss, admits
-        self._naming, self._admitting = threading.Lock(), threading.Lock()
+        self._naming, self._admitting = world().lock(), world().lock()
         self._codes: dict[str, dict[str, int]] = {"key": {"": 0}, "source": {"": 0}}
         self._texts: dict[str, list[str]] = {"key": [""], "source": [""]}
 
@@ -479,7 +478,7 @@ class JournalWords:
     def close(self) -> None:
         """Close the file."""
         self._unmap()
-        os.close(self._file)
+        self._file.close()
 
     def _new_code(self, kind: str, text: str) -> int:
         with self._naming:
@@ -508,7 +507,7 @@ class JournalWords:
         """Map the rest of the file, and room for some bytes at least. Raises OSError if the disk is full."""
         start = self._size - self._size % mmap.ALLOCATIONGRANULARITY
         length = max(_ROOM, self._size - start + least)
-        made = mapped_end(self._file, start, length)
+        made = world().disk.map(self._file, start, length)
         if self._map is not None:
             self._map.close()
         self._map, self._start, self._end = made, start, start + length
@@ -518,7 +517,8 @@ class JournalWords:
         if self._map is not None:
             self._map.close()
             self._map, self._start, self._end = None, 0, 0
-            os.ftruncate(self._file, self._size)
+            with contextlib.suppress(OSError):  # zeros after the last line do no harm
+                self._file.truncate(self._size)
 
 
 def words_in(unfinished: Path, start: int, links: list[str]) -> Words:
@@ -557,7 +557,7 @@ class KeyLimit:
         self._used: dict[str, tuple[int, int]] = {}  # side → keys, characters
         self._full: set[str] = set()
         self._earlier: set[str] = set()
-        self._lock = threading.Lock()
+        self._lock = world().lock()
         sources = {link.name: link.source for link in links}
         for link, key, _ in earlier:
             if key not in self._earlier:
@@ -610,18 +610,19 @@ class JournalPlace:
         """The folder inside it for records that are not yet in a Parquet file."""
         make_private(self.unfinished)
         self._lock = locked(journal)
-        self._alive: int | None = None
-        self._telling = threading.RLock()  # so that threads that miss something at once tell so once
+        self._alive: FileIO | None = None
+        self._telling = world().rlock()  # so that threads that miss something at once tell so once
 
     def begin(self) -> None:
         """Begin to note that the wire is alive, once an earlier start has been recovered. Raises OSError."""
-        self._alive = os.open(self.unfinished / "alive", os.O_WRONLY | os.O_CREAT, 0o600)
+        self._alive = world().disk.open(self.unfinished / "alive", "wb")
         self.beat()
 
     def beat(self) -> None:
         """Note that the wire is alive now. Raises OSError."""
         assert self._alive is not None  # noqa: S101 - it has begun
-        os.pwrite(self._alive, struct.pack("<d", time.time()), 0)
+        self._alive.seek(0)
+        self._alive.write(struct.pack("<d", world().time()))
 
     def poll(self) -> None:
         """Check whether the folder is still there, and report at once if it is not."""
@@ -630,7 +631,7 @@ class JournalPlace:
                 return
             self.removed = self._lost()
             if self.removed is not None:
-                self.incomplete_since = self.incomplete_since or time.time()
+                self.incomplete_since = self.incomplete_since or world().time()
                 self._tell(
                     f"{self.removed} was removed or moved while the wire runs, so the wire no longer has a journal; it goes on; "
                     "end it, and start it again"
@@ -641,7 +642,7 @@ class JournalPlace:
         with self._telling:
             self.poll()
             if self.incomplete_since is None:
-                self.incomplete_since = time.time()
+                self.incomplete_since = world().time()
                 at = time.strftime("%H:%M:%S", time.localtime(self.incomplete_since))
                 self._tell(
                     f"the journal is incomplete from {at} on, because {self.folder} cannot be written ({error.strerror}); the "
@@ -661,7 +662,7 @@ class JournalPlace:
         try:
             if not os.path.samestat(os.fstat(self._lock), os.stat(self.folder)):
                 return self.folder
-            return self.unfinished if self._alive is not None and os.fstat(self._alive).st_nlink == 0 else None
+            return self.unfinished if self._alive is not None and os.fstat(self._alive.fileno()).st_nlink == 0 else None
         except (FileNotFoundError, NotADirectoryError):
             return self.folder
         except OSError:  # a disk that does not answer may answer later
@@ -669,16 +670,16 @@ class JournalPlace:
 
     def close(self) -> None:
         """Let another wire use the folder."""
-        for descriptor in (self._alive, self._lock):
-            if descriptor is not None:
-                os.close(descriptor)
+        if self._alive is not None:
+            self._alive.close()
+        world().disk.let_go(self._lock)
 
 
 def locked(folder: Path) -> int:
     """The descriptor of a folder that this process alone may use until it closes it. Raises UsageError if another one does."""
-    descriptor = os.open(folder, os.O_RDONLY)
+    descriptor = world().disk.hold(folder)
     if not try_lock(descriptor):
-        os.close(descriptor)
+        world().disk.let_go(descriptor)
         raise UsageError(f"another wire writes to {folder.parent}; end it, or give another folder")
     return descriptor
 
@@ -691,21 +692,22 @@ def recover(journal: Path, history: WireHistory) -> int:
     place = journal / UNFINISHED
     recovered, alive = 0, last_beat(place)
     names = [name for name in part_names(journal) if int(name.partition("-")[0]) == history.start]
-    if not history.ended:
-        counts = dict(history.counts)
-        for name in names:
-            path = parquet_path(journal, name)
-            try:
-                if not path.exists():
-                    table = unfinished_table(place / f"{name}.rows", history.links, killed=True)
-                    recovered += table.num_rows
-                    write_parquet(path, table)
+    counts = dict(history.counts)
+    for name in names:
+        path = parquet_path(journal, name)
+        try:
+            if not path.exists():  # of a start that ended, too: a power cut may have taken the name of the file
+                table = unfinished_table(place / f"{name}.rows", history.links, killed=True)
+                recovered += table.num_rows
+                write_parquet(path, table)
+            if not history.ended:
                 _count_table(counts, path)
-            except (pa.ArrowException, KeyError) as error:
-                raise damaged(journal, name, error) from error
+        except (pa.ArrowException, KeyError) as error:
+            raise damaged(journal, name, error) from error
+    if not history.ended:
         history.end(counts, alive)
     for path in (*journal.glob("*.new"), *place.iterdir()):
-        path.unlink()
+        world().disk.remove(path)
     return recovered
 
 

@@ -9,13 +9,13 @@ Source: docs/wire/semantics.md, liveliness.
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from typing import final
 
 import zenoh
 
+from evedrop.system.world import world
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.side import SideSession, expressions_of
 
@@ -46,7 +46,7 @@ class LivelinessRelay:
         noted: Callable[[str, str], None],
     ) -> None:
         self._sides, self._joined, self._changed, self._noted = sides, joined(plan), changed, noted
-        self._lock = threading.Lock()
+        self._lock = world().lock()
         self._events: deque[tuple[str, str, bool]] = deque()
         self._held: dict[str, set[str]] = {name: set() for name in sides}
         self._mirrored: dict[str, dict[str, zenoh.LivelinessToken]] = {name: {} for name in sides}
@@ -56,7 +56,7 @@ class LivelinessRelay:
             (
                 name,
                 side.session.liveliness().declare_subscriber(
-                    expression, zenoh.handlers.Callback(self._heard(name), indirect=True), history=True
+                    expression, world().zenoh.handlers.Callback(self._heard(name), indirect=True), history=True
                 ),
             )
             for name, side in sides.items()
@@ -120,13 +120,13 @@ class LivelinessRelay:
 
     def _lives(self, name: str, key: str) -> bool:
         """Whether a token lives at a side at which the wire does not hold it: then a program there does."""
-        seen, over = threading.Event(), threading.Event()
+        seen, over = world().event(), world().event()
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
                 seen.set()
 
-        handler = zenoh.handlers.Callback(take, drop=over.set, indirect=False)
+        handler = world().zenoh.handlers.Callback(take, drop=over.set, indirect=False)
         self._sides[name].session.liveliness().get(key, handler, timeout=_ANSWER_SECONDS)
         over.wait(_ANSWER_SECONDS)
         return seen.is_set()

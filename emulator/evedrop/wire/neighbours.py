@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import secrets
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import Any, final
 
 import zenoh
 
+from evedrop.system.world import world
 from evedrop.wire.departures import FewLines
 from evedrop.wire.running_link import RunningLink
 from evedrop.wire.side import PROBES, SideSession
@@ -57,13 +56,13 @@ class Bypasses:
 
     def update(self) -> None:
         """Look by multicast, for some seconds, for programs that may be peers because their multicast scouting is off."""
-        if self._scout is not None and time.monotonic() > self._until:
+        if self._scout is not None and world().monotonic() > self._until:
             self.close()
         if self._new and self._scout is None:
             self._new = False
-            self._until = time.monotonic() + _SCOUT_SECONDS
+            self._until = world().monotonic() + _SCOUT_SECONDS
             config = zenoh.Config.from_json5(json.dumps({"scouting": {"multicast": _MULTICAST}}))
-            scout: Callable[..., Any] = zenoh.scout  # whose type hints lack the form with a callback
+            scout: Callable[..., Any] = world().zenoh.scout  # whose type hints lack the form with a callback
             with contextlib.suppress(zenoh.ZError):  # a machine without multicast, on which nobody is found
                 self._scout = scout(self._answered, "peer", config)
 
@@ -130,7 +129,7 @@ class Neighbours:
         self._sides, self._states, self._tell, self._bypasses = sides, states, tell, bypasses
         self._told: set[tuple[str, str, str]] = set()
         self._heard: dict[tuple[str, str], float] = {}
-        self._probes = {name: f"@evedrop/{secrets.token_hex(8)}/{at}" for at, name in enumerate(sides)}
+        self._probes = {name: f"@evedrop/{world().token(8).hex()}/{at}" for at, name in enumerate(sides)}
         self._sent: dict[bytes, tuple[str, float]] = {}
         """Number in a probe → the side at which it was sent, and when."""
         self._subscribers = [
@@ -171,10 +170,10 @@ class Neighbours:
 
     def _probe(self) -> None:
         """Send a probe at each side. Those of the last seconds still count: on a busy machine they are slow."""
-        now = time.monotonic()
+        now = world().monotonic()
         self._sent = {nonce: sent for nonce, sent in self._sent.items() if sent[1] > now - _PROBE_SECONDS}
         for name, side in self._sides.items():
-            nonce = secrets.token_bytes(_NONCE_BYTES)
+            nonce = world().token(_NONCE_BYTES)
             self._sent[nonce] = (name, now)
             side.session.put(self._probes[name], nonce)
 
@@ -184,13 +183,13 @@ class Neighbours:
                 return
             source, _ = self._sent.get(sample.payload.to_bytes(), (name, 0.0))
             if source != name:
-                self._heard[source, name] = time.monotonic()
+                self._heard[source, name] = world().monotonic()
 
         return heard
 
     def _passes(self, first: str, second: str) -> bool:
         """Whether messages pass between two sides outside the wire, in either direction."""
-        since = time.monotonic() - _PROBE_SECONDS
+        since = world().monotonic() - _PROBE_SECONDS
         return any(self._heard.get(way, 0.0) > since for way in ((first, second), (second, first)))
 
 

@@ -9,8 +9,6 @@ Source: docs/wire/semantics.md, messages.
 from __future__ import annotations
 
 import math
-import threading
-import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, final
@@ -18,6 +16,7 @@ from typing import Any, final
 import zenoh
 
 from evedrop.system.waiting import wait_for_thread
+from evedrop.system.world import world
 from evedrop.wire.departures import Backlog
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WirePlan
@@ -157,16 +156,14 @@ class PublicationRelay:
         self._subscribers = []
         self._threads = []
         for at, expression in enumerate(expressions):
-            channel: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(WAITING)
+            channel: zenoh.handlers.FifoChannel[zenoh.Sample] = world().zenoh.handlers.FifoChannel(WAITING)
             subscriber = side.session.declare_subscriber(expression, channel, allowed_origin=REMOTE)
             earlier = tuple(text for text in expressions[:at] if text.intersects(expression))
             self._subscribers.append(subscriber)
             self.duties.append(Duty(f"among the messages from the side {side.name}"))
             self.backlogs.append(Backlog(subscriber.handler, WAITING))
             arguments = (self.backlogs[-1], earlier, self.duties[-1])
-            self._threads.append(
-                threading.Thread(target=self._run, args=arguments, name=f"from {side.name}", daemon=True)
-            )
+            self._threads.append(world().thread(self._run, *arguments, name=f"from {side.name}"))
 
     def start(self) -> None:
         """Begin to take messages."""
@@ -204,7 +201,7 @@ class PublicationRelay:
     def _taker(self) -> Callable[[zenoh.Sample], None]:
         """The function that is called for every message: it looks up as little as possible."""
         ways_of: dict[str, _Ways] = {}
-        now, clock, way_to = time.time, time.monotonic, self._way_to
+        now, clock, way_to = world().time, world().monotonic, self._way_to
         records = self._journal.records
         record, amend, sent = records.record, records.amend, records.sent
         read = SenderReader(self._journal.words.source_code)
@@ -283,7 +280,7 @@ class PublicationRelay:
         code = self._journal.words.key_code(key, self._name)
         taken = [self._plan.link_of(self._name, target, expression) for target in self._targets]
         states = [self._links[link.name] for link in taken if link is not None]
-        ended = time.time() > self._until
+        ended = world().time() > self._until
         if code and not ended:
             lossless = self._plan.is_lossless(expression)
             decisions = [state.lane("put", key, lossless) for state in states]
@@ -327,7 +324,7 @@ class Publishers:
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
         self._count = 0
-        self._lock = threading.Lock()
+        self._lock = world().lock()
 
     def declare(self, sample: zenoh.Sample, congestion: zenoh.CongestionControl) -> zenoh.Publisher | None:
         """A publisher with the key, priority and express of a sample; None if there are too many. Raises zenoh.ZError."""

@@ -10,15 +10,14 @@ Source: docs/wire/semantics.md, queries.
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Iterable, Mapping
-from queue import SimpleQueue
 from typing import Any, final
 
 import zenoh
 
+from evedrop.system.threads import Queue
 from evedrop.system.waiting import wait_for_thread
+from evedrop.system.world import world
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import LOST_HISTORY_SECONDS, WirePlan, published_key
 from evedrop.wire.publications import READY_KEYS
@@ -41,14 +40,14 @@ class _Asked:
         """send_queue: of the side at which it was asked."""
         self.query, self.side, self._send_queue = query, side, send_queue
         self.key = str(query.key_expr)
-        self._over = time.monotonic() + reply_seconds(self.key, query_seconds)
+        self._over = world().monotonic() + reply_seconds(self.key, query_seconds)
         self._open = 1
-        self._lock = threading.Lock()
+        self._lock = world().lock()
 
     @property
     def patience(self) -> float:
         """For how many seconds from now on its asker waits for something that is lost."""
-        left = max(0.0, self._over - time.monotonic())
+        left = max(0.0, self._over - world().monotonic())
         return left if published_key(self.key) is None else min(left, LOST_HISTORY_SECONDS)
 
     def hold(self) -> None:
@@ -87,12 +86,12 @@ class QueryRelay:
         self._queriers: dict[tuple[str, str, bool, bool], zenoh.Querier] = {}
         self._services: tuple[frozenset[tuple[str, str]], tuple[bool, ...]] | None = None
         self._mirrored: dict[str, dict[str, tuple[zenoh.KeyExpr, Any]]] = {name: {} for name in sides}
-        self._lock = threading.RLock()
+        self._lock = world().rlock()
         self._read = SenderReader(journal.words.source_code)
         self._patience = Scheduler(_MOST_WAITING, 0, lambda _: None)
-        self._heard: SimpleQueue[tuple[str, str | None, zenoh.Query] | None] = SimpleQueue()
+        self._heard: Queue[tuple[str, str | None, zenoh.Query] | None] = world().queue()
         self.duty = Duty("among the queries")
-        self._thread = threading.Thread(target=self._run, name="queries", daemon=True)
+        self._thread = world().thread(self._run, name="queries")
         self._queryables = [
             (name, side.session.declare_queryable(expression, self._taker(name, None), allowed_origin=_REMOTE))
             for name, side in sides.items()
@@ -158,7 +157,7 @@ class QueryRelay:
 
     def _taker(self, name: str, key: str | None) -> Any:
         # On the thread that Zenoh calls it on: the queries of a program stay in order.
-        return zenoh.handlers.Callback(lambda query: self._heard.put((name, key, query)), indirect=False)
+        return world().zenoh.handlers.Callback(lambda query: self._heard.put((name, key, query)), indirect=False)
 
     def _run(self) -> None:
         while (heard := self._heard.get()) is not None:
@@ -197,7 +196,7 @@ class QueryRelay:
 
         def send() -> None:
             asked.hold()
-            handler: Any = zenoh.handlers.Callback(
+            handler: Any = world().zenoh.handlers.Callback(
                 lambda reply: self._reply(asked, target, reply), asked.release, indirect=False
             )
             querier.get(
@@ -251,7 +250,7 @@ class QueryRelay:
         self, kind: Kind, asked: _Asked, way: tuple[str, str], key: str, expression: zenoh.KeyExpr, message: _Message
     ) -> None:
         """Let the link between two sides decide on a message, record it, and send it when it is due."""
-        now, size = time.time(), message.size
+        now, size = world().time(), message.size
         with self._lock:
             sender, sequence = self._read(message.attachment, message.source)
         code = self._journal.words.key_code(key, way[0])

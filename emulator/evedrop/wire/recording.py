@@ -8,7 +8,6 @@ Source: docs/wire/results.md, the view.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WIRE_FILE
 from evedrop.show.view.recording import RecordingThread
+from evedrop.system.world import world
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import JOURNAL_FOLDER, WireJournal, journal_tables
@@ -48,7 +48,7 @@ class WireView(RecordingThread[NDArray[Any], Notice]):
         name: str,
         start: float,
         pace: Pace | None = None,
-        clocks: Callable[[], tuple[float, float]] = lambda: (time.time(), time.monotonic()),
+        clocks: Callable[[], tuple[float, float]] = lambda: (world().time(), world().monotonic()),
         most_rows: int = _MOST_ROWS,
     ) -> None:
         """name: identifies the recording. start: when the wire started, in seconds since 1970.
@@ -157,7 +157,7 @@ def replay_wire(folder: Path, path: Path) -> Path:
         for steps in counter.finish():
             recording.add(steps)
     if recording.failure is not None:
-        path.unlink(missing_ok=True)
+        world().disk.remove(path, missing_ok=True)
         raise UsageError(f"{path} cannot be written ({recording.failure})")
     return path
 

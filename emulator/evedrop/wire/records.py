@@ -11,7 +11,6 @@ Source: docs/wire/results.md, the journal.
 from __future__ import annotations
 
 import mmap
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 from evedrop.model.links.loss_model import Fate
 from evedrop.results.crash_proof_tables import parquet_writer
 from evedrop.results.folder import private_replacement
-from evedrop.system.files import write_all
+from evedrop.system.world import world
 
 
 class WireFate(IntEnum):
@@ -130,7 +129,6 @@ Records = NDArray[Any]
 """Structured, of the type `RECORD`."""
 STORED = 1
 """Added to fates in memory and in files of records."""
-_POPULATE = getattr(mmap, "MAP_POPULATE", 0)
 
 REASONS: dict[WireFate, str] = {
     fate: "loss" if fate is WireFate.LOST else fate.name.lower() for fate in WireFate if fate is not WireFate.DELIVERED
@@ -179,6 +177,9 @@ class Words:
     sources: dict[int, str]
 
 
+_AHEAD = 512  # rows that are looked at together for the first that is not whole: most of a part is empty for long
+
+
 @final
 class JournalPart:
     """Records in a file, or in memory alone if the disk is full."""
@@ -197,9 +198,14 @@ class JournalPart:
 
     def take(self) -> Records:
         """A copy of the rows that are whole and were not taken yet, up to the first that is not whole."""
-        rest = self._stored[self.handed :]
-        missing = rest["fate"] == 0
-        rows = _whole(rest[: int(missing.argmax()) if missing.any() else len(rest)])
+        fates, stop = self._stored["fate"], self.handed
+        while len(ahead := fates[stop : stop + _AHEAD]) and ahead.all():
+            stop += len(ahead)
+        if len(ahead):
+            stop += int(ahead.argmin())
+        if stop == self.handed:
+            return np.empty(0, RECORD)
+        rows = _whole(self._stored[self.handed : stop])
         self.handed += len(rows)
         return rows
 
@@ -226,25 +232,13 @@ class JournalPart:
     def remove(self) -> None:
         """Remove the file. The memory goes with the last reference to it."""
         if self.path is not None:
-            self.path.unlink(missing_ok=True)
+            world().disk.remove(self.path, missing_ok=True)
 
 
 def _mapped(path: Path, size: int) -> mmap.mmap:
     """A new file, complete at once under its name. Raises OSError if the disk is full."""
-    with private_replacement(path) as unfinished, unfinished.open("r+b") as file:
-        return mapped_end(file.fileno(), 0, size, populate=True)
-
-
-def mapped_end(file: int, start: int, length: int, *, populate: bool = False) -> mmap.mmap:
-    """The last bytes of an open file, from a start where a mapping may begin, with zeros for those that it does not have yet.
-
-    populate: whether to have all of them in memory at once. Raises OSError if the disk has no room for them.
-    """
-    if hasattr(os, "posix_fallocate"):  # not on macOS
-        os.posix_fallocate(file, start, length)
-    elif (lacking := start + length - os.lseek(file, 0, os.SEEK_END)) > 0:
-        write_all(file, bytes(lacking))
-    return mmap.mmap(file, length, flags=mmap.MAP_SHARED | (_POPULATE if populate else 0), offset=start)
+    with private_replacement(path, lasting=False) as unfinished, world().disk.open(unfinished, "r+b") as file:
+        return world().disk.map(file, 0, size, populate=True)
 
 
 def _whole(stored: Records) -> Records:
@@ -260,6 +254,7 @@ def records_in(path: Path, killed: bool = False) -> Records:
     killed: whether the process that wrote them was killed, so that what was still to be delivered never was.
     """
     stored = np.fromfile(path, RECORD)
+    stored["fate"][stored["time"] == 0.0] = 0  # a power cut left only the page with the end of such a record
     if killed:
         stored["fate"][(stored["fate"] & HELD) != 0] = WireFate.UNDERWAY + STORED
     return _whole(stored)

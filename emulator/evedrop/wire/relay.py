@@ -7,17 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import os
-import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Self, final
 
-import zenoh
-
 from evedrop.live.network.connecting import LOGGED
 from evedrop.system.output import warn
 from evedrop.system.waiting import wait_for_thread
+from evedrop.system.world import world
 from evedrop.wire.departures import Departures
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.liveliness import LivelinessRelay
@@ -65,10 +62,10 @@ class WireRelay:
         self._journal, self._tell, self._happened = journal, tell, happened
         self._stack = contextlib.ExitStack()
         self._duty = Duty("in the list of what programs declare")
-        self._ended = threading.Event()
-        self._woken = threading.Event()
+        self._ended = world().event()
+        self._woken = world().event()
         os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_RECEIVERS}))")  # read with the first session
-        zenoh.init_log_from_env_or(LOGGED)
+        world().zenoh.init_log_from_env_or(LOGGED)
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
@@ -133,7 +130,7 @@ class WireRelay:
         backlogs = {name: relay.backlogs for name, relay in zip(self.sides, relays, strict=True)}
         departures = Departures(backlogs, lambda side: send_queues[side].waiting, self._note_departure)
         departures.watch(self.sides.values())
-        thread = threading.Thread(target=self._keep_up, name="wire", daemon=True)
+        thread = world().thread(self._keep_up, name="wire")
         thread.start()
         stack.callback(wait_for_thread, thread)
         stack.callback(self._woken.set)
@@ -150,7 +147,7 @@ class WireRelay:
 
     def _leave(self, relays: Sequence[PublicationRelay]) -> None:
         """Limit the time in which messages that wait still cross."""
-        until = time.time() + _LAST_SECONDS
+        until = world().time() + _LAST_SECONDS
         for relay in relays:
             relay.leave(until)
 
@@ -158,7 +155,7 @@ class WireRelay:
         """End what sends to the sides, all at once: each may have to wait for its programs."""
         for send_queue in send_queues:
             send_queue.end()
-        deadline = time.monotonic() + LAST_SECONDS
+        deadline = world().monotonic() + LAST_SECONDS
         for send_queue in send_queues:
             send_queue.close(deadline)
 
@@ -176,15 +173,15 @@ class WireRelay:
     def _keep_up(self) -> None:
         due = 0.0
         while not self._ended.is_set():
-            self._woken.wait(max(0.0, due - time.monotonic()))
+            self._woken.wait(max(0.0, due - world().monotonic()))
             self._woken.clear()
             try:
                 with self._duty.busy():
                     self._poll()
-                    if time.monotonic() >= due:
+                    if world().monotonic() >= due:
                         self._neighbours.update()
                         self._bypasses.update()
-                        due = time.monotonic() + _POLL_SECONDS
+                        due = world().monotonic() + _POLL_SECONDS
             except Exception as error:  # whatever it is: the next look may succeed
                 if not self._ended.is_set():
                     self._tell(f"Zenoh does not say what programs declare ({error!r}); trying again")

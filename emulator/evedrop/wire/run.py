@@ -8,7 +8,6 @@ Source: docs/wire/results.md, the view.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -23,7 +22,7 @@ from evedrop.show.report.wire import wire_failures
 from evedrop.show.view.viewer import Viewer, choose
 from evedrop.system.environment import check_zenoh_runtime
 from evedrop.system.output import warn
-from evedrop.system.signals import stop_or_leave_on_signals
+from evedrop.system.world import world
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import Numbered
 from evedrop.wire.journal import JOURNAL_FOLDER, WireJournal
@@ -67,7 +66,7 @@ def run_wire(
 
     with (
         Watchdog(lambda problem: leave(f"the wire no longer answers: {problem}", RunError.exit_status)) as watchdog,
-        stop_or_leave_on_signals(lambda: leave("interrupted again", Interrupted.exit_status)) as stop,
+        world().process.stop_or_leave_on_signals(lambda: leave("interrupted again", Interrupted.exit_status)) as stop,
     ):
         with live_view(plan, out, view, say) as shown, WireJournal(out, plan) as journal:
             scorekeeper = WireScorekeeper(plan, journal)
@@ -153,7 +152,7 @@ def _removed(folder: Path, out: Path) -> str:
 def _begin_results(out: Path, plan: WirePlan) -> None:
     """Write wire.toml, the complete file of the wire, and remove the summary of an earlier start."""
     try:
-        (out / WIRE_SUMMARY_FILE).unlink(missing_ok=True)
+        world().disk.remove(out / WIRE_SUMMARY_FILE, missing_ok=True)
     except OSError as error:
         warn(f"the summary of an earlier start cannot be removed ({error}); the wire goes on")
     try:
@@ -185,7 +184,7 @@ def live_view(plan: WirePlan, out: Path, mode: str, say: Callable[[str], None]) 
             say(f"the wire is shown to anybody who has this address:\n{viewer.address}")
         if viewer is not None and viewer.warning is not None:
             warn(viewer.warning)
-        view = WireView(path, plan, out.resolve().name, time.time())
+        view = WireView(path, plan, out.resolve().name, world().time())
         try:
             yield view
         finally:

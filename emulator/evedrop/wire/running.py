@@ -11,8 +11,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
-import time
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -32,6 +30,7 @@ from evedrop.scenario.words import listed
 from evedrop.show.report.wire import expectation_failures, wire_faults
 from evedrop.system.native_log import MARK
 from evedrop.system.processes import kill, wait_for
+from evedrop.system.world import world
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.journal import journal_tables
 from evedrop.wire.on_disk import scorekeeper_on_disk
@@ -111,15 +110,15 @@ class RunningWire:
     def _wait(self) -> None:
         """Wait until the wire answers."""
         assert self._process is not None  # noqa: S101 - it was started
-        self._listener = threading.Thread(target=self._hear_errors, args=(self._process,), name="wire", daemon=True)
+        self._listener = world().thread(self._hear_errors, self._process, name="wire")
         self._listener.start()
-        deadline = time.monotonic() + _PATIENCE
+        deadline = world().monotonic() + _PATIENCE
         while not self._endpoints:
-            if not self.is_running or time.monotonic() > deadline:
+            if not self.is_running or world().monotonic() > deadline:
                 raise self._failure(self._stop(signal.SIGKILL))
             with suppress(UsageError):  # it has not begun yet
                 self._endpoints = self.status().sides
-            time.sleep(_POLL_SECONDS)
+            world().sleep(_POLL_SECONDS)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

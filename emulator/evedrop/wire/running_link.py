@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import heapq
 import itertools
-import threading
-import time
 from collections.abc import Callable, Iterable, Mapping
 from itertools import repeat
 from typing import Any, NamedTuple, final
@@ -23,6 +21,7 @@ from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule
 from evedrop.model.streams import Batch, SingleTrialReader, root_of_seed, stream_keys
 from evedrop.scenario.receivers import wire_stream
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock, wait_for_thread
+from evedrop.system.world import world
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import WireFate
@@ -216,10 +215,10 @@ class Scheduler:
         self._heap: list[_Held] = []
         self._bytes = 0
         self._serial = itertools.count()
-        self._changed = threading.Condition()
+        self._changed = world().condition()
         self._ended = False
         self.duty = Duty("among the delayed messages")
-        self._thread = threading.Thread(target=self._run, name="delays", daemon=True)
+        self._thread = world().thread(self._run, name="delays")
         self._thread.start()
 
     def hold(
@@ -311,7 +310,7 @@ class RunningLink:
         self._numbers: dict[_Stream, int] = {}
         self._links_of_keys: tuple[tuple[Change, ...], PerKeyLinks] | None = None  # the latest, which new keys share
         self._orders: dict[_Stream, KeyOrder] = {}
-        self._lock = threading.Lock()
+        self._lock = world().lock()
         self._free = 0.0  # when the queue will have sent all its messages
         self._set(link.settings)
 
@@ -351,11 +350,11 @@ class RunningLink:
             if n is not None and n != self._counted(stream):
                 self._numbers[stream] = n
             order = self._orders.get(stream)
-            if order is not None and order.due <= time.monotonic():
+            if order is not None and order.due <= world().monotonic():
                 del self._orders[stream]
 
     def _decide(self, stream: _Stream) -> Lane:
-        lock, largest = self._lock, self._largest
+        lock, largest, clock = self._lock, self._largest, world().monotonic
         with lock:
             fates = self._fates_of(stream)
             after = fates.next
@@ -378,7 +377,7 @@ class RunningLink:
             if self.cut:
                 return at, _CUT, 0.0, False
             if order is not None and code == 0:
-                delay = order.delay(delay, time.monotonic())
+                delay = order.delay(delay, clock())
             return at, code, delay if code == 0 else 0.0, again
 
         return decide

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
-import threading
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -32,6 +31,7 @@ from evedrop.results.wire_summary import (
 )
 from evedrop.score.summary import Judged
 from evedrop.system.output import warn
+from evedrop.system.world import world
 from evedrop.wire.deliveries import KeyDeliveries, bounds
 from evedrop.wire.journal import JournalOnDisk, WireJournal
 from evedrop.wire.plan import WireLink, WirePlan
@@ -54,7 +54,7 @@ class WireScorekeeper:
         self._links = {link.number: LinkTally() for link in plan.links}
         self._unlinked = LinkTally()
         self._lossless: dict[int, bool] = {}
-        self._lock = threading.Lock()
+        self._lock = world().lock()
         journal.listeners.append(self.add)
         journal.amendment_listeners.append(self.amend)
 

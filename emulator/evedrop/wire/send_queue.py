@@ -9,12 +9,11 @@ Source: docs/wire/semantics.md, programs that stop reading.
 
 from __future__ import annotations
 
-import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final, final
 
+from evedrop.system.world import world
 from evedrop.wire.journal import JournalRecords
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.records import WireFate
@@ -70,10 +69,10 @@ class SendQueue:
         self._queue: deque[tuple[int, int, Task]] = deque()
         """What waits, as bytes, row, and task; the first one is being sent."""
         self._given = self._taken = 0  # bytes
-        self._lock = threading.Lock()
-        self._bell, self._sleeps = threading.Lock(), False  # the thread sleeps until the bell is released
+        self._lock = world().lock()
+        self._bell, self._sleeps = world().lock(), False  # the thread sleeps until the bell is released
         self._bell.acquire(blocking=False)
-        self._room = threading.Event()
+        self._room = world().event()
         self._watched = False  # whether the queue was full, and room in it must be noticed
         self._stopped = self._ending = self._over = self._ended = False
         self._trust = 1.0  # halved each time: a reader that stops again and again costs others a few seconds in all
@@ -83,7 +82,7 @@ class SendQueue:
         self._delays = Scheduler(plan.held_messages, plan.held_bytes, self._refused)
         self._duty = Duty(f"in what is sent at the side {side}")
         self.duties = (self._delays.duty, self._duty)
-        self._thread = threading.Thread(target=self._run, name=f"to {side}", daemon=True)
+        self._thread = world().thread(self._run, name=f"to {side}")
         self._thread.start()
 
     def send(
@@ -124,7 +123,7 @@ class SendQueue:
 
     def took(self, seconds: float, alone: bool) -> None:
         """Note that a message took longer than `LONG_SECONDS` past the queue. alone: whether no third side waited meanwhile."""
-        now = time.monotonic()
+        now = world().monotonic()
         with self._lock:
             if not alone:
                 self._waited = max(0.0, self._waited - _FRACTION * (now - self._noted)) + seconds
@@ -151,7 +150,7 @@ class SendQueue:
 
     def close(self, deadline: float) -> None:
         """Wait for the end, until a time; what is not sent by then is `UNDERWAY`."""
-        self._thread.join(max(0.0, deadline - time.monotonic()))
+        self._thread.join(max(0.0, deadline - world().monotonic()))
         with self._lock:
             self._ended = True
             for _, row, _ in self._queue:
@@ -247,7 +246,7 @@ class SendQueue:
     def _wait(self) -> bool:
         """Wait for a message; returns whether there is one, and not the end."""
         with self._lock:
-            self._is_slow = self._is_slow and time.monotonic() < self._slow_until
+            self._is_slow = self._is_slow and world().monotonic() < self._slow_until
             self._sleeps = not (self._queue or self._over)
             sleeps = self._sleeps
         if sleeps:

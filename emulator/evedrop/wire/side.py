@@ -58,7 +58,7 @@ class SideSession:
         with contextlib.nullcontext() if side.users is None else users_file(side.users) as users:
             self.session, self.endpoints = _opened(side, largest, None if users is None else str(users))
         """Its session, and where programs connect: with a free port where the plan has port 0."""
-        self.zid = str(self.session.zid())
+        self.zid = str(self.session.info.zid())
         self.duty = Duty(f"at the side {side.name}", ANSWER_SECONDS)
         """The work of the main thread on the session when the wire ends."""
 

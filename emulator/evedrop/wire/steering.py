@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import secrets
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -33,6 +31,7 @@ from evedrop.names import OPERATOR, RECORDER
 from evedrop.system.output import warn
 from evedrop.system.ports import free_port
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock, wait_for_thread
+from evedrop.system.world import world
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay
@@ -50,12 +49,12 @@ class WireConductor:
         """say: for a line about each event."""
         self._clock = clock
         self._plan, self._relay, self._say = plan, relay, say
-        self._changed = threading.Condition(threading.RLock())
+        self._changed = world().condition()
         self._ended = False
         self._done = -1.0  # the time up to which all events are carried out
         self._begun = self._clock.monotonic()
         self._relay.apply(moment_at(plan, 0.0))
-        self._thread = threading.Thread(target=self._run, name="events", daemon=True)
+        self._thread = world().thread(self._run, name="events")
 
     def __enter__(self) -> Self:
         self._begun = self._clock.monotonic()
@@ -141,13 +140,13 @@ class WireControl:
         """folder: the wire's; events: the events so far, a line each, to which lines may be added."""
         self._folder, self._relay, self._conductor = folder, relay, conductor
         self._scorekeeper, self._journal, self._events = scorekeeper, journal, events
-        self._run = f"wire-{secrets.token_hex(8)}"
+        self._run = f"wire-{world().token(8).hex()}"
         self._key = RunKeys(self._run).control(RECORDER)
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
-            password = secrets.token_urlsafe(24)
+            password = world().token(24).hex()
             session, router = self._open(password)
             stack.enter_context(session)
             Questions(self._key, Dropped("the wire"), self._answer).declare(session)

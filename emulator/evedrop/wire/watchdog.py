@@ -9,14 +9,13 @@ Source: docs/wire/results.md, a wire that hangs.
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import NoReturn, Self, final
 
 from evedrop.system.output import say
+from evedrop.system.world import world
 
 ANSWER_SECONDS = 60.0
 """How long a side may take to answer: nothing crosses meanwhile."""
@@ -68,11 +67,11 @@ class Watchdog:
         """end: called once, with what has hung and for how long."""
         self._end = end
         self._duties: dict[Duty, tuple[object, int]] = {}  # what it had in hand, and for how many ticks
-        self._lock = threading.Lock()
+        self._lock = world().lock()
         self._ending = False
-        self._over = threading.Event()
-        self._asks_no_more = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="watchdog", daemon=True)
+        self._over = world().event()
+        self._asks_no_more = world().event()
+        self._thread = world().thread(self._run, name="watchdog")
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -99,7 +98,7 @@ class Watchdog:
                 with duty.busy(), contextlib.suppress(Exception):  # an error is an answer
                     question()
 
-        threading.Thread(target=go_on, name="questions", daemon=True).start()
+        world().thread(go_on, name="questions").start()
 
     @contextlib.contextmanager
     def doing(self, duty: Duty) -> Iterator[None]:
@@ -147,10 +146,10 @@ def end_at_once(sentence: str, status: int, *steps: Callable[[], object]) -> NoR
             stream.flush()
 
     try:
-        threads = [threading.Thread(target=step, daemon=True) for step in (*steps, tell)]
+        threads = [world().thread(step, name="last step") for step in (*steps, tell)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join(_LAST_SECONDS)
     finally:
-        os._exit(status)
+        world().process.exit(status)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.errors import EvedropError, Gap, MalformedMessage, MissingProcesses, Refusal, RunError
+from evedrop.errors import EvedropError, Gap, MalformedMessage, MissingProcesses, NoRouter, Refusal, RunError
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 
 ERRORS: list[tuple[EvedropError, Cause, tuple[str, ...]]] = [
@@ -17,6 +17,7 @@ ERRORS: list[tuple[EvedropError, Cause, tuple[str, ...]]] = [
     (Gap("evedrop/r/downlink/eve", 3, 4), Cause.BROKEN_PROTOCOL, ("router",)),
     (Refusal("router", "evedrop/r/uplink", "sensor", "why"), Cause.BROKEN_PROTOCOL, ("sensor",)),
     (MalformedMessage("operator", "3", "4", b"x"), Cause.FAILURE, ()),
+    (NoRouter("nobody"), Cause.NO_CONNECTION, ()),
     (RunError("\u00e9"), Cause.FAILURE, ()),
 ]
 

@@ -19,7 +19,9 @@ from tests.live.recorder.test_conductor_ending import Network
 class Conducted:
     """The part of a conductor and of a steering that a recovery uses, with the connections in the test's hands."""
 
-    relayed, at = False, None
+    relayed = False
+    at: int | None = None
+    awaits_belief = False
 
     def __init__(self) -> None:
         self.lost: dict[str, float] = {}
@@ -122,6 +124,19 @@ def recovery_of(conducted: Conducted, clock: TestClock, longest_outage: float, p
         lambda _: None,
         clock,
     )
+
+
+@pytest.mark.parametrize("awaits_belief", [False, True])
+def test_a_held_run_that_waits_for_a_belief_asks_for_it_again(awaits_belief: bool) -> None:
+    """The message may have been lost without a connection, as one that came on a key that it does not name."""
+    conducted, clock = Conducted(), TestClock()
+    recovery = recovery_of(conducted, clock, 30.0)
+    recovery.poll(10)
+    conducted.at, conducted.awaits_belief = 10, awaits_belief
+    for _ in range(40):
+        clock.now += 1.0
+        recovery.poll(10)
+    assert bool(conducted.rounds) is awaits_belief
 
 
 def test_a_round_waits_for_processes_that_are_back_and_cannot_be_told_yet() -> None:

@@ -1,4 +1,4 @@
-"""The times of slots, which the axes of the view show where a slot has seconds."""
+"""The times of slots, which the axes of the view show where a slot has seconds; and lines as Rerun takes them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import rerun as rr
 from rerun.chunk import RrdReader
 
-from evedrop.show.view.column import CLOCK, ELAPSED, TIMELINE, SlotTimes
+from evedrop.show.view.column import CLOCK, ELAPSED, TIMELINE, SlotTimes, line_strips
 from evedrop.show.view.picture import HeadlessViewer
 from evedrop.show.view.recording import ViewRecording
 from tests.show.view.read_back import events
@@ -61,6 +62,16 @@ def test_every_row_has_its_slot_and_its_time(
     times = SlotTimes.of(80, seconds)
     for k, shown in events(tmp_path / "r.rrd").items():
         assert shown[0].startswith(times.text(k))
+
+
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_lines_are_those_that_rerun_makes(count: int) -> None:
+    """With values and types alike, so that a viewer draws the same."""
+    points = np.random.default_rng(5).normal(size=(count, 5, 2)).astype(np.float32)
+    single = [column.as_arrow_array() for column in rr.LineStrips2D.columns(strips=points)]
+    whole = [column.as_arrow_array() for column in rr.LineStrips2D.columns(strips=line_strips(points))]
+    assert whole == single
+    assert [array.type for array in whole] == [array.type for array in single]
 
 
 class Client:

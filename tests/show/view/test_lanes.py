@@ -9,11 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from scipy import stats
 
 from evedrop.model.process import Floats
 from evedrop.score.synchronisation import FACTOR, Synchronisation
-from evedrop.score.verdict import Verdict
+from evedrop.score.verdict import Verdict, distance_text
 from evedrop.show.view.lanes import KNOWLEDGE, SPIED, ErrorDistance, KnowledgeLane, knowledge
 from evedrop.show.view.panels.fates import WhoKnowsWhat
 from evedrop.show.view.panels.texts import VerdictLine
@@ -109,6 +111,18 @@ def test_distances_have_a_unit() -> None:
     assert ErrorDistance(replace(moving, units=())).of(x, np.zeros((1, 3)))[0] == 13.0
     texts = [ErrorDistance(moving).text(distance_) for distance_ in (0.0, 0.316, 12.34, 4567.0, 1e9, np.inf)]
     assert texts == ["0 m", "0.32 m", "12 m", "4,600 m", "1e9 m", "everything"]
+
+
+@given(distance=st.floats(1e-5, 1e7))
+@example(distance=9.95e-4)
+@example(distance=0.001)
+@example(distance=98.9)
+@example(distance=99.5)
+@example(distance=9500.0)
+@example(distance=8.99e5)
+def test_distances_are_written_as_in_the_verdict(distance: float) -> None:
+    """Also those that are written fast."""
+    assert ErrorDistance(replace(SCENE, noise=1e-20, units=("m", "m"))).text(distance) == distance_text(distance, "m")
 
 
 def test_distances_of_rounding_are_none() -> None:

@@ -158,8 +158,10 @@ def test_a_disk_that_is_full_at_the_end_is_reported(
     run: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The run ends as usual, and says that its recording is incomplete."""
+    close = StagedChunks.close
 
-    def full(_staged: StagedChunks) -> None:
+    def full(staged: StagedChunks) -> None:
+        close(staged)
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(StagedChunks, "close", full)

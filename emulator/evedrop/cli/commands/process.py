@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -74,10 +73,9 @@ def process(options: argparse.Namespace) -> int:
     """Run one process of a run."""
     from evedrop.live.protocol.brief import ImportingPart, RecorderPart, RoutingPart, read_brief
     from evedrop.scenario.plugins import look_in
-
-    os.umask(0o077)  # only this user may read its files
     from evedrop.system.world import world
 
+    world().process.keep_files_private()
     world().process.show_stacks()
     if options.role != "recorder":  # the recorder ends the run in order
         world().process.leave_on_signals()

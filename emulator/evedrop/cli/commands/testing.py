@@ -7,11 +7,17 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from evedrop.cli.in_memory import check_resuming, resuming, scheduler
 from evedrop.cli.options import Command
 from evedrop.errors import UsageError
 from evedrop.system.output import tell
+
+if TYPE_CHECKING:
+    from evedrop.studies.simulated_tests import SeedsToPlay
+
+_PROGRAM = "evedrop.cli.simulated:program"
 
 
 def test(options: argparse.Namespace) -> int:
@@ -27,8 +33,16 @@ def test(options: argparse.Namespace) -> int:
     if options.resume and not options.in_memory:
         raise UsageError("--resume goes on with tests in memory; add --in-memory, or leave it out")
     check_resuming(options)
+    simulation = _simulation(options)
     scenarios = scenarios_of(options.places)
-    manner = Manner(options.in_memory, options.trials, options.out, scheduler=options.scheduler, resume=options.resume)
+    manner = Manner(
+        options.in_memory,
+        options.trials,
+        options.out,
+        scheduler=options.scheduler,
+        resume=options.resume,
+        simulation=simulation,
+    )
     started, tested = time.time(), list[Finding]()
     try:
         for finding in results(scenarios, manner, options.jobs):
@@ -51,6 +65,23 @@ def test(options: argparse.Namespace) -> int:
     return max(outcome.value for outcome in counts)
 
 
+def _simulation(options: argparse.Namespace) -> SeedsToPlay | None:
+    """How the scenarios are run in the simulated world, or None. Raises UsageError."""
+    from evedrop.studies.simulated_tests import SeedsToPlay
+
+    if not options.simulated:
+        for name in ("seeds", "seed"):
+            if getattr(options, name) is not None:
+                raise UsageError(f"--{name} is of runs in the simulated world; add --simulated, or leave it out")
+        return None
+    if options.in_memory:
+        raise UsageError("--in-memory and --simulated are two ways to run a scenario; give one of them")
+    seeds, first = 100 if options.seeds is None else options.seeds, 1 if options.seed is None else options.seed
+    if seeds < 1:
+        raise UsageError(f"--seeds {seeds}: expected 1 or more")
+    return SeedsToPlay(first, seeds, _PROGRAM)
+
+
 def _places(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "places",
@@ -62,6 +93,13 @@ def _places(parser: argparse.ArgumentParser) -> None:
 
 def _tests(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--in-memory", action="store_true", help="in memory instead of live")
+    parser.add_argument(
+        "--simulated", action="store_true", help="in the simulated world, disturbed by faults that seeds decide"
+    )
+    parser.add_argument(
+        "--seeds", type=int, metavar="N", help="with --simulated: how many seeds of each scenario; default 100"
+    )
+    parser.add_argument("--seed", type=int, metavar="FIRST", help="with --simulated: the first seed; default 1")
     parser.add_argument("--trials", type=int, metavar="N", help="number of trials; default the scenario's")
     parser.add_argument("--junit", type=Path, metavar="FILE", help="write a report in JUnit XML")
     parser.add_argument(

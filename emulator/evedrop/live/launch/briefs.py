@@ -49,21 +49,21 @@ from evedrop.score.links import ack_channel_of, chart_of
 from evedrop.system.world import world
 
 _WINDOW_BYTES = 64 * 2**20
-_MOST_SLOTS_AHEAD = 4096
 _REPORT_SECONDS = 0.04
 _MOST_SLOTS = 64  # whose packets one message carries
 _MESSAGE_BYTES = 1 << 20  # of the numbers of one message
 LAUNCHED_PATIENCE = 30  # seconds
+MOST_SLOTS_AHEAD = 4096
 
 
-def flow_of(scenario: Scenario) -> Flow:
-    """The flow control: a window of at most 4096 slots and 64 MiB, and four reports per window; with a pace, one every 40 ms.
+def flow_of(scenario: Scenario, ahead: int = MOST_SLOTS_AHEAD) -> Flow:
+    """The flow control: a window of at most `ahead` slots and 64 MiB, and four reports per window; with a pace, one every 40 ms.
 
     A program that gives the states may be slow: at its own pace there is a report for each slot.
     """
     receivers = len(scenario.receivers)
     slot_bytes = 8 * len(scenario.process.A) * scenario.trials * (2 * receivers + 2)
-    window = max(2, min(_MOST_SLOTS_AHEAD, _WINDOW_BYTES // slot_bytes))
+    window = max(2, min(ahead, _WINDOW_BYTES // slot_bytes))
     batch = max(1, window // 4)
     if scenario.pace:
         batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
@@ -138,11 +138,13 @@ def briefs_of(
     task: RecorderTask,
     ends_with_stdin: bool = True,
     patience: int = LAUNCHED_PATIENCE,
+    ahead: int = MOST_SLOTS_AHEAD,
 ) -> dict[str, AnyBrief]:
     """Process name → brief, with a new run name, new passwords and, if the router takes them, new certificates.
 
-    endpoints: a string is the endpoint of one router, both to listen on and to connect to. Raises UsageError if their number
-    differs from the scenario's number of routers.
+    endpoints: a string is the endpoint of one router, both to listen on and to connect to. ahead: as for `flow_of`.
+
+    Raises UsageError if the number of endpoints differs from the scenario's number of routers.
     """
     run = f"r{world().token(4).hex()}"
     if isinstance(endpoints, str):
@@ -161,7 +163,7 @@ def briefs_of(
     model = Model(*matrices, mu_d, header, public.singular_noise, scenario.encoding.state_probabilities)
     leaks, channel, chart = scenario.leaks, ack_channel_of(scenario), chart_of(scenario)
     identities = identities_of(run, endpoints, tuple(users))
-    loop, flow = LoopBriefs(scenario), flow_of(scenario)
+    loop, flow = LoopBriefs(scenario), flow_of(scenario, ahead)
     states = None if public.source == "zenoh" else states_of(scenario)
     limits = sizes_of(scenario, flow.batch, flow.message).of_kinds
 

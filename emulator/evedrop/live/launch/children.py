@@ -32,7 +32,7 @@ from evedrop.live.protocol.launcher_events import (
     read_event,
 )
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR, ProcessAction
-from evedrop.results.folder import HeldFolder, private_opener
+from evedrop.results.folder import HeldFolder
 from evedrop.scenario.progress_events import OnEvent, ProgressEvent, RunEnded, Started
 from evedrop.system.environment import SINGLE_THREADED, check_zenoh_runtime, lock_step_environment, own_environment
 from evedrop.system.processes import wait_for
@@ -131,10 +131,10 @@ class Children:
         if isinstance(brief.part, RoutingPart):
             environment["TMPDIR"] = str(self._private)  # their password files are removed with the briefs
         try:
-            last_word.unlink(missing_ok=True)  # of an earlier start
+            world().disk.remove(last_word, missing_ok=True)  # of an earlier start
             path = brief.write(self._private)
             log_file = self._folder.now / "logs" / f"{brief.process}.log"
-            with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
+            with world().disk.writer(log_file, "ab" if again else "wb") as log:
                 process = self._starter(brief.role, path, log, environment)
         except OSError as error:
             why = error.strerror or str(error)
@@ -169,7 +169,7 @@ class Children:
         """Write into a process's log that the launcher cannot read its events."""
         with (
             contextlib.suppress(OSError),
-            (self._folder.now / "logs" / f"{name}.log").open("a", encoding="utf-8") as log,
+            world().disk.text_writer(self._folder.now / "logs" / f"{name}.log", "ab") as log,
         ):
             log.write(f"evedrop: the launcher refused a malformed event: {error}\n")
 

@@ -13,9 +13,7 @@ Source: docs/performance.md, shards.
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -219,10 +217,10 @@ def _tidy(folder: Path, shards: Sequence[Shard]) -> None:
     for shard in shards:
         make_private(folder / "logs")
         with suppress(FileNotFoundError):
-            os.replace(shard.folder / "logs", folder / "logs" / shard.name)
+            world().disk.replace(shard.folder / "logs", folder / "logs" / shard.name)
     with suppress(FileNotFoundError):
-        os.replace(shards[0].folder / _RECORDING, folder / _RECORDING)
-    shutil.rmtree(shards[0].folder.parent)
+        world().disk.replace(shards[0].folder / _RECORDING, folder / _RECORDING)
+    world().disk.remove_tree(shards[0].folder.parent)
 
 
 _BYTES = 4 * 2**20

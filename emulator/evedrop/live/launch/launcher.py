@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.errors import UsageError
+from evedrop.live.launch.briefs import MOST_SLOTS_AHEAD
 from evedrop.live.launch.ports import loopback_endpoints, warn_if_exposed
 from evedrop.live.launch.process_set import FinishedRun, launch_one
 from evedrop.live.launch.starter import process_starter
@@ -40,13 +41,14 @@ def launch(
     paused: bool = False,
     hosts: HostsPlan | None = None,
     starters: Callable[[ThreadEvent], AbstractContextManager[Starter]] = process_starter,
+    ahead: int = MOST_SLOTS_AHEAD,
 ) -> FinishedRun:
     """Run a scenario live into a results folder; `on_event` gets the recorder's events as they come.
 
     view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; by default no
     port, or free ports for two routers; paused: whether the run is held before slot 0, until the operator lets it continue;
     hosts: the hosts of processes that are not on this machine, and the endpoints of the routers then; starters: gives what starts
-    processes.
+    processes; ahead: how many slots at most the sensor may be ahead of the process that has done the fewest.
 
     Raises UsageError before any process is started, RunError if the run failed, Interrupted on Ctrl-C or SIGTERM; in the
     last two cases the results so far are in the folder and no process is left.
@@ -60,13 +62,13 @@ def launch(
     this = world().process
     with this.stop_on_signals() as stop, this.told_when_suspended(suspended), starters(stop) as start:
         if hosts is not None:
-            return _on_hosts(scenario, folder, view, on_event, stop, start, hosts, paused)
+            return _on_hosts(scenario, folder, view, on_event, stop, start, hosts, paused, ahead)
         if scenario.shards == 1:
             endpoints = None
             if listen is not None or relay is not None or scenario.relayed:
                 endpoints = loopback_endpoints(listen, relay, scenario.relayed)
                 warn_if_exposed(endpoints)
-            return launch_one(scenario, folder, view, endpoints, on_event, stop, start, paused=paused)
+            return launch_one(scenario, folder, view, endpoints, on_event, stop, start, paused=paused, ahead=ahead)
         from evedrop.live.launch.shards import launch_shards  # noqa: PLC0415 - not needed for one set of processes
 
         given = {"listen": listen, "relay": relay}
@@ -78,7 +80,7 @@ def launch(
                 )
         if paused:
             raise UsageError(f"--paused: a run in {scenario.shards} shards cannot be steered; give --set shards=1")
-        return launch_shards(scenario, folder, view, on_event, stop, start)
+        return launch_shards(scenario, folder, view, on_event, stop, start, ahead)
 
 
 def _on_hosts(
@@ -90,6 +92,7 @@ def _on_hosts(
     here: Starter,
     hosts: HostsPlan,
     paused: bool,
+    ahead: int,
 ) -> FinishedRun:
     """Run a scenario as `launch` does, with processes on other hosts."""
     from evedrop.live.launch.other_hosts import ssh_starter  # noqa: PLC0415 - not needed on one machine
@@ -100,5 +103,14 @@ def _on_hosts(
         )
     with ssh_starter(hosts, here, stop, scenario.longest_outage) as start:
         return launch_one(
-            scenario, folder, view, hosts.endpoints, on_event, stop, start, paused=paused, patience=_HOSTS_PATIENCE
+            scenario,
+            folder,
+            view,
+            hosts.endpoints,
+            on_event,
+            stop,
+            start,
+            paused=paused,
+            patience=_HOSTS_PATIENCE,
+            ahead=ahead,
         )

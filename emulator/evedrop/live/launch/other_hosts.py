@@ -279,7 +279,7 @@ class SshHost:
     def start(self, number: int, path: Path, log: IO[bytes], environment: Mapping[str, str]) -> HostedProcess:
         """Start the process of the brief at a path there. Raises RunError if the connection is lost."""
         brief = read_brief(path)
-        path.unlink()  # its keys should not stay on disk
+        world().disk.remove(path)  # its keys should not stay on disk
         if self._table.modules is not None and isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
             brief = replace(brief, part=replace(brief.part, modules=self._table.modules))
         process = HostedProcess(number, self, os.dup(log.fileno()), brief.last_word)
@@ -546,7 +546,7 @@ class HostProcesses:
         try:
             with os.fdopen(write, "wb") as log:
                 path = brief.write(self._private)
-                last_word_file(self._private, brief.process).unlink(missing_ok=True)
+                world().disk.remove(last_word_file(self._private, brief.process), missing_ok=True)
                 self._processes[number] = self._start(brief.role, path, log, environment)
         except OSError as error:
             os.close(read)

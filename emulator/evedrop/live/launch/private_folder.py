@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,7 +43,7 @@ def private_folder(where: Path | None = None) -> Iterator[Path]:
             with _locked(folder):
                 yield folder
         finally:
-            shutil.rmtree(folder, ignore_errors=True)
+            world().disk.remove_tree(folder, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -61,14 +60,15 @@ def socket_folder(private: Path) -> Iterator[Path]:
 def _locked(folder: Path) -> Iterator[None]:
     """Make the folder, and hold the lock in it."""
     try:
-        folder.mkdir(mode=0o700)
-        lock = (folder / f"{_LOCK}.new").open("wb")
+        world().disk.make_folder(folder, 0o700)
+        unfinished = folder / f"{_LOCK}.new"
+        lock = world().disk.open(unfinished, "wb")
     except OSError as error:
         raise _unmade(error) from error
     with lock:
         with contextlib.suppress(OSError):  # on a file system without locks, nothing is swept
             fcntl.flock(lock, fcntl.LOCK_EX)
-            os.replace(lock.name, folder / _LOCK)  # so that the file never exists unlocked
+            world().disk.replace(unfinished, folder / _LOCK)  # so that the file never exists unlocked
         yield
 
 
@@ -82,6 +82,6 @@ def _sweep(where: Path) -> None:
         with contextlib.suppress(OSError):
             if folder.is_symlink() or folder.stat().st_uid != os.getuid():
                 continue
-            with (folder / _LOCK).open("rb+") as lock:
+            with world().disk.open(folder / _LOCK, "r+b") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(folder, ignore_errors=True)
+                world().disk.remove_tree(folder, ignore_errors=True)

@@ -7,13 +7,12 @@ outlives the launcher, even if that is killed.
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
-from evedrop.live.launch.briefs import LAUNCHED_PATIENCE, RecorderTask, briefs_of
+from evedrop.live.launch.briefs import LAUNCHED_PATIENCE, MOST_SLOTS_AHEAD, RecorderTask, briefs_of
 from evedrop.live.launch.children import SILENCE_SECONDS, Children, ProcessExit
 from evedrop.live.launch.ports import RouterEndpoints, socket_endpoints
 from evedrop.live.launch.private_folder import private_folder, socket_folder
@@ -57,11 +56,13 @@ def launch_one(
     shard: bool = False,
     paused: bool = False,
     patience: int = LAUNCHED_PATIENCE,
+    ahead: int = MOST_SLOTS_AHEAD,
 ) -> FinishedRun:
     """Run a scenario as `launch` does, in one set of processes, until `stop` is set.
 
     endpoints: None for a socket in a private folder, which other users cannot enter.
-    shard: whether other sets of processes carry further trials; patience: seconds for which processes wait for each other.
+    shard: whether other sets of processes carry further trials; patience: seconds for which processes wait for each other;
+    ahead: as for `launch`.
     """
     with (
         private_folder() as private,
@@ -75,7 +76,7 @@ def launch_one(
             with contextlib.suppress(OSError):  # the recorder writes it, too, and reports why it cannot
                 write_resolved(folder, scenario)
             task = RecorderTask(folder.absolute(), view != "off", shard, paused)
-            briefs = briefs_of(scenario, at, task, patience=patience)
+            briefs = briefs_of(scenario, at, task, patience=patience, ahead=ahead)
             recorder = briefs.pop(RECORDER)
             with Children(held, private, scenario.controller is not None, starter) as children:
                 for name in (ROUTER, RELAY):
@@ -154,7 +155,7 @@ def _now(held: HeldFolder) -> Path:
 def _forget(folder: Path) -> None:
     """Remove the folder of a run that was not started, so that the next run can use it."""
     with contextlib.suppress(OSError):
-        shutil.rmtree(folder)
+        world().disk.remove_tree(folder)
 
 
 def follow_to_end(children: Children, stop: ThreadEvent, on_event: OnEvent) -> int:

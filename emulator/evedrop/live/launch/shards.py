@@ -9,7 +9,6 @@ Source: docs/performance.md, shards.
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -118,10 +117,11 @@ class _ShardsState:
         view: str,
         stop: ThreadEvent,
         starter: Starter,
+        ahead: int,
     ) -> None:
         """Run one shard to its end, its routers at these endpoints, or at a socket; if it ends early, all shards end."""
         try:
-            ended = launch_one(shard.scenario, shard.folder, view, at, on_event, stop, starter, shard=True)
+            ended = launch_one(shard.scenario, shard.folder, view, at, on_event, stop, starter, shard=True, ahead=ahead)
         except BaseException as error:
             self.failures.append((shard, error))
             stop.set()
@@ -142,6 +142,7 @@ def launch_shards(
     on_event: OnEvent,
     stop: ThreadEvent,
     starter: Starter,
+    ahead: int,
 ) -> FinishedRun:
     """Run a scenario in its shards, all at the same time, into one results folder; raises as `launch` does.
 
@@ -155,12 +156,13 @@ def launch_shards(
     progress, state = OneProgress(shards, on_event), _ShardsState()
     first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, endpoints, strict=True)]
     threads = [
-        world().thread(state.launched, *shard, "off", stop, starter, name="shard", daemon=False) for shard in others
+        world().thread(state.launched, *shard, "off", stop, starter, ahead, name="shard", daemon=False)
+        for shard in others
     ]
     for thread in threads:
         thread.start()
     # On this thread, not on another one: a viewer ends with the thread that started it.
-    state.launched(*first, view, stop, starter)
+    state.launched(*first, view, stop, starter, ahead)
     try:
         for thread in threads:
             while thread.is_alive() and not stop.is_set():  # a run lasts as long as it lasts
@@ -206,7 +208,7 @@ def _made_one(
     if fault is not None:
         shard, error = fault
         if isinstance(error, UsageError):
-            shutil.rmtree(folder)  # the run was not started
+            world().disk.remove_tree(folder)  # the run was not started
         if not isinstance(error, RunError):
             raise error
         how = shard.of_run(error)

@@ -187,35 +187,151 @@ OF_SUMMARIES = ("scipy.special",)
 """What it imports once it makes a summary, which takes an eighth of a second."""
 
 
+class ProcessHandle(Protocol):
+    """Refers to a process: once it has ended, its id may be another process's."""
+
+    @property
+    def over(self) -> bool:
+        """Whether the process has ended."""
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal to it. Raises ProcessLookupError if it has ended."""
+
+    def close(self) -> None:
+        """Refer to it no longer."""
+
+
+class StandardFiles(Protocol):
+    """The standard files of a process that is forked."""
+
+    descriptors: tuple[int, int, int]
+    """Of standard input, standard output and standard error."""
+    stdin: IO[bytes]
+    """The launcher's end of standard input."""
+    stdout: IO[bytes] | None
+    """The launcher's end of standard output, if the launcher reads it."""
+
+    def close_theirs(self) -> None:
+        """Close the ends of the process, which has its own."""
+
+
+class ForkChannel(Protocol):
+    """The launcher's end of its channel with a fork server."""
+
+    def files(self, log: IO[bytes], tells: bool) -> StandardFiles:
+        """Files for a process; tells: whether the launcher reads its standard output."""
+
+    def send(self, request: bytes, descriptors: tuple[int, int, int]) -> None:
+        """Send a request, with the standard files of the process. Raises OSError."""
+
+    def receive(self) -> tuple[bytes, list[ProcessHandle]]:
+        """The next report, with a process that it is about; empty at the end. Raises TimeoutError after a moment, OSError."""
+
+    def shut(self) -> None:
+        """End it for both sides. Raises OSError if it is closed."""
+
+    def close(self) -> None:
+        """Close this end."""
+
+
+@final
+class _Descriptor:
+    """A file descriptor that refers to a process."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    @property
+    def over(self) -> bool:
+        """Whether the process has ended: the system says so."""
+        system = select.poll()
+        system.register(self._descriptor, select.POLLIN)
+        return bool(system.poll(0))
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal to it."""
+        signal.pidfd_send_signal(self._descriptor, sig)
+
+    def close(self) -> None:
+        """Close the descriptor."""
+        os.close(self._descriptor)
+
+
+@final
+class _Pipes:
+    """A pipe to a process, its log, and perhaps a pipe from it."""
+
+    def __init__(self, log: IO[bytes], tells: bool) -> None:
+        read_stdin, write_stdin = os.pipe()
+        self._write_stdout: int | None
+        read_stdout, self._write_stdout = os.pipe() if tells else (None, None)
+        self._read_stdin = read_stdin
+        self.stdin: IO[bytes] = os.fdopen(write_stdin, "wb")
+        self.stdout: IO[bytes] | None = None if read_stdout is None else os.fdopen(read_stdout, "rb")
+        stdout = log.fileno() if self._write_stdout is None else self._write_stdout
+        self.descriptors = (read_stdin, stdout, log.fileno())
+
+    def close_theirs(self) -> None:
+        """Close the ends of the process."""
+        os.close(self._read_stdin)
+        if self._write_stdout is not None:
+            os.close(self._write_stdout)
+
+
+@final
+class _Socket:
+    """A channel over a socket that passes file descriptors on."""
+
+    def __init__(self, ours: socket.socket) -> None:
+        ours.settimeout(_POLL_SECONDS)
+        self._ours = ours
+
+    def files(self, log: IO[bytes], tells: bool) -> StandardFiles:
+        """Pipes of the system."""
+        return _Pipes(log, tells)
+
+    def send(self, request: bytes, descriptors: tuple[int, int, int]) -> None:
+        """Send a request, with descriptors."""
+        socket.send_fds(self._ours, [request], descriptors)
+
+    def receive(self) -> tuple[bytes, list[ProcessHandle]]:
+        """The next report."""
+        report, handles, _, _ = socket.recv_fds(self._ours, _MOST_BYTES, 1)
+        return report, [_Descriptor(handle) for handle in handles]
+
+    def shut(self) -> None:
+        """End it for both sides."""
+        self._ours.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Close this end."""
+        self._ours.close()
+
+
 @final
 class Fork(ReportedProcess):
     """A process that a fork server has started, and whose end it reports."""
 
-    def __init__(self, pid: int, handle: int) -> None:
-        """handle: a file descriptor that refers to the process; once it has ended, its id may be another process's."""
+    def __init__(self, pid: int, handle: ProcessHandle) -> None:
         super().__init__(pid)
-        self._handle: int | None = handle
+        self._handle: ProcessHandle | None = handle
 
     def _close(self) -> None:
         if self._handle is not None:
-            os.close(self._handle)
+            self._handle.close()
         self._handle = None
 
     @property
     def over(self) -> bool:
         """Whether it has ended, reported or not: the system says so."""
         with self._lock:
-            if self._handle is None:
-                return True
-            system = select.poll()
-            system.register(self._handle, select.POLLIN)
-            return bool(system.poll(0))
+            return self._handle is None or self._handle.over
 
     def send_signal(self, sig: int) -> None:
         """Send a signal to it, if it still runs."""
         with self._lock, suppress(ProcessLookupError):
             if self._handle is not None:
-                signal.pidfd_send_signal(self._handle, sig)
+                self._handle.send_signal(sig)
 
 
 def start_servers(channels: Sequence[socket.socket], modules: Sequence[Sequence[str]]) -> KillableProcess:
@@ -245,8 +361,7 @@ class ForkServer:
     channel: whose other end the server has.
     """
 
-    def __init__(self, channel: socket.socket) -> None:
-        channel.settimeout(_POLL_SECONDS)
+    def __init__(self, channel: ForkChannel) -> None:
         self._channel = channel
         self._forks: dict[int, Fork] = {}
         self._asking = world().lock()
@@ -269,7 +384,7 @@ class ForkServer:
     def _give_up(self) -> None:
         """Close the channel: the server ends, if it is not suspended, and `_follow` ends its processes."""
         with suppress(OSError):  # it is closed
-            self._channel.shutdown(socket.SHUT_RDWR)
+            self._channel.shut()
 
     def start(
         self,
@@ -280,23 +395,17 @@ class ForkServer:
         stop: ThreadEvent | None = None,
     ) -> StartedProcess:
         """Start `evedrop ROLE BRIEF`, whose files only this user may read. Raises OSError, Interrupted once `stop` is set."""
-        read_stdin, write_stdin = os.pipe()
-        read_stdout, write_stdout = os.pipe() if role in TELLING else (None, None)
-        stdin = os.fdopen(write_stdin, "wb")
-        stdout = None if read_stdout is None else os.fdopen(read_stdout, "rb")
-        files = (read_stdin, log.fileno() if write_stdout is None else write_stdout, log.fileno())
+        files = self._channel.files(log, role in TELLING)
         try:
-            process = self.fork([role, str(brief)], files, environment, _folder(), 0o077, stop)
+            process = self.fork([role, str(brief)], files.descriptors, environment, _folder(), 0o077, stop)
         except BaseException:
-            stdin.close()
-            if stdout is not None:
-                stdout.close()
+            files.stdin.close()
+            if files.stdout is not None:
+                files.stdout.close()
             raise
         finally:
-            os.close(read_stdin)
-            if write_stdout is not None:
-                os.close(write_stdout)
-        process.stdin, process.stdout = stdin, stdout
+            files.close_theirs()
+        process.stdin, process.stdout = files.stdin, files.stdout
         return process
 
     def fork(
@@ -315,7 +424,7 @@ class ForkServer:
         request = {"words": [*words], "environment": dict(environment), "folder": folder, "umask": umask}
         with self._asking:
             try:
-                socket.send_fds(self._channel, [json.dumps(request).encode()], files)
+                self._channel.send(json.dumps(request).encode(), files)
             except (ConnectionError, TimeoutError):
                 raise OSError(*_GONE) from None
             begun = self._answer(stop)
@@ -346,12 +455,12 @@ class ForkServer:
                 fork.ended(FORK_SERVER_LOST)
             self._begun.put(OSError(*_GONE))
 
-    def _next_report(self) -> tuple[dict[str, int], list[int]] | None:
-        """The server's next report, and the files that came with it; None if it has ended, or hangs."""
+    def _next_report(self) -> tuple[dict[str, int], list[ProcessHandle]] | None:
+        """The server's next report, and the process that came with it; None if it has ended, or hangs."""
         unreported = 0.0
         while unreported < _REPORT_SECONDS:
             try:
-                report, handles, _, _ = socket.recv_fds(self._channel, _MOST_BYTES, 1)
+                report, handles = self._channel.receive()
             except TimeoutError:
                 # Not by the clock: this process may have been suspended, too.
                 unreported = unreported + _POLL_SECONDS if any(fork.over for fork in self._forks.values()) else 0.0
@@ -361,7 +470,7 @@ class ForkServer:
                 return (json.loads(report), handles) if report else None
         return None
 
-    def _take(self, report: dict[str, int], handles: list[int]) -> None:
+    def _take(self, report: dict[str, int], handles: list[ProcessHandle]) -> None:
         if "error" in report:
             self._begun.put(OSError(report["error"], os.strerror(report["error"])))
         elif "status" in report:
@@ -383,7 +492,7 @@ def fork_servers(*modules: Sequence[str]) -> Iterator[tuple[ForkServer, ...]]:
                 theirs.enter_context(end)
             process = start_servers([end for _, end in pairs], modules)
         stack.callback(kill, process)  # it may be in the middle of its imports, or suspended
-        servers = tuple(ForkServer(ours) for ours, _ in pairs)
+        servers = tuple(ForkServer(_Socket(ours)) for ours, _ in pairs)
         for server in servers:
             stack.callback(server.close)
         yield servers

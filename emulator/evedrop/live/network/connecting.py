@@ -18,7 +18,7 @@ from typing import Protocol, final
 
 import zenoh
 
-from evedrop.errors import BriefError, RunError
+from evedrop.errors import BriefError, NoRouter, RunError
 from evedrop.live.network.endpoint import AnyEndpoint, Endpoint, SocketEndpoint, endpoint_in
 from evedrop.live.protocol.brief import Identity
 from evedrop.live.protocol.keys import ZenohConfig
@@ -171,7 +171,7 @@ def connected(
                     "run, or another program listens there; start the router of this run, or give the brief of that one"
                 ) from error
             if clock.monotonic() - began > patience:
-                raise RunError(
+                raise NoRouter(
                     f"no router answered at {address.router} within {patience:.0f} s ({why}); start it there, and check that no "
                     "firewall is in between"
                 ) from error

@@ -6,7 +6,6 @@ The file is written when the run starts and removed when it ends, for whatever r
 from __future__ import annotations
 
 import json
-import os
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from evedrop.errors import UsageError
 from evedrop.live.protocol.brief import Identity
 from evedrop.live.protocol.json_tables import read
 from evedrop.system.files import Unreadable, is_folder, is_there, text_of
+from evedrop.system.world import world
 
 _NAME = "control.json"
 _MOST_BYTES = 2**20
@@ -37,15 +37,14 @@ class Control:
     def write(self, folder: Path) -> None:
         """Write the file into a results folder, readable by its owner only."""
         unfinished = folder / f"{_NAME}.new"
-        with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-            json.dump(asdict(self), file, indent=1)
-        os.replace(unfinished, folder / _NAME)
+        world().disk.write(unfinished, json.dumps(asdict(self), indent=1).encode())
+        world().disk.replace(unfinished, folder / _NAME)
 
 
 def remove_control(folder: Path) -> None:
     """Remove the control file of a run that is over."""
     with suppress(OSError):  # the disk may not be writable any more; the password is useless after the run
-        (folder / _NAME).unlink()
+        world().disk.remove(folder / _NAME)
 
 
 def no_run(folder: Path, why: str) -> UsageError:

@@ -322,7 +322,9 @@ class Session:
         deadline = world().monotonic() + self.patience
         while unread := self._unread():
             missing = dict.fromkeys(reader_of(key) for key in unread)
-            if RECORDER not in missing and self._process != RECORDER:
+            # A process without a connection sees nobody; its watchdog ends it.
+            alone = self._watchdog is not None and not self.linked()
+            if alone or (RECORDER not in missing and self._process != RECORDER):
                 deadline = world().monotonic() + self.patience
             if world().monotonic() > deadline:
                 raise MissingProcesses(

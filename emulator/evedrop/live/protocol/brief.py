@@ -42,6 +42,7 @@ from evedrop.model.streams import KEY_BYTES, MOST_SLOTS, Batch
 from evedrop.names import ACKNOWLEDGEMENTS
 from evedrop.system.fields import Finite, NotNegative, Slot
 from evedrop.system.files import Unreadable, opened, why_of
+from evedrop.system.world import world
 
 Positive = Annotated[int, Meta(ge=1, le=2**62)]
 Window = Annotated[int, Meta(ge=0, le=MOST_SLOTS)]
@@ -550,8 +551,7 @@ class Brief(Generic[P_co]):
     def write(self, directory: Path) -> Path:
         """Write `<process>.json`, readable by its owner only."""
         path = directory / f"{self.process}.json"
-        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-            file.write(self.text)
+        world().disk.write(path, self.text.encode())
         return path
 
     @classes_known()

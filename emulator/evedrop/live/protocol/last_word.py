@@ -13,10 +13,11 @@ from pathlib import Path
 
 from msgspec import Struct, json
 
-from evedrop.errors import EvedropError, Gap, MalformedMessage, MissingProcesses, Refusal
+from evedrop.errors import EvedropError, Gap, MalformedMessage, MissingProcesses, NoRouter, Refusal
 from evedrop.live.protocol.keys import writer_of
 from evedrop.system.files import Unreadable, contents
 from evedrop.system.output import escaped
+from evedrop.system.world import world
 
 _MOST_BYTES = 2**16
 
@@ -47,6 +48,8 @@ class LastWord(Struct, frozen=True, forbid_unknown_fields=True):
         """The last word of a process that ends with this error."""
         if isinstance(error, MissingProcesses):
             return cls(Cause.MISSING_PROCESSES, str(error), error.missing)
+        if isinstance(error, NoRouter):
+            return cls(Cause.NO_CONNECTION, str(error))
         if (sender := protocol_breaker(error)) is not None:
             return cls(Cause.BROKEN_PROTOCOL, str(error), (sender,))
         return cls(Cause.FAILURE, str(error))
@@ -55,7 +58,7 @@ class LastWord(Struct, frozen=True, forbid_unknown_fields=True):
         """Write it into a file, if that is possible; None: nobody asks for it."""
         if file is not None:
             with suppress(OSError):
-                Path(file).write_bytes(json.encode(self))
+                world().disk.write(Path(file), json.encode(self))
 
 
 def protocol_breaker(error: EvedropError) -> str | None:

@@ -221,8 +221,8 @@ class Recovery:
             self._returned = now if self._returned is None else self._returned
             if now - self._returned > _REACH_SECONDS or not self._conductor.unreached:
                 self._all_back(now)
-        elif self._steering.at is not None and done >= self._steering.at:
-            self._moved = self._joined = now  # the run is held: no slots are expected
+        elif self._steering.at is not None and done >= self._steering.at and not self._steering.awaits_belief:
+            self._moved = self._joined = now  # the run is held: nothing is expected
             self._close(done, now)
         elif now - self._moved > self._limit:
             self._round(now)

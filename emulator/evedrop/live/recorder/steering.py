@@ -105,6 +105,11 @@ class Steering:
         """Whether a receiver has left before slot k."""
         return self._left.get(name) == k
 
+    @property
+    def awaits_belief(self) -> bool:
+        """Whether the run is held until a receiver has sent its final belief."""
+        return self.at is not None and bool(self._pending) and not self._may(self._pending[0])
+
     def done(self, number: int) -> None:
         """Take the launcher's confirmation of an act on a process; number: that of the event, from 1 on."""
         self._confirmed = self._confirmed or number == len(self.events)

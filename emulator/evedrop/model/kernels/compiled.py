@@ -24,6 +24,7 @@ from evedrop.model.kernels.reference import (
     expect_histograms,
     expect_mixture,
     expect_records,
+    expect_room,
     expect_runs,
     expect_wide,
     expect_words,
@@ -62,19 +63,21 @@ def fill_counters(counters: NDArray[np.uint64], slot: int, first: int) -> None:
     _lib.kernels_counters(slots, count, slot, first, out)
 
 
-def uniforms(words: Words, width: int) -> Floats:
+def uniforms(words: Words, width: int, out: Floats | None = None) -> Floats:
     """As `reference.uniforms`."""
     slots, trials, stride = words.shape
-    out = np.empty((slots, width, trials))
-    _lib.kernels_uniforms(slots, trials, stride, width, _words(words, width), _buffer("double[]", out))
+    out = expect_room(out, (slots, width, trials))
+    numbers = _buffer("double[]", out, require_writable=True)
+    _lib.kernels_uniforms(slots, trials, stride, width, _words(words, width), numbers)
     return out
 
 
-def normals(words: Words, width: int) -> Floats:
+def normals(words: Words, width: int, out: Floats | None = None) -> Floats:
     """As `reference.normals`."""
     slots, trials, stride = words.shape
-    out = np.empty((slots, width, trials))
-    _lib.kernels_normals(slots, trials, stride, width, _words(words, width), _buffer("double[]", out))
+    out = expect_room(out, (slots, width, trials))
+    numbers = _buffer("double[]", out, require_writable=True)
+    _lib.kernels_normals(slots, trials, stride, width, _words(words, width), numbers)
     return out
 
 

@@ -40,6 +40,16 @@ def expect_words(words: NDArray[Any], width: int) -> None:
         raise ValueError(f"words of shape {words.shape}; expected at least {width} for each slot and trial")
 
 
+def expect_room(out: Floats | None, shape: tuple[int, ...]) -> Floats:
+    """Where to put numbers: an array of this shape, a new one if none is given. Raises ValueError if it is another one."""
+    if out is None:
+        return np.empty(shape)
+    expect(out, shape)
+    if out.dtype != np.float64 or not out.flags.c_contiguous:
+        raise ValueError("expected room for doubles in order")
+    return out
+
+
 def expect_counters(counters: NDArray[Any]) -> None:
     """Raise ValueError if these are not AES counters (c, m, 2)."""
     if counters.ndim != 3 or counters.shape[2] != 2 or counters.itemsize != 8:
@@ -117,9 +127,9 @@ def fill_counters(counters: NDArray[np.uint64], slot: int, first: int) -> None:
     big[:, :, 1] = np.arange(first, first + count, dtype=np.uint64)
 
 
-def uniforms(words: Words, width: int) -> Floats:
-    """Uniform numbers in [0, 1), multiples of 2⁻⁵³, (c, width, R), from words (c, R, m), m ≥ width."""
-    return fractions(_ordered(words, width))
+def uniforms(words: Words, width: int, out: Floats | None = None) -> Floats:
+    """Uniform numbers in [0, 1), multiples of 2⁻⁵³, (c, width, R), from words (c, R, m), m ≥ width; out: where to put them."""
+    return _put(fractions(_ordered(words, width)), out)
 
 
 def fractions(words: Words) -> Floats:
@@ -129,12 +139,19 @@ def fractions(words: Words) -> Floats:
     return numbers
 
 
-def normals(words: Words, width: int) -> Floats:
-    """Standard normal numbers, (c, width, R), from words (c, R, m), by the inverse distribution on an odd grid of 2⁻⁵³."""
+def normals(words: Words, width: int, out: Floats | None = None) -> Floats:
+    """The same for standard normal numbers, by the inverse distribution on an odd grid of 2⁻⁵³."""
     numbers = (_ordered(words, width) >> np.uint64(12)).view(np.int64).astype(np.float64)
     numbers += 0.5
     numbers *= 2.0**-52
-    return elementary.normal_quantile(numbers)
+    return _put(elementary.normal_quantile(numbers), out)
+
+
+def _put(numbers: Floats, out: Floats | None) -> Floats:
+    if out is None:
+        return numbers
+    expect_room(out, numbers.shape)[...] = numbers
+    return out
 
 
 def _ordered(words: Words, width: int) -> Words:

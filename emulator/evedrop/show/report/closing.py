@@ -28,6 +28,9 @@ from evedrop.score.summary import (
 from evedrop.score.verdict import SecrecyOutcome, times_text
 from evedrop.show.report.text_table import TextColumn, TextTable
 
+SWEEP_TABLE = "sweep.parquet"
+"""The file that has the results of a sweep."""
+
 
 def amount(summary: Summary) -> str:
     """How much was run, and how fast."""

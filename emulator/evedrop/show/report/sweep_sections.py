@@ -27,14 +27,13 @@ from evedrop.results.tables import swept_strategies
 from evedrop.scenario.loading import value_of
 from evedrop.score.verdict import SecrecyOutcome, weakest
 from evedrop.show.report.chart import Curve, LogChart
-from evedrop.show.report.closing import sweep_table
+from evedrop.show.report.closing import SWEEP_TABLE, sweep_table
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.travel import SCENARIO, circumstances, download
 from evedrop.show.view.axis_name import axis_name
 from evedrop.show.view.palette import paper_inks
 from evedrop.system.files import Unreadable, text_of
 
-SWEEP_TABLE = "sweep.parquet"
 _MOST_BYTES = 2**24
 _MOST_CHARTS = 12
 _NAMES_A_FILE = re.compile(r"\bfile\w*\s*=|_file\s*=")

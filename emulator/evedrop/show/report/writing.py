@@ -16,12 +16,10 @@ from evedrop.results.comparison import COMPARISON
 from evedrop.results.folder import replace_private
 from evedrop.results.reading import Results, results_of_this_version
 from evedrop.results.wire_summary import WIRE_FILE
-from evedrop.show.report.closing import amount, outcome
+from evedrop.show.report.closing import SWEEP_TABLE, amount, outcome
 from evedrop.show.report.comparison import comparison_heading
-from evedrop.show.report.comparison_sections import COMPARISON_SECTIONS, ComparisonSource
 from evedrop.show.report.page import Page, parts_of
 from evedrop.show.report.run_sections import RUN_SECTIONS, RunSource
-from evedrop.show.report.sweep_sections import SWEEP_SECTIONS, SWEEP_TABLE, SweepSource
 from evedrop.system.output import warn
 
 if TYPE_CHECKING:
@@ -37,12 +35,16 @@ def run_page(folder: Path) -> Page:
 
 def sweep_page(folder: Path) -> Page:
     """The report of a sweep."""
+    from evedrop.show.report.sweep_sections import SWEEP_SECTIONS, SweepSource  # noqa: PLC0415 - no other page needs it
+
     source = SweepSource.read(folder)
     return Page(f"Sweep of {source.scenario}", source.amount, source.outcome, None, parts_of(SWEEP_SECTIONS, source))
 
 
 def comparison_page(folder: Path) -> Page:
     """The report of a comparison."""
+    from evedrop.show.report.comparison_sections import COMPARISON_SECTIONS, ComparisonSource  # noqa: PLC0415 - the same
+
     source = ComparisonSource.read(folder)
     about = comparison_heading(source.comparison)
     return Page("Schemes against adversaries", about, source.outcome, None, parts_of(COMPARISON_SECTIONS, source))

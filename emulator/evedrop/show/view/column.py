@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import pyarrow as pa
@@ -136,6 +136,14 @@ class _Values:
 def scalars(path: str, k: NDArray[np.int64], values: Floats) -> Column:
     """A number in each slot: slots k (c,), and values (c,)."""
     return Column(path, k, rr.Scalars.columns(scalars=values))
+
+
+def line_strips(points: NDArray[np.float32]) -> Any:
+    """Lines with equally many points, (f, p, 2), as `rr.LineStrips2D.columns` takes them; Rerun would convert them one by one."""
+    count, length, _ = points.shape
+    inner = rr.encodings.Vec2DBatch(points.reshape(-1, 2)).as_arrow_array()
+    kind = rr.components.LineStrip2DBatch([]).as_arrow_array().type
+    return pa.ListArray.from_arrays(length * np.arange(count + 1, dtype=np.int32), inner, type=kind)
 
 
 def laid_out(content: rrb.Container, timeline: str) -> rrb.Blueprint:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evedrop.model.acknowledgements import AckFate
 from evedrop.model.receiver import INNOVATION, Action, Codes, Flags
@@ -74,8 +75,10 @@ class Watcher:
             events.append(Event(k, "WARN", f"{self._name} took {self._other} for the state, for the first time"))
         places = np.flatnonzero(good)
         starts, ends = np.concatenate([[0], places + 1]), np.append(places, len(codes))
-        looked_at = ends > starts  # a good slot after a good slot changes nothing
-        looked_at[0] = True
+        looked_at = (
+            ends - starts >= self._long
+        )  # a shorter stretch that also begins and ends in the chunk changes nothing
+        looked_at[[0, -1]] = True
         before = _numbers_before(misled), _numbers_before(silent)
         for start, end in zip(starts[looked_at].tolist(), ends[looked_at].tolist(), strict=True):
             if end > start:
@@ -85,20 +88,20 @@ class Watcher:
         return sorted(events, key=lambda event: event.k)
 
     def _extend(
-        self, first: int, start: int, end: int, before: tuple[list[int], list[int]], events: list[Event]
+        self, first: int, start: int, end: int, before: tuple[NDArray[np.int64], NDArray[np.int64]], events: list[Event]
     ) -> None:
         """Extend the current stretch by some slots of the chunk; before: how many slots before each are misled, and silent."""
         misled, silent = before
         length = self._bad + end - start
         if not self._told and length >= self._long:
             turn = start + self._long - self._bad  # the slot after the one that made it long
-            deceived = self._misled + misled[turn] - misled[start]
-            unsent = self._silent + silent[turn] - silent[start]
+            deceived = self._misled + int(misled[turn] - misled[start])
+            unsent = self._silent + int(silent[turn] - silent[start])
             events.append(Event(first + turn - 1, "WARN", self._lost(deceived, unsent)))
             self._told = True
         self._bad = length
-        self._misled += misled[end] - misled[start]
-        self._silent += silent[end] - silent[start]
+        self._misled += int(misled[end] - misled[start])
+        self._silent += int(silent[end] - silent[start])
 
     def _recover(self, k: int, events: list[Event]) -> None:
         if self._told:
@@ -164,7 +167,6 @@ class AckWatcher:
 _REACHED = frozenset({AckFate.ARRIVED, AckFate.FORGED})
 
 
-def _numbers_before(flags: Flags) -> list[int]:
+def _numbers_before(flags: Flags) -> NDArray[np.int64]:
     """How many flags before each are set, and how many in all, (c + 1,)."""
-    numbers: list[int] = np.concatenate([[0], np.cumsum(flags)]).tolist()
-    return numbers
+    return np.concatenate([[0], np.cumsum(flags)])

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import final
 
 import numpy as np
@@ -161,6 +160,7 @@ class ErrorDistance:
         self._count, self._unit = leading_states(scene.units, scene.n), scene.unit
         self._near = math.sqrt(FACTOR * scene.noise)
         self._nothing = math.sqrt(scene.noise) * _NOTHING
+        self._plain_from, self._suffix = max(self._nothing, _LEAST_PLAIN), f" {self._unit}".rstrip()
         first = math.floor(math.log10(self._near)) + 1
         self._steps = np.array([self._near, *(10.0**decade for decade in range(first, first + _DECADES))])
 
@@ -172,6 +172,9 @@ class ErrorDistance:
 
     def text(self, distance: float) -> str:
         """A distance with two digits and its unit, such as "0.32 m"; "0 m" if it is less than a thousandth of √(tr Q)."""
+        if self._plain_from <= distance < _LARGEST_PLAIN:  # as below, in a fraction of the time: a view has thousands
+            digits = f"{distance:.2g}"
+            return (digits if distance < _LARGE else f"{float(digits):,.0f}") + self._suffix
         return self._text(0.0 if distance < self._nothing else distance)
 
     @property
@@ -191,6 +194,7 @@ class ErrorDistance:
 
 
 _DECADES = 9
+_LEAST_PLAIN, _LARGE, _LARGEST_PLAIN = 1e-3, 99.0, 9e5  # numbers of which two digits are written without a power of ten
 _NOTHING = 1e-3  # the fraction of √(tr Q), the distance of one step, below which a distance is only that of rounding
 
 
@@ -212,6 +216,7 @@ class KnowledgeLane:
         )
         self.labels = [bound or " " for _, bound in kinds]
         """What the lane shows for each of its words."""
+        self._widths = [*map(len, self._bounds)]
         self._level, self._bound = -1, 0  # of the last slot
         self._since, self._worded = 0, False  # the stretch of the last slot, and whether it has its word
 
@@ -225,15 +230,25 @@ class KnowledgeLane:
         stretch, each = np.cumsum(starts), len(self._bounds)
         carried = np.where(stretch == 0, self._bound, 0)
         bound = np.maximum.accumulate(stretch * each + np.maximum(bound, carried)) - stretch * each
-        changed = np.flatnonzero(starts | (np.diff(bound, prepend=self._bound) != 0))
-        edges = sorted({0, *changed.tolist(), len(level)})
-        for at, end in pairwise(edges):
-            code = int(level[at]) * (1 + each)
-            if starts[at] or (self._worded and bound[at] != self._bound):
-                self._since, self._worded = first + at, False
-                yield self._since, code
-            self._bound = int(bound[at])
-            if not self._worded and first + end - self._since > len(self._bounds[self._bound]):
+        changed = starts | (np.diff(bound, prepend=self._bound) != 0)
+        changed[:1] = True
+        edges = np.flatnonzero(changed)
+        parts = (
+            values.tolist()
+            for values in (
+                first + edges,
+                first + np.append(edges, len(level))[1:],
+                starts[edges],
+                (1 + each) * level[edges],
+                bound[edges],
+            )
+        )
+        for start, end, begins, code, now in zip(*parts, strict=True):
+            if begins or (self._worded and now != self._bound):
+                self._since, self._worded = start, False
+                yield start, code
+            self._bound = now
+            if not self._worded and end - self._since > self._widths[now]:
                 self._worded = True
-                yield self._since, code + 1 + self._bound
+                yield self._since, code + 1 + now
         self._level = int(level[-1]) if len(level) else self._level

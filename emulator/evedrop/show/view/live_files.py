@@ -16,8 +16,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import final
 
-from evedrop.results.folder import UNFINISHED, make_private, private_file
-from evedrop.system.files import write_all
+from evedrop.results.folder import UNFINISHED, make_private
+from evedrop.system.disk import write_all
+from evedrop.system.world import world
 
 _NAME = "view"
 _NUMBER = struct.Struct("<Q")
@@ -42,7 +43,7 @@ class WrittenPositions:
     def __init__(self, recording: Path, files: int) -> None:
         """Create the file; files: their number, the recording included. A reader looks for it once there is a recording."""
         make_private(recording.parent / UNFINISHED)
-        self._file = os.open(private_file(_positions_file(recording)), os.O_WRONLY | os.O_CLOEXEC)
+        self._file = world().disk.open(_positions_file(recording), "wb")
         write_all(self._file, _NUMBER.pack(files))
 
     def append(self, spans: Sequence[Span]) -> None:
@@ -51,7 +52,7 @@ class WrittenPositions:
 
     def close(self) -> None:
         """Close the file."""
-        os.close(self._file)
+        self._file.close()
 
 
 @final

@@ -30,7 +30,8 @@ from typing import IO, TYPE_CHECKING, final
 from urllib.parse import quote
 
 from evedrop.errors import UsageError
-from evedrop.results.folder import make_private, private_opener
+from evedrop.results.folder import make_private
+from evedrop.system.disk import private_opener
 from evedrop.system.environment import viewer_environment
 from evedrop.system.parents import signalled_when_parent_dies
 from evedrop.system.ports import free_port

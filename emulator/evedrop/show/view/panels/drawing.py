@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
 from evedrop.scenario.application import DrawnFlow, DrawnLevel
-from evedrop.show.view.column import Column
+from evedrop.show.view.column import Column, line_strips
 from evedrop.show.view.palette import GROUND, LABEL, PLANT, TRUTH, TRUTH_CURVE, Colour, dim
 from evedrop.show.view.panels.panel import PlacedView, ViewPanel
 from evedrop.show.view.panels.plane import frames
@@ -88,12 +88,14 @@ class DrawnPlant(ViewPanel):
         levels, flows = self._drawing.levels, self._drawing.flows
         if levels:
             strips = np.stack([filled(level, x[:, level.state]) for level in levels], axis=1)
-            bars = rr.LineStrips2D.columns(strips=strips.reshape(-1, *strips.shape[2:]))
+            bars = rr.LineStrips2D.columns(strips=line_strips(strips.reshape(-1, *strips.shape[2:])))
             yield Column(_BARS, k, bars.partition([len(levels)] * len(k)))
         if flows:
             widths = half_widths(powers, self._drawing.most)
             strips = np.stack([arrow(flow, powers[:, i], widths[:, i]) for i, flow in enumerate(flows)], axis=1)
-            arrows = rr.LineStrips2D.columns(strips=strips.reshape(-1, *strips.shape[2:]), radii=widths.ravel())
+            arrows = rr.LineStrips2D.columns(
+                strips=line_strips(strips.reshape(-1, *strips.shape[2:])), radii=widths.ravel()
+            )
             yield Column(_ARROWS, k, arrows.partition([len(flows)] * len(k)))
         words = [[level_text(level, value, self.scene) for value in x[:, level.state].tolist()] for level in levels]
         words += [

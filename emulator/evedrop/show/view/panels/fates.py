@@ -73,7 +73,7 @@ class StateLanes:
 
 def states(lane: Lane, codes: Sequence[int] | NDArray[np.integer]) -> rr.ComponentColumnList:
     """The words of codes of a lane, as Rerun's states."""
-    words: Any = pa.array(lane.words).take(pa.array(codes))
+    words: Any = pa.array(lane.words).take(pa.array(np.asarray(codes)))
     return rr.StateChange.columns(state=words)
 
 

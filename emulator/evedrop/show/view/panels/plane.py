@@ -22,7 +22,7 @@ from evedrop.model.links.way import Way
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.show.view.attacks import Attacks, cut_off, lane_count
-from evedrop.show.view.column import Column
+from evedrop.show.view.column import Column, line_strips
 from evedrop.show.view.lanes import ErrorDistance
 from evedrop.show.view.palette import GROUND, LABEL, TRUTH, Colour, dim
 from evedrop.show.view.panels.curves import times_of
@@ -151,23 +151,25 @@ class StatePlane(ViewPanel):
         low, high = boxes[:, 0] + border, boxes[:, 2] - border
         truth = positions[TRUTH_NAME][at]
         labels: list[Points] = []
-        yield Column(_FRAME, k[at], rr.LineStrips2D.columns(strips=boxes))
+        yield Column(_FRAME, k[at], rr.LineStrips2D.columns(strips=line_strips(boxes)))
         size = boxes[:, 2] - boxes[:, 0]
-        yield Column(_HEADING, k[at], rr.LineStrips2D.columns(strips=heading_strips(truth, headings, size)))
+        yield Column(
+            _HEADING, k[at], rr.LineStrips2D.columns(strips=line_strips(heading_strips(truth, headings, size)))
+        )
         bars, lengths = scale_bars(boxes[:, 0], boxes[:, 2])
         texts = [self._distance.text(length) for length in lengths.tolist()]
-        yield Column(_SCALE, k[at], rr.LineStrips2D.columns(strips=bars, labels=texts))
+        yield Column(_SCALE, k[at], rr.LineStrips2D.columns(strips=line_strips(bars), labels=texts))
         places: dict[str, Points] = {}
         for name, points in positions.items():
             trail = within(pieces[name], low, high, truth)
-            yield Column(_trail(name), k[at], rr.LineStrips2D.columns(strips=trail))
+            yield Column(_trail(name), k[at], rr.LineStrips2D.columns(strips=line_strips(trail)))
             places[name] = side_by_side(truth, points[at], [*places.values()], low, high)
             yield Column(_point(name), k[at], rr.Points2D.columns(positions=places[name]))
         for i, shown in enumerate(self.scene.receivers):
             peer = slots.peers[shown.name]
             outlines = np.clip(ellipses(peer.x_hat[at], peer.P[at]), low[:, None], high[:, None])
             outlines = np.where(inside(positions[shown.name][at], low, high)[:, None, None], outlines, truth[:, None])
-            yield Column(_ellipse(shown.name), k[at], rr.LineStrips2D.columns(strips=outlines))
+            yield Column(_ellipse(shown.name), k[at], rr.LineStrips2D.columns(strips=line_strips(outlines)))
             distances = self._distance.of(slots.x[at], peer.x_hat[at])
             offs = [f"{self._distance.text(distance)} off" for distance in distances.tolist()]
             below = rr.Points2D.columns(positions=labels_below(places[shown.name], low, high), labels=offs)
@@ -212,7 +214,7 @@ class StatePlane(ViewPanel):
         drawn = arrows(truth[far], points[far], tips[far], low[far], high[far])
         texts = [f"{name}: {self._distance.text(distance)}" for distance in distances[far].tolist()]
         lengths = far.astype(np.int64)
-        yield Column(_arrow(name), k, rr.LineStrips2D.columns(strips=drawn).partition(lengths))
+        yield Column(_arrow(name), k, rr.LineStrips2D.columns(strips=line_strips(drawn)).partition(lengths))
         centres = np.full((len(k), 2), np.nan, np.float32)
         centres[far] = labels_of(truth[far], drawn[:, 1], low[far], high[far])
         centres = apart(centres, labels, low, high)
@@ -454,10 +456,12 @@ class Frame:
         before = len(self._lows)
         self._lows = np.concatenate([self._lows, lows])
         self._highs = np.concatenate([self._highs, highs])
-        low, high = np.empty((len(offsets), 2)), np.empty((len(offsets), 2))
-        for i, end in enumerate((offsets + before + 1).tolist()):
-            recent = slice(max(0, end - _FRAMED_SLOTS), end)
-            low[i], high[i] = self._lows[recent].min(axis=0), self._highs[recent].max(axis=0)
+        ends = offsets + before + 1
+        recent = np.stack([np.maximum(ends - _FRAMED_SLOTS, 0), ends], axis=1).ravel()
+        low, high = (
+            least.reduceat(np.pad(bounds, ((0, 1), (0, 0))), recent, axis=0)[::2].astype(np.float64)
+            for least, bounds in ((np.minimum, self._lows), (np.maximum, self._highs))
+        )
         self._lows, self._highs = self._lows[-_FRAMED_SLOTS:], self._highs[-_FRAMED_SLOTS:]
         room = _FRAME_ROOM * (high - low).max(axis=1, keepdims=True, initial=0.0)
         low, high = low - room, high + room
@@ -482,11 +486,10 @@ class TruthDirection:
         ends = offsets + before
         moved = path[ends] - path[np.maximum(ends - _HEADED_SLOTS, 0)]
         lengths = np.hypot(moved[:, 0], moved[:, 1])
-        directions = np.empty((len(offsets), 2), np.float32)
-        for i, length in enumerate(lengths.tolist()):
-            if 0.0 < length < _LARGEST:
-                self._last = (moved[i] / length).astype(np.float32)
-            directions[i] = self._last
+        known = np.flatnonzero((lengths > 0.0) & (lengths < _LARGEST))
+        turns = np.concatenate([self._last[None], (moved[known] / lengths[known, None]).astype(np.float32)])
+        directions = turns[np.searchsorted(known, np.arange(len(offsets)), side="right")]
+        self._last = turns[-1]
         self._recent = path[-_HEADED_SLOTS:].astype(np.float32)
         return directions
 
@@ -597,7 +600,7 @@ class GroundMap(ViewPanel):
             ends = np.stack([_on_map(way, k.astype(np.float64)) for way in ways], axis=1)
             distances = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
             labels = [text for distance in distances.tolist() for text in ("sensor", f"{name}: {distance:,.0f} m away")]
-            yield Column(f"{_MAP_PATH}/{name}/link", k, rr.LineStrips2D.columns(strips=ends))
+            yield Column(f"{_MAP_PATH}/{name}/link", k, rr.LineStrips2D.columns(strips=line_strips(ends)))
             both = ends.reshape(-1, 2)
             points, words = rr.Points2D.columns(positions=both), rr.Points2D.columns(positions=both, labels=labels)
             yield Column(f"{_MAP_PATH}/{name}/at", k, points.partition([2] * len(k)))

@@ -27,8 +27,14 @@ _FRACTIONS = ("received_fraction", "used_fraction")
 _MEANS = (*_ERRORS, *_FRACTIONS)
 
 
-def unlike_memory(summary: Mapping[str, Any], wanted: Mapping[str, Any]) -> Iterator[str]:
-    """The entries of a complete run's summary that differ from those of the same trials in memory."""
+def unlike_memory(summary: Mapping[str, Any], wanted: Mapping[str, Any], shards: int = 1) -> Iterator[str]:
+    """The entries of a complete run's summary that differ from those of the same trials in memory.
+
+    shards: of the run; a decision covers all trials in memory, and those of one shard in the run.
+    """
+    controller = wanted.get("controller")
+    if controller is not None:
+        wanted = {**wanted, "controller": {**controller, "decisions": shards * controller["decisions"]}}
     for name, value in wanted.items():
         if name not in _OF_A_LIVE_RUN:
             yield from _differences(name, summary.get(name), value)

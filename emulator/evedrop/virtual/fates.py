@@ -1,6 +1,6 @@
 """The journal that a run must write, from the fates that the link model decides in memory, counted here packet by packet.
 
-Source: docs/results.md, tables, `journal.parquet`.
+Source: docs/results.md, tables.
 """
 
 from __future__ import annotations

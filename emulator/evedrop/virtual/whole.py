@@ -11,7 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from tests.faults.reference import KEYS, Reference
+from evedrop.virtual.reference import KEYS, RunReference
 
 _SHOWN = 2
 _BY_TRIAL = ("trials", "inputs", "digests")
@@ -19,7 +19,7 @@ _CONTROLLER = "controller"
 
 
 def missing_rows(
-    tables: Mapping[str, pa.Table], summary: Mapping[str, Any], reference: Reference, complete: bool
+    tables: Mapping[str, pa.Table], summary: Mapping[str, Any], reference: RunReference, complete: bool
 ) -> Iterator[str]:
     """The rows of a folder that are missing: of slots below the summary's `slots`, of all its trials.
 
@@ -42,11 +42,14 @@ def missing_rows(
         if lacking:
             shown = ", ".join(map(str, lacking[:_SHOWN]))
             yield f"{name} lacks {len(lacking)} of {len(due)} rows of the {slots} slots that are done: {shown} …"
-    yield from _uneven(tables, slots)
+    recorded = len({key[2] for key in reference.tables["trials"]})
+    yield from _uneven(
+        tables, slots, recorded > int(reference.summary["trials"]) * (reference.shards - 1) // reference.shards
+    )
 
 
 def _ended(
-    key: tuple[Any, ...], wanted: Mapping[tuple[Any, ...], Any], reference: Reference, slots: int, complete: bool
+    key: tuple[Any, ...], wanted: Mapping[tuple[Any, ...], Any], reference: RunReference, slots: int, complete: bool
 ) -> bool:
     """Whether a block of digests had ended when these slots were done."""
     peer, trial, block = key
@@ -56,15 +59,18 @@ def _ended(
     return min(ends, default=int(reference.summary["slots"])) <= slots
 
 
-def _uneven(tables: Mapping[str, pa.Table], slots: int) -> Iterator[str]:
-    """Slots beyond those of the summary, which only some shards have reached: every table has them for every receiver."""
+def _uneven(tables: Mapping[str, pa.Table], slots: int, all_recorded: bool) -> Iterator[str]:
+    """Slots beyond those of the summary, which only some shards have reached: every table has them for every receiver.
+
+    all_recorded: whether some trial of every shard is recorded.
+    """
     ends = {}
     for name, column in (("slots", "peer"), ("journal", "link"), ("trials", "peer")):
         rows = zip(tables[name]["slot"].to_pylist(), tables[name][column].to_pylist(), strict=True)
         ends[name] = Counter(key for key in rows if key[0] >= slots)
     if ends["slots"].keys() != ends["journal"].keys():
         yield "slots and journal have rows of different slots beyond those that all trials have"
-    if ends["trials"].keys() != ends["slots"].keys() or len({*_by_slot(ends["trials"])}) > len(
+    if (all_recorded and ends["trials"].keys() != ends["slots"].keys()) or len({*_by_slot(ends["trials"])}) > len(
         {slot for slot, _ in ends["trials"]}
     ):
         yield "trials has rows of different slots, or of some receivers only, beyond those that all trials have"

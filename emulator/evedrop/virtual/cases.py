@@ -1,0 +1,195 @@
+"""Runs drawn from a seed: a scenario with any scheme, strategy, link and event, and the faults that disturb it.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass
+from typing import Any, final
+
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.live.launch.briefs import MOST_SLOTS_AHEAD
+from evedrop.model.delays import DELAY_MODELS
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.links import LOSS_MODELS
+from evedrop.model.schemes import SCHEMES
+from evedrop.scenario.loading import Scenario
+from evedrop.virtual.faults import KINDS, Disturbance, faults_of
+
+_MOST_SLOTS, _MOST_TRIALS = 80, 4
+_AHEAD = (2, 3, 5, 8, 16, 40, MOST_SLOTS_AHEAD)
+_COSTLY: Mapping[str, Mapping[str, Any]] = {"learning-em": {"keeps": 4}, "learning-particle": {"particles": 4}}
+"""Strategies that take longer than all other processes of a run together → how they take less."""
+_MOST_BLOCKS = 40
+"""How often the sensor may have to wait, where it need not be ahead of others by little."""
+_PACES = (0.001, 0.01, 0.1, 0.3)
+"""Seconds of a slot: a run of half a minute is written to the disk while it goes on."""
+_UNSTABLE, _STABLE = 1.02, 0.9
+_LOOP: Mapping[str, Any] = {
+    "plant": {"inputs": ["u"], "input_matrix": [[0.1], [0.0]], "noise": [[1e-4, 0.0], [0.0, 1e-4]]},
+    "controller": {"strategy": "lqr", "state_weights": [1.0, 1.0], "input_weights": [0.1]},
+}
+
+
+@dataclass(frozen=True)
+class SimulatedCase:
+    """A run that is disturbed."""
+
+    seed: int
+    scenario: Scenario
+    faults: tuple[Disturbance, ...]
+    ahead: int = MOST_SLOTS_AHEAD
+    """How many slots the sensor may be ahead: the flow control of a run of a hundred thousand slots fits into a few."""
+
+    def __str__(self) -> str:
+        scenario = self.scenario
+        eves = ", ".join(table.strategy for table in scenario.eavesdroppers.values()) or "nobody"
+        faults = "; ".join(map(str, self.faults)) or "no fault"
+        return (
+            f"{scenario.encoding.spec['scheme']} against {eves}, {scenario.slots} slots of {scenario.trials}, "
+            f"{self.ahead} ahead: {faults}"
+        )
+
+    def to_text(self) -> str:
+        """The case in one line, from which `case_from` makes it again."""
+        faults = [[fault.kind, *astuple(fault)] for fault in self.faults]
+        tables = self.scenario.as_tables()
+        return json.dumps({"seed": self.seed, "ahead": self.ahead, "faults": faults, "scenario": tables})
+
+
+def case_from(text: str) -> SimulatedCase:
+    """The case of a text: of a seed alone, or of a line that `Case.to_text` has written. Raises UsageError."""
+    try:
+        described = json.loads(text)
+        if isinstance(described, int):
+            return case_of(described)
+        faults = tuple(KINDS[kind](*rest) for kind, *rest in described["faults"])
+        scenario, ahead = Scenario(described["scenario"]), described.get("ahead", MOST_SLOTS_AHEAD)
+        return SimulatedCase(described["seed"], scenario, faults, ahead)
+    except (ValueError, TypeError, KeyError) as error:
+        raise UsageError(f"not a case ({type(error).__name__}: {error}); expected a seed or a shrunk case") from error
+
+
+def case_of(seed: int) -> SimulatedCase:
+    """The case of a seed, and of nothing else."""
+    draw = CaseDraw(random.Random(f"case {seed}"))  # noqa: S311 - to be repeated, not to be secret
+    scenario = draw.scenario()
+    ahead = draw.random.choice(_AHEAD)
+    return SimulatedCase(seed, scenario, faults_of(draw.random, scenario, ahead), ahead)
+
+
+def case_with(scenario: Scenario, seed: int) -> SimulatedCase:
+    """The case of a seed with this scenario: what is drawn are the faults, and how far the sensor may be ahead."""
+    source = random.Random(f"scenario {seed}")  # noqa: S311 - to be repeated, not to be secret
+    few = [
+        ahead for ahead in _AHEAD if scenario.slots <= _MOST_BLOCKS * ahead
+    ]  # or a long run would have too many messages
+    ahead = source.choice(few or [MOST_SLOTS_AHEAD])
+    return SimulatedCase(seed, scenario, faults_of(source, scenario, ahead), ahead)
+
+
+@final
+class CaseDraw:
+    """Draws the parts of a scenario."""
+
+    def __init__(self, source: random.Random) -> None:
+        self.random = source
+
+    def scenario(self) -> Scenario:
+        """A scenario that fits together: a draw that does not is drawn again."""
+        while True:
+            try:
+                return Scenario(self._tables())
+            except ScenarioError:
+                continue
+
+    def _tables(self) -> dict[str, Any]:
+        some, chance = self.random, self._chance
+        trials = some.randint(1, _MOST_TRIALS)
+        tables: dict[str, Any] = {
+            "title": "Drawn",
+            "slots": round(_MOST_SLOTS ** some.random()),
+            "seed": some.getrandbits(32),
+            "trials": trials,
+            "record_trials": some.randint(1, trials),
+            "longest_outage": some.choice([3.0, 30.0]),
+            "pace": some.choice(_PACES) if chance(0.3) else 0.0,
+            "process": self._process(),
+            "encoding": self._encoding(),
+            "legitimate": {"link": self._link(), **({"window": some.randint(1, 4)} if chance(0.3) else {})},
+            "eavesdroppers": {f"eve{i}": self._eavesdropper() for i in range(some.randint(0, 3))},
+        }
+        if SCHEMES[tables["encoding"]["scheme"]].needs_acknowledgements:
+            tables["acknowledgements"] = {"link": {"quality": self._quality()}}
+            if chance(0.3) and tables["eavesdroppers"]:
+                tables["acknowledgements"] |= {"attack": "critical", "jammer": "eve0"}
+        if chance(0.2):
+            tables |= _LOOP
+            told = {"period": some.randint(1, 4), "acts_on": some.choice(["truth", "estimate"])}
+            tables["controller"] = {**tables["controller"], **told}
+            tables["legitimate"]["knows_input"] = chance(0.7)
+        if chance(0.15):
+            tables["network"] = {"routers": 2}
+        if chance(0.15) and trials > 1 and "network" not in tables:
+            tables["shards"] = 2
+        if chance(0.3):
+            tables["event"] = [self._event(tables) for _ in range(some.randint(1, 3))]
+        return tables
+
+    def _process(self) -> dict[str, Any]:
+        growth = self.random.choice([_STABLE, 1.0, _UNSTABLE])
+        return {
+            "A": [[growth, 0.1], [0.0, 0.9]],
+            "Q": [[0.01, 0.0], [0.0, 0.01]],
+            "initial_covariance": [[1.0, 0.0], [0.0, 1.0]],
+        }
+
+    def _encoding(self) -> dict[str, Any]:
+        name = self.random.choice(sorted(SCHEMES.names))
+        return {"scheme": name, **SCHEMES[name].parameters}
+
+    def _eavesdropper(self) -> dict[str, Any]:
+        names = sorted(STRATEGIES.names)
+        name = self.random.choice(names)
+        if name in _COSTLY and self._chance(0.9):
+            name = self.random.choice([cheap for cheap in names if cheap not in _COSTLY])
+        table = {"strategy": name, "link": self._link(), **STRATEGIES[name].parameters, **_COSTLY.get(name, {})}
+        if self._chance(0.2):
+            table["window"] = self.random.randint(1, 4)
+        return table
+
+    def _link(self) -> dict[str, Any]:
+        link: dict[str, Any] = {}
+        if self._chance(0.5):
+            link["quality"] = self._quality()
+        else:
+            name = self.random.choice(sorted(LOSS_MODELS.names))
+            link["loss"] = {"model": name, **LOSS_MODELS[name].parameters}
+        if self._chance(0.3):
+            name = self.random.choice(sorted(DELAY_MODELS.names))
+            link["delay"] = {"model": name, **DELAY_MODELS[name].parameters}
+        if self._chance(0.2):
+            link["duplicate"] = 0.1
+        if self._chance(0.2):
+            link["corrupt"] = 0.05
+        return link
+
+    def _event(self, tables: Mapping[str, Any]) -> dict[str, Any]:
+        some, slots = self.random, int(tables["slots"])
+        receiver = some.choice(["legitimate", *tables["eavesdroppers"]])
+        first = some.randrange(slots)
+        span = {"from": first, "to": some.randint(first + 1, slots)}
+        kind = some.choice(["set", "kill", "pause", "cut"])
+        if kind == "set":
+            return {"at": first, "link": receiver, "set": {"quality": self._quality()}}
+        return {**span, kind: receiver, **({"state": some.choice(["prior", "last"])} if kind == "kill" else {})}
+
+    def _quality(self) -> float:
+        return round(self.random.uniform(0.3, 1.0), 2)
+
+    def _chance(self, probability: float) -> bool:
+        return self.random.random() < probability

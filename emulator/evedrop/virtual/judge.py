@@ -1,0 +1,213 @@
+"""What must hold after a run in the simulated world, whatever happened to it.
+
+The same trials in memory say which rows a run may write: it ends with all of them, or with those of the slots that it has done.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from evedrop.errors import Interrupted, RunError, UsageError
+from evedrop.live.launch.briefs import LAUNCHED_PATIENCE
+from evedrop.names import RECORDER, RELAY, ROUTER
+from evedrop.results.reading import Results
+from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
+from evedrop.virtual.cases import SimulatedCase
+from evedrop.virtual.faults import (
+    LAUNCHER,
+    ConfuseKeys,
+    CutConnection,
+    CutPower,
+    DiskDisturbance,
+    Disturbance,
+    FreezeConnection,
+    InterruptProcess,
+    KillProcess,
+    SlowConnection,
+    StopProcess,
+)
+from evedrop.virtual.processes import FORK_SERVERS
+from evedrop.virtual.reference import RunReference
+from evedrop.virtual.results import wrong_outages, wrong_summary, wrong_tables
+from evedrop.virtual.run import SimulatedRun
+
+_KILLED = -9
+_HEEDED_SECONDS = 1.0
+"""After a signal to the launcher, a run that has slots to come does not complete."""
+_USUAL_SECONDS, _FAULT_SECONDS = 5.0, 15.0
+"""That a run takes besides those of its slots, and that each fault may cost besides those that it lasts."""
+_PATIENCES = 2.0
+"""How many times the longest outage a run may wait before it gives up."""
+_SILENCE_SECONDS = 120.0
+"""For which a launcher waits for a fork server that is suspended; it waits less for any other process."""
+_CUTTING = (CutConnection, FreezeConnection, SlowConnection, StopProcess, ConfuseKeys)
+_GOES_ON = ("control.json", "unfinished")
+"""What the folder of a run that goes on has, and that of a run that has ended has not."""
+
+
+def misses(
+    case: SimulatedCase,
+    run: SimulatedRun,
+    struck: Mapping[Disturbance, float],
+    reference: RunReference,
+    temporary: Path,
+) -> list[str]:
+    """The broken promises; struck: the faults that hit something, each with its moment; reference: the same trials in memory.
+
+    temporary: the folder of temporary files.
+    """
+    if run.stuck is not None:
+        return [f"stuck: {run.stuck}"]
+    found = [f"{name} is left" for name in run.left]
+    found += [f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors]
+    found += _of_status(case, run, struck, reference.status)
+    found += _of_time(case, run, struck)
+    if not any(map(_kills_launcher, struck)) and not run.suspended:
+        found += [f"{path.name} is left" for path in sorted(temporary.iterdir())]
+    found += _of_logs(run)
+    found += _of_files(run, struck)
+    found += _of_results(run, struck, reference)
+    return found
+
+
+def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float], good: int) -> Iterator[str]:
+    """Whether the exit status, and what is said, tell what happened; good: the status of a run that completes."""
+    status = run.status
+    said = next((line for line in run.said.splitlines() if line.strip() and "warning" not in line), "")
+    fatal = [fault for fault in struck if not fault.survived(case.scenario.longest_outage)]
+    if run.suspended:
+        return
+    if status == good:
+        yield from _of_ignored_signals(case, run, {fault: struck[fault] for fault in fatal})
+    elif not fatal:
+        yield f"status {status}, although nothing of this may end a run: {said}"
+    elif status == RunError.exit_status:
+        blamed = [word for fault in fatal for word in fault.blamed]
+        whole = run.said if any(isinstance(fault, DiskDisturbance) for fault in fatal) else said
+        if not any(word in whole for word in blamed):
+            yield f"the failure names none of {', '.join(blamed)}: {said or '(nothing was said)'}"
+    elif status == UsageError.exit_status:
+        if not any(isinstance(fault, DiskDisturbance) for fault in fatal):
+            yield f"status 2: {said}"
+    elif status == Interrupted.exit_status:
+        if not any(isinstance(fault, InterruptProcess) for fault in fatal):
+            yield "status 130, but no signal asked for the end"
+    elif status == _KILLED:
+        if not any(map(_kills_launcher, fatal)):
+            yield "the launcher was killed by something else"
+    else:
+        yield f"status {status}: {said}"
+
+
+def _of_ignored_signals(case: SimulatedCase, run: SimulatedRun, fatal: Mapping[Disturbance, float]) -> Iterator[str]:
+    """A launcher that is told to end while slots are to come ends the run, rather than complete it."""
+    for fault, at in fatal.items():
+        if isinstance(fault, InterruptProcess) and fault.target == LAUNCHER:
+            late = at + _HEEDED_SECONDS
+            if any(moment > late and done < case.scenario.slots for moment, done in _progress(run)):
+                yield f"the run went on to its end, {_HEEDED_SECONDS:.0f} s and more after {fault}"
+
+
+def _kills_launcher(fault: Disturbance) -> bool:
+    return isinstance(fault, CutPower) or (isinstance(fault, KillProcess) and fault.target == LAUNCHER)
+
+
+def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
+    """Whether the run ended as soon as it could: a wake-up that is lost, and a wait that is too long, cost nothing but time."""
+    scenario = case.scenario
+    most = scenario.slots * scenario.pace + _USUAL_SECONDS
+    for fault in struck:
+        most += _FAULT_SECONDS + (fault.seconds or 0.0)
+    if any(not fault.survived(scenario.longest_outage) for fault in struck):
+        most += _PATIENCES * scenario.longest_outage + LAUNCHED_PATIENCE
+    if any(isinstance(fault, StopProcess) and fault.seconds is None for fault in struck):
+        most += _SILENCE_SECONDS
+    if run.seconds > most and not run.suspended:
+        yield f"the run took {run.seconds:.1f} s, and not {most:.1f} s at most"
+
+
+def _progress(run: SimulatedRun) -> Iterator[tuple[float, int]]:
+    """When the run told of its progress, and how many slots were done."""
+    for at, event in run.told:
+        if isinstance(event, RunProgress):
+            yield at, event.done
+
+
+def _of_logs(run: SimulatedRun) -> Iterator[str]:
+    if "Traceback" in run.said:
+        yield f"the launcher: {run.said.strip().splitlines()[-1]}"
+    for path in sorted(run.folder.glob("**/*.log")):
+        text = path.read_text("utf-8", "replace")
+        if "Traceback" in text:
+            yield f"{path.name}: {text.strip().splitlines()[-1]}"
+
+
+def _of_files(run: SimulatedRun, struck: Iterable[Disturbance]) -> Iterator[str]:
+    """Files that others may read, and those of a run that goes on."""
+    cleans_up = (
+        run.status != _KILLED and not run.suspended and not any(isinstance(fault, DiskDisturbance) for fault in struck)
+    )
+    for path in sorted(run.folder.glob("**/*")):
+        if path.stat().st_mode & 0o077:
+            yield f"others may use {path.relative_to(run.folder)}, whose mode is {path.stat().st_mode & 0o777:o}"
+        if cleans_up and path.name in _GOES_ON:
+            yield f"{path.relative_to(run.folder)} is left of the run"
+
+
+def _of_results(run: SimulatedRun, struck: Mapping[Disturbance, float], reference: RunReference) -> Iterator[str]:
+    """Whether the tables can be read, and have the right rows, and no others, and the summary is of them."""
+    done = run.status == reference.status
+    disk = any(isinstance(fault, DiskDisturbance) for fault in struck)
+    # Those of each shard, where they could not be made one.
+    folders = sorted((run.folder / "shards").glob("*")) or [run.folder] * run.folder.is_dir()
+    if done and not folders:
+        yield "there are no results"
+    for folder in folders:
+        try:
+            results = Results.read(folder)
+        except UsageError as error:
+            if done or (len(folders) == 1 and not disk and any(slots for _, slots in _progress(run))):
+                yield f"the results cannot be read: {error}"
+            continue
+        summary = results.summary
+        yield from wrong_tables(results, reference, done, reference.shards if len(folders) == 1 else 1)
+        if disk and not done:
+            continue
+        yield from wrong_summary(summary, reference, done)
+        if not done and summary["ended"] == "complete" and run.status not in (_KILLED, Interrupted.exit_status):
+            yield f"status {run.status}, and the summary says complete"
+        if not any(fault.target in (RECORDER, LAUNCHER) and isinstance(fault, KillProcess) for fault in struck):
+            yield from _of_course(run, struck, summary, reference, len(folders) == 1)
+
+
+def _of_course(
+    run: SimulatedRun,
+    struck: Mapping[Disturbance, float],
+    summary: Mapping[str, Any],
+    reference: RunReference,
+    whole: bool,
+) -> Iterator[str]:
+    """Whether the summary has what the run went through; whole: whether it is of all shards."""
+    told = max((done for _, done in _progress(run)), default=0)
+    if summary["slots"] < told and whole:
+        yield f"{told} slots were done, and the summary has {summary['slots']}"
+    outages = [event for _, event in run.told if isinstance(event, ConnectionOutage)] if whole else []
+    yield from wrong_outages(summary, reference, frozenset((event.process, event.slot) for event in outages))
+    for entry in summary["outages"]:
+        if not any(_explains(fault, entry["process"]) for fault in struck):
+            yield f"an outage of {entry['process']} at slot {entry['slot']}, and no fault caused one"
+
+
+def _explains(fault: Disturbance, process: str) -> bool:
+    """Whether a fault can have cut a process off; a process that ends may be missed first, whichever it is.
+
+    With a fork server that is suspended for too long, all its processes end.
+
+    Routers, and the recorder, stand for all that were connected to them.
+    """
+    hubs = (ROUTER, RELAY, RECORDER)
+    return not isinstance(fault, _CUTTING) or fault.target in (process, *hubs, *FORK_SERVERS) or process in hubs

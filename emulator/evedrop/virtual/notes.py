@@ -1,0 +1,68 @@
+"""The words of notes: what the parts of the simulated world write down as it happens, for the hash of a run and to be shown.
+
+A note has one of these words, and others that say more. They begin with the process that it is about, except for those of PUT,
+which is about the process whose thread goes on, and of FAULT.
+
+Source: docs/maintainers/simulated-world.md, a failing seed.
+"""
+
+from __future__ import annotations
+
+import msgpack
+
+STARTS = "starts"
+"""Process."""
+ENDS = "ends"
+"""Process, exit status."""
+SUSPENDED = "is suspended"
+"""Process."""
+GOES_ON = "goes on"
+"""Process."""
+SIGNAL = "signal"
+"""Process, number of the signal."""
+FAULT = "fault"
+"""What a case does to the run, as a text."""
+PUT = "put"
+"""Key (`key_within`), bytes of the message, what the message says (`said_in`). After it, the number of events so far
+(`VirtualScheduler.events`) names the message."""
+GETS = "gets"
+"""Process, key, number of the message that has arrived at it."""
+LOST = "lost"
+"""Process, key, number of the message that will never arrive at it, why."""
+CONNECTS = "connects"
+"""Process, to which router."""
+DISCONNECTS = "disconnects"
+"""Process, from which router, why: "cut", "closed", "router is gone"."""
+FREEZES = "freezes"
+"""Process, router: nothing gets through between them."""
+DECLARES = "declares"
+"""Process, what: such as "subscriber uplink" or "token"."""
+WRITES = "changes"
+"""Process, what it does to a file (writes, renames, …), name of the file."""
+
+
+def key_within(key: str) -> str:
+    """A run's key without the run: `evedrop/RUN/control/sensor` is `control/sensor`; any other key as it is."""
+    parts = key.split("/", 2)
+    return parts[2] if len(parts) > 2 and parts[0] == "evedrop" else key
+
+
+def said_in(message: bytes) -> str:
+    """The command or the slots that a message carries, in few words: "end", "12", "0-27", "hold 28"; empty if neither.
+
+    message: as it is put, with its envelope.
+    """
+    unpacker = msgpack.Unpacker(strict_map_key=False)
+    unpacker.feed(message)
+    try:
+        unpacker.skip()
+        fields = unpacker.unpack()
+    except (ValueError, msgpack.UnpackException):
+        return ""
+    if not isinstance(fields, dict):
+        return ""
+    first, slots = fields.get("k"), fields.get("c", 1)
+    words = [str(fields["do"])] if "do" in fields else [word for word in ("hold", "again", "over") if word in fields]
+    if isinstance(first, int) and isinstance(slots, int):
+        words.append(f"{first}-{first + slots - 1}" if slots > 1 else str(first))
+    return " ".join(words)

@@ -1,0 +1,143 @@
+"""A live run in the simulated world: its launcher, and all the processes that it starts.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TextIO, cast, final
+
+from evedrop.errors import EvedropError
+from evedrop.live.launch.briefs import MOST_SLOTS_AHEAD
+from evedrop.live.launch.launcher import launch
+from evedrop.scenario.progress_events import ProgressEvent
+from evedrop.scenario.tables import Scenario
+from evedrop.system.output import say
+from evedrop.system.world import inside
+from evedrop.virtual.disk import VirtualDisk
+from evedrop.virtual.processes import ProcessOutput, Program, VirtualMachine, VirtualProcess
+from evedrop.virtual.scheduler import Occurrence, Stuck, VirtualScheduler
+from evedrop.virtual.world import VirtualWorld
+from evedrop.virtual.zenoh import VirtualZenoh
+
+MOST_SECONDS = 3600.0
+"""Virtual seconds within which every run must end, whatever happens to it."""
+_ROUTER, _RELAY = "tcp/127.0.0.1:17460", "tcp/127.0.0.1:17461"
+"""Where two routers listen: encryption is not simulated."""
+_LEAVE_SECONDS = 60.0
+"""Virtual seconds for processes whose launcher has ended, or was killed, to write what they have and to end."""
+
+
+@final
+@dataclass
+class SimulatedRun:
+    """What became of a run in the simulated world."""
+
+    folder: Path
+    """Of its results."""
+    status: int | None = None
+    """The exit status of its launcher; None if it never ended."""
+    said: str = ""
+    """What the launcher wrote to standard error."""
+    told: list[tuple[float, ProgressEvent]] = field(default_factory=list)
+    """The events that the launcher got, each with its virtual time."""
+    left: list[str] = field(default_factory=list)
+    """Processes that outlived it."""
+    suspended: bool = False
+    """Whether its launcher was suspended for good, and all others have ended."""
+    stuck: str | None = None
+    """Why it did not end, if so."""
+    errors: list[tuple[str, BaseException]] = field(default_factory=list)
+    """Thread → the exception that nobody caught."""
+    seconds: float = 0.0
+    """Virtual seconds."""
+    events: int = 0
+    digest: str = ""
+    """The hash of all events."""
+    happened: list[Occurrence] = field(default_factory=list)
+    """All events, if they were kept."""
+
+
+@final
+class SimulatedWorld:
+    """The parts of a simulated world, for those who disturb it."""
+
+    def __init__(self, seed: int, program: Program, root: Path, keep: bool = False) -> None:
+        """program: what `evedrop` is there. root: an empty folder for its disk. keep: whether to keep all events."""
+        self.scheduler = VirtualScheduler(seed, keep)
+        self.machine = VirtualMachine(self.scheduler, program)
+        self.zenoh = VirtualZenoh(self.scheduler)
+        self.disk = VirtualDisk(self.scheduler, root)
+        self.world = VirtualWorld(self.scheduler, self.machine, self.zenoh, self.disk)
+
+    @contextlib.contextmanager
+    def entered(self) -> Iterator[None]:
+        """Let all programs of the interpreter be in this world while the block runs."""
+        out, err = (cast(TextIO, ProcessOutput(self.machine, stream)) for stream in (sys.stdout, sys.stderr))
+        mask = os.umask(0o077)
+        with inside(self.world), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            try:
+                yield
+            finally:
+                self.scheduler.take_down()
+                os.umask(mask)
+
+    def process(self, name: str) -> VirtualProcess | None:
+        """The latest process of this name, if it runs."""
+        found = [process for process in self.machine.processes if process.task.name == name and process.task.alive]
+        return found[-1] if found else None
+
+
+def run_in(
+    world: SimulatedWorld,
+    scenario: Scenario,
+    folder: Path,
+    disturb: Callable[[SimulatedWorld, VirtualProcess], object] | None = None,
+    ahead: int = MOST_SLOTS_AHEAD,
+) -> SimulatedRun:
+    """Run a scenario live in a simulated world; disturb: arranges what happens to it, given its launcher; ahead: of `launch`."""
+    run = SimulatedRun(folder)
+    scheduler = world.scheduler
+
+    def launcher() -> int:
+        try:
+            return launch(
+                scenario,
+                folder,
+                "off",
+                _ROUTER if scenario.relayed else None,
+                lambda event: run.told.append((scheduler.now, event)),
+                _RELAY if scenario.relayed else None,
+                starters=world.machine.starter,
+                ahead=ahead,
+            ).status
+        except EvedropError as error:
+            say(error.illustrated)
+            return error.exit_status
+
+    with world.entered():
+        process = world.machine.begin("launcher", launcher)
+        if disturb is not None:
+            disturb(world, process)
+        try:
+            scheduler.run(MOST_SECONDS, lambda: not process.task.alive)
+            ended = scheduler.now
+            with contextlib.suppress(Stuck):
+                scheduler.run(ended + _LEAVE_SECONDS, lambda: not _alive(world))
+        except Stuck as why:
+            run.suspended = process.task.stopped  # the processes of a run that has failed wait for it to end them
+            run.stuck = None if run.suspended else str(why)
+        run.status, run.said, run.left = process.task.status, process.printed, [] if run.suspended else _alive(world)
+        run.errors, run.seconds, run.events = scheduler.errors, scheduler.now, scheduler.events
+        run.digest, run.happened = scheduler.digest, scheduler.happened
+    return run
+
+
+def _alive(world: SimulatedWorld) -> list[str]:
+    return [process.task.name for process in world.machine.processes if process.task.alive]

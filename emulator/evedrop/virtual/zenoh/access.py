@@ -1,0 +1,109 @@
+"""Which messages a simulated router lets in and out: users, access control and the sizes of messages.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple, final
+
+import zenoh
+
+
+class Peer(NamedTuple):
+    """The other end of a connection, as a router knows it."""
+
+    zid: str
+    user: str | None
+
+
+@lru_cache(maxsize=1 << 16)
+def intersects(one: str, other: str) -> bool:
+    """Whether two key expressions have a key in common."""
+    return one == other or bool(("*" in one or "*" in other) and zenoh.KeyExpr(one).intersects(zenoh.KeyExpr(other)))
+
+
+@lru_cache(maxsize=1 << 16)
+def includes(wide: str, narrow: str) -> bool:
+    """Whether the first key expression has all keys of the second."""
+    return wide == narrow or bool("*" in wide and zenoh.KeyExpr(wide).includes(zenoh.KeyExpr(narrow)))
+
+
+@final
+class Access:
+    """The rules of a router's configuration."""
+
+    def __init__(self, config: zenoh.Config) -> None:
+        control = section(config, "access_control") or {}
+        self._enabled = bool(control.get("enabled"))
+        self._default = control.get("default_permission") == "allow"
+        self._control = control
+        self._limits: Sequence[Mapping[str, Any]] = section(config, "low_pass_filter") or []
+        self._users = _users(section(config, "transport/auth/usrpwd/dictionary_file"))
+        self._rules: dict[Peer, list[tuple[bool, str, str, str]]] = {}
+
+    def knows(self, user: str | None, password: str | None) -> bool:
+        """Whether a user may connect."""
+        return self._users is None or (user is not None and self._users.get(user) == password)
+
+    def allows(self, peer: Peer, flow: str, message: str, key: str) -> bool:
+        """Whether a message from (`ingress`) or to (`egress`) a peer passes."""
+        if not self._enabled:
+            return True
+        rules = self._rules.get(peer)
+        if rules is None:
+            rules = self._rules[peer] = self._of(peer)
+        allowed = self._default
+        for allows, at, kind, keys in rules:
+            if at == flow and kind == message and includes(keys, key):
+                if not allows:
+                    return False
+                allowed = True
+        return allowed
+
+    def has_room(self, message: str, key: str, size: int) -> bool:
+        """Whether a message that comes in is small enough."""
+        return all(
+            size <= limit["size_limit"]
+            for limit in self._limits
+            if message in limit["messages"] and any(includes(keys, key) for keys in limit["key_exprs"])
+        )
+
+    def _of(self, peer: Peer) -> list[tuple[bool, str, str, str]]:
+        subjects = {entry["id"] for entry in self._control["subjects"] if _matches(entry, peer)}
+        ids = {
+            rule for policy in self._control["policies"] if subjects & {*policy["subjects"]} for rule in policy["rules"]
+        }
+        return [
+            (rule["permission"] == "allow", flow, message, keys)
+            for rule in self._control["rules"]
+            if rule["id"] in ids
+            for flow in rule["flows"] or ("ingress", "egress")
+            for message in rule["messages"]
+            for keys in rule["key_exprs"]
+        ]
+
+
+def _matches(subject: Mapping[str, Any], peer: Peer) -> bool:
+    """Whether a peer is one of these: each kind of name that is given has to fit."""
+    users, zids = subject.get("usernames"), subject.get("zids")
+    return (not users or peer.user in users) and (not zids or peer.zid in zids)
+
+
+def section(config: zenoh.Config, path: str) -> Any:
+    """A part of Zenoh's configuration; None if it is not given."""
+    try:
+        return json.loads(config.get_json(path))
+    except zenoh.ZError:
+        return None
+
+
+def _users(file: str | None) -> dict[str, str] | None:
+    if file is None:
+        return None
+    lines = Path(file).read_text("utf-8").splitlines()
+    return {user: password for user, _, password in (line.partition(":") for line in lines)}

@@ -1,0 +1,244 @@
+"""What stands for the module `zenoh` in the simulated world, and what a nemesis can do to its connections.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Self, final
+
+import zenoh
+
+from evedrop.system.world import Address
+from evedrop.virtual import notes
+from evedrop.virtual.scheduler import VirtualScheduler, VirtualTask
+from evedrop.virtual.zenoh.access import Peer, section
+from evedrop.virtual.zenoh.session import Callback, FifoChannel, VirtualSession
+from evedrop.virtual.zenoh.transport import End, VirtualConnection
+
+_OPEN_SECONDS = 2e-3
+"""The mean time that it takes to open a session."""
+_OPEN_MS, _POLL_SECONDS = 10_000, 0.05
+_SLOW = 300.0
+"""By which a slow connection takes longer."""
+
+
+@final
+class _Link:
+    """A connection on which nothing is said."""
+
+    def __init__(self, scheduler: VirtualScheduler) -> None:
+        self._scheduler, self._seconds = scheduler, 0.0
+
+    def settimeout(self, seconds: float) -> None:
+        """How long to wait for something."""
+        self._seconds = seconds
+
+    def recv(self, most: int) -> bytes:
+        """A router says nothing to who says nothing."""
+        del most
+        self._scheduler.sleep(self._seconds)
+        raise TimeoutError
+
+    def close(self) -> None:
+        """Close it."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@final
+class VirtualZenoh:
+    """The simulated Zenoh: its sessions, and the network between them."""
+
+    Config, ZError, ZBytes, KeyExpr = zenoh.Config, zenoh.ZError, zenoh.ZBytes, zenoh.KeyExpr
+    SampleKind, CongestionControl, Reliability = zenoh.SampleKind, zenoh.CongestionControl, zenoh.Reliability
+    handlers = SimpleNamespace(FifoChannel=FifoChannel, Callback=Callback)
+
+    def __init__(self, scheduler: VirtualScheduler) -> None:
+        self.scheduler = scheduler
+        self._routers: dict[str, VirtualSession] = {}
+        """Endpoint → the session that listens there."""
+        self._sessions: list[VirtualSession] = []
+        self._cut: dict[str, float] = {}
+        """Process that cannot connect → until when."""
+        self._confused: set[str] = set()
+        scheduler.on_stop = self._stopped
+
+    # What programs call
+
+    @staticmethod
+    def init_log_from_env_or(level: str) -> None:
+        """There is no log."""
+
+    def open(self, config: zenoh.Config) -> VirtualSession:
+        """Open a session. Raises ZError if it cannot listen or connect."""
+        scheduler = self.scheduler
+        thread = scheduler.current
+        assert thread is not None  # noqa: S101 - only programs open sessions
+        scheduler.sleep(scheduler.random.expovariate(1.0 / _OPEN_SECONDS))
+        session = VirtualSession(self, thread.task, config)
+        self._sessions.append(session)
+        try:
+            for place in self._listens_at(session, config):
+                if place in self._routers:
+                    raise zenoh.ZError(f"{place} is in use")
+                self._routers[place] = session
+                session.places.append(place)
+            places = section(config, "connect/endpoints") or []
+            for place in places:
+                self._wait_while_suspended(place, (section(config, "transport/unicast/open_timeout") or _OPEN_MS) / 1e3)
+                connected = self._connect(session, place)
+                if not connected and not session.router:
+                    raise zenoh.ZError(f"cannot connect to {place}")
+                session.connects_to = place if session.router or session.again < _NEVER_SECONDS else None
+                if not connected:
+                    self.connect_again(session)
+        except zenoh.ZError:
+            session.close()
+            raise
+        return session
+
+    def dial(self, address: Address) -> _Link:
+        """Connect to whatever listens at an address. Raises OSError if nothing does."""
+        thread = self.scheduler.current
+        assert thread is not None  # noqa: S101 - only programs dial
+        self.scheduler.sleep(self.scheduler.random.expovariate(1.0 / _OPEN_SECONDS))
+        if not any(_address(place) == address for place in self._routers) or self._is_cut(thread.task):
+            raise ConnectionRefusedError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
+        return _Link(self.scheduler)
+
+    def expect_free(self, address: Address) -> None:
+        """Raise OSError if something listens at an address."""
+        if any(_address(place) == address for place in self._routers):
+            raise OSError(errno.EADDRINUSE, os.strerror(errno.EADDRINUSE))
+
+    # Connections
+
+    @staticmethod
+    def _listens_at(session: VirtualSession, config: zenoh.Config) -> list[str]:
+        if not session.router:
+            return []
+        places = section(config, "listen/endpoints") or []
+        return list(places["router"] if isinstance(places, dict) else places)
+
+    def _is_cut(self, task: VirtualTask) -> bool:
+        return self._cut.get(task.name, 0.0) > self.scheduler.now
+
+    def _wait_while_suspended(self, place: str, seconds: float) -> None:
+        """The system takes connections for a router that is suspended; it answers once it goes on."""
+        deadline = self.scheduler.now + seconds
+        while self.scheduler.now < deadline and (router := self._routers.get(place)) and router.task.stopped:
+            self.scheduler.sleep(_POLL_SECONDS)
+
+    def _connect(self, session: VirtualSession, place: str) -> bool:
+        """Connect a session with the router at an endpoint; returns whether it is connected."""
+        router = self._routers.get(place)
+        if router is None or router is session or router.task.stopped or self._is_cut(session.task):
+            return False
+        if not router.access.knows(session.user, session.password):
+            return False
+        mine = End(session, Peer(router.zid, None), to_router=True)
+        theirs = End(router, Peer(session.zid, session.user), to_router=session.router)
+        VirtualConnection(self.scheduler, mine, theirs)
+        self.scheduler.note(notes.CONNECTS, session.name, router.name)
+        session.ends.append(mine)
+        router.ends.append(theirs)
+        session.greet(mine)
+        router.greet(theirs)
+        return True
+
+    def connect_again(self, session: VirtualSession) -> None:
+        """Try to connect a session that has lost its router, until it is connected or closed."""
+
+        def attempt() -> None:
+            if session.is_closed() or not session.task.alive or session.connects_to is None:
+                return
+            if session.task.stopped or not self._connect(session, session.connects_to):
+                self.scheduler.at(self.scheduler.now + session.again, attempt)
+
+        self.scheduler.at(self.scheduler.now + session.again, attempt)
+
+    def forget(self, session: VirtualSession) -> None:
+        """A session has ended: nobody listens at its endpoints."""
+        for place in session.places:
+            self._routers.pop(place, None)
+        if session in self._sessions:
+            self._sessions.remove(session)
+
+    def _stopped(self, task: VirtualTask) -> None:
+        """A process is suspended: after the lease, the others take it for gone."""
+        for session in self._sessions:
+            if session.task is task:
+                self.scheduler.at(self.scheduler.now + session.lease, lambda session=session: self._expire(session))  # type: ignore[misc]
+
+    def _expire(self, session: VirtualSession) -> None:
+        if session.task.stopped and session.task.suspended_for(self.scheduler.now) >= session.lease:
+            for end in [*session.ends]:
+                end.connection.close("nothing came for the lease")
+
+    # What a nemesis does
+
+    def _connections(self, process: str) -> Iterator[VirtualConnection]:
+        for session in self._sessions:
+            if session.name == process:
+                for end in [*session.ends]:
+                    yield end.connection
+
+    def cut(self, process: str, seconds: float | None) -> bool:
+        """Cut the connections of a process, which cannot be made again, nor for the first time, for some time, or for good."""
+        self._cut[process] = float("inf") if seconds is None else self.scheduler.now + seconds
+        for connection in self._connections(process):
+            connection.close("is cut")
+        return True
+
+    def freeze(self, process: str, seconds: float | None) -> bool:
+        """Let nothing through the connections of a process for some time, or for good."""
+        hit = False
+        for connection in self._connections(process):
+            connection.freeze(seconds, min(end.session.lease for end in connection.ends))
+            hit = True
+        if hit:
+            self._cut[process] = float("inf") if seconds is None else self.scheduler.now + seconds
+        return hit
+
+    def slow(self, process: str, seconds: float | None) -> bool:
+        """Make everything on the connections of a process take longer for some time, or for good."""
+        hit = False
+        for connection in self._connections(process):
+            connection.slow(_SLOW, seconds)
+            hit = True
+        return hit
+
+    def confuse(self, process: str) -> bool:
+        """Let the next message to a process arrive at the subscriber of another key."""
+        hit = any(session.name == process for session in self._sessions)
+        if hit:
+            self._confused.add(process)
+        return hit
+
+    def confused(self, session: VirtualSession) -> bool:
+        """Whether the message that a session gets now is to arrive at the wrong subscriber."""
+        if session.name in self._confused:
+            self._confused.remove(session.name)
+            return True
+        return False
+
+
+_NEVER_SECONDS = 86_400.0
+
+
+def _address(place: str) -> Address:
+    protocol, _, where = place.partition("/")
+    if protocol == "unixsock-stream":
+        return Path(where)
+    host, _, port = where.rpartition(":")
+    return host, int(port)

@@ -1,0 +1,213 @@
+"""A connection between two simulated sessions: frames arrive in order, later, or never.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, final
+
+import zenoh
+
+from evedrop.virtual import notes
+from evedrop.virtual.scheduler import VirtualQueue, VirtualScheduler, Waiter
+from evedrop.virtual.zenoh.access import Peer
+
+_DELAY_SECONDS = 1e-4
+"""The mean time of a frame on its way."""
+_NOTICE_SECONDS = 5e-3
+"""The mean time until an end notices that the other one is gone."""
+_ROOM = 1 << 20
+"""How many bytes are under way to one reader before its sender waits."""
+
+
+class Details(NamedTuple):
+    """What a message carries besides its payload, in the order of `VirtualSample`."""
+
+    kind: zenoh.SampleKind = zenoh.SampleKind.PUT
+    encoding: zenoh.Encoding = zenoh.Encoding.ZENOH_BYTES
+    attachment: zenoh.ZBytes | None = None
+    timestamp: zenoh.Timestamp | None = None
+    source_info: zenoh.SourceInfo | None = None
+    priority: zenoh.Priority = zenoh.Priority.DATA
+    congestion_control: zenoh.CongestionControl = zenoh.CongestionControl.BLOCK
+    express: bool = False
+
+    @property
+    def waits(self) -> bool:
+        """Whether it waits for room, rather than to be dropped."""
+        return self.congestion_control == zenoh.CongestionControl.BLOCK
+
+    @classmethod
+    def of(cls, attachment: bytes | zenoh.ZBytes | None = None, **given: Any) -> Details:
+        """Those that are given, but for None; the others as they are by default."""
+        known = {name: value for name, value in given.items() if value is not None and name in cls._fields}
+        if attachment is not None:
+            known["attachment"] = zenoh.ZBytes(attachment) if isinstance(attachment, bytes) else attachment
+        return cls(**known) if known else NO_DETAILS
+
+
+NO_DETAILS = Details()
+
+
+class TransportFrame(NamedTuple):
+    """What one end sends to the other."""
+
+    kind: str
+    key: str
+    payload: bytes = b""
+    number: int = 0
+    """Of the message, or of the question that it belongs to."""
+    details: Details = NO_DETAILS
+
+
+class EndOwner(Protocol):
+    """The part of a session that its ends use."""
+
+    scheduler: VirtualScheduler
+    name: str
+    """Of its process."""
+    patience: float
+    """Seconds that it waits for room before it closes a connection."""
+    lease: float
+    """Seconds without a word after which it takes the other end for gone."""
+    inbox: VirtualQueue
+
+
+@final
+class End:
+    """One end of a connection, as its session sees it."""
+
+    def __init__(self, session: EndOwner, peer: Peer, to_router: bool) -> None:
+        """peer: who is at the other end; to_router: whether that is a router."""
+        self.session, self.peer, self.to_router = session, peer, to_router
+        self.connection: VirtualConnection
+        self.other: End
+        self.subscribed: dict[str, int] = {}
+        """Key expression that the other end reads → how many of its subscribers do."""
+        self.answers: dict[str, int] = {}
+        """Key expression at which the other end answers questions."""
+        self.tokens: dict[str, None] = {}
+        """Liveliness token of the other end, or of those behind it."""
+        self.watched: dict[str, None] = {}
+        """Liveliness tokens of which the other end wants to know."""
+        self._bytes = 0
+        """Under way to the other end, or not taken by it yet."""
+        self._last = 0.0
+        """When the latest frame arrives there."""
+        self._full: deque[Waiter] = deque()
+        self.until = -1.0
+        """Until when frames of this end arrive although the connection is closed."""
+
+    def send(self, frame: TransportFrame, *, wait: bool = True) -> bool:
+        """Send a frame; returns whether it is on its way. wait: for room, rather than to drop it."""
+        connection, scheduler = self.connection, self.session.scheduler
+        size = len(frame.payload) + len(frame.key)
+        deadline = scheduler.now + self.session.patience
+        while connection.open and self._bytes and self._bytes + size > _ROOM:
+            if not wait or scheduler.current is None:
+                return False
+            if scheduler.now >= deadline:
+                connection.close(f"{self.session.name} has waited for room")
+                break
+            scheduler.wait(self._full, deadline - scheduler.now)
+        if not connection.open:
+            return False
+        self._bytes += size
+        self._last = max(self._last, connection.arrival())
+        scheduler.at(self._last, lambda: self._arrive(frame, size))
+        return True
+
+    def _arrive(self, frame: TransportFrame, size: int) -> None:
+        if not self.connection.open and self.session.scheduler.now > self.until:
+            self.lose(frame, "the connection is closed")
+            return
+        if self.connection.held is not None:
+            self.connection.held.append(lambda: self._arrive(frame, size))
+            return
+        self.other.session.inbox.put((self.other, frame, size))
+
+    def lose(self, frame: TransportFrame, why: str) -> None:
+        """Note that a message will never arrive at the other end."""
+        if frame.kind == "put":
+            self.session.scheduler.note(
+                notes.LOST, self.other.session.name, notes.key_within(frame.key), frame.number, why
+            )
+
+    def taken(self, size: int) -> None:
+        """The session at this end has dealt with a frame of this size."""
+        sender = self.other
+        sender._bytes -= size
+        sender.session.scheduler.wake(sender._full)
+
+    def leave(self, *, gracefully: bool) -> float:
+        """Send no more; returns when the other end learns that. gracefully: everything that was sent arrives before."""
+        scheduler = self.session.scheduler
+        way = max(0.0, self._last - scheduler.now)
+        self.until = scheduler.now + (way if gracefully else way * scheduler.random.random())
+        return self.until
+
+    def free(self) -> None:
+        """Nobody waits for room any more."""
+        self.session.scheduler.wake(self._full)
+
+
+@final
+class VirtualConnection:
+    """Two ends, and what lies between them."""
+
+    def __init__(self, scheduler: VirtualScheduler, one: End, other: End) -> None:
+        self._scheduler, self.ends = scheduler, (one, other)
+        one.other, other.other = other, one
+        one.connection = other.connection = self
+        self.open = True
+        self.held: list[Callable[[], object]] | None = None
+        """Frames that have come as far as where nothing gets through; None where everything does."""
+        self._slow_until, self._factor = 0.0, 1.0
+
+    def __str__(self) -> str:
+        return f"{self.ends[0].session.name} – {self.ends[1].session.name}"
+
+    def arrival(self) -> float:
+        """When a frame that is sent now arrives."""
+        scheduler = self._scheduler
+        factor = self._factor if scheduler.now < self._slow_until else 1.0
+        return scheduler.now + factor * scheduler.random.expovariate(1.0 / _DELAY_SECONDS)
+
+    def close(self, why: str, by: End | None = None, *, gracefully: bool = False) -> None:
+        """Close it: what is under way is lost, but for what the end that closes it has sent.
+
+        by: that end, which knows it; all others notice. gracefully: all that it has sent arrives; otherwise some.
+        """
+        if not self.open:
+            return
+        self.open, self.held = False, None
+        self._scheduler.note(notes.DISCONNECTS, self.ends[0].session.name, self.ends[1].session.name, why)
+        begun = self._scheduler.now if by is None else by.leave(gracefully=gracefully)
+        for end in self.ends:
+            end.free()
+            if end is not by:
+                moment = begun + self._scheduler.random.expovariate(1.0 / _NOTICE_SECONDS)
+                self._scheduler.at(moment, lambda end=end: end.session.inbox.put((end, None, 0)))  # type: ignore[misc]
+
+    def freeze(self, seconds: float | None, lease: float) -> None:
+        """Let nothing through for some time, or for good; after the lease, both ends take the other one for gone."""
+        if self.held is None:
+            self.held = []
+        self._scheduler.note(notes.FREEZES, self.ends[0].session.name, self.ends[1].session.name)
+        if seconds is None or seconds >= lease:
+            self._scheduler.at(self._scheduler.now + lease, lambda: self.close("nothing came for the lease"))
+        else:
+            self._scheduler.at(self._scheduler.now + seconds, self._thaw)
+
+    def _thaw(self) -> None:
+        held, self.held = self.held, None
+        for arrive in held or ():
+            arrive()
+
+    def slow(self, factor: float, seconds: float | None) -> None:
+        """Make everything take longer for some time, or for good."""
+        self._factor = factor
+        self._slow_until = float("inf") if seconds is None else self._scheduler.now + seconds

@@ -1,0 +1,137 @@
+"""Whether the simulated world notices mistakes: each mutant is put into a copy of the package, and seeds are played in it.
+
+    python -m tests.virtual.mutation
+
+Prints a row for each mutant: what noticed it, and after how many seeds. A seed that breaks a promise without the mistake does
+not count. A mutant that no seed notices shows what the simulation lacks. Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from tests.mutants import Mutant, cell, copy_with, mutants
+from tests.virtual.simulated import played
+
+_ROOT = Path(__file__).parents[2]
+_FOREVER_SECONDS = 60.0
+"""A seed takes a fraction of a second: one that takes so long does not end."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the simulated world said of a mutant."""
+
+    mutant: Mutant
+    noticed: str | None
+    """The first miss; None if there was none."""
+    seeds: int
+    """How many seeds had been played by then."""
+    seconds: float
+
+    def __str__(self) -> str:
+        return f"{self.mutant.row} {self.noticed or 'NOT NOTICED'} | {self.seeds} | {self.seconds:.0f} s |"
+
+
+def tried(mutant: Mutant, seeds: range, seconds: float) -> Outcome:
+    """Play seeds with a mutant until one notices it, for some seconds at most."""
+    begun, count = time.monotonic(), 0
+    with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
+        copy_with(mutant, Path(folder))
+        for seed, miss in _played_with(Path(folder), seeds):
+            count += 1
+            took = time.monotonic() - begun
+            if miss and not _broken_anyway(seed):
+                return Outcome(mutant, cell(miss), count, took)
+            if took > seconds:
+                break
+    return Outcome(mutant, None, count, time.monotonic() - begun)
+
+
+@cache
+def _broken_anyway(seed: int) -> bool:
+    """Whether a seed breaks a promise without any mistake."""
+    return bool(played(seed)[5])
+
+
+def _played_with(folder: Path, seeds: range) -> Iterator[tuple[int, str]]:
+    """The seeds that are played with the copy of the package in a folder, each with its first miss."""
+    words = [sys.executable, "-m", "tests.virtual.mutation", "--play", str(seeds.start), str(len(seeds))]
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    with (
+        (folder / "stderr").open("w+") as errors,
+        subprocess.Popen(
+            words, cwd=_ROOT, env=environment, stdout=subprocess.PIPE, stderr=errors, text=True
+        ) as process,
+    ):
+        lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+
+        def read() -> None:
+            for line in process.stdout or ():
+                lines.put(line)
+            lines.put(None)
+
+        threading.Thread(target=read, daemon=True).start()
+        try:
+            for seed in seeds:
+                line = lines.get(timeout=_FOREVER_SECONDS)
+                if line is None:
+                    process.wait()
+                    errors.seek(0)
+                    yield seed, f"in memory: {(errors.read().strip().splitlines() or ['(nothing)'])[-1]}"
+                    return
+                yield seed, line.strip()
+        except queue.Empty:
+            yield seed, "the seed does not end, and no virtual time passes"
+        finally:
+            process.kill()
+
+
+def _play(seeds: range) -> None:
+    """Play seeds, and print the first miss of each, on a line of its own."""
+    for seed in seeds:
+        misses = played(seed)[5]
+        _say(" ".join(misses[0].split()) if misses else "")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Try all mutants, or those whose description contains a word; 1 if one is not noticed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.virtual.mutation", description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", default="", help="mutants whose description or file contains this")
+    parser.add_argument("--seeds", type=int, default=400, help="how many are played with each")
+    parser.add_argument("--seconds", type=float, default=120.0, help="for how long they are played at most")
+    parser.add_argument("--play", nargs=2, type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.play is not None:
+        first, count = options.play
+        _play(range(first, first + count))
+        return 0
+    chosen = [mutant for mutant in mutants(options.only) if mutant.simulated]
+    _say(f"| {len(chosen)} mutants | file | noticed by | seeds | time |\n|---|---|---|---|---|")
+    missed = 0
+    for mutant in chosen:
+        outcome = tried(mutant, range(1, 1 + options.seeds), options.seconds)
+        missed += outcome.noticed is None
+        _say(str(outcome))
+    _say(f"\n{len(chosen) - missed} of {len(chosen)} mutants were noticed")
+    return 1 if missed else 0
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,31 @@
+"""A seed is a run, whatever hash Python gives to texts."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+_PLAY = """
+from evedrop.results.reading import Results
+from evedrop.virtual import campaign
+from tests.virtual.simulated import program
+campaign.misses = lambda case, run, *rest: [run.digest, Results.read(run.folder).summary["outages"]]
+print(campaign.play(1002, program).misses)
+"""
+
+
+def test_the_order_of_texts_in_sets_decides_nothing() -> None:
+    """The router of this run ends while others watch it: who heard first of whose end was in the order of a set."""
+    said = {
+        subprocess.run(
+            [sys.executable, "-c", _PLAY],
+            env={**os.environ, "PYTHONHASHSEED": seed},
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60,
+        ).stdout
+        for seed in ("0", "3", "4", "5")
+    }
+    assert len(said) == 1

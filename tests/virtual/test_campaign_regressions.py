@@ -1,0 +1,21 @@
+"""Cases that once broke a promise keep all of them."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evedrop.cli.simulated import program
+from evedrop.virtual.campaign import play_case
+from evedrop.virtual.cases import case_from
+
+REGRESSIONS = tomllib.loads(Path(__file__).with_name("regressions.toml").read_text("utf-8"))["regression"]
+
+
+@pytest.mark.parametrize("regression", REGRESSIONS, ids=[one["why"] for one in REGRESSIONS])
+def test_a_case_that_broke_a_promise_keeps_it(regression: dict[str, Any]) -> None:
+    """Every entry of regressions.toml."""
+    assert play_case(case_from(str(regression["case"])), program).misses == ()

@@ -1,0 +1,62 @@
+"""The judge of simulated runs: what it says of a run that ended late, or went on although it was told to end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from evedrop.scenario.progress_events import RunProgress
+from evedrop.scenario.tables import Scenario
+from evedrop.virtual.cases import SimulatedCase
+from evedrop.virtual.faults import Disturbance, InterruptProcess, KillProcess, StopProcess
+from evedrop.virtual.judge import misses
+from evedrop.virtual.reference import RunReference
+from evedrop.virtual.run import SimulatedRun
+
+SCENARIO = Scenario(
+    {
+        "title": "A case",
+        "slots": 10,
+        "pace": 0.1,
+        "longest_outage": 3.0,
+        "process": {"A": [[1.0]], "Q": [[1.0]], "initial_covariance": [[1.0]]},
+        "encoding": {"scheme": "plain"},
+        "legitimate": {"link": {"quality": 1.0}},
+    }
+)
+REFERENCE = RunReference({"slots": 10}, {})
+KILLED = KillProcess("legitimate", 50)
+TOLD = InterruptProcess("launcher", 60)
+
+
+def judged(folder: Path, struck: Mapping[Disturbance, float], **run: object) -> list[str]:
+    """What the judge says of a run that has no results."""
+    (folder / "temporary").mkdir()
+    faults = tuple(struck)
+    ended = SimulatedRun(folder / "results", **run)  # type: ignore[arg-type]
+    return misses(SimulatedCase(1, SCENARIO, faults), ended, struck, REFERENCE, folder / "temporary")
+
+
+@pytest.mark.parametrize(("seconds", "late"), [(56.0, False), (58.0, True)])
+def test_a_run_that_ends_late_is_a_miss(seconds: float, late: bool, tmp_path: Path) -> None:
+    """1 s of slots, 5 of any run, 15 of a fault, twice the longest outage, and 30 for processes that do not appear."""
+    found = judged(tmp_path, {KILLED: 0.5}, status=3, said="evedrop: legitimate was ended by signal 9", seconds=seconds)
+    assert found == (["the run took 58.0 s, and not 57.0 s at most"] if late else [])
+
+
+def test_a_fork_server_that_is_suspended_may_cost_two_minutes(tmp_path: Path) -> None:
+    """Its launcher waits for it so long."""
+    said = "evedrop: recorder cannot be started (its fork server did not respond within 120 s)"
+    stopped = StopProcess("fork server", 30)
+    assert judged(tmp_path, {stopped: 0.1}, status=3, said=said, seconds=120.2) == []
+
+
+@pytest.mark.parametrize(("moment", "ignored"), [(1.4, False), (1.6, True)])
+def test_a_launcher_that_goes_on_after_a_signal_is_a_miss(moment: float, ignored: bool, tmp_path: Path) -> None:
+    """A second after it was told to end, no more slots are done."""
+    told = [(moment, RunProgress(5, 1.0, "slots/s", {}))]
+    found = judged(tmp_path, {TOLD: 0.5}, status=0, told=told)
+    assert "there are no results" in found
+    assert any("went on to its end" in miss for miss in found) == ignored
