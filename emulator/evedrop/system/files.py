@@ -22,7 +22,6 @@ from typing import Any, BinaryIO, Self, final
 
 from evedrop.errors import UsageError
 from evedrop.system.disk import write_all
-from evedrop.system.world import world
 
 LINE_CHARACTERS = 65_536
 """The longest line of a table."""
@@ -175,6 +174,8 @@ class LineFile:
 
     def __init__(self, path: Path) -> None:
         """Open the file, which is new or continues after its last complete line. Only this user can read it. Raises OSError."""
+        from evedrop.system.world import world  # noqa: PLC0415 - the pytest plugin loads this module, and little else
+
         self._file = world().disk.open(path, "a+b")
         try:
             descriptor = self._file.fileno()
