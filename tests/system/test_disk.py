@@ -101,7 +101,7 @@ def machine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Machine]
 
 
 def test_a_file_that_is_opened_again_goes_on_at_its_end(machine: Machine) -> None:
-    """And one that is written anew begins anew."""
+    """Opening it for writing removes what it contained."""
     path = machine.folder / "file"
     for text in (b"one ", b"two"):
         with machine.disk.open(path, "ab") as file:
@@ -131,7 +131,7 @@ def test_only_this_user_can_read_what_is_written(machine: Machine) -> None:
 
 
 def test_a_replaced_file_is_the_new_one(machine: Machine) -> None:
-    """Whoever has the old one open reads it to its end."""
+    """A reader that has the old file open can still read it to its end."""
     old, new = machine.folder / "file", machine.folder / "file.new"
     machine.disk.write(old, b"old")
     machine.disk.write(new, b"new")

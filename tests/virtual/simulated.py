@@ -59,7 +59,7 @@ def show(case: SimulatedCase, view: Path | None = None, say: Callable[[str], obj
 def record(steps: Sequence[Step], view: Path) -> None:
     """Write a recording, or open a viewer of it until it is closed."""
     from evedrop.show.view.viewer import open_run
-    from evedrop.virtual.view import write_recording
+    from evedrop.studies.simulated_view import write_recording
 
     if view != WINDOW:
         write_recording(steps, view)

@@ -1,4 +1,4 @@
-"""What the command that plays cases says of those that fail."""
+"""The command that plays cases prints why a case failed."""
 
 from __future__ import annotations
 

@@ -75,20 +75,6 @@ def test_everything_that_can_happen_is_shown() -> None:
     assert diagram(steps_of(HAPPENED)) == SHOWN.strip("\n")
 
 
-def test_words_of_keys_are_enough() -> None:
-    """Where notes hold the last word of a key alone, and no arrivals, the sender says what a message is."""
-    happened = [
-        Occurrence(0.0, "router", notes.PUT, ("legitimate", 9)),
-        Occurrence(0.0, "recorder", notes.PUT, ("legitimate", 9)),
-        Occurrence(0.0, "legitimate", notes.PUT, ("legitimate", 9)),
-        Occurrence(0.0, "legitimate", notes.PUT, ("sent", 9)),
-        Occurrence(0.0, "router", notes.PUT, ("delivered", 9)),
-    ]
-    steps = steps_of(happened)
-    assert [step.text for step in steps] == ["delivery", "command", "report", "ack", "ack"]
-    assert [[*step.to] for step in steps] == [["legitimate"], ["legitimate"], ["recorder"], ["router"], ["sensor"]]
-
-
 def test_messages_that_cross_have_a_line_each() -> None:
     """They arrive at once, whatever else is under way."""
     keys = ["control/sensor", "control/legitimate", "uplink"]

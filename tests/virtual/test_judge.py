@@ -1,4 +1,4 @@
-"""The judge of simulated runs: what it says of a run that ended late, or went on although it was told to end."""
+"""The judge of simulated runs reports a run that ends late, or that goes on although it was told to end."""
 
 from __future__ import annotations
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -22,6 +21,7 @@ from typing import Any, Self, final
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import xxhash
 from numpy.typing import NDArray
 
 from evedrop.results.folder import UNFINISHED, make_private, replace_private
@@ -127,7 +127,8 @@ class _Sink:
         self._file = world().disk.open(path, "xb")
         self._waiting: list[bytes] = []
         self.closed = False
-        self.size = self.check = 0
+        self.size = 0
+        self._check = xxhash.xxh3_64()
 
     def write(self, data: Any) -> int:
         self._waiting.append(bytes(data))
@@ -136,7 +137,13 @@ class _Sink:
     def flush(self) -> None:
         data, self._waiting = b"".join(self._waiting), []
         write_all(self._file, data)
-        self.size, self.check = self.size + len(data), zlib.crc32(data, self.check)
+        self.size += len(data)
+        self._check.update(data)
+
+    @property
+    def check(self) -> int:
+        """A checksum of all that is on disk."""
+        return self._check.intdigest()
 
     def close(self) -> None:
         if not self.closed:
@@ -189,14 +196,15 @@ class TableRound:
 def _checksum(path: Path, size: int, state: tuple[int, ...]) -> int | None:
     """The checksum of the first bytes of a file; None if there are fewer. state: something that changes with the file."""
     del state
-    checksum = 0
+    check = xxhash.xxh3_64()
     try:
         with path.open("rb") as file:
             while size and (data := file.read(min(size, _CHECKED_AT_ONCE))):
-                size, checksum = size - len(data), zlib.crc32(data, checksum)
+                size -= len(data)
+                check.update(data)
     except OSError:
         return None
-    return None if size else checksum
+    return None if size else check.intdigest()
 
 
 class Unfinished:

@@ -78,7 +78,7 @@ class Disk(ABC):
 
     @final
     def write(self, path: Path, data: bytes) -> None:
-        """Write a file that only this user can read, or write it anew."""
+        """Write a file that only this user can read; replaces what it contained."""
         with self.open(path, "wb") as file:
             write_all(file, data)
 

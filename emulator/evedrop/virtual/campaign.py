@@ -17,7 +17,7 @@ from evedrop.virtual import notes
 from evedrop.virtual.cases import SimulatedCase, case_of
 from evedrop.virtual.faults import Disturbance
 from evedrop.virtual.judge import misses
-from evedrop.virtual.processes import Program, VirtualProcess
+from evedrop.virtual.processes import Program
 from evedrop.virtual.reference import RunReference, in_memory
 from evedrop.virtual.run import SimulatedRun, SimulatedWorld, run_in
 
@@ -59,14 +59,10 @@ def play_case(
         world = SimulatedWorld(case.seed, program, machine, keep)
         temporary = world.disk.root / "temporary"
         temporary.mkdir(0o700)
-
-        def disturb(world: SimulatedWorld, launcher: VirtualProcess) -> None:
-            del launcher
-            for fault in case.faults:
-                world.scheduler.after(fault.after, partial(_strike, fault, world, struck))
-
+        for fault in case.faults:
+            world.scheduler.after(fault.after, partial(_strike, fault, world, struck))
         with _temporary(temporary):
-            run = run_in(world, case.scenario, world.disk.root / "results", disturb, case.ahead)
+            run = run_in(world, case.scenario, world.disk.root / "results", case.ahead)
         return PlayedCase(case, run, struck, tuple(misses(case, run, struck, reference, temporary)))
 
 

@@ -62,7 +62,7 @@ class SimulatedCase:
 
 
 def case_from(text: str) -> SimulatedCase:
-    """The case of a text: of a seed alone, or of a line that `Case.to_text` has written. Raises UsageError."""
+    """The case of a text: of a seed alone, or of a line that `SimulatedCase.to_text` has written. Raises UsageError."""
     try:
         described = json.loads(text)
         if isinstance(described, int):

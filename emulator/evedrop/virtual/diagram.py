@@ -26,7 +26,7 @@ _NOTABLE, _FIRST = 5, 8
 """Such steps are shown once all steps this near to a fault or to the end are."""
 _LONGEST_CYCLE, _LEAST_REPEATS = 10, 4
 _FULL = 12
-"""Steps before and after a fault, and before the end, of which only what repeats by itself is folded."""
+"""The number of steps before and after a fault, and before the end, that are folded only if they repeat."""
 _NEAR = 30
 """The most steps before and after a fault that are shown because of it."""
 _MOST_COUNTED = 5
@@ -92,10 +92,10 @@ def _ranks(steps: Sequence[Step]) -> list[int]:
     """How little each step matters: 0 for faults and for the last one."""
     count = len(steps)
     ranks = [min(count - 1 - i, 2 * i) for i in range(count)]
-    known: set[str] = set()
+    kinds: set[str] = set()
     for i, step in enumerate(steps):
-        if step.kind not in known:
-            known.add(step.kind)
+        if step.kind not in kinds:
+            kinds.add(step.kind)
             ranks[i] = min(ranks[i], _FIRST)
         if not step.steady:
             ranks[i] = min(ranks[i], _NOTABLE)
@@ -110,7 +110,7 @@ def _repeated(run: Sequence[Step]) -> set[int]:
     kinds = [step.kind for step in run]
     faults = [i for i, step in enumerate(run) if step.process is None]
     near = {i + by for i in [*faults, len(run)] for by in range(-_FULL, _FULL + 1)}
-    found: set[int] = set()
+    repeated: set[int] = set()
     i = 0
     while i < len(run):
         for length in range(1, _LONGEST_CYCLE + 1):
@@ -119,11 +119,11 @@ def _repeated(run: Sequence[Step]) -> set[int]:
                 end += length
             if end - i >= _LEAST_REPEATS * length and notes.FAULT not in cycle:
                 between = set(range(i + length, end - length))
-                found |= between if length == 1 else between - near
+                repeated |= between if length == 1 else between - near
                 i = end - length - 1
                 break
         i += 1
-    return found
+    return repeated
 
 
 def _fold(run: Sequence[Step]) -> str:

@@ -39,9 +39,9 @@ class DiskFault(Enum):
     SHORT = "short write"
     """The program is told how many bytes arrived."""
     FULL_ONCE = "full once"
-    """There is no room for the rest: the next write is refused; then there is room again."""
+    """The disk is full: the rest and the next write are refused, and later writes succeed."""
     FULL = "full"
-    """There is no room for the rest, and for any other write until `make_room`."""
+    """The disk is full: the rest and all later writes are refused until `make_room`."""
     BROKEN = "input/output error"
     """The program is told that it failed."""
     KILL = "kill"
@@ -225,10 +225,10 @@ class VirtualDisk(Disk):
     def unsynced(self, file: FileIO) -> _Unsynced:
         """What is on the disk of an open file, which is about to change."""
         status = os.fstat(file.fileno())
-        known = self._unsynced.get(status.st_ino)
-        if known is None:
-            known = self._unsynced[status.st_ino] = _Unsynced(status.st_size)
-        return known
+        unsynced = self._unsynced.get(status.st_ino)
+        if unsynced is None:
+            unsynced = self._unsynced[status.st_ino] = _Unsynced(status.st_size)
+        return unsynced
 
     def keep_pages(self, file: FileIO, first: int, last: int) -> None:
         """Keep the pages between two places of an open file as they are on the disk."""

@@ -74,7 +74,7 @@ class KillProcess(Disturbance):
     kind = "kill"
 
     def strike(self, world: SimulatedWorld) -> bool:
-        """KillProcess it."""
+        """Kill it."""
         return _signal(world, self.target, signal.SIGKILL)
 
     def survived(self, longest_outage: float) -> bool:
@@ -125,7 +125,7 @@ class CutConnection(Disturbance):
     lasts = True
 
     def strike(self, world: SimulatedWorld) -> bool:
-        """CutConnection it."""
+        """Cut it."""
         return world.zenoh.cut(self.target, self.seconds)
 
 
@@ -165,7 +165,7 @@ class ConfuseKeys(Disturbance):
     kind = "confuse"
 
     def strike(self, world: SimulatedWorld) -> bool:
-        """ConfuseKeys its keys once."""
+        """Confuse its keys once."""
         return world.zenoh.confuse(self.target)
 
     def survived(self, longest_outage: float) -> bool:
@@ -210,7 +210,7 @@ class FillDisk(DiskDisturbance):
 
 @final
 class RefuseWrite(DiskDisturbance):
-    """There is no room for one write."""
+    """One write is refused, as if the disk were full."""
 
     kind = "refuse a write to"
     fault = DiskFault.FULL_ONCE
@@ -251,8 +251,8 @@ class CutPower(DiskDisturbance):
 
 DISK = "disk"
 KINDS: Mapping[str, type[Disturbance]] = {
-    one.kind: one
-    for one in (
+    disturbance.kind: disturbance
+    for disturbance in (
         KillProcess,
         InterruptProcess,
         StopProcess,

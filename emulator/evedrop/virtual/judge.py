@@ -62,37 +62,37 @@ def misses(
     """
     if run.stuck is not None:
         return [f"stuck: {run.stuck}"]
-    found = [f"{name} is left" for name in run.left]
-    found += [f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors]
-    found += _of_status(case, run, struck, reference.status)
-    found += _of_time(case, run, struck)
+    broken = [f"{name} is left" for name in run.left]
+    broken += [f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors]
+    broken += _of_status(case, run, struck, reference.status)
+    broken += _of_time(case, run, struck)
     if not any(map(_kills_launcher, struck)) and not run.suspended:
-        found += [f"{path.name} is left" for path in sorted(temporary.iterdir())]
-    found += _of_logs(run)
-    found += _of_files(run, struck)
-    found += _of_results(run, struck, reference)
-    return found
+        broken += [f"{path.name} is left" for path in sorted(temporary.iterdir())]
+    broken += _of_logs(run)
+    broken += _of_files(run, struck)
+    broken += _of_results(run, struck, reference)
+    return broken
 
 
 def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float], good: int) -> Iterator[str]:
     """Whether the exit status, and what is said, tell what happened; good: the status of a run that completes."""
     status = run.status
-    said = next((line for line in run.said.splitlines() if line.strip() and "warning" not in line), "")
+    complaint = next((line for line in run.said.splitlines() if line.strip() and "warning" not in line), "")
     fatal = [fault for fault in struck if not fault.survived(case.scenario.longest_outage)]
     if run.suspended:
         return
     if status == good:
         yield from _of_ignored_signals(case, run, {fault: struck[fault] for fault in fatal})
     elif not fatal:
-        yield f"status {status}, although nothing of this may end a run: {said}"
+        yield f"status {status}, although nothing of this may end a run: {complaint}"
     elif status == RunError.exit_status:
         blamed = [word for fault in fatal for word in fault.blamed]
-        whole = run.said if any(isinstance(fault, DiskDisturbance) for fault in fatal) else said
+        whole = run.said if any(isinstance(fault, DiskDisturbance) for fault in fatal) else complaint
         if not any(word in whole for word in blamed):
-            yield f"the failure names none of {', '.join(blamed)}: {said or '(nothing was said)'}"
+            yield f"the failure names none of {', '.join(blamed)}: {complaint or '(nothing was said)'}"
     elif status == UsageError.exit_status:
         if not any(isinstance(fault, DiskDisturbance) for fault in fatal):
-            yield f"status 2: {said}"
+            yield f"status 2: {complaint}"
     elif status == Interrupted.exit_status:
         if not any(isinstance(fault, InterruptProcess) for fault in fatal):
             yield "status 130, but no signal asked for the end"
@@ -100,7 +100,7 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
         if not any(map(_kills_launcher, fatal)):
             yield "the launcher was killed by something else"
     else:
-        yield f"status {status}: {said}"
+        yield f"status {status}: {complaint}"
 
 
 def _of_ignored_signals(case: SimulatedCase, run: SimulatedRun, fatal: Mapping[Disturbance, float]) -> Iterator[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO, cast, final
@@ -80,28 +80,22 @@ class SimulatedWorld:
     def entered(self) -> Iterator[None]:
         """Let all programs of the interpreter be in this world while the block runs."""
         out, err = (cast(TextIO, ProcessOutput(self.machine, stream)) for stream in (sys.stdout, sys.stderr))
-        mask = os.umask(0o077)
-        with inside(self.world), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            try:
-                yield
-            finally:
-                self.scheduler.take_down()
-                os.umask(mask)
+        with contextlib.ExitStack() as stack:
+            stack.callback(os.umask, os.umask(0o077))
+            stack.enter_context(inside(self.world))
+            stack.enter_context(contextlib.redirect_stdout(out))
+            stack.enter_context(contextlib.redirect_stderr(err))
+            stack.callback(self.scheduler.take_down)
+            yield
 
     def process(self, name: str) -> VirtualProcess | None:
         """The latest process of this name, if it runs."""
-        found = [process for process in self.machine.processes if process.task.name == name and process.task.alive]
-        return found[-1] if found else None
+        running = [process for process in self.machine.processes if process.task.name == name and process.task.alive]
+        return running[-1] if running else None
 
 
-def run_in(
-    world: SimulatedWorld,
-    scenario: Scenario,
-    folder: Path,
-    disturb: Callable[[SimulatedWorld, VirtualProcess], object] | None = None,
-    ahead: int = MOST_SLOTS_AHEAD,
-) -> SimulatedRun:
-    """Run a scenario live in a simulated world; disturb: arranges what happens to it, given its launcher; ahead: of `launch`."""
+def run_in(world: SimulatedWorld, scenario: Scenario, folder: Path, ahead: int = MOST_SLOTS_AHEAD) -> SimulatedRun:
+    """Run a scenario live in a simulated world; ahead: as for `launch`."""
     run = SimulatedRun(folder)
     scheduler = world.scheduler
 
@@ -123,8 +117,6 @@ def run_in(
 
     with world.entered():
         process = world.machine.begin("launcher", launcher)
-        if disturb is not None:
-            disturb(world, process)
         try:
             scheduler.run(MOST_SECONDS, lambda: not process.task.alive)
             ended = scheduler.now

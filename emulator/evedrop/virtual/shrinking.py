@@ -18,7 +18,7 @@ from evedrop.errors import EvedropError, ScenarioError
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.loading import Scenario
 from evedrop.virtual.cases import SimulatedCase
-from evedrop.virtual.faults import LAUNCHER, Disturbance, processes_of
+from evedrop.virtual.faults import Disturbance, processes_of
 
 Tables = dict[str, Any]
 
@@ -273,8 +273,8 @@ def _changed(case: SimulatedCase, changes: Mapping[str, Any]) -> Iterator[Simula
         scenario = Scenario(tables)
     except ScenarioError:
         return
-    there = (LAUNCHER, *processes_of(scenario))
-    yield replace(case, scenario=scenario, faults=tuple(fault for fault in case.faults if fault.target in there))
+    gone = {*processes_of(case.scenario)} - {*processes_of(scenario)}
+    yield replace(case, scenario=scenario, faults=tuple(fault for fault in case.faults if fault.target not in gone))
 
 
 def _fit(tables: Tables) -> None:

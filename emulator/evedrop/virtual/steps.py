@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import final
 
-from evedrop.live.protocol.keys import KINDS, reader_of, writer_of
-from evedrop.names import RECORDER, RELAY, ROUTER
+from evedrop.live.protocol.keys import reader_of, writer_of
 from evedrop.virtual import notes
 from evedrop.virtual.faults import LAUNCHER
 from evedrop.virtual.processes import FORK_SERVERS
@@ -88,9 +87,9 @@ class Step:
 
 def steps_of(happened: Sequence[Occurrence]) -> list[Step]:
     """The steps of everything that happened."""
-    reader = _NoteReader(any(one.what == notes.GETS for one in happened))
-    for number, one in enumerate(happened, 1):
-        reader.read(number, one)
+    reader = _NoteReader()
+    for number, note in enumerate(happened, 1):
+        reader.read(number, note)
     return reader.steps
 
 
@@ -98,77 +97,64 @@ def steps_of(happened: Sequence[Occurrence]) -> list[Step]:
 class _NoteReader:
     """Makes steps of notes."""
 
-    def __init__(self, arrivals: bool) -> None:
-        """arrivals: whether arrivals are noted; otherwise every message arrives, as far as one knows."""
+    def __init__(self) -> None:
         self.steps: list[Step] = []
-        self._arrivals = arrivals
         self._sent: dict[object, tuple[Step, int]] = {}
         """Number of a message → its step, and how many notable steps, which are no messages, there were before."""
         self._notable = 0
 
-    def read(self, number: int, one: Occurrence) -> None:
+    def read(self, number: int, note: Occurrence) -> None:
         """Add the step of a note, or complete that of an earlier one."""
-        if one.what == notes.PUT:
-            self._put(number, one)
-        elif one.what in (notes.GETS, notes.LOST):
-            self._ends(one)
-        elif one.what != notes.WRITES and not (one.what in _LIVES and one.words[0] in FORK_SERVERS):
-            self._add(_other(one))
+        if note.what == notes.PUT:
+            self._put(number, note)
+        elif note.what in (notes.GETS, notes.LOST):
+            self._ends(note)
+        elif note.what != notes.WRITES and not (note.what in _LIVES and note.words[0] in FORK_SERVERS):
+            self._add(_other(note))
 
     def _add(self, step: Step) -> None:
         self._notable += not step.steady
         self.steps.append(step)
 
-    def _put(self, number: int, one: Occurrence) -> None:
-        key = _key_of(one.process, str(one.words[0]))
+    def _put(self, number: int, note: Occurrence) -> None:
+        key, _, content = map(str, note.words)
         kind = key.partition("/")[0]
         name = _MESSAGES.get(kind, kind)
-        said = str(one.words[2]) if len(one.words) > 2 else ""
-        step = Step(one.at, f"{name} {said}".strip(), one.process, f"{name} {key}", steady=kind != "control")
-        step.to[reader_of(f"//{key}")] = Mark.UNKNOWN if self._arrivals else Mark.ARRIVES
+        step = Step(note.at, f"{name} {content}".strip(), note.process, f"{name} {key}", steady=kind != "control")
+        step.to[reader_of(f"//{key}")] = Mark.UNKNOWN
         self.steps.append(step)
         self._sent[number] = step, self._notable
 
-    def _ends(self, one: Occurrence) -> None:
+    def _ends(self, note: Occurrence) -> None:
         """A message ends its way to a process: in the step in which it was sent, unless much happened since then."""
-        receiver, key, number, why = (*one.words, "", "", "")[:4]
-        lost = one.what == notes.LOST
+        receiver, key, number, why = (*note.words, "", "", "")[:4]
+        lost = note.what == notes.LOST
         mark, ending = (Mark.LOST, f" lost {why}".rstrip()) if lost else (Mark.ARRIVES, "")
         sent, notable = self._sent.get(number, (None, 0))
         if sent is None:
             text, sender = str(key), writer_of(f"//{key}") or str(receiver)
         else:
-            if one.at - sent.at <= _LATE and notable == self._notable:
+            if note.at - sent.at <= _LATE and notable == self._notable:
                 sent.to[str(receiver)] = mark
                 sent.text, sent.steady = sent.text + ending, sent.steady and not lost
                 return
             sent.to[str(receiver)] = Mark.LEAVES
             text, sender = sent.text, sent.process or str(receiver)
         kind = f"{'lost' if lost else 'late'} {key}"
-        self._add(Step(one.at, text + ending, sender, kind, {str(receiver): mark}, steady=not lost, late=True))
+        self._add(Step(note.at, text + ending, sender, kind, {str(receiver): mark}, steady=not lost, late=True))
 
 
-def _key_of(sender: str, word: str) -> str:
-    """A key within a run, also of its last word alone."""
-    if "/" in word or word in KINDS:
-        return word
-    if word in ("sent", "delivered"):
-        return f"ack/{word}"
-    kinds = {ROUTER: "downlink", RELAY: "downlink", RECORDER: "progress" if word == RECORDER else "control"}
-    return f"{kinds.get(sender, 'telemetry')}/{word}"
-
-
-def _other(one: Occurrence) -> Step:
-    words = [str(word) for word in one.words]
-    if one.what == notes.FAULT:
-        return Step(one.at, " ".join(words), None, notes.FAULT)
-    about = words[0] if words else one.process
-    text = " ".join([one.what, *_BETWEEN.get(one.what, ()), *words[1:]])
-    if one.what == notes.SIGNAL and isinstance(one.words[1], int):
-        text = signal.Signals(one.words[1]).name
-    life = Life(one.what) if one.what in {life.value for life in Life} else None
-    steady = one.what == notes.DECLARES
-    step = Step(one.at, text, about, f"{one.what} {about}", steady=steady, life=life, about=about)
-    if one.what in (notes.SIGNAL, notes.STARTS) and one.process not in ("world", about):
-        step.process, step.to = LAUNCHER if one.process in FORK_SERVERS else one.process, {about: Mark.ARRIVES}
+def _other(note: Occurrence) -> Step:
+    words = [str(word) for word in note.words]
+    if note.what == notes.FAULT:
+        return Step(note.at, " ".join(words), None, notes.FAULT)
+    about = words[0] if words else note.process
+    text = " ".join([note.what, *_BETWEEN.get(note.what, ()), *words[1:]])
+    if note.what == notes.SIGNAL and isinstance(note.words[1], int):
+        text = signal.Signals(note.words[1]).name
+    life = Life(note.what) if note.what in {life.value for life in Life} else None
+    steady = note.what == notes.DECLARES
+    step = Step(note.at, text, about, f"{note.what} {about}", steady=steady, life=life, about=about)
+    if note.what in (notes.SIGNAL, notes.STARTS) and note.process not in ("world", about):
+        step.process, step.to = LAUNCHER if note.process in FORK_SERVERS else note.process, {about: Mark.ARRIVES}
     return step

@@ -30,6 +30,8 @@ class Conducted:
         """What was said again in rounds: the progress, as a number, and other commands."""
         self.processes = dict.fromkeys(("router", "sensor", "smart"), True)
         self.changes: dict[str, Any] = {}
+        self.restarts = 0
+        """How often the time limit of a hold began again."""
         self.another_router = False
         self.unreached: list[str] = []
         self.clock: Clock = SYSTEM_CLOCK
@@ -55,6 +57,10 @@ class Conducted:
     def start(self) -> None:
         """Note it."""
         self.repeated.append("start")
+
+    def restart_limit(self) -> None:
+        """Count it."""
+        self.restarts += 1
 
     def report_progress(self, done: int) -> None:
         """Note it."""
@@ -137,6 +143,7 @@ def test_a_held_run_that_waits_for_a_belief_asks_for_it_again(awaits_belief: boo
         clock.now += 1.0
         recovery.poll(10)
     assert bool(conducted.rounds) is awaits_belief
+    assert conducted.restarts == 0  # or a receiver that never sends it would hold the run for ever
 
 
 def test_a_round_waits_for_processes_that_are_back_and_cannot_be_told_yet() -> None:
@@ -173,6 +180,7 @@ def test_a_round_repeats_the_commands_that_may_have_been_lost(done: int) -> None
     assert conducted.repeated == []
     conducted.lost = {}
     recovery.poll(done)
+    assert conducted.restarts == 1
     assert conducted.rounds == [done]
     assert conducted.repeated == [*(() if done else ("start",)), "the operator's commands", done]
 

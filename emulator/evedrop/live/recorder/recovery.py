@@ -281,6 +281,7 @@ class Recovery:
         self._missing, self._returned = {}, None
         self._target = self._done + self._flow.window + self._flow.batch
         self._wait = 0.0
+        self._steering.restart_limit()
         self._round(now)
 
     def _round(self, now: float) -> None:

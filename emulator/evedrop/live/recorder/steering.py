@@ -281,12 +281,15 @@ class Steering:
         timeline = self._scenario.timeline.changes
         return {name: tuple(timeline[name]) for name in sorted(self._changed)}
 
+    def restart_limit(self) -> None:
+        """Let processes that were cut off have the whole time limit of the hold."""
+        self._since = world().monotonic()
+
     def remind(self) -> None:
-        """Send the last commands again, which may have been lost with a connection; restart the time limit of the hold.
+        """Send the last commands again, which may have been lost with a connection.
 
         The last `Go` is sent even if the sensor holds again: a router that was restarted may still wait at the previous hold.
         """
-        self._since = world().monotonic()
         self._go()
         if self._asked:
             self._conductor.send_to(SENSOR, Hold())

@@ -22,9 +22,11 @@ class Peer(NamedTuple):
 
 
 @lru_cache(maxsize=1 << 16)
-def intersects(one: str, other: str) -> bool:
+def intersects(expression: str, other: str) -> bool:
     """Whether two key expressions have a key in common."""
-    return one == other or bool(("*" in one or "*" in other) and zenoh.KeyExpr(one).intersects(zenoh.KeyExpr(other)))
+    return expression == other or bool(
+        ("*" in expression or "*" in other) and zenoh.KeyExpr(expression).intersects(zenoh.KeyExpr(other))
+    )
 
 
 @lru_cache(maxsize=1 << 16)

@@ -339,7 +339,7 @@ class Replies:
 @final
 @dataclass
 class Info:
-    """What a session says of itself."""
+    """The identity and connections of a session."""
 
     session: VirtualSession
     listeners: list[Callable[[TransportEvent], object]] = field(default_factory=list)
@@ -764,10 +764,10 @@ class VirtualSession:
     def _take(self, end: End, frame: TransportFrame) -> None:
         """Deal with a frame, if access control lets it in."""
         kind, key = frame.kind, frame.key
-        if kind in _KNOWN:
+        if kind in _DECLARED:
             if self.access.allows(end.peer, "ingress", kind, key):
-                known = getattr(end, _KNOWN[kind])
-                known[key] = known.get(key, 0) + 1
+                declared = getattr(end, _DECLARED[kind])
+                declared[key] = declared.get(key, 0) + 1
                 self._tell_others(end, kind, key)
         elif kind in _WITHDRAWN:
             self._forget(end, _WITHDRAWN[kind], key)
@@ -856,11 +856,11 @@ class VirtualSession:
                     self._tell(end, kind, key)
 
     def _forget(self, end: End, kind: str, key: str) -> None:
-        known = end.subscribed if kind == "declare_subscriber" else end.answers
-        if key in known:
-            known[key] -= 1
-            if not known[key]:
-                del known[key]
+        declared = getattr(end, _DECLARED[kind])
+        if key in declared:
+            declared[key] -= 1
+            if not declared[key]:
+                del declared[key]
             if self.router:
                 for other in self.ends:
                     if other is not end:
@@ -885,8 +885,8 @@ class VirtualSession:
         if end not in self.ends:
             return
         self.ends.remove(end)
-        for kind, known in (("declare_subscriber", end.subscribed), ("declare_queryable", end.answers)):
-            for key, count in [*known.items()]:
+        for kind, name in _DECLARED.items():
+            for key, count in [*getattr(end, name).items()]:
                 for _ in range(count):
                     self._forget(end, kind, key)
         for key in [*end.tokens]:
@@ -913,9 +913,9 @@ class VirtualSession:
             subscriber.end()
 
 
-_KNOWN = {"declare_subscriber": "subscribed", "declare_queryable": "answers"}
+_DECLARED = {"declare_subscriber": "subscribed", "declare_queryable": "answers"}
 """Declaration → where an end keeps what the other one has declared."""
-_WITHDRAWN = {f"no {kind}": kind for kind in _KNOWN}
+_WITHDRAWN = {f"no {kind}": kind for kind in _DECLARED}
 _TAKEN: Mapping[str, Callable[[VirtualSession, End, TransportFrame], object]] = {
     "put": VirtualSession._take_put,
     "connected": VirtualSession._take_connection,

@@ -43,10 +43,10 @@ class Details(NamedTuple):
     @classmethod
     def of(cls, attachment: bytes | zenoh.ZBytes | None = None, **given: Any) -> Details:
         """Those that are given, but for None; the others as they are by default."""
-        known = {name: value for name, value in given.items() if value is not None and name in cls._fields}
+        details = {name: value for name, value in given.items() if value is not None and name in cls._fields}
         if attachment is not None:
-            known["attachment"] = zenoh.ZBytes(attachment) if isinstance(attachment, bytes) else attachment
-        return cls(**known) if known else NO_DETAILS
+            details["attachment"] = zenoh.ZBytes(attachment) if isinstance(attachment, bytes) else attachment
+        return cls(**details) if details else NO_DETAILS
 
 
 NO_DETAILS = Details()
@@ -158,10 +158,10 @@ class End:
 class VirtualConnection:
     """Two ends, and what lies between them."""
 
-    def __init__(self, scheduler: VirtualScheduler, one: End, other: End) -> None:
-        self._scheduler, self.ends = scheduler, (one, other)
-        one.other, other.other = other, one
-        one.connection = other.connection = self
+    def __init__(self, scheduler: VirtualScheduler, client: End, router: End) -> None:
+        self._scheduler, self.ends = scheduler, (client, router)
+        client.other, router.other = router, client
+        client.connection = router.connection = self
         self.open = True
         self.held: list[Callable[[], object]] | None = None
         """Frames that have come as far as where nothing gets through; None where everything does."""
@@ -179,13 +179,15 @@ class VirtualConnection:
     def close(self, why: str, by: End | None = None, *, gracefully: bool = False) -> None:
         """Close it: what is under way is lost, but for what the end that closes it has sent.
 
-        by: that end, which knows it; all others notice. gracefully: all that it has sent arrives; otherwise some.
+        by: that end, which knows it; all others notice. gracefully: all that it has sent arrives; otherwise some. Where nothing
+        gets through, none of it does.
         """
         if not self.open:
             return
+        frozen = self.held is not None
         self.open, self.held = False, None
         self._scheduler.note(notes.DISCONNECTS, self.ends[0].session.name, self.ends[1].session.name, why)
-        begun = self._scheduler.now if by is None else by.leave(gracefully=gracefully)
+        begun = self._scheduler.now if by is None or frozen else by.leave(gracefully=gracefully)
         for end in self.ends:
             end.free()
             if end is not by:
