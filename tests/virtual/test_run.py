@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from evedrop.cli.simulated import program
@@ -9,7 +11,7 @@ from evedrop.live.recorder.steering import Steering
 from evedrop.scenario.loading import Scenario
 from evedrop.virtual.campaign import play_case
 from evedrop.virtual.cases import SimulatedCase
-from evedrop.virtual.faults import CutConnection
+from evedrop.virtual.faults import CutConnection, Disturbance, KillProcess, StopProcess
 
 SCENARIO = Scenario(
     title="A receiver that leaves",
@@ -41,3 +43,12 @@ def test_a_process_that_is_cut_off_at_any_moment_is_named() -> None:
         played = play_case(SimulatedCase(1, SCENARIO, (CutConnection("legitimate", events),)), program)
         assert played.misses == (), events
         assert "legitimate" in played.run.said.partition("\n")[0]
+
+
+@pytest.mark.parametrize(
+    "fault", [StopProcess("launcher", 0), KillProcess("fork server of the recorder", 0)], ids=lambda fault: fault.target
+)
+def test_a_run_keeps_its_promises_without_those_that_start_processes(fault: Disturbance) -> None:
+    """Whenever they are suspended for good, or killed."""
+    for events in range(20, 400, 20):
+        assert play_case(SimulatedCase(1, SCENARIO, (replace(fault, after=events),)), program).misses == (), events

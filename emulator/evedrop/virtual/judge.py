@@ -116,6 +116,11 @@ def _kills_launcher(fault: Disturbance) -> bool:
     return isinstance(fault, CutPower) or (isinstance(fault, KillProcess) and fault.target == LAUNCHER)
 
 
+def _kills_recorder(fault: Disturbance) -> bool:
+    """Whether the recorder may end at once: by itself, with its launcher, or with its fork server."""
+    return fault.target in FORK_SERVERS or (isinstance(fault, KillProcess) and fault.target in (RECORDER, LAUNCHER))
+
+
 def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
     """Whether the run ended as soon as it could: a wake-up that is lost, and a wait that is too long, cost nothing but time."""
     scenario = case.scenario
@@ -178,9 +183,9 @@ def _of_results(run: SimulatedRun, struck: Mapping[Disturbance, float], referenc
         if disk and not done:
             continue
         yield from wrong_summary(summary, reference, done)
-        if not done and summary["ended"] == "complete" and run.status not in (_KILLED, Interrupted.exit_status):
+        if not done and summary["ended"] == "complete" and run.status not in (None, _KILLED, Interrupted.exit_status):
             yield f"status {run.status}, and the summary says complete"
-        if not any(fault.target in (RECORDER, LAUNCHER) and isinstance(fault, KillProcess) for fault in struck):
+        if not any(map(_kills_recorder, struck)):
             yield from _of_course(run, struck, summary, reference, len(folders) == 1)
 
 

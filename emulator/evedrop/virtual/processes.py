@@ -251,6 +251,7 @@ class VirtualForkServer:
         """Simulated pipes."""
         files = _Files(self._scheduler, log, tells, self._scheduler.number())
         self._files[files.descriptors[0]] = files
+        self._machine.logs.append(files.log)
         return files
 
     def send(self, request: bytes, descriptors: tuple[int, int, int]) -> None:
@@ -319,6 +320,8 @@ class VirtualMachine:
         """program: what `evedrop` is on this machine."""
         self.scheduler, self.program = scheduler, program
         self._of: dict[VirtualTask, VirtualProcess] = {}
+        self.logs: list[IO[bytes]] = []
+        """All logs, also of processes that never began."""
 
     @property
     def current(self) -> VirtualProcess:
@@ -327,6 +330,11 @@ class VirtualMachine:
         if thread is None:
             raise AssertionError("the world itself is no process")
         return self._of[thread.task]
+
+    def close(self) -> None:
+        """Close the logs of processes that have not ended."""
+        for log in self.logs:
+            log.close()
 
     @property
     def processes(self) -> list[VirtualProcess]:

@@ -85,6 +85,7 @@ class SimulatedWorld:
             stack.enter_context(inside(self.world))
             stack.enter_context(contextlib.redirect_stdout(out))
             stack.enter_context(contextlib.redirect_stderr(err))
+            stack.callback(self.machine.close)
             stack.callback(self.scheduler.take_down)
             yield
 
