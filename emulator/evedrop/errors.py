@@ -174,6 +174,10 @@ class Silence(RunError):
         super().__init__(f"{' and '.join(processes)}: {failure}")
 
 
+class UnwrittenResults(RunError):
+    """The disk refuses the results of a run, for which no process is to blame."""
+
+
 class NoRouter(RunError):
     """No router answered a process for too long."""
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO, cast, final
 
-from evedrop.errors import EvedropError
+from evedrop.errors import EvedropError, UsageError
 from evedrop.live.launch.briefs import MOST_SLOTS_AHEAD
 from evedrop.live.launch.launcher import launch
 from evedrop.scenario.progress_events import ProgressEvent
@@ -115,6 +115,9 @@ def run_in(world: SimulatedWorld, scenario: Scenario, folder: Path, ahead: int =
         except EvedropError as error:
             say(error.illustrated)
             return error.exit_status
+        except OSError as error:  # as the command line does
+            say(f"{error.filename}: {error.strerror}; free some space, or check its permissions")
+            return UsageError.exit_status
 
     with world.entered():
         process = world.machine.begin("launcher", launcher)

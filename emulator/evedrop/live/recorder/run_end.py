@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import final
 
-from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError
+from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError, UnwrittenResults
 from evedrop.live.protocol.last_word import protocol_breaker
 from evedrop.results.summary_file import unwritten
 from evedrop.scenario.progress_events import RunEnded
@@ -45,7 +45,8 @@ class RunEnd:
 
     def blame(self, missing: list[str], error: EvedropError) -> None:
         """Note which processes are at fault for the error; missing: those that are not on the network."""
-        self.suspects = tuple(missing)
+        # Some may be missing just now, too: a cut connection does not fill the disk.
+        self.suspects = () if isinstance(error, UnwrittenResults) else tuple(missing)
         self.accused = error.at_fault if isinstance(error, RunError) else ()
         self.broken_by = protocol_breaker(error)
 

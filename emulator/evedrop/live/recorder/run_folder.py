@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import final
 
-from evedrop.errors import NoAnswer, RunError
+from evedrop.errors import NoAnswer, UnwrittenResults
 from evedrop.live.recorder.run_end import RunEnd
 from evedrop.live.recorder.run_score import RunScore
 from evedrop.results.ending import note_end
@@ -67,7 +67,7 @@ class RunFolder:
         try:
             self._writer.write_rows(self._at)
         except OSError as error:
-            raise RunError(unwritten(error)) from error
+            raise UnwrittenResults(unwritten(error)) from error
 
     def save(self) -> None:
         """Save the results so far, from time to time. Raises RunError if they cannot be written."""
@@ -75,7 +75,7 @@ class RunFolder:
             with suppress(NoAnswer):  # reported at the end; rows are written before the summary is computed
                 self._writer.checkpoint(self._at, self._so_far)
         except OSError as error:
-            raise RunError(unwritten(error)) from error
+            raise UnwrittenResults(unwritten(error)) from error
 
     @property
     def verdict(self) -> Verdict | None:
