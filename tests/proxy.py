@@ -57,9 +57,10 @@ class Cable:
         return len(self._ends) // 2
 
     def cut(self) -> None:
-        """Close all connections, and take no new one."""
+        """Close all connections, and take no new one. What was held back is lost."""
         self._accepts = False
         self._close()
+        self._flows.set()
 
     def flap(self) -> None:
         """Reset all connections, those that are just being opened too, and take new ones at once."""

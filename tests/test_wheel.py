@@ -137,6 +137,12 @@ def test_a_wire(evedrop_wire, tmp_path):
     sides = "[side.here]\\n[side.there]\\n[[link]]\\nname = 'all'\\nfrom = 'here'\\nto = 'there'\\n"
     (tmp_path / "wire.toml").write_text("seed = 1\\n" + sides)
     assert evedrop_wire(tmp_path / "wire.toml").endpoint("here")
+
+
+def test_a_simulated_wire(evedrop_simulated_wire):
+    radio = evedrop_simulated_wire(side=["here", "there"], link=[{"from": "here", "to": "there"}])
+    radio.clock.sleep(600.0)
+    assert radio.status().seconds > 600.0
 """
 PROJECT = {
     "pyproject.toml": """
@@ -177,7 +183,7 @@ def test_a_project_with_the_names_of_our_folders_runs_its_suite(installed: Insta
     """With all warnings as errors: its tests, a wire, and a live scenario whose class is asked and run in processes."""
     done = installed.python(project, "-m", "pytest", "-q", "--evedrop-out", "kept", "tests", "scenarios")
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "3 passed" in done.stdout
+    assert "4 passed" in done.stdout
     assert (project / "kept" / "spied" / "summary.json").exists()
 
 
@@ -190,7 +196,7 @@ def test_it_may_choose_how_pytest_imports_and_shares_work(installed: Installed, 
     words = ("--import-mode=importlib", "-o", "pythonpath=.", "-p", "no:cacheprovider", "-n", "2", "tests")
     done = installed.python(project, "-m", "pytest", "-q", *words)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "2 passed" in done.stdout
+    assert "3 passed" in done.stdout
     assert {path for path in project.rglob("*") if "__pycache__" not in path.parts} == before
 
 

@@ -42,7 +42,7 @@ _WEIGHTS = {
     "little memory": 4,
     **dict.fromkeys(SIGNALS, 6),
 }
-_FAMILIES = {"live": 84, "wire": 9, "study": 7}
+FAMILIES = {"live": 84, "wire": 9, "study": 7}
 _PHASES = {"start": 25, "run": 50, "finish": 25}
 _OVER_SSH = (16, 15)
 """Numbers with this remainder, when divided by the first, are runs over ssh, drawn separately: all others stay as they were."""
@@ -103,7 +103,7 @@ def case_of(seed: int) -> AnyCase:
     if seed % count == remainder:
         return _case_over_ssh(seed)
     draw = random.Random(f"faults {seed}")  # noqa: S311 - a campaign must be repeatable
-    (family,) = draw.choices([*_FAMILIES], [*_FAMILIES.values()])
+    (family,) = draw.choices([*FAMILIES], [*FAMILIES.values()])
     if family == "wire":
         return wire_case(seed, draw)
     if family == "study":

@@ -239,9 +239,9 @@ def _folders(run: Run) -> list[Path]:
 
 def _of_results(status: int, run: Run, hits: Mapping[Fault, float], reference: RunReference) -> Iterator[str]:
     disk, limited = any(map(_of_disk, hits)), any(map(_of_limits, hits))
-    folders = _folders(run)
+    folders = {name: one for folder in (run.out, run.renamed) for name, one in reference.of_folders(folder).items()}
     written = [folder for folder in folders if any(_has_rows(path) for path in folder.glob("**/*.parquet"))]
-    for folder in folders:
+    for folder, expected in folders.items():
         try:
             results = Results.read(folder)
             dict(tables_of(results))
@@ -251,9 +251,9 @@ def _of_results(status: int, run: Run, hits: Mapping[Fault, float], reference: R
                 yield f"{folder.name} cannot be read: {error}"
             continue
         summary = results.summary
-        yield from wrong_tables(results, reference, status == 0, run.variant.shards if len(folders) == 1 else 1)
+        yield from wrong_tables(results, expected, status == 0)
         if not disk:
-            yield from _of_summary(status, run, hits, summary, reference)
+            yield from _of_summary(status, run, hits, summary, expected)
         yield from failed_looks(folder, reference.folder if summary["slots"] else None)
     if not folders and status == 0:
         yield "there are no results"

@@ -142,7 +142,7 @@ def carried_out(case: WireCase, folder: Path, before: frozenset[int]) -> Iterato
     for number, start in enumerate(starts, 1):
         yield from true_to_receivers(number, start, rows[number])
     if case.faults[-1].kind in _ENDS:
-        yield from _summary(out, rows[len(starts)], len(starts))
+        yield from wrong_summary(out, rows[len(starts)], len(starts))
     yield from failed_looks(out, None)
 
 
@@ -304,7 +304,7 @@ def true_to_receivers(number: int, start: Start, rows: list[dict[str, Any]]) -> 
         yield f"{where}: the journal has no message"
 
 
-def _summary(out: Path, rows: list[dict[str, Any]], start: int) -> Iterator[str]:
+def wrong_summary(out: Path, rows: list[dict[str, Any]], start: int) -> Iterator[str]:
     """The metrics of the last start, which ended by itself, are those of its rows."""
     path = out / "summary.json"
     if not path.exists():

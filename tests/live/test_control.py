@@ -108,6 +108,12 @@ def slot_of(answer: str) -> int:
     return int(re.findall(r"slot (\d+)", answer)[-1])
 
 
+def theory_of(folder: Path) -> object:
+    """What theory expects in each slot, to nine digits."""
+    columns = load_results(folder).slots.select(["slot", "peer", "theoretical_trace_covariance"])
+    return sorted((slot, peer, f"{trace:.9g}") for slot, peer, trace in zip(*columns.to_pydict().values(), strict=True))
+
+
 def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> None:
     """Steered in real time, while a receiver is away too: live and in memory its folder gives the same digests again."""
     run = steered(slots=500, pace=0.002, events=KILLED + DELAYED)
@@ -138,6 +144,7 @@ def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> No
         again = evedrop.folder / f"again-{command[0]}"
         assert evedrop(*command, "--out", str(again)).status == 0
         assert digests_of(again) == once
+        assert theory_of(again) == theory_of(run.live.folder)
         assert evedrop("diff", folder, str(again)).status == 0
         events = [(event["slot"], event["event"]) for event in load_results(run.live.folder).summary["events"]]
         repeated = [(event["slot"], event["event"]) for event in load_results(again).summary["events"]]

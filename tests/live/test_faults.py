@@ -91,11 +91,15 @@ def test_a_process_that_breaks_the_protocol_is_named(evedrop: Evedrop, case: str
         ("def fail(self):\n    raise RuntimeError('no such luck')\nReport.pack = fail", "no such luck"),
         ("import os\nReport.pack = lambda self: os._exit(0)", "smart left before the run ended"),
         ("import os\nos._exit(7)", "smart ended with status 7"),
+        (
+            "import threading\ndef fail():\n    raise MemoryError\nthreading.Thread(target=fail).start()",
+            "there is not enough memory",
+        ),
     ],
-    ids=["exception", "leaves early", "does not start"],
+    ids=["exception", "leaves early", "does not start", "exception in a thread"],
 )
 def test_a_process_that_fails_is_named(evedrop: Evedrop, does: str, message: str) -> None:
-    """An exception, an early leave and a failed start all end the run, with the log."""
+    """An exception, on any thread, an early leave and a failed start all end the run, with the log."""
     live = evedrop.live("eavesdroppers", *ENDLESS, env=with_rogue(evedrop, "smart", does))
     done = live.end()
     assert done.status == 3

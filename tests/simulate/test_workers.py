@@ -25,7 +25,7 @@ from evedrop.simulate.simulation import Mode
 from evedrop.simulate.tasks import OnProgress, Result, Stopped, Task
 from evedrop.simulate.trials import BLOCK_TRIALS, tasks_of
 from evedrop.simulate.workers import in_processes, usable_cores
-from evedrop.system.processes import is_suspended
+from evedrop.system.world import world
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until, with_mark
 from tests.processes import catches, descendants
 
@@ -202,7 +202,7 @@ def test_a_worker_that_is_continued_is_not_named(monkeypatch: pytest.MonkeyPatch
         if not suspended:
             suspended.append(own_crew()[-1])
             os.kill(suspended[0], signal.SIGSTOP)
-            wait_until(lambda: is_suspended(suspended[0]), "a suspended worker")
+            wait_until(lambda: world().is_suspended(suspended[0]), "a suspended worker")
             os.kill(suspended[0], signal.SIGCONT)
 
     results = outcome(tasks, on_progress=pause)

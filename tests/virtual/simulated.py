@@ -15,37 +15,61 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from evedrop.cli.simulated import program
-from evedrop.virtual.campaign import PlayedCase, play, play_case
-from evedrop.virtual.cases import SimulatedCase, case_from, case_of
+from evedrop.virtual.campaign import PlayedCase, play_case
+from evedrop.virtual.campaign import play as play_seed
+from evedrop.virtual.cases import SEEDS_OF_A_SCENARIO, SimulatedCase, case_from, case_of
 from evedrop.virtual.diagram import diagram
-from evedrop.virtual.shrinking import kind_of, shrink
+from evedrop.virtual.shrinking import Shrunk, kind_of, shrink
 from evedrop.virtual.steps import Step, steps_of
+from tests.virtual.wire_cases import EVERY, PlayedWire, SimulatedWireCase
 
+AnyCase = SimulatedCase | SimulatedWireCase
 WINDOW = Path()
 """What `--view` is without a file: the viewer is opened."""
 
 
+def any_case(seed: int) -> AnyCase:
+    """The case of a seed: one of so many is a wire."""
+    return case_of(seed) if seed % EVERY else SimulatedWireCase.of(seed)
+
+
+def read_case(text: str) -> AnyCase:
+    """The case of a text: of a seed alone, or of a case written down. Raises UsageError."""
+    if text.isdecimal():
+        return any_case(int(text))
+    return SimulatedWireCase.read(text) if '"starts"' in text else case_from(text)
+
+
+def play(case: AnyCase, keep: bool = False) -> PlayedCase | PlayedWire:
+    """Play a case."""
+    return case.play(keep) if isinstance(case, SimulatedWireCase) else play_case(case, program, keep)
+
+
 def played(seed: int) -> tuple[int, str, str, int, float, tuple[str, ...], int | None]:
     """A case, as it is told: seed, case, digest, events, virtual seconds, misses, status."""
-    result: PlayedCase = play(seed, program)
+    result = play_seed(seed, program) if seed % EVERY else play(any_case(seed))
     run = result.run
     return seed, str(result.case), run.digest, run.events, run.seconds, result.misses, run.status
 
 
-def shrunk(case: SimulatedCase, misses: Sequence[str], say: Callable[[str], object] = print) -> SimulatedCase:
+def shrunk(case: AnyCase, misses: Sequence[str], say: Callable[[str], object] = print) -> AnyCase:
     """The smallest case found that breaks the same promise; says how it is played again."""
-    result = shrink(case, misses, lambda smaller: play_case(smaller, program).misses)
+    result: Shrunk[SimulatedWireCase] | Shrunk[SimulatedCase]
+    if isinstance(case, SimulatedWireCase):
+        result = shrink(case, misses, lambda smaller: smaller.play().misses, reductions=[SimulatedWireCase.smaller])
+    else:
+        result = shrink(case, misses, lambda smaller: play_case(smaller, program).misses)
     say(f"shrunk in {result.plays} plays; to play it again:")
     say(f"    {sys.executable} -m tests.virtual.simulated --case '{result.case.to_text()}'")
     return result.case
 
 
-def show(case: SimulatedCase, view: Path | None = None, say: Callable[[str], object] = print) -> bool:
+def show(case: AnyCase, view: Path | None = None, say: Callable[[str], object] = print) -> bool:
     """Play a case, and say what happened; returns whether all promises were kept.
 
     view: a file for its recording, or WINDOW.
     """
-    result = play_case(case, program, keep=True)
+    result = play(case, keep=True)
     run, steps = result.run, steps_of(result.run.happened)
     say(f"{case}\n{run.events} events, {run.seconds:.2f} s, status {run.status}, {run.digest}")
     for miss in result.misses:
@@ -89,7 +113,9 @@ def campaign(seeds: range, workers: int, explained: int, view: Path | None) -> b
     begun, events, total = time.perf_counter(), 0, hashlib.blake2b(digest_size=8)
     failed: list[tuple[int, tuple[str, ...]]] = []
     with ProcessPoolExecutor(workers) as pool:
-        for seed, case, digest, happened, seconds, misses, status in pool.map(played, seeds, chunksize=4):
+        for seed, case, digest, happened, seconds, misses, status in pool.map(
+            played, seeds, chunksize=4 * SEEDS_OF_A_SCENARIO
+        ):
             events += happened
             total.update(digest.encode())
             if misses or len(seeds) <= 20:
@@ -100,8 +126,8 @@ def campaign(seeds: range, workers: int, explained: int, view: Path | None) -> b
                 failed.append((seed, misses))
     took = time.perf_counter() - begun
     for seed, misses in unlike(failed)[:explained]:
-        print(f"\nseed {seed}: {case_of(seed)}")
-        show(shrunk(case_of(seed), misses), view)
+        print(f"\nseed {seed}: {any_case(seed)}")
+        show(shrunk(any_case(seed), misses), view)
         view = None
     print(
         f"{len(seeds)} runs, {len(failed)} with a miss; {events:,} events in {took:.1f} s, {len(seeds) / took:.1f} runs/s; "
@@ -127,10 +153,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.case is not None:
         text = options.case
-        kept = show(case_from(text if text.lstrip()[:1] in "{0123456789" else Path(text).read_text()), options.view)
+        kept = show(read_case(text if text.lstrip()[:1] in "{0123456789" else Path(text).read_text()), options.view)
     elif options.explain is not None:
-        case = case_of(options.explain)
-        misses = play_case(case, program).misses
+        case = any_case(options.explain)
+        misses = play(case).misses
         print(f"seed {options.explain}: {case}")
         kept = show(shrunk(case, misses) if misses else case, options.view)
     else:

@@ -10,7 +10,8 @@ import pytest
 from evedrop.scenario.progress_events import RunProgress
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.cases import SimulatedCase
-from evedrop.virtual.faults import Disturbance, InterruptProcess, KillProcess, StopProcess
+from evedrop.virtual.disturbance import Disturbance
+from evedrop.virtual.faults import InterruptProcess, KillProcess, StopProcess
 from evedrop.virtual.judge import misses
 from evedrop.virtual.reference import RunReference
 from evedrop.virtual.run import SimulatedRun
@@ -26,7 +27,7 @@ SCENARIO = Scenario(
         "legitimate": {"link": {"quality": 1.0}},
     }
 )
-REFERENCE = RunReference({"slots": 10}, {})
+REFERENCE = RunReference(SCENARIO, {"slots": 10}, {})
 KILLED = KillProcess("legitimate", 50)
 TOLD = InterruptProcess("launcher", 60)
 

@@ -27,6 +27,7 @@ KEY = "evedrop/r0123/control/sensor"
         (b"", ""),
         (b"\xc1", ""),
         (b"\x07", ""),
+        (b"\x81\x90\x01", ""),
     ],
 )
 def test_a_message_is_known_by_its_command_or_slots(payload: bytes, said: str) -> None:

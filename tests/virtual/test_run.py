@@ -11,7 +11,8 @@ from evedrop.live.recorder.steering import Steering
 from evedrop.scenario.loading import Scenario
 from evedrop.virtual.campaign import play_case
 from evedrop.virtual.cases import SimulatedCase
-from evedrop.virtual.faults import CutConnection, Disturbance, KillProcess, StopProcess
+from evedrop.virtual.disturbance import Disturbance
+from evedrop.virtual.faults import CutConnection, KillProcess, StopProcess
 
 SCENARIO = Scenario(
     title="A receiver that leaves",

@@ -198,7 +198,13 @@ def test_a_recorder_that_forgets_rows_is_shown_by_a_run_without_anything(monkeyp
 
 def test_a_recorder_that_never_asks_again_is_shown_by_one_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     """A process is cut off before it has reported."""
-    case = where(lambda case: case.scenario.encoding.scheme == "random-code" and len(case.scenario.eavesdroppers) > 1)
+    case = where(
+        lambda case: (
+            case.scenario.encoding.scheme == "random-code"
+            and len(case.scenario.eavesdroppers) > 1
+            and case.scenario.shards == 1
+        )
+    )
     cuts = (
         SimulatedCase(case.seed, case.scenario, (CutConnection("eve1", after, 1.0), KillProcess("launcher", 10**6)))
         for after in range(50, 90)

@@ -14,7 +14,8 @@ PROCESS = "a process of a run: SIGTERM ends it at once, and so do the recorder, 
 END = "a daemon thread that waits for the end of a process; nobody waits for the thread"
 VIRTUAL = "a simulation in which everybody waits ends with `Stuck`"
 EXCEPTIONS = {
-    "emulator/evedrop/virtual/zenoh/session.py __iter__ self._queue.get": VIRTUAL,
+    "emulator/evedrop/virtual/zenoh/handlers.py items_of channel.recv": VIRTUAL,
+    "emulator/evedrop/virtual/zenoh/session.py recv self.handler.recv": VIRTUAL,
     "emulator/evedrop/virtual/zenoh/session.py _receive self.inbox.get": VIRTUAL,
     "emulator/evedrop/virtual/processes.py _serve self._requests.get": VIRTUAL,
     "emulator/evedrop/virtual/scheduler.py wait self._lock.acquire": VIRTUAL,

@@ -1,6 +1,6 @@
 """A pytest plugin that runs scenario files as tests: `pytest scenarios/`, `pytest my.toml`. One file is one test and one run.
 
-Its fixture `evedrop_wire` gives a test wires between programs (docs/wire/python.md, from pytest).
+Its fixtures `evedrop_wire` and `evedrop_simulated_wire` give a test wires between programs (docs/wire/python.md, from pytest).
 
 pytest loads this plugin in every project of an environment that has Evedrop installed. So it imports nothing of Evedrop before it
 finds a TOML file, and only what runs a scenario when a scenario is run.
@@ -15,12 +15,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, TypeVar, final
 
 import pytest
 
 if TYPE_CHECKING:
     from evedrop.studies.scenario_tests import Finding
+    from evedrop.virtual.simulated_wire import SimulatedWire
     from evedrop.wire.running import RunningWire
 
 _LONGEST_NAME = 100
@@ -69,20 +70,48 @@ def evedrop_wire(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Cal
     Its results are in a folder of the test below that of `--evedrop-out`, or in `tmp_path`. The test fails if an expectation of
     a wire failed.
     """
+    from evedrop.wire.running import wire  # needed only by tests that open a wire
+
+    with ExitStack() as stack:
+        yield _opening(
+            request, tmp_path, lambda *arguments, **entries: stack.enter_context(wire(*arguments, **entries))
+        )
+
+
+@pytest.fixture
+def evedrop_simulated_wire(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[..., SimulatedWire]]:
+    """As `evedrop_wire`, but the wire and the programs that its `start` starts are in a simulated world, in virtual time.
+
+    `zenoh.open` opens simulated sessions there, and the wire's `clock` is to be used in place of the module `time`.
+    """
+    if "evedrop_wire" in request.fixturenames:
+        pytest.fail(
+            "a test has either evedrop_wire or evedrop_simulated_wire: only one of them can be the world it is in"
+        )
+    from evedrop.cli.simulated import program  # needed only by tests that open a simulated wire
+    from evedrop.virtual.simulated_wire import SimulatedWires  # the same
+
+    with SimulatedWires(program) as wires:
+        yield _opening(request, tmp_path, wires.open)
+
+
+_Wire = TypeVar("_Wire", "RunningWire", "SimulatedWire")
+
+
+def _opening(request: pytest.FixtureRequest, tmp_path: Path, open_wire: Callable[..., _Wire]) -> Callable[..., _Wire]:
+    """The same function, with results folders of the test, which its report names."""
     from evedrop.results.folder import claimed  # needed only by tests that open a wire
-    from evedrop.wire.running import wire  # the same
 
     out: Path | None = request.config.option.evedrop_out
-    with ExitStack() as stack:
-        place = tmp_path if out is None else claimed(out / re.sub(r"\W", "_", request.node.name)[:_LONGEST_NAME])
-        folders = (place / f"wire-{number}" for number in count(1))
+    place = tmp_path if out is None else claimed(out / re.sub(r"\W", "_", request.node.name)[:_LONGEST_NAME])
+    folders = (place / f"wire-{number}" for number in count(1))
 
-        def opened(*arguments: Any, **entries: Any) -> RunningWire:
-            running = stack.enter_context(wire(*arguments, **{"out": next(folders), **entries}))
-            request.node.user_properties.append(("evedrop_results", str(running.folder)))
-            return running
+    def opened(*arguments: Any, **entries: Any) -> _Wire:
+        running = open_wire(*arguments, **{"out": next(folders), **entries})
+        request.node.user_properties.append(("evedrop_results", str(running.folder)))
+        return running
 
-        yield opened
+    return opened
 
 
 @final

@@ -276,6 +276,13 @@ def metrics_path(folder: Path) -> Path:
     return folder / UNFINISHED / _SUMMARY
 
 
+def keep(folder: Path) -> None:
+    """Let a power cut leave all rows that count. Raises OSError."""
+    for file in (*(file for file, _ in last_round(folder).tables.values()), _ROUNDS):
+        with contextlib.suppress(FileNotFoundError):  # of a table that is a Parquet file already
+            world().disk.sync(folder / UNFINISHED / file)
+
+
 def batches_of(folder: Path, name: str) -> Iterator[pa.RecordBatch]:
     """The rows of a table in a stream, batch by batch; none if there is no such stream, fewer if it is damaged."""
     file, rows = last_round(folder).tables.get(name, ("", 0))
@@ -333,6 +340,7 @@ def finish(folder: Path) -> None:
 
     Raises OSError if a file cannot be written: its table and all later ones stay streams, which can be read as well.
     """
+    keep(folder)  # or a power cut would leave some tables whole, and of the others what had reached the disk by itself
     for name, (file, _) in last_round(folder).tables.items():
         schema = schema_of(folder, name)
         if schema is None:

@@ -19,6 +19,7 @@ from evedrop.errors import UnknownName, UsageError
 from evedrop.model.digest import DIGEST_BYTES
 from evedrop.model.streams import MOST_SLOTS
 from evedrop.results.crash_proof_tables import (
+    TableRound,
     batches_of,
     goes_on,
     is_unfinished,
@@ -185,10 +186,12 @@ class Results:
     @property
     def inputs(self) -> pa.Table | None:
         """A row per slot and recorded trial of a closed loop; None without a controller."""
-        if self.summary.get("controller") is None:
-            return None
         path = self.folder / "inputs.parquet"
-        schema = None if path.exists() else schema_of(self.folder, "inputs")
+        written = path.exists()
+        schema = None if written else schema_of(self.folder, "inputs")
+        # Metrics of before the first slot have no controller, although a run that was killed soon after has rows.
+        if self.summary.get("controller") is None and schema is None and not written:
+            return None
         return self._table("inputs", inputs_schema_in(path) if schema is None else schema)
 
     @property
@@ -277,10 +280,7 @@ def _cut_short(folder: Path) -> dict[str, Any]:
         raise UsageError(
             f"{folder} has nothing yet: its run has just begun, or was killed then; run the scenario again"
         )
-    try:
-        summary = _read_summary(metrics_path(folder))
-    except UsageError:
-        summary = _no_metrics(folder)
+    summary = _metrics(folder, last) or _no_metrics(folder)
     ended = (
         f"the run goes on, at {at}"
         if goes_on(folder)
@@ -292,12 +292,18 @@ def _cut_short(folder: Path) -> dict[str, Any]:
 def age_of_metrics(folder: Path) -> str:
     """What `ended` of an unfinished results folder adds if its metrics are of an earlier moment than its rows."""
     rows = last_round(folder)
+    metrics = _metrics(folder, rows)
+    at, slots = ("slot 0", 0) if metrics is None else (metrics["ended"], metrics["slots"])
+    return as_of(at, slots < rows.slots) if rows.at and at != rows.at else ""
+
+
+def _metrics(folder: Path, rows: TableRound) -> dict[str, Any] | None:
+    """The last metrics that were written; None without them, or if a power cut has taken rows of theirs."""
     try:
         metrics = _read_summary(metrics_path(folder))
-        at, slots = metrics["ended"], metrics["slots"]
-    except UsageError:  # no metrics have been written
-        at, slots = "slot 0", 0
-    return as_of(at, slots < rows.slots) if rows.at and at != rows.at else ""
+    except UsageError:
+        return None
+    return metrics if metrics["slots"] <= rows.slots else None
 
 
 def as_of(moment: str, more: bool = True) -> str:

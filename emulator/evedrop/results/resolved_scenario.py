@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, final
 
@@ -97,6 +98,11 @@ def made_with(tables: dict[str, Any]) -> dict[str, Any]:
     """The versions of the software, and the SHA-256 of the modules of a scenario, given as its tables."""
     return {
         "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")},
+        **_versions(),
         **sources_of(tables),
     }
+
+
+@cache
+def _versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")}

@@ -21,7 +21,7 @@ from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
 from evedrop.model.receiver import ACTIONS, MISLED, NOTHING, TYPES, Action, Codes, Flags, packed_flags
 from evedrop.names import CONTROLLER
-from evedrop.results.crash_proof_tables import BATCH_BYTES, TableStream, Unfinished, finish, write_metrics
+from evedrop.results.crash_proof_tables import BATCH_BYTES, TableStream, Unfinished, finish, keep, write_metrics
 from evedrop.results.folder import UNFINISHED, HeldFolder
 from evedrop.results.resolved_scenario import TakenStates
 from evedrop.results.summary_file import summary_text
@@ -181,6 +181,7 @@ class ResultsWriter:
     def write_metrics(self, metrics: Summary) -> None:
         """Write the summary so far, of a run that has not ended."""
         self._with_metrics()
+        keep(self._held.now)  # or a power cut could leave metrics of rows that are lost
         write_metrics(self._held.now, summary_text(replace(metrics, ended=self._at)))
 
     def restart_slots(self) -> None:

@@ -70,12 +70,21 @@ class Scorekeeper:
         theory: Mapping[str, TheoreticalTraceStream] | None = None,
         revealed: HeardBitsStream | None = None,
     ) -> None:
-        if theory is None:
-            theory = {name: expectation.stream() for name, expectation in expectations_of(scenario).items()}
-        self._theory = theory
+        self._theory = _theory_of(scenario) if theory is None else theory
+        self._slots = 0
+        """How many are scored."""
         self._revealed = HeardBitsStream(scenario) if revealed is None else revealed
         self._built_in = not has_foreign(scenario)
         self.run_tally = RunTally.from_scenario(scenario, trials)
+
+    def amend(self, scenario: Scenario) -> None:
+        """Expect what another scenario lets expect, which is the same for the slots so far. Raises NoAnswer."""
+        theory = _theory_of(scenario)
+        for stream in theory.values():
+            stream.next_traces(self._slots)
+        revealed = HeardBitsStream(scenario)
+        revealed.of(range(self._slots))
+        self._theory, self._revealed = theory, revealed
 
     def add_slots(
         self, slots: Slots, errors_and_traces: Mapping[str, tuple[Floats, Floats]] | None = None
@@ -85,6 +94,7 @@ class Scorekeeper:
         errors_and_traces: receiver → its squared errors, and tr P of every trial, (c, R) each, if they have been computed.
         """
         scored = {}
+        self._slots += slots.count
         self._add_plant(slots)
         revealed = self._revealed.of(range(slots.first, slots.first + slots.count))
         sensor = slots.sensor
@@ -141,6 +151,10 @@ class Scorekeeper:
             run_tally.filter.add_errors(true_errors(sensor.true, sensor.x, estimates))
         if run_tally.loop is not None:
             run_tally.loop.add_slots(sensor, estimates, slots.receivers[LEGITIMATE].action)
+
+
+def _theory_of(scenario: Scenario) -> Mapping[str, TheoreticalTraceStream]:
+    return {name: expectation.stream() for name, expectation in expectations_of(scenario).items()}
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Collection
-from pathlib import Path
 from typing import Protocol, TypeVar, final
 
 from evedrop.system.world import world
@@ -48,14 +47,6 @@ def wait_for(processes: Collection[P], seconds: float) -> list[P]:
     return left
 
 
-def is_suspended(pid: int) -> bool:
-    """Whether a process is suspended, as by SIGSTOP; False where the system does not say (outside Linux)."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()[:1] == ["T"]
-    except OSError:
-        return False
-
-
 @final
 class SuspensionWatch:
     """Finds processes that stay suspended. Only the time in which this process runs counts."""
@@ -72,5 +63,5 @@ class SuspensionWatch:
         if world().monotonic() < self._next:
             return None
         self._next = world().monotonic() + _POLL_SECONDS
-        self._looks = {pid: self._looks.get(pid, 0) + 1 for pid in pids if is_suspended(pid)}
+        self._looks = {pid: self._looks.get(pid, 0) + 1 for pid in pids if world().is_suspended(pid)}
         return next((pid for pid, looks in self._looks.items() if looks * _POLL_SECONDS > SUSPENDED_SECONDS), None)

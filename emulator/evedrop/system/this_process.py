@@ -67,6 +67,10 @@ class ThisProcess(ABC):
         """An event that the first of these signals sets while the block runs; a second one calls `leave`, which exits."""
 
     @abstractmethod
+    def on_thread_failure(self, handle: Callable[[BaseException], object]) -> None:
+        """Call this, on the thread, when an error ends a thread other than the first."""
+
+    @abstractmethod
     def told_when_suspended(self, tell: Callable[[], object]) -> AbstractContextManager[None]:
         """Call `tell` before Ctrl-Z suspends it while the block runs."""
 
@@ -152,6 +156,15 @@ class RealProcess(ThisProcess):
     def stop_or_leave_on_signals(self, leave: Callable[[], object]) -> AbstractContextManager[ThreadEvent]:
         """An event that the first signal sets; has no effect outside the main thread."""
         return stop_or_leave_on_signals(leave)
+
+    def on_thread_failure(self, handle: Callable[[BaseException], object]) -> None:
+        """Call this when an error ends a thread."""
+
+        def hook(failure: threading.ExceptHookArgs) -> None:
+            if failure.exc_value is not None and not isinstance(failure.exc_value, SystemExit):
+                handle(failure.exc_value)
+
+        threading.excepthook = hook
 
     def told_when_suspended(self, tell: Callable[[], object]) -> AbstractContextManager[None]:
         """Call `tell` before Ctrl-Z suspends it; has no effect outside the main thread."""

@@ -79,6 +79,10 @@ class World(ABC):
     def expect_free(self, host: str, port: int) -> None:
         """Raise OSError unless this machine can listen at this port."""
 
+    @abstractmethod
+    def is_suspended(self, pid: int) -> bool:
+        """Whether a process is suspended, as by SIGSTOP; False where the system does not say."""
+
     @property
     @abstractmethod
     def process(self) -> ThisProcess:
@@ -154,6 +158,13 @@ class RealWorld(World):
         with socket.socket(family, kind, protocol) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
+
+    def is_suspended(self, pid: int) -> bool:
+        """Whether it is suspended, by Linux."""
+        try:
+            return Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()[:1] == ["T"]
+        except OSError:
+            return False
 
     @property
     def process(self) -> ThisProcess:

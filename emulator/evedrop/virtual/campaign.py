@@ -8,14 +8,17 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
+from evedrop.errors import UsageError
+from evedrop.scenario.loading import load
+from evedrop.scenario.tables import Scenario
 from evedrop.virtual import notes
-from evedrop.virtual.cases import SimulatedCase, case_of
-from evedrop.virtual.faults import Disturbance
+from evedrop.virtual.cases import SEEDS_OF_A_SCENARIO, SimulatedCase, case_of, scenario_of
+from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.judge import misses
 from evedrop.virtual.processes import Program
 from evedrop.virtual.reference import RunReference, in_memory
@@ -43,7 +46,7 @@ class PlayedCase:
 
 def play(seed: int, program: Program, keep: bool = False) -> PlayedCase:
     """Play the case of a seed; program: what `evedrop` is in its world. keep: whether to keep all events."""
-    return play_case(case_of(seed), program, keep)
+    return play_case(case_of(seed), program, keep, _reference_of(seed // SEEDS_OF_A_SCENARIO))
 
 
 def play_case(
@@ -51,10 +54,10 @@ def play_case(
 ) -> PlayedCase:
     """Play a case; reference: the same trials in memory, if they have been computed."""
     with _folder() as folder:
-        memory, machine = folder / "memory", folder / "machine"
-        machine.mkdir()
         if reference is None:
-            reference = in_memory(case.scenario, memory)
+            reference = in_memory(case.scenario, folder / "memory")
+        machine = folder / "machine"
+        machine.mkdir()
         struck: dict[Disturbance, float] = {}
         world = SimulatedWorld(case.seed, program, machine, keep)
         temporary = world.disk.root / "temporary"
@@ -62,8 +65,27 @@ def play_case(
         for fault in case.faults:
             world.scheduler.after(fault.after, partial(_strike, fault, world, struck))
         with _temporary(temporary):
-            run = run_in(world, case.scenario, world.disk.root / "results", case.ahead)
+            run = run_in(world, case.scenario, case.ahead)
+        if any(fault.amends for fault in struck):
+            reference = _amended(reference, case.scenario, run.folder, folder / "amended")
         return PlayedCase(case, run, struck, tuple(misses(case, run, struck, reference, temporary)))
+
+
+@lru_cache(maxsize=1)
+def _reference_of(number: int) -> RunReference:
+    """The trials in memory of the scenario that some seeds play."""
+    with _folder() as folder:
+        return in_memory(scenario_of(number), folder / "memory")
+
+
+def _amended(reference: RunReference, scenario: Scenario, results: Path, folder: Path) -> RunReference:
+    """The same trials in memory with the events that an operator has added; results: of the run."""
+    with suppress(UsageError):  # it has no results
+        amended = load(results)
+        if added := [event for event in amended.event if event not in scenario.event]:
+            first = min(act.at for event in added for act in event.acts())
+            return in_memory(amended, folder).after(first, reference)
+    return reference
 
 
 def _strike(fault: Disturbance, world: SimulatedWorld, struck: dict[Disturbance, float]) -> None:

@@ -9,6 +9,7 @@ import json
 import random
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass
+from functools import lru_cache
 from typing import Any, final
 
 from evedrop.errors import ScenarioError, UsageError
@@ -18,8 +19,12 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.loading import Scenario
-from evedrop.virtual.faults import KINDS, Disturbance, faults_of
+from evedrop.virtual import own_classes
+from evedrop.virtual.disturbance import Disturbance
+from evedrop.virtual.drawn_faults import KINDS, faults_of
 
+SEEDS_OF_A_SCENARIO = 3
+"""How many seeds after each other play the same scenario: the same trials in memory are computed once for all of them."""
 _MOST_SLOTS, _MOST_TRIALS = 80, 4
 _AHEAD = (2, 3, 5, 8, 16, 40, MOST_SLOTS_AHEAD)
 _COSTLY: Mapping[str, Mapping[str, Any]] = {"learning-em": {"keeps": 4}, "learning-particle": {"particles": 4}}
@@ -28,6 +33,8 @@ _MOST_BLOCKS = 40
 """How often the sensor may have to wait, where it need not be ahead of others by little."""
 _PACES = (0.001, 0.01, 0.1, 0.3)
 """Seconds of a slot: a run of half a minute is written to the disk while it goes on."""
+_OWN = 0.03
+"""The fraction of classes that are not built in."""
 _UNSTABLE, _STABLE = 1.02, 0.9
 _LOOP: Mapping[str, Any] = {
     "plant": {"inputs": ["u"], "input_matrix": [[0.1], [0.0]], "noise": [[1e-4, 0.0], [0.0, 1e-4]]},
@@ -76,10 +83,16 @@ def case_from(text: str) -> SimulatedCase:
 
 def case_of(seed: int) -> SimulatedCase:
     """The case of a seed, and of nothing else."""
-    draw = CaseDraw(random.Random(f"case {seed}"))  # noqa: S311 - to be repeated, not to be secret
-    scenario = draw.scenario()
-    ahead = draw.random.choice(_AHEAD)
-    return SimulatedCase(seed, scenario, faults_of(draw.random, scenario, ahead), ahead)
+    scenario = scenario_of(seed // SEEDS_OF_A_SCENARIO)
+    source = random.Random(f"case {seed}")  # noqa: S311 - to be repeated, not to be secret
+    ahead = source.choice(_AHEAD)
+    return SimulatedCase(seed, scenario, faults_of(source, scenario, ahead), ahead)
+
+
+@lru_cache(maxsize=1)
+def scenario_of(number: int) -> Scenario:
+    """The scenario that some seeds play."""
+    return CaseDraw(random.Random(f"drawn {number}")).scenario()  # noqa: S311 - to be repeated, not to be secret
 
 
 def case_with(scenario: Scenario, seed: int) -> SimulatedCase:
@@ -149,7 +162,7 @@ class CaseDraw:
         }
 
     def _encoding(self) -> dict[str, Any]:
-        name = self.random.choice(sorted(SCHEMES.names))
+        name = own_classes.SCHEME if self._chance(_OWN) else self.random.choice(sorted(SCHEMES.names))
         return {"scheme": name, **SCHEMES[name].parameters}
 
     def _eavesdropper(self) -> dict[str, Any]:
@@ -157,6 +170,8 @@ class CaseDraw:
         name = self.random.choice(names)
         if name in _COSTLY and self._chance(0.9):
             name = self.random.choice([cheap for cheap in names if cheap not in _COSTLY])
+        if self._chance(_OWN / 3.0):  # it is asked in a process of its own, which takes a second
+            name = own_classes.STRATEGY
         table = {"strategy": name, "link": self._link(), **STRATEGIES[name].parameters, **_COSTLY.get(name, {})}
         if self._chance(0.2):
             table["window"] = self.random.randint(1, 4)
@@ -167,7 +182,7 @@ class CaseDraw:
         if self._chance(0.5):
             link["quality"] = self._quality()
         else:
-            name = self.random.choice(sorted(LOSS_MODELS.names))
+            name = own_classes.LOSS_MODEL if self._chance(_OWN) else self.random.choice(sorted(LOSS_MODELS.names))
             link["loss"] = {"model": name, **LOSS_MODELS[name].parameters}
         if self._chance(0.3):
             name = self.random.choice(sorted(DELAY_MODELS.names))

@@ -187,6 +187,7 @@ class VirtualDisk(Disk):
         """An operation begins; returns what goes wrong at it."""
         if (caller := self.caller()) is None:
             return None
+        caller.allocate()
         self.operations += 1
         self._scheduler.note(notes.WRITES, caller.name, what, str(path).removeprefix(f"{self.root}/"), *words)
         return self.faults(self.operations)

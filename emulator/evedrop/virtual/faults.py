@@ -5,152 +5,213 @@ Source: docs/maintainers/simulated-world.md.
 
 from __future__ import annotations
 
-import random
+import os
+import shutil
 import signal
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from abc import abstractmethod
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar, final
 
-from evedrop.model.schemes import SCHEMES
-from evedrop.names import CONTROLLER, RECORDER, RELAY, ROUTER, SENSOR
+from evedrop.errors import Interrupted, UsageError
+from evedrop.names import RECORDER, ROUTER, SENSOR
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.disk import DiskFault
+from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance, processes_of
 from evedrop.virtual.processes import FORK_SERVERS
 
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld
+    from evedrop.virtual.zenoh import VirtualZenoh
 
-LAUNCHER = "launcher"
-_ROUTERS = (ROUTER, RELAY)
-_MOST_FAULTS = 3
-_LATE = 0.5
-"""The fraction of faults that strike at any moment of a run; the others strike rather at its beginning."""
-_FIRST = 20
-"""Events, of the starts of the first processes, before which no fault strikes."""
-_OF_PROCESS, _OF_SLOT = 8, 1.2
-"""About how many events there are for each process of a run, and for each slot of a receiver for which somebody waits."""
+DISK = "disk"
+_SILENCE_SECONDS = 120.0
+"""For which a launcher waits for a fork server that is suspended; it waits less for any other process."""
+_FLAP_SECONDS = 0.05
+"""Between two cuts of a connection that flaps."""
 
 
-@dataclass(frozen=True)
-class Disturbance(ABC):
-    """Something that happens to a run."""
+class _OfProcess(Disturbance):
+    """Something happens to a process."""
 
-    target: str
-    """The process that it hits."""
-    after: int
-    """The number of events in the world after which it strikes."""
-    seconds: float | None = None
-    """How long it lasts; None for good, or where it does not last."""
+    @classmethod
+    def targets(cls, scenario: Scenario) -> Sequence[str]:
+        """All processes, and rather those which all others need."""
+        return [LAUNCHER, *FORK_SERVERS, *processes_of(scenario), ROUTER, SENSOR, RECORDER]
 
-    kind: ClassVar[str]
-    lasts: ClassVar[bool] = False
-    """Whether it has a duration."""
 
-    @abstractmethod
-    def strike(self, world: SimulatedWorld) -> bool:
-        """Do it; returns whether it hit anything."""
-
-    def survived(self, longest_outage: float) -> bool:
-        """Whether the run must go on to its end as if nothing had happened."""
-        return self.seconds is not None and self.seconds < longest_outage / 2.0
+class _Kill(_OfProcess):
+    """Its target is killed."""
 
     @property
-    def blamed(self) -> tuple[str, ...]:
-        """What a failure that it causes may name: who is cut off cannot tell who is at fault."""
-        if self.target in FORK_SERVERS:
-            return ("fork server",)
-        return (self.target, *(_ROUTERS if self.target in (RECORDER, *_ROUTERS) else ()))
+    def statuses(self) -> frozenset[int]:
+        """Those of any failure, and that of a launcher which is killed."""
+        return super().statuses | ({KILLED} if self.target == LAUNCHER else frozenset())
 
-    def __str__(self) -> str:
-        lasting = "" if not self.lasts else " for good" if self.seconds is None else f" for {self.seconds:.2f} s"
-        return f"{self.kind} {self.target}{lasting} after {self.after} events"
+    def ends_at_once(self, process: str) -> bool:
+        """The target, and the recorder of a launcher."""
+        killed = {self.target, *([RECORDER] if self.target == LAUNCHER else [])}
+        return process in killed or super().ends_at_once(process)
+
+    def survived(self, longest_outage: float) -> bool:
+        """Whether it is a router, which the launcher starts again."""
+        del longest_outage
+        return self.target in ROUTERS
 
 
 @final
-class KillProcess(Disturbance):
+class KillProcess(_Kill):
     """SIGKILL. A router is started again."""
 
-    kind = "kill"
+    kind, share = "kill", 14
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Kill it."""
         return _signal(world, self.target, signal.SIGKILL)
 
-    def survived(self, longest_outage: float) -> bool:
-        """Whether it is a router, which the launcher starts again."""
-        del longest_outage
-        return self.target in _ROUTERS
-
 
 @final
-class InterruptProcess(Disturbance):
-    """SIGTERM, which ends a run if its launcher gets it."""
+class StopAndKillProcess(_Kill):
+    """SIGSTOP, and SIGKILL after some time."""
 
-    kind = "interrupt"
+    kind, share = "stop and kill", 4
+    lasts, for_good = True, False
+
+    def strike(self, world: SimulatedWorld) -> bool:
+        """Suspend it, and kill it later."""
+        return _suspend(world, self.target, self.seconds, signal.SIGKILL)
+
+
+class _Signal(_OfProcess):
+    """A signal that ends a run if its launcher gets it."""
+
+    number: ClassVar[signal.Signals]
+
+    @property
+    def statuses(self) -> frozenset[int]:
+        """Those of any failure, and that of an interrupt."""
+        return super().statuses | {Interrupted.exit_status}
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Ask it to end."""
-        return _signal(world, self.target, signal.SIGTERM)
+        return _signal(world, self.target, self.number)
 
     def survived(self, longest_outage: float) -> bool:
         """Whether it is a router, which the launcher starts again."""
         del longest_outage
-        return self.target in _ROUTERS
+        return self.target in ROUTERS
 
 
 @final
-class StopProcess(Disturbance):
+class InterruptProcess(_Signal):
+    """SIGINT, as by Ctrl-C."""
+
+    kind, share, number = "interrupt", 6, signal.SIGINT
+
+    @classmethod
+    def targets(cls, scenario: Scenario) -> Sequence[str]:
+        """The launcher as often as all others together: it is typed at."""
+        processes = super().targets(scenario)
+        return [*processes, *[LAUNCHER] * len(processes)]
+
+
+@final
+class TerminateProcess(_Signal):
+    """SIGTERM."""
+
+    kind, share, number = "terminate", 4, signal.SIGTERM
+
+
+@final
+class HangUpProcess(_Signal):
+    """SIGHUP, as when a terminal is closed."""
+
+    kind, share, number = "hang up", 2, signal.SIGHUP
+
+
+@final
+class StopProcess(_OfProcess):
     """SIGSTOP, and SIGCONT after some time."""
 
-    kind = "stop"
-    lasts = True
+    kind, share = "stop", 14
+    lasts, cuts_off = True, True
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Suspend it."""
-        process = world.process(self.target)
-        if process is None:
-            return False
-        process.signal(signal.SIGSTOP)
-        if self.seconds is not None:
-            world.scheduler.at(world.scheduler.now + self.seconds, lambda: process.signal(signal.SIGCONT))
-        return True
+        return _suspend(world, self.target, self.seconds, signal.SIGCONT)
+
+    @property
+    def awaited_seconds(self) -> float:
+        """That of a fork server, if it is for good."""
+        return _SILENCE_SECONDS if self.seconds is None else 0.0
+
+
+class _OfConnection(Disturbance):
+    """Something happens to the connections of a process, or of everybody."""
+
+    lasts, cuts_off = True, True
+
+    @classmethod
+    def targets(cls, scenario: Scenario) -> Sequence[str]:
+        """All that connect with a router."""
+        return [*(name for name in processes_of(scenario) if name not in ROUTERS), EVERYBODY]
+
+    def strike(self, world: SimulatedWorld) -> bool:
+        """Do it to each."""
+        targets = world.zenoh.clients if self.target == EVERYBODY else [self.target]
+        hit = [self.disturb(world.zenoh, target) for target in targets]
+        return any(hit)
+
+    @abstractmethod
+    def disturb(self, zenoh: VirtualZenoh, target: str) -> bool:
+        """Do it to the connections of one process; returns whether there are any."""
 
 
 @final
-class CutConnection(Disturbance):
+class CutConnection(_OfConnection):
     """The connection of a process is cut, and cannot be made again for some time."""
 
-    kind = "cut"
-    lasts = True
+    kind, share = "cut", 10
 
-    def strike(self, world: SimulatedWorld) -> bool:
+    def disturb(self, zenoh: VirtualZenoh, target: str) -> bool:
         """Cut it."""
-        return world.zenoh.cut(self.target, self.seconds)
+        return zenoh.cut(target, self.seconds)
 
 
 @final
-class FreezeConnection(Disturbance):
+class FlapConnection(_OfConnection):
+    """The connection of a process is cut again and again for some time."""
+
+    kind, share = "flap", 4
+    for_good = False
+
+    def disturb(self, zenoh: VirtualZenoh, target: str) -> bool:
+        """Cut it, also later."""
+        scheduler = zenoh.scheduler
+        for number in range(1, int((self.seconds or 0.0) / _FLAP_SECONDS) + 1):
+            scheduler.at(scheduler.now + number * _FLAP_SECONDS, lambda: zenoh.cut(target, 0.0))
+        return zenoh.cut(target, 0.0)
+
+
+@final
+class FreezeConnection(_OfConnection):
     """Nothing gets through the connection of a process for some time, though it seems open."""
 
-    kind = "freeze"
-    lasts = True
+    kind, share = "freeze", 10
 
-    def strike(self, world: SimulatedWorld) -> bool:
+    def disturb(self, zenoh: VirtualZenoh, target: str) -> bool:
         """Let nothing through."""
-        return world.zenoh.freeze(self.target, self.seconds)
+        return zenoh.freeze(target, self.seconds)
 
 
 @final
-class SlowConnection(Disturbance):
+class SlowConnection(_OfConnection):
     """Everything takes longer on the connection of a process."""
 
-    kind = "slow"
-    lasts = True
+    kind, share = "slow", 9
 
-    def strike(self, world: SimulatedWorld) -> bool:
+    def disturb(self, zenoh: VirtualZenoh, target: str) -> bool:
         """Make it slow."""
-        return world.zenoh.slow(self.target, self.seconds)
+        return zenoh.slow(target, self.seconds)
 
     def survived(self, longest_outage: float) -> bool:
         """It always is."""
@@ -159,14 +220,15 @@ class SlowConnection(Disturbance):
 
 
 @final
-class ConfuseKeys(Disturbance):
+class ConfuseKeys(_OfConnection):
     """The next message to a process arrives at the subscriber of another key of it."""
 
-    kind = "confuse"
+    kind, share = "confuse", 9
+    lasts = False
 
-    def strike(self, world: SimulatedWorld) -> bool:
+    def disturb(self, zenoh: VirtualZenoh, target: str) -> bool:
         """Confuse its keys once."""
-        return world.zenoh.confuse(self.target)
+        return zenoh.confuse(target)
 
     def survived(self, longest_outage: float) -> bool:
         """It always is: the message names its key."""
@@ -174,10 +236,39 @@ class ConfuseKeys(Disturbance):
         return True
 
 
+@final
+class ShortenMessage(_OfConnection):
+    """Half of the next message to a process arrives, as from a program that is not the right one."""
+
+    kind, share = "shorten a message to", 4
+    lasts = cuts_off = False
+
+    def disturb(self, zenoh: VirtualZenoh, target: str) -> bool:
+        """Let half of one arrive."""
+        return zenoh.shorten(target)
+
+    @property
+    def blamed(self) -> tuple[str, ...]:
+        """Whoever sent it."""
+        return ("broke the protocol",)
+
+
 class DiskDisturbance(Disturbance):
     """Something goes wrong with the disk, at the next operation of any process."""
 
     fault: ClassVar[DiskFault]
+    lacking = True
+
+    @property
+    def statuses(self) -> frozenset[int]:
+        """Those of any failure, and that of a file which cannot be used."""
+        return super().statuses | {UsageError.exit_status}
+
+    @classmethod
+    def targets(cls, scenario: Scenario) -> Sequence[str]:
+        """There is one disk."""
+        del scenario
+        return [DISK]
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Let it go wrong."""
@@ -203,7 +294,7 @@ class DiskDisturbance(Disturbance):
 class FillDisk(DiskDisturbance):
     """The disk is full, for some time or for good."""
 
-    kind = "fill"
+    kind, share = "fill", 3
     lasts = True
     fault = DiskFault.FULL
 
@@ -212,7 +303,7 @@ class FillDisk(DiskDisturbance):
 class RefuseWrite(DiskDisturbance):
     """One write is refused, as if the disk were full."""
 
-    kind = "refuse a write to"
+    kind, share = "refuse a write to", 2
     fault = DiskFault.FULL_ONCE
 
 
@@ -220,7 +311,7 @@ class RefuseWrite(DiskDisturbance):
 class BreakWrite(DiskDisturbance):
     """An input/output error."""
 
-    kind = "break a write to"
+    kind, share = "break a write to", 2
     fault = DiskFault.BROKEN
 
 
@@ -228,7 +319,7 @@ class BreakWrite(DiskDisturbance):
 class ShortenWrite(DiskDisturbance):
     """Half of a write arrives, and the program is told so."""
 
-    kind = "shorten a write to"
+    kind, share = "shorten a write to", 2
     fault = DiskFault.SHORT
 
     def survived(self, longest_outage: float) -> bool:
@@ -241,7 +332,17 @@ class ShortenWrite(DiskDisturbance):
 class CutPower(DiskDisturbance):
     """Everything ends, and the disk keeps what it has."""
 
-    kind = "cut the power of"
+    kind, share = "cut the power of", 3
+
+    @property
+    def statuses(self) -> frozenset[int]:
+        """Those of the disk, and that of a launcher which is killed."""
+        return super().statuses | {KILLED}
+
+    def ends_at_once(self, process: str) -> bool:
+        """Every process."""
+        del process
+        return True
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Cut it."""
@@ -249,29 +350,59 @@ class CutPower(DiskDisturbance):
         return True
 
 
-DISK = "disk"
-KINDS: Mapping[str, type[Disturbance]] = {
-    disturbance.kind: disturbance
-    for disturbance in (
-        KillProcess,
-        InterruptProcess,
-        StopProcess,
-        CutConnection,
-        FreezeConnection,
-        SlowConnection,
-        ConfuseKeys,
-        FillDisk,
-        RefuseWrite,
-        BreakWrite,
-        ShortenWrite,
-        CutPower,
-    )
-}
-_OF_PROCESSES: tuple[type[Disturbance], ...] = (KillProcess, InterruptProcess, StopProcess)
-_OF_CONNECTIONS: tuple[type[Disturbance], ...] = (CutConnection, FreezeConnection, SlowConnection, ConfuseKeys)
-_OF_DISK: tuple[type[Disturbance], ...] = tuple(kind for kind in KINDS.values() if issubclass(kind, DiskDisturbance))
-_OFTEN: Mapping[tuple[type[Disturbance], ...], float] = {_OF_PROCESSES: 0.45, _OF_CONNECTIONS: 0.4, _OF_DISK: 0.15}
-"""Kinds of faults → how often one is of these: a process or a connection can be hit at any message, and a disk at few moments."""
+class _OfResults(Disturbance):
+    """Somebody else does something to the results folder of a run that goes on."""
+
+    lacking = True
+
+    @property
+    def statuses(self) -> frozenset[int]:
+        """Those of any failure, and that of a file which cannot be used."""
+        return super().statuses | {UsageError.exit_status}
+
+    @classmethod
+    def targets(cls, scenario: Scenario) -> Sequence[str]:
+        """There is one folder."""
+        del scenario
+        return ["results"]
+
+    def survived(self, longest_outage: float) -> bool:
+        """It may end a run."""
+        del longest_outage
+        return False
+
+    @property
+    def blamed(self) -> tuple[str, ...]:
+        """What was not written, or is not there."""
+        return ("was removed while the run went on", "cannot be written", "cannot be started", "cannot be merged")
+
+
+@final
+class RenameResults(_OfResults):
+    """Moves it."""
+
+    kind, share = "rename", 1
+
+    def strike(self, world: SimulatedWorld) -> bool:
+        """Move it beside its place."""
+        if not world.results.is_dir():
+            return False
+        os.rename(world.results, world.renamed)
+        return True
+
+
+@final
+class RemoveResults(_OfResults):
+    """Removes it, with all that is in it."""
+
+    kind, share = "remove", 1
+    destroys = True
+
+    def strike(self, world: SimulatedWorld) -> bool:
+        """Remove it."""
+        there = world.results.is_dir()
+        shutil.rmtree(world.results, ignore_errors=True)
+        return there
 
 
 def _signal(world: SimulatedWorld, target: str, number: signal.Signals) -> bool:
@@ -282,42 +413,12 @@ def _signal(world: SimulatedWorld, target: str, number: signal.Signals) -> bool:
     return True
 
 
-def processes_of(scenario: Scenario) -> tuple[str, ...]:
-    """The processes that the launcher of a scenario starts."""
-    relay = (RELAY,) if scenario.relayed else ()
-    controller = (CONTROLLER,) if scenario.controller is not None else ()
-    return (ROUTER, *relay, SENSOR, *scenario.receivers, *controller, RECORDER)
-
-
-def events_of(scenario: Scenario, ahead: int) -> float:
-    """About how many events a run has; ahead: how many slots the sensor may be ahead.
-
-    A message carries some slots, unless each slot waits for an answer or for its time.
-    """
-    answered = scenario.controller is not None or SCHEMES[scenario.encoding.spec["scheme"]].needs_acknowledgements
-    messages = scenario.slots if answered or scenario.pace else scenario.slots * 4.0 / ahead
-    processes = len(processes_of(scenario))
-    return scenario.shards * processes * (_OF_PROCESS + messages * (2.0 if answered else _OF_SLOT))
-
-
-def faults_of(source: random.Random, scenario: Scenario, ahead: int) -> tuple[Disturbance, ...]:
-    """The faults of a case; ahead: as in `events_of`."""
-    processes = processes_of(scenario)
-    last = max(2.0 * _FIRST, events_of(scenario, ahead))
-    faults = []
-    for _ in range(source.choice([0, 1, 1, 1, 2, _MOST_FAULTS])):
-        [kinds] = source.choices([*_OFTEN], [*_OFTEN.values()])
-        kind = source.choice(kinds)
-        targets = {
-            _OF_PROCESSES: [LAUNCHER, *FORK_SERVERS, *processes, ROUTER, SENSOR, RECORDER],  # which all others need
-            _OF_CONNECTIONS: [name for name in processes if name not in _ROUTERS],
-            _OF_DISK: [DISK],
-        }
-        target = source.choice(targets[kinds])
-        seconds = None
-        if kind.lasts and source.random() < 0.85:
-            seconds = round(10.0 ** source.uniform(-2.0, 1.0), 3)
-        uniform = source.random() < _LATE
-        after = int(source.uniform(_FIRST, last) if uniform else _FIRST * (last / _FIRST) ** source.random())
-        faults.append(kind(target, after, seconds))
-    return tuple(faults)
+def _suspend(world: SimulatedWorld, target: str, seconds: float | None, number: signal.Signals) -> bool:
+    """Suspend a process, and send it a signal after some time."""
+    process = world.process(target)
+    if process is None:
+        return False
+    process.signal(signal.SIGSTOP)
+    if seconds is not None:
+        world.scheduler.at(world.scheduler.now + seconds, lambda: process.signal(number))
+    return True

@@ -13,38 +13,22 @@ from typing import Any
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.briefs import LAUNCHED_PATIENCE
-from evedrop.names import RECORDER, RELAY, ROUTER
+from evedrop.names import RECORDER
 from evedrop.results.reading import Results
 from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
 from evedrop.virtual.cases import SimulatedCase
-from evedrop.virtual.faults import (
-    LAUNCHER,
-    ConfuseKeys,
-    CutConnection,
-    CutPower,
-    DiskDisturbance,
-    Disturbance,
-    FreezeConnection,
-    InterruptProcess,
-    KillProcess,
-    SlowConnection,
-    StopProcess,
-)
+from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance
 from evedrop.virtual.processes import FORK_SERVERS
-from evedrop.virtual.reference import RunReference
+from evedrop.virtual.reference import RunReference, tables_of
 from evedrop.virtual.results import wrong_outages, wrong_summary, wrong_tables
 from evedrop.virtual.run import SimulatedRun
 
-_KILLED = -9
 _HEEDED_SECONDS = 1.0
 """After a signal to the launcher, a run that has slots to come does not complete."""
 _USUAL_SECONDS, _FAULT_SECONDS = 5.0, 15.0
 """That a run takes besides those of its slots, and that each fault may cost besides those that it lasts."""
 _PATIENCES = 2.0
 """How many times the longest outage a run may wait before it gives up."""
-_SILENCE_SECONDS = 120.0
-"""For which a launcher waits for a fork server that is suspended; it waits less for any other process."""
-_CUTTING = (CutConnection, FreezeConnection, SlowConnection, StopProcess, ConfuseKeys)
 _GOES_ON = ("control.json", "unfinished")
 """What the folder of a run that goes on has, and that of a run that has ended has not."""
 
@@ -66,11 +50,12 @@ def misses(
     broken += [f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors]
     broken += _of_status(case, run, struck, reference.status)
     broken += _of_time(case, run, struck)
-    if not any(map(_kills_launcher, struck)) and not run.suspended:
+    if not any(fault.ends_at_once(LAUNCHER) for fault in struck) and not run.suspended:
         broken += [f"{path.name} is left" for path in sorted(temporary.iterdir())]
     broken += _of_logs(run)
-    broken += _of_files(run, struck)
-    broken += _of_results(run, struck, reference)
+    if not any(fault.destroys for fault in struck):
+        broken += _of_files(run, struck)
+        broken += _of_results(run, struck, reference)
     return broken
 
 
@@ -85,40 +70,37 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
         yield from _of_ignored_signals(case, run, {fault: struck[fault] for fault in fatal})
     elif not fatal:
         yield f"status {status}, although nothing of this may end a run: {complaint}"
+    elif not any(status in fault.statuses for fault in fatal):
+        yield f"status {status}, by which none of this ends a run: {complaint}"
     elif status == RunError.exit_status:
-        blamed = [word for fault in fatal for word in fault.blamed]
-        whole = run.said if any(isinstance(fault, DiskDisturbance) for fault in fatal) else complaint
-        if not any(word in whole for word in blamed):
+        first = min(struck[fault] for fault in fatal)  # what comes later hits a run that fails already
+        counted = [
+            fault
+            for fault in struck
+            if fault in fatal or struck[fault] >= first or any(map(_is_worse_for_others, fatal))
+        ]
+        blamed = [word for fault in counted for word in fault.blamed]
+        said = complaint if all(fault.named_first for fault in fatal) else run.said
+        if not any(word in said for word in blamed):
             yield f"the failure names none of {', '.join(blamed)}: {complaint or '(nothing was said)'}"
-    elif status == UsageError.exit_status:
-        if not any(isinstance(fault, DiskDisturbance) for fault in fatal):
-            yield f"status 2: {complaint}"
-    elif status == Interrupted.exit_status:
-        if not any(isinstance(fault, InterruptProcess) for fault in fatal):
-            yield "status 130, but no signal asked for the end"
-    elif status == _KILLED:
-        if not any(map(_kills_launcher, fatal)):
-            yield "the launcher was killed by something else"
-    else:
-        yield f"status {status}: {complaint}"
+
+
+def _is_worse_for_others(fault: Disturbance) -> bool:
+    """Whether because of it a run may not survive another fault.
+
+    To a recorder that nothing reaches, whoever was cut off before seems to stay so; without a fork server, no router is started
+    again.
+    """
+    return fault.target in FORK_SERVERS or (fault.cuts_off and fault.target in (RECORDER, EVERYBODY))
 
 
 def _of_ignored_signals(case: SimulatedCase, run: SimulatedRun, fatal: Mapping[Disturbance, float]) -> Iterator[str]:
     """A launcher that is told to end while slots are to come ends the run, rather than complete it."""
     for fault, at in fatal.items():
-        if isinstance(fault, InterruptProcess) and fault.target == LAUNCHER:
+        if Interrupted.exit_status in fault.statuses and fault.target == LAUNCHER:
             late = at + _HEEDED_SECONDS
             if any(moment > late and done < case.scenario.slots for moment, done in _progress(run)):
                 yield f"the run went on to its end, {_HEEDED_SECONDS:.0f} s and more after {fault}"
-
-
-def _kills_launcher(fault: Disturbance) -> bool:
-    return isinstance(fault, CutPower) or (isinstance(fault, KillProcess) and fault.target == LAUNCHER)
-
-
-def _kills_recorder(fault: Disturbance) -> bool:
-    """Whether the recorder may end at once: by itself, with its launcher, or with its fork server."""
-    return fault.target in FORK_SERVERS or (isinstance(fault, KillProcess) and fault.target in (RECORDER, LAUNCHER))
 
 
 def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
@@ -129,8 +111,7 @@ def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
         most += _FAULT_SECONDS + (fault.seconds or 0.0)
     if any(not fault.survived(scenario.longest_outage) for fault in struck):
         most += _PATIENCES * scenario.longest_outage + LAUNCHED_PATIENCE
-    if any(isinstance(fault, StopProcess) and fault.seconds is None for fault in struck):
-        most += _SILENCE_SECONDS
+    most += max((fault.awaited_seconds for fault in struck), default=0.0)
     if run.seconds > most and not run.suspended:
         yield f"the run took {run.seconds:.1f} s, and not {most:.1f} s at most"
 
@@ -153,9 +134,7 @@ def _of_logs(run: SimulatedRun) -> Iterator[str]:
 
 def _of_files(run: SimulatedRun, struck: Iterable[Disturbance]) -> Iterator[str]:
     """Files that others may read, and those of a run that goes on."""
-    cleans_up = (
-        run.status != _KILLED and not run.suspended and not any(isinstance(fault, DiskDisturbance) for fault in struck)
-    )
+    cleans_up = run.status != KILLED and not run.suspended and not any(fault.lacking for fault in struck)
     for path in sorted(run.folder.glob("**/*")):
         if path.stat().st_mode & 0o077:
             yield f"others may use {path.relative_to(run.folder)}, whose mode is {path.stat().st_mode & 0o777:o}"
@@ -166,27 +145,28 @@ def _of_files(run: SimulatedRun, struck: Iterable[Disturbance]) -> Iterator[str]
 def _of_results(run: SimulatedRun, struck: Mapping[Disturbance, float], reference: RunReference) -> Iterator[str]:
     """Whether the tables can be read, and have the right rows, and no others, and the summary is of them."""
     done = run.status == reference.status
-    disk = any(isinstance(fault, DiskDisturbance) for fault in struck)
-    # Those of each shard, where they could not be made one.
-    folders = sorted((run.folder / "shards").glob("*")) or [run.folder] * run.folder.is_dir()
-    if done and not folders:
+    lacking = any(fault.lacking for fault in struck)
+    references = reference.of_folders(run.folder)
+    if done and not references:
         yield "there are no results"
-    for folder in folders:
+    for folder, expected in references.items():
+        whole = expected is reference
         try:
             results = Results.read(folder)
+            dict(tables_of(results))
         except UsageError as error:
-            if done or (len(folders) == 1 and not disk and any(slots for _, slots in _progress(run))):
+            if done or (whole and not lacking and any(slots for _, slots in _progress(run))):
                 yield f"the results cannot be read: {error}"
             continue
         summary = results.summary
-        yield from wrong_tables(results, reference, done, reference.shards if len(folders) == 1 else 1)
-        if disk and not done:
+        yield from wrong_tables(results, expected, done)
+        if lacking and not done:
             continue
-        yield from wrong_summary(summary, reference, done)
-        if not done and summary["ended"] == "complete" and run.status not in (None, _KILLED, Interrupted.exit_status):
+        yield from wrong_summary(summary, expected, done)
+        if not done and summary["ended"] == "complete" and run.status not in (None, KILLED, Interrupted.exit_status):
             yield f"status {run.status}, and the summary says complete"
-        if not any(map(_kills_recorder, struck)):
-            yield from _of_course(run, struck, summary, reference, len(folders) == 1)
+        if not any(fault.ends_at_once(RECORDER) for fault in struck):
+            yield from _of_course(run, struck, summary, expected, whole)
 
 
 def _of_course(
@@ -214,5 +194,5 @@ def _explains(fault: Disturbance, process: str) -> bool:
 
     Routers, and the recorder, stand for all that were connected to them.
     """
-    hubs = (ROUTER, RELAY, RECORDER)
-    return not isinstance(fault, _CUTTING) or fault.target in (process, *hubs, *FORK_SERVERS) or process in hubs
+    hubs = (*ROUTERS, RECORDER)
+    return not fault.cuts_off or fault.target in (process, EVERYBODY, *hubs, *FORK_SERVERS) or process in hubs

@@ -9,7 +9,7 @@ import hashlib
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import pyarrow as pa
@@ -35,11 +35,27 @@ def unlike_memory(summary: Mapping[str, Any], wanted: Mapping[str, Any], shards:
     controller = wanted.get("controller")
     if controller is not None:
         wanted = {**wanted, "controller": {**controller, "decisions": shards * controller["decisions"]}}
+    summary = {**summary, "events": _repeatable(summary["events"], wanted["events"])}
     for name, value in wanted.items():
         if name not in _OF_A_LIVE_RUN:
             yield from _differences(name, summary.get(name), value)
     for name in summary.keys() - wanted.keys() - _OF_A_LIVE_RUN:
         yield f"the summary has {name}, and in memory it has not"
+
+
+def _repeatable(
+    events: Sequence[Mapping[str, Any]], wanted: Sequence[Mapping[str, Any]]
+) -> Sequence[Mapping[str, Any]]:
+    """The events of a run that it has again when it is repeated; wanted: those of its repetition.
+
+    Of what an operator did, these are the changes of links, which are then the scenario's; not pauses and steps.
+    """
+    if all(event["by"] != "operator" for event in events):
+        return events
+    again = {(event["slot"], event["event"]) for event in wanted}
+    kept = [event for event in events if event["by"] != "operator" or (event["slot"], event["event"]) in again]
+    same_events = sorted((event["slot"], event["event"]) for event in kept) == sorted(again)
+    return wanted if same_events else kept
 
 
 def _differences(place: str, value: Any, wanted: Any) -> Iterator[str]:
@@ -97,8 +113,14 @@ def unlike_rows(summary: Mapping[str, Any], tables: Mapping[str, pa.Table], shar
             # A late packet counts as received, and perhaps as used, when it arrives; rows of slots have none of them.
             least = mean[metric] / mean["trials"]
             most = least + (late / mean["trials"] if metric in _FRACTIONS else 0.0)
-            if not (same(peer[metric], least) or same(peer[metric], most) or least < peer[metric] < most):
-                yield f"{metric} of {name} is {peer[metric]}, and by the rows of slots {least}"
+            value = peer[metric]
+            fits = (
+                not math.isfinite(least)
+                if value is None
+                else same(value, least) or same(value, most) or least < value < most
+            )
+            if not fits:
+                yield f"{metric} of {name} is {value}, and by the rows of slots {least}"
     for name, link in summary["links"].items():
         account = links[name]
         offered, lost_by = account["offered"], account["lost_by"]

@@ -57,7 +57,7 @@ def said_in(message: bytes) -> str:
     try:
         unpacker.skip()
         fields = unpacker.unpack()
-    except (ValueError, msgpack.UnpackException):
+    except (ValueError, TypeError, msgpack.UnpackException):  # whoever wrote it
         return ""
     if not isinstance(fields, dict):
         return ""

@@ -5,6 +5,7 @@ Source: docs/maintainers/simulated-world.md.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -139,6 +140,10 @@ class VirtualProcess(ThisProcess):
             yield stop
         finally:
             self._handle = before
+
+    def on_thread_failure(self, handle: Callable[[BaseException], object]) -> None:
+        """Call this when an error ends a thread."""
+        self.task.on_failure = handle
 
     def told_when_suspended(self, tell: Callable[[], object]) -> AbstractContextManager[None]:
         """Nobody types Ctrl-Z."""
@@ -285,6 +290,9 @@ class VirtualForkServer:
 
     def _start(self, words: Sequence[str], files: _Files) -> None:
         scheduler, launcher = self._scheduler, self._launcher
+        if self._machine.lacks_threads:
+            self._reports.put((json.dumps({"error": errno.EAGAIN}).encode(), []))
+            return
         name = Path(words[1]).stem
         process = VirtualProcess(scheduler, scheduler.process(name), files.log, files.to, files.back)
 
@@ -322,6 +330,20 @@ class VirtualMachine:
         self._of: dict[VirtualTask, VirtualProcess] = {}
         self.logs: list[IO[bytes]] = []
         """All logs, also of processes that never began."""
+        self.no_threads_until = 0.0
+        """Until when no thread and no process can be started."""
+
+    @property
+    def lacks_threads(self) -> bool:
+        """Whether no thread and no process can be started now."""
+        return self.scheduler.now < self.no_threads_until
+
+    def admit_thread(self) -> None:
+        """The current process starts a thread. Raises RuntimeError if it cannot, in the words of Python, or MemoryError."""
+        if self.scheduler.current is not None:
+            self.scheduler.current.task.allocate()
+        if self.lacks_threads:
+            raise RuntimeError("can't start new thread")
 
     @property
     def current(self) -> VirtualProcess:
@@ -340,6 +362,11 @@ class VirtualMachine:
     def processes(self) -> list[VirtualProcess]:
         """All processes, also those that have ended."""
         return list(self._of.values())
+
+    def adopt(self, process: VirtualProcess) -> None:
+        """Take a process that the machine did not start for one of its own."""
+        self._of[process.task] = process
+        self.scheduler.note(notes.STARTS, process.task.name)
 
     def begin(self, name: str, work: Callable[[], int], process: VirtualProcess | None = None) -> VirtualProcess:
         """Start a process that does this work, whose result is its exit status."""

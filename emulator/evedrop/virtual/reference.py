@@ -6,13 +6,15 @@ The campaign of faults on real processes judges by it, too. Source: docs/results
 from __future__ import annotations
 
 import math
+import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
+from evedrop.live.launch.gathering import shards_of
 from evedrop.model.digest import block_starts
 from evedrop.results.reading import Results
 from evedrop.scenario.tables import Scenario
@@ -39,13 +41,34 @@ Row = Mapping[str, Any]
 class RunReference:
     """Rows by their keys, and the summary in memory."""
 
+    scenario: Scenario
     summary: Mapping[str, Any]
     tables: Mapping[str, Mapping[tuple[Any, ...], Row]]
-    shards: int = 1
     folder: Path | None = None
     """The results in memory."""
     status: int = 0
     """The exit status of a run with these results: 1 if an expectation of the scenario fails."""
+
+    @property
+    def shards(self) -> int:
+        """In how many shards the run is."""
+        return self.scenario.shards
+
+    def of_folders(self, folder: Path) -> Mapping[Path, RunReference]:
+        """The folders in which a run has left its results → what those must come to: one, or that of each shard."""
+        shards = [shard for shard in shards_of(self.scenario, folder) if shard.folder.is_dir()]
+        if not shards:
+            return {folder: self} if folder.is_dir() else {}
+        with tempfile.TemporaryDirectory() as memory:
+            return {shard.folder: in_memory(shard.scenario, Path(memory, shard.name)) for shard in shards}
+
+    def after(self, slot: int, earlier: RunReference) -> RunReference:
+        """The rows of a slot and later ones, and earlier rows of another: a link that changes later may be one without theory."""
+        rows = {
+            key: row if row["slot"] >= slot else earlier.tables["slots"][key]
+            for key, row in self.tables["slots"].items()
+        }
+        return replace(self, tables={**self.tables, "slots": rows})
 
     def wrong_rows(self, name: str, table: pa.Table, whole: int | None = None) -> Iterator[str]:
         """Rows of a table on disk that differ from those that are right; rows that must not be there.
@@ -100,7 +123,7 @@ def in_memory(scenario: Scenario, folder: Path) -> RunReference:
         raise ValueError(f"the same trials in memory are not whole: {'; '.join(wrong)}")
     journal = {_key("journal", row): row for row in journal_rows(scenario)}
     status = min(1, results.typed_summary.failed_expectations)
-    return RunReference(results.summary, {**tables, "journal": journal}, scenario.shards, folder, status)
+    return RunReference(scenario, results.summary, {**tables, "journal": journal}, folder, status)
 
 
 def tables_of(results: Results, journal: bool = True) -> Iterator[tuple[str, pa.Table]]:

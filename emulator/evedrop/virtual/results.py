@@ -15,17 +15,17 @@ from evedrop.virtual.reference import RunReference, tables_of
 from evedrop.virtual.whole import missing_rows
 
 
-def wrong_tables(results: Results, reference: RunReference, done: bool, shards: int) -> Iterator[str]:
+def wrong_tables(results: Results, reference: RunReference, done: bool) -> Iterator[str]:
     """What is wrong with the tables of a run, and with the metrics of its summary, by its tables.
 
-    done: whether it ended well; shards: of how many the folder is: each shard has its own where they could not be made one.
+    done: whether it ended well.
     """
     summary, tables = results.summary, dict(tables_of(results))
     for name, table in tables.items():
-        yield from reference.wrong_rows(name, table, int(summary["slots"]) if shards == reference.shards else 0)
+        yield from reference.wrong_rows(name, table, int(summary["slots"]))
     yield from missing_rows(tables, summary, reference, done)
     yield from unlike_digests(summary, tables["digests"])
-    yield from unlike_rows(summary, tables, shards)
+    yield from unlike_rows(summary, tables, reference.shards)
 
 
 def wrong_summary(summary: Mapping[str, Any], reference: RunReference, done: bool) -> Iterator[str]:

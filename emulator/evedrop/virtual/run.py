@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO, cast, final
 
-from evedrop.errors import EvedropError, UsageError
+from evedrop.errors import EvedropError, RunError, UsageError
 from evedrop.live.launch.briefs import MOST_SLOTS_AHEAD
 from evedrop.live.launch.launcher import launch
 from evedrop.scenario.progress_events import ProgressEvent
 from evedrop.scenario.tables import Scenario
+from evedrop.system.lacks import lack_of
 from evedrop.system.output import say
 from evedrop.system.world import inside
 from evedrop.virtual.disk import VirtualDisk
@@ -74,6 +75,8 @@ class SimulatedWorld:
         self.machine = VirtualMachine(self.scheduler, program)
         self.zenoh = VirtualZenoh(self.scheduler)
         self.disk = VirtualDisk(self.scheduler, root)
+        self.results, self.renamed = self.disk.root / "results", self.disk.root / "renamed"
+        """Where the results of a run are, and where somebody else may move them."""
         self.world = VirtualWorld(self.scheduler, self.machine, self.zenoh, self.disk)
 
     @contextlib.contextmanager
@@ -95,16 +98,16 @@ class SimulatedWorld:
         return running[-1] if running else None
 
 
-def run_in(world: SimulatedWorld, scenario: Scenario, folder: Path, ahead: int = MOST_SLOTS_AHEAD) -> SimulatedRun:
+def run_in(world: SimulatedWorld, scenario: Scenario, ahead: int = MOST_SLOTS_AHEAD) -> SimulatedRun:
     """Run a scenario live in a simulated world; ahead: as for `launch`."""
-    run = SimulatedRun(folder)
+    run = SimulatedRun(world.results)
     scheduler = world.scheduler
 
     def launcher() -> int:
         try:
             return launch(
                 scenario,
-                folder,
+                world.results,
                 "off",
                 _ROUTER if scenario.relayed else None,
                 lambda event: run.told.append((scheduler.now, event)),
@@ -115,7 +118,12 @@ def run_in(world: SimulatedWorld, scenario: Scenario, folder: Path, ahead: int =
         except EvedropError as error:
             say(error.illustrated)
             return error.exit_status
-        except OSError as error:  # as the command line does
+        except BaseException as error:  # as the command line does
+            if (lack := lack_of(error)) is not None:
+                say(lack)
+                return RunError.exit_status
+            if not isinstance(error, OSError):
+                raise
             say(f"{error.filename}: {error.strerror}; free some space, or check its permissions")
             return UsageError.exit_status
 
@@ -132,6 +140,7 @@ def run_in(world: SimulatedWorld, scenario: Scenario, folder: Path, ahead: int =
         run.status, run.said, run.left = process.task.status, process.printed, [] if run.suspended else _alive(world)
         run.errors, run.seconds, run.events = scheduler.errors, scheduler.now, scheduler.events
         run.digest, run.happened = scheduler.digest, scheduler.happened
+        run.folder = world.renamed if world.renamed.is_dir() else world.results
     return run
 
 

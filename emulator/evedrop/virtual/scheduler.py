@@ -14,6 +14,7 @@ import heapq
 import random
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from queue import Empty
 from types import TracebackType
@@ -26,6 +27,10 @@ from evedrop.virtual import notes
 T = TypeVar("T")
 _INTERRUPTED = 0.1
 """The fraction of the places where a thread touches something shared at which another one goes on first."""
+_MOST_THROWS = 1000
+"""How often a thread that is taken down may catch that."""
+_UNENDING: list[Any] = []
+"""The greenlets of those that did so each time: to delete them would let them go on."""
 
 
 class Ended(BaseException):
@@ -66,10 +71,16 @@ class VirtualTask:
     """What its end releases, whatever ended it: connections, locks of files, pipes."""
     waiting: list[Waiter] = field(default_factory=list)
     """Threads that may go on once it is continued."""
+    on_failure: Callable[[BaseException], object] | None = None
+    """Called with an error that ends a thread; None: it is told, and the other threads go on."""
+    lacks_memory: bool = False
+    """Whether its next large allocation fails."""
 
-    def suspended_for(self, now: float) -> float:
-        """For how many seconds it has been suspended; 0 if it is not."""
-        return now - self.since if self.stopped else 0.0
+    def allocate(self) -> None:
+        """It asks for more memory than a little. Raises MemoryError once, if it lacks memory."""
+        if self.lacks_memory:
+            self.lacks_memory = False
+            raise MemoryError
 
 
 @final
@@ -86,15 +97,24 @@ class Waiter:
 class VirtualThread:
     """A thread of a simulated process."""
 
-    def __init__(self, scheduler: VirtualScheduler, task: VirtualTask, name: str, work: Callable[[], object]) -> None:
-        self.name, self.task, self._scheduler, self._work = name, task, scheduler, work
+    def __init__(
+        self,
+        scheduler: VirtualScheduler,
+        task: VirtualTask,
+        name: str,
+        work: Callable[[], object],
+        admit: Callable[[], object] = lambda: None,
+    ) -> None:
+        """admit: called before it is started; raises an error if it cannot be."""
+        self.name, self.task, self._scheduler, self._work, self._admit = name, task, scheduler, work, admit
         self.ident: int | None = None
         self.over = False
         self._joining: deque[Waiter] = deque()
         self.greenlet: Any = None
 
     def start(self) -> None:
-        """Start it."""
+        """Start it. Raises RuntimeError if the machine lacks threads."""
+        self._admit()
         self.ident = self._scheduler.number()
         self.task.threads.append(self)
         self.greenlet = greenlet(self._run, parent=self._scheduler.hub)
@@ -103,18 +123,22 @@ class VirtualThread:
         self._scheduler.interruptible()
 
     def _run(self, *_: object) -> None:
-        try:
-            self._work()
-        except Ended:
-            pass
-        except SystemExit:
-            pass
-        except BaseException as error:  # as an exception in a thread: it is told, and the others go on
-            self._scheduler.failed(f"{self.task.name}: {self.name}", error)
-        finally:
-            self.over = True
+        with suppress(Ended):
+            self._work_or_fail()
+        self.over = True
         if self.task.alive:
             self._scheduler.wake(self._joining)
+
+    def _work_or_fail(self) -> None:
+        try:
+            self._work()
+        except (Ended, SystemExit):
+            pass
+        except BaseException as error:
+            if self.task.on_failure is None:
+                self._scheduler.failed(f"{self.task.name}: {self.name}", error)
+            else:
+                self.task.on_failure(error)
 
     def join(self, timeout: float | None = None) -> None:
         """Wait until it has ended."""
@@ -176,11 +200,17 @@ class VirtualScheduler:
         self.tasks.append(task)
         return task
 
-    def thread(self, name: str, work: Callable[[], object], task: VirtualTask | None = None) -> VirtualThread:
-        """A thread, not started yet, of this process or another."""
+    def thread(
+        self,
+        name: str,
+        work: Callable[[], object],
+        task: VirtualTask | None = None,
+        admit: Callable[[], object] = lambda: None,
+    ) -> VirtualThread:
+        """A thread, not started yet, of this process or another; admit: as for `VirtualThread`."""
         if task is None:
             task = self._running.task
-        return VirtualThread(self, task, name, work)
+        return VirtualThread(self, task, name, work, admit)
 
     @property
     def _running(self) -> VirtualThread:
@@ -321,9 +351,13 @@ class VirtualScheduler:
             task.alive = False
         for task in self.tasks:
             for thread in task.threads:
-                while thread.greenlet:
+                for _ in range(_MOST_THROWS):
+                    if not thread.greenlet:
+                        break
                     self.current = thread
                     thread.greenlet.throw(Ended)
+                else:
+                    _UNENDING.append(thread.greenlet)
         self.current = None
 
 

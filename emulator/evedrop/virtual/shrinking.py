@@ -12,13 +12,13 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any, Generic, Protocol, TypeVar, cast, final
 
 from evedrop.errors import EvedropError, ScenarioError
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.loading import Scenario
 from evedrop.virtual.cases import SimulatedCase
-from evedrop.virtual.faults import Disturbance, processes_of
+from evedrop.virtual.disturbance import Disturbance, processes_of
 
 Tables = dict[str, Any]
 
@@ -44,12 +44,24 @@ _SIMPLE_STRATEGY = "naive"
 _SIMPLE_PROCESS: Tables = {"A": [[1.0]], "Q": [[0.01]], "initial_covariance": [[1.0]]}
 
 
+class ShrinkableCase(Protocol):
+    """The part of a case that is used here; a dataclass with a field `seed`, for the seed of the world."""
+
+    def to_text(self) -> str:
+        """The case in one line."""
+
+
+C = TypeVar("C", bound=ShrinkableCase)
+Reduction = Callable[[C], Iterator[C]]
+"""A case → the smaller cases next to it, the smallest first."""
+
+
 @final
 @dataclass(frozen=True)
-class Shrunk:
+class Shrunk(Generic[C]):
     """A small case that breaks a promise."""
 
-    case: SimulatedCase
+    case: C
     misses: tuple[str, ...]
     plays: int
     """How many cases were played to find it."""
@@ -63,24 +75,36 @@ def kind_of(miss: str) -> str:
 
 
 def shrink(
-    case: SimulatedCase, misses: Sequence[str], play: Callable[[SimulatedCase], Sequence[str]], most: int = MOST_PLAYS
-) -> Shrunk:
-    """Find a smaller case with a miss of the same kind; play: the misses of a case. Plays at most `most` cases."""
-    shrinker = _Shrinker(case, tuple(misses), play, most)
+    case: C,
+    misses: Sequence[str],
+    play: Callable[[C], Sequence[str]],
+    most: int = MOST_PLAYS,
+    reductions: Sequence[Reduction[C]] = (),
+) -> Shrunk[C]:
+    """Find a smaller case with a miss of the same kind. Plays at most `most` cases.
+
+    play: the misses of a case; reductions: those of its kind, by default of a `SimulatedCase`.
+    """
+    shrinker = _Shrinker(case, tuple(misses), play, most, reductions or cast("Sequence[Reduction[C]]", _REDUCTIONS))
     for seed in range(_SEEDS):
         shrinker.try_all(seed)
     return Shrunk(shrinker.case, shrinker.misses, shrinker.plays)
 
 
 @final
-class _Shrinker:
+class _Shrinker(Generic[C]):
     """The smallest case so far."""
 
     def __init__(
-        self, case: SimulatedCase, misses: tuple[str, ...], play: Callable[[SimulatedCase], Sequence[str]], most: int
+        self,
+        case: C,
+        misses: tuple[str, ...],
+        play: Callable[[C], Sequence[str]],
+        most: int,
+        reductions: Sequence[Reduction[C]],
     ) -> None:
         self.case, self.misses, self.plays = case, misses, 0
-        self._play, self._most = play, most
+        self._play, self._most, self._reductions = play, most, reductions
         self._kinds = set(map(kind_of, misses))
         self._tried = {case.to_text()}
 
@@ -89,19 +113,19 @@ class _Shrinker:
         smaller = True
         while smaller:
             smaller = False
-            for reduction in _REDUCTIONS:
+            for reduction in self._reductions:
                 while self._try(reduction, seed):
                     smaller = True
 
-    def _try(self, reduction: Callable[[SimulatedCase], Iterator[SimulatedCase]], seed: int) -> bool:
+    def _try(self, reduction: Reduction[C], seed: int) -> bool:
         """Try the cases of a reduction until one breaks the promise."""
         for smaller in reduction(self.case):
-            candidate = replace(smaller, seed=seed) if seed else smaller
+            candidate = cast(C, replace(cast(Any, smaller), seed=seed)) if seed else smaller
             if self.plays < self._most and self._breaks(candidate):
                 return True
         return False
 
-    def _breaks(self, candidate: SimulatedCase) -> bool:
+    def _breaks(self, candidate: C) -> bool:
         text = candidate.to_text()
         if text in self._tried:
             return False

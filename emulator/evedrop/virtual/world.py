@@ -42,6 +42,10 @@ class VirtualWorld(World):
         """Virtual seconds since 1970."""
         return EPOCH + self.scheduler.now
 
+    def is_suspended(self, pid: int) -> bool:
+        """Whether it is."""
+        return any(task.stopped for task in self.scheduler.tasks if task.number == pid)
+
     def sleep(self, seconds: float) -> None:
         """Let time pass."""
         self.scheduler.sleep(seconds)
@@ -49,7 +53,7 @@ class VirtualWorld(World):
     def thread(self, work: Callable[..., object], *arguments: object, name: str, daemon: bool = True) -> Thread:
         """A thread of the current process."""
         del daemon
-        return self.scheduler.thread(name, lambda: work(*arguments))
+        return self.scheduler.thread(name, lambda: work(*arguments), admit=self.machine.admit_thread)
 
     def lock(self) -> Lock:
         """A lock."""

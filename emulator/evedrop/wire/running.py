@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, final
+from typing import TYPE_CHECKING, Any, Self
 
 import zenoh
 
@@ -67,6 +67,13 @@ def wire(
     Raises ScenarioError with every mistake of the wire. The `with` statement raises UsageError or RunError if the wire cannot
     begin, and ExpectationFailed if one of its `[[expect]]` failed, or programs could speak past it.
     """
+    return RunningWire(*described_wire(source, out, entries), seconds)
+
+
+def described_wire(
+    source: str | Path | WirePlan | None, out: str | Path | None, entries: dict[str, Any]
+) -> tuple[WirePlan, Path]:
+    """The plan of a wire, and its results folder, from the arguments of `wire`."""
     if isinstance(source, WirePlan):
         if entries:
             raise UsageError(
@@ -82,10 +89,9 @@ def wire(
             entries["side"] = {side_name: {} for side_name in side}
         plan, name = wire_of(entries), "wire"
     folder = claimed(default_folder(f"wire-{name}")) if out is None else Path(out)
-    return RunningWire(plan, folder, seconds)
+    return plan, folder
 
 
-@final
 class RunningWire:
     """A wire in a process of its own; use it as a context manager."""
 
@@ -103,15 +109,18 @@ class RunningWire:
         with tempfile.TemporaryDirectory() as given:  # the results folder must be empty, or that of an earlier start
             file = Path(given) / "wire.toml"
             write_private(file, resolved_wire(self.plan))
-            self._process = _started("wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds:g} s")
+            self._begin("wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds:g} s")
             self._wait()
         return self
 
+    def _begin(self, *words: str) -> None:
+        """Start the process; words: the command."""
+        self._process = process = _started(*words)
+        self._listener = world().thread(self._hear_errors, process, name="wire")
+        self._listener.start()
+
     def _wait(self) -> None:
         """Wait until the wire answers."""
-        assert self._process is not None  # noqa: S101 - it was started
-        self._listener = world().thread(self._hear_errors, self._process, name="wire")
-        self._listener.start()
         deadline = world().monotonic() + _PATIENCE
         while not self._endpoints:
             if not self.is_running or world().monotonic() > deadline:

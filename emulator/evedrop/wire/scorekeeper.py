@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -66,11 +66,10 @@ class WireScorekeeper:
             streams = np.stack([records["link"], records["key"], kinds]).astype(np.int64)
             order = np.lexsort(streams[::-1])  # stable
             streams, records = streams[:, order], records[order]
-            for part in _split(records, streams[:1]):
-                self._tally(int(part["link"][0])).add(part)
+            for (code,), start, stop in _groups(streams[:1]):
+                self._tally(code).add(records[start:stop])
             times, numbers, fates = (records[name].tolist() for name in ("time", "n", "fate"))
-            starts = [0, *_changes(streams).tolist(), len(records)]
-            for (code, key, kind), start, stop in zip(_firsts(streams), starts, starts[1:], strict=False):
+            for (code, key, kind), start, stop in _groups(streams):
                 if code == UNLINKED or not key:
                     continue  # a key that is not kept has no numbers
                 streams_of = self._links[code].streams
@@ -237,17 +236,7 @@ class WireScorekeeper:
         return shared[name]
 
 
-def _changes(columns: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Where sorted columns differ from those before them."""
-    return np.flatnonzero((np.diff(columns) != 0).any(axis=0)) + 1
-
-
-def _split(records: Records, columns: NDArray[np.int64]) -> list[Records]:
-    """The records in groups with equal columns."""
-    return np.split(records, _changes(columns))
-
-
-def _firsts(columns: NDArray[np.int64]) -> list[list[int]]:
-    """The columns of each group."""
-    firsts: list[list[int]] = columns[:, np.r_[0, _changes(columns)]].T.tolist()
-    return firsts
+def _groups(columns: NDArray[np.int64]) -> Iterator[tuple[list[int], int, int]]:
+    """The groups of equal ones among sorted columns: the column, the place of its first, and that after its last."""
+    starts = [0, *(np.flatnonzero((columns[:, 1:] != columns[:, :-1]).any(axis=0)) + 1).tolist()]
+    yield from zip(columns[:, starts].T.tolist(), starts, [*starts[1:], columns.shape[1]], strict=True)

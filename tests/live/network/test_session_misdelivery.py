@@ -6,6 +6,8 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -13,7 +15,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from evedrop.errors import MalformedMessage
+from evedrop.errors import MalformedMessage, MissingProcesses
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.network.access import users_file
 from evedrop.live.network.connection import Question, SubscriptionClosedError
@@ -170,6 +172,26 @@ def test_a_malformed_message_of_its_own_key_is_an_error(stage: Stage) -> None:
         with pytest.raises(MalformedMessage, match=f"malformed message on {key}"):
             Reader(key, subscription.recv())
         assert session.dropped == 0
+
+
+def test_a_connection_that_comes_and_goes_does_not_hold_up_a_process_for_ever(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time in which it is there counts, also if it is never there for the whole patience."""
+    looks = count()
+
+    def linked(_: Session) -> bool:
+        if threading.current_thread() is not threading.main_thread():
+            return True
+        look = next(looks)
+        assert look < 3000, "it waits on"
+        return look % 2 == 0
+
+    with Session(replace(stage.eve, patience=1)) as session:
+        session.publisher(stage.keys.telemetry("eve"))
+        monkeypatch.setattr(Session, "linked", linked)
+        with pytest.raises(MissingProcesses, match="nobody reads"):
+            session.ready()
 
 
 def test_a_lost_connection_is_replaced(stage: Stage) -> None:

@@ -84,6 +84,10 @@ def test_only_a_key_that_the_process_reads_can_be_refused(key: str) -> None:
     right = RefusalNotice.read(Reader(KEY, RefusalNotice.of("evedrop/r1/downlink/eve", "no\nk").pack()), "eve")
     assert right is not None
     assert RefusalNotice.read(Reader(KEY, Progress(3).pack()), "eve") is None
+    of_input = Reader("evedrop/r1/telemetry/legitimate", RefusalNotice.of("evedrop/r1/input", "no k").pack())
+    refusal = RefusalNotice.read(of_input, "legitimate")  # a legitimate estimator may know the inputs
+    assert refusal is not None
+    assert refusal.at_fault == ("controller",)
     assert (right.at_fault, "no?k" in str(right)) == (("router",), True)
     with pytest.raises(MalformedMessage, match="expected a key that eve reads"):
         RefusalNotice.read(Reader(KEY, RefusalNotice.of(key, "no k").pack()), "eve")

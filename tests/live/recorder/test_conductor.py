@@ -8,7 +8,7 @@ import pytest
 
 from evedrop.errors import Interrupted, RunError
 from evedrop.live.protocol.commands import Abandon, Start
-from evedrop.live.protocol.notices import EndReport
+from evedrop.live.protocol.notices import EndReport, Progress
 from evedrop.live.recorder.conductor import Conductor, Stop
 from evedrop.names import RECORDER
 from tests.clock import TestClock
@@ -60,7 +60,8 @@ def test_a_run_begins_when_all_are_there() -> None:
     conductor.start()
     assert network.sent == [("sensor", Start().pack(), 0.0)]
     conductor.report_progress(7)
-    assert network.sent[-1][0] == RECORDER
+    conductor.repeat_progress()
+    assert network.sent[-2:] == [(RECORDER, Progress(7).pack(), 0.0)] * 2
 
 
 @pytest.mark.parametrize(

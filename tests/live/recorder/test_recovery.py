@@ -62,9 +62,9 @@ class Conducted:
         """Count it."""
         self.restarts += 1
 
-    def report_progress(self, done: int) -> None:
+    def repeat_progress(self) -> None:
         """Note it."""
-        self.repeated.append(done)
+        self.repeated.append("progress")
 
     def remind(self) -> None:
         """Note it."""
@@ -182,7 +182,7 @@ def test_a_round_repeats_the_commands_that_may_have_been_lost(done: int) -> None
     recovery.poll(done)
     assert conducted.restarts == 1
     assert conducted.rounds == [done]
-    assert conducted.repeated == [*(() if done else ("start",)), "the operator's commands", done]
+    assert conducted.repeated == [*(() if done else ("start",)), "the operator's commands", "progress"]
 
 
 @pytest.mark.parametrize(("longest_outage", "pace"), [(1.0, 0.0), (8.0, 0.25), (60.0, 0.0), (60.0, 2.0)])

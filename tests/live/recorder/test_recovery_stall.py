@@ -126,7 +126,7 @@ class Run:
         self.asked = 0
         self.answers: dict[str, ProcessStatus] = {}
         self.places = {"sensor": 60, "router": 60, "eve": 50}
-        self.stall = Stall(patience, 10, self.ask, self.clock)
+        self.stall = Stall(patience, 10, self.ask, "router", self.clock)
 
     def ask(self) -> None:
         """Everybody is asked, and answers."""
@@ -178,6 +178,14 @@ def test_time_in_which_nobody_is_expected_to_do_anything_does_not_count(how: str
     run.wait(5.0, done=run.places["eve"])
     with pytest.raises(Silence):
         run.wait(25.0, done=run.places["eve"])
+
+
+def test_the_router_is_named_if_nobody_answers() -> None:
+    """It is suspended: the questions, or the answers, do not come through."""
+    run = Run(20.0)
+    with pytest.raises(Silence) as raised:
+        run.wait(30.0)
+    assert raised.value.at_fault == ("router",)
 
 
 def test_a_slow_process_is_not_silent() -> None:

@@ -66,8 +66,8 @@ def test_a_right_covariance_is_hardly_ever_called_overconfident() -> None:
 
 def walk(distances: list[float], levels: list[int], knows: KnowledgeLane, first: int = 0) -> dict[int, str]:
     """Slot → the lane's word from there on, for distances in the next slots."""
-    changes = [*knows.changes(first, np.array(levels, np.uint8), np.array(distances))]
-    return {k: knows.lane.words[code] for k, code in changes}
+    slots, codes = knows.changes(first, np.array(levels, np.uint8), np.array(distances))
+    return {k: knows.lane.words[code] for k, code in zip(slots.tolist(), codes, strict=True)}
 
 
 def test_words_say_the_largest_distance_of_a_stretch() -> None:
@@ -96,7 +96,8 @@ def test_no_word_of_a_lane_is_cut(simulated: Callable[..., Simulated]) -> None:
     for shown in run.scene.receivers:
         knows, peer = KnowledgeLane(shown, distance), run.slots.peers[shown.name]
         levels = knowledge(run.scene, run.slots.x, peer.x_hat, peer.P)
-        changes = dict(knows.changes(0, levels, distance.of(run.slots.x, peer.x_hat)))
+        slots, codes = knows.changes(0, levels, distance.of(run.slots.x, peer.x_hat))
+        changes = dict(zip(slots.tolist(), codes.tolist(), strict=True))
         labels = [knows.labels[code] for code in changes.values()]
         for start, end, label in zip(changes, [*[*changes][1:], 300], labels, strict=True):
             assert label == " " or (end - start > len(label) and label[0] in "<>" and len(label) <= 8)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from evedrop.cli.commands import ROLES
 from evedrop.cli.options import Command, Option, argument, changes_of, entries, loaded, scenario, served
-from evedrop.errors import BriefError, EvedropError, UsageError
+from evedrop.errors import BriefError, EvedropError, RunError, UsageError
 
 if TYPE_CHECKING:
     from evedrop.live.protocol.brief import AnyBrief, Brief, RecorderPart
@@ -79,6 +79,7 @@ def process(options: argparse.Namespace) -> int:
     world().process.show_stacks()
     if options.role != "recorder":  # the recorder ends the run in order
         world().process.leave_on_signals()
+    world().process.on_thread_failure(_end_of_thread)
     brief = read_brief(options.brief, options.role)
     if brief.ends_with_stdin:  # started by a launcher, which writes another brief if it restarts the process
         options.brief.unlink(missing_ok=True)  # its keys should not stay on disk
@@ -98,6 +99,22 @@ def process(options: argparse.Namespace) -> int:
         if isinstance(error, BriefError):
             raise BriefError(f"{options.brief}: {error}") from error
         raise
+
+
+def _end_of_thread(error: BaseException) -> None:
+    """End the process, because an error has ended one of its threads: it would wait for ever for what that thread does."""
+    import traceback
+
+    from evedrop.system.lacks import lack_of
+    from evedrop.system.output import say
+    from evedrop.system.world import world
+
+    if (lack := lack_of(error)) is not None:
+        say(lack)
+    else:
+        traceback.print_exception(error)
+    sys.stderr.flush()
+    world().process.exit(RunError.exit_status)
 
 
 def _play(brief: AnyBrief, serve: str | None) -> int:

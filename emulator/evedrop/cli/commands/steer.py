@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evedrop.cli.options import Command, as_json
 from evedrop.errors import BriefError, UsageError
 from evedrop.system.output import print_json
+from evedrop.system.world import world
 
 if TYPE_CHECKING:
     from evedrop.live.network.control_file import Control
@@ -107,7 +107,7 @@ def _answer(run: Path, control: Control, request: OperatorRequest, subject: str,
     from evedrop.live.network.control_file import no_run, read_controls
     from evedrop.live.network.operator import ask
 
-    began = time.monotonic()
+    began = world().monotonic()
     if control.identity is not None:
         from evedrop.live.network.certificates import check_identity
 
@@ -118,15 +118,15 @@ def _answer(run: Path, control: Control, request: OperatorRequest, subject: str,
     try:
         answer = ask(control, request, patience)
         # A recorder that has lost its connection is back in a moment; these requests may be carried out twice.
-        while answer is None and request.repeatable and time.monotonic() - began < _AWAY_SECONDS:
+        while answer is None and request.repeatable and world().monotonic() - began < _AWAY_SECONDS:
             read_controls(run)  # raises UsageError when the run is over
-            time.sleep(_AGAIN_SECONDS)
+            world().sleep(_AGAIN_SECONDS)
             answer = ask(control, request, patience)
     except zenoh.ZError as error:
         raise no_run(
             run, f"no router answers at {control.router}: it was killed, or it lost its router and is restarting it"
         ) from error
-    if answer is None and time.monotonic() - began >= patience:
+    if answer is None and world().monotonic() - began >= patience:
         raise UsageError(f"{subject}: no answer from the run in {run}; look at its logs, or end it")
     if answer is None:
         raise no_run(run, "it ended before it answered, or its router did, which is then restarted")

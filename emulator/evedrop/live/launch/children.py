@@ -293,15 +293,13 @@ class Children:
             return f"the fork server of {theirs} ended or stopped responding (killed, suspended or out of memory); run again"
         suspects, accused = ([], []) if ending is None else (list(ending.suspects), list(ending.accused))
         why = ending.how if ending is not None and ending.status not in {0, 1, INTERRUPTED} else ""
-        lost = None if first is None else self._lost_by_all(first.process, suspects)
-        if lost is not None:
-            first, suspects = None, [lost]  # the router is at fault, not the process that gave up first
+        first, suspects = self._at_fault(first, suspects)
         if first is not None and self._missed_recorder(first.process):
             return "\n".join(
                 [f"{RECORDER}: {why}" if why else f"{RECORDER} did not appear", *self._log_lines(RECORDER)]
             )
         if not accused and (first is None or (first.process == RECORDER and first.status > 0)):
-            first = self._first_failure(suspects) or first
+            first, suspects = self._at_fault(self._first_failure(suspects) or first, suspects)
         broken_by = None if ending is None else ending.broken_by
         if accused and why:
             named, head = [name for name in accused if name in self._processes], why
@@ -353,6 +351,11 @@ class Children:
         word = self._last_word(name)
         return word is not None and word.cause is Cause.NO_CONNECTION
 
+    def _at_fault(self, first: ProcessExit | None, suspects: list[str]) -> tuple[ProcessExit | None, list[str]]:
+        """The router in place of a process that only gave up on it first."""
+        lost = None if first is None else self._lost_by_all(first.process, suspects)
+        return (first, suspects) if lost is None else (None, [lost])
+
     def _lost_by_all(self, name: str, suspects: list[str]) -> str | None:
         """The router that a process gave up on, if the recorder or all its other users miss it, too; otherwise None."""
         if not self._lost_router(name):
@@ -360,11 +363,14 @@ class Children:
         if missed := next((process for process in (RELAY, ROUTER) if process in suspects), None):
             return missed
         place = self._briefs[name].router
+        hub = RELAY if RELAY in self._processes and name != SENSOR else ROUTER
+        if world().is_suspended(self._processes[hub].pid):
+            return hub
         others = [process for process, brief in self._briefs.items() if brief.router == place and process not in _HUBS]
         deadline = world().monotonic() + (_GONE_SECONDS if len(others) > 1 and not suspects else 0.0)
         while world().monotonic() < deadline:
             if all(self._lost_router(process) for process in others):
-                return RELAY if RELAY in self._processes and name != SENSOR else ROUTER
+                return hub
             world().sleep(0.05)
         return None
 

@@ -319,14 +319,16 @@ class Session:
         Raises MissingProcesses after the brief's patience, naming them and the keys without a reader. While the
         recorder is present, this process waits on: the recorder reports the missing processes.
         """
-        deadline = world().monotonic() + self.patience
+        waited, before = 0.0, world().monotonic()
         while unread := self._unread():
             missing = dict.fromkeys(reader_of(key) for key in unread)
-            # A process without a connection sees nobody; its watchdog ends it.
-            alone = self._watchdog is not None and not self.linked()
-            if alone or (RECORDER not in missing and self._process != RECORDER):
-                deadline = world().monotonic() + self.patience
-            if world().monotonic() > deadline:
+            now = world().monotonic()
+            if RECORDER not in missing and self._process != RECORDER:
+                waited = 0.0
+            elif self._watchdog is None or self.linked():
+                waited += now - before  # not without a connection: then it sees nobody, and its watchdog ends it
+            before = now
+            if waited > self.patience:
                 raise MissingProcesses(
                     self._process,
                     tuple(missing),

@@ -106,6 +106,11 @@ def reader_of(key: str) -> str:
     return readers.get(kind, name)
 
 
+def reads(process: str, key: str) -> bool:
+    """Whether a process may read a key."""
+    return process == reader_of(key) or (process == LEGITIMATE and key.split("/")[2:] == ["input"])
+
+
 def writer_of(key: str) -> str:
     """The only process that may write a key; empty if it is not a key of a run."""
     kind, _, name = "/".join(key.split("/")[2:]).partition("/")

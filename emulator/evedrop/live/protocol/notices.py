@@ -11,7 +11,7 @@ from msgspec import Meta, Struct, to_builtins
 
 from evedrop.errors import Refusal
 from evedrop.live.protocol.codec import Reader, pack, shown
-from evedrop.live.protocol.keys import reader_of, writer_of
+from evedrop.live.protocol.keys import reads, writer_of
 from evedrop.system.fields import Slot
 
 _WHY_CHARACTERS = 1000
@@ -75,7 +75,7 @@ class RefusalNotice(ProcessNotice, frozen=True):
             return None
         notice = message.read(cls)
         key = notice.refuses
-        if key.split("/")[:2] != message.key.split("/")[:2] or not writer_of(key) or reader_of(key) != process:
+        if key.split("/")[:2] != message.key.split("/")[:2] or not writer_of(key) or not reads(process, key):
             raise message.malformed(f"refuses = {shown(key)}", f"a key that {process} reads")
         plain = "".join(letter if letter.isprintable() else "?" for letter in notice.why[:_WHY_CHARACTERS])
         return Refusal(process, key, writer_of(key), plain)

@@ -88,6 +88,7 @@ class Conductor:
         session.asked(keys.control(RECORDER), self.questions.put)
         self._commands = {name: session.publisher(keys.control(name)) for name in self._present}
         self._progress = session.publisher(keys.progress(RECORDER))
+        self._reported = 0
 
     @property
     def missing(self) -> list[str]:
@@ -169,8 +170,13 @@ class Conductor:
                 self.send_to(name, command)
 
     def report_progress(self, done: int) -> None:
-        """Tell the sensor that all slots below `done` are scored."""
-        self._progress(Progress(done).pack())
+        """Tell the sensor that all slots below `done` are scored, and reported by the controller."""
+        self._reported = done
+        self.repeat_progress()
+
+    def repeat_progress(self) -> None:
+        """Tell the sensor once more."""
+        self._progress(Progress(self._reported).pack())
 
     def end(self, patience: float) -> None:
         """Tell all processes that the run is over, repeatedly until they have left; the routers after all others.

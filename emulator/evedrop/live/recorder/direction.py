@@ -22,7 +22,7 @@ from evedrop.live.recorder.conductor import Conductor
 from evedrop.live.recorder.recorded_run import RecordedRun
 from evedrop.live.recorder.recovery import Recovery, Stall, patience_of
 from evedrop.live.recorder.steering import Steering, status_of
-from evedrop.names import CONTROLLER, OPERATOR
+from evedrop.names import CONTROLLER, OPERATOR, RELAY, ROUTER
 from evedrop.scenario.progress_events import Started
 from evedrop.system.threads import Queue
 
@@ -37,11 +37,12 @@ class Direction:
         """confirmations: the launcher's, each with the number of an event."""
         scenario, flow = run.score.scenario, brief.flow
         self._conductor, self._brief, self._run, self._confirmations = conductor, brief, run, confirmations
-        self._steering = Steering(scenario, conductor, emit, run.folder.amend, paused=brief.part.paused)
+        self._steering = Steering(scenario, conductor, emit, run.amend, paused=brief.part.paused)
         self._recovery = Recovery(conductor, self._steering, flow, scenario.pace, emit)
         program = scenario.process.source == "zenoh"
         patience = patience_of(flow.longest_outage, scenario.pace, flow.batch, program)
-        self._stall = Stall(patience, flow.batch, lambda: conductor.send_to_all(ReportStatus()))
+        router = RELAY if conductor.relayed else ROUTER
+        self._stall = Stall(patience, flow.batch, lambda: conductor.send_to_all(ReportStatus()), router)
         course = run.score.course
         course.events, course.outages = self._steering.events, self._recovery.outages  # which grow
 
@@ -67,8 +68,11 @@ class Direction:
             raise refusal
         if is_process_status(message):
             self._stall.add_answer(source, read_process_status(message, self._run.score.scenario.slots))
-        elif self._run.take(source, message, self._steering):
-            self._conductor.report_progress(self._run.done)
+            return
+        before = self._run.reported
+        self._run.take(source, message, self._steering)
+        if self._run.reported > before:
+            self._conductor.report_progress(self._run.reported)
 
     def steer(self) -> None:
         """Take the launcher's confirmations and the operator's questions, and carry out due events."""
@@ -85,7 +89,10 @@ class Direction:
         self._recovery.poll(done)
         held = at is not None and done >= at
         present = set(self._run.score.scenario.digested) - self._conductor.absent
-        unneeded = () if self._run.score.all_joined else (CONTROLLER,)
+        # Slots are joined without the controller's reports, until the sensor waits for them.
+        flow = self._brief.flow
+        owed = self._run.score.all_joined or done - self._run.reported >= flow.window - flow.batch
+        unneeded = () if owed else (CONTROLLER,)
         missing = bool(self._conductor.missing)
         self._stall.poll(done, lambda: self._run.places(present), unneeded, held=held, missing=missing)
 

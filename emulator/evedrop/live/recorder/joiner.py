@@ -72,6 +72,11 @@ class Joiner:
         return self._done
 
     @property
+    def progress(self) -> int:
+        """The first slot that has not been returned, or that a controller has not reported: all earlier reports are here."""
+        return self._done if self._period is None else min(self._done, self._decided)
+
+    @property
     def sent(self) -> int:
         """The first slot that the sensor has not reported."""
         return self._truth.end

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import final
 
+from evedrop.errors import NoAnswer
 from evedrop.live.protocol.brief import Brief, RecorderPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.recorder.intake import Intake
@@ -36,6 +38,11 @@ class RecordedRun:
         return self._intake.joiner.done
 
     @property
+    def reported(self) -> int:
+        """The first slot that is not scored, or that a controller has not reported."""
+        return self._intake.joiner.progress
+
+    @property
     def complete(self) -> bool:
         """Whether all slots are scored and, if there is a controller, it has reported them, too."""
         return self._intake.joiner.complete(self.score.scenario.slots)
@@ -49,16 +56,21 @@ class RecordedRun:
         self.score.course.start()
         self.progress.start()
 
-    def take(self, source: str, message: Reader, steering: Steering) -> bool:
-        """Take a message of telemetry or of the journal; returns whether slots are complete with it.
+    def amend(self, scenario: Scenario) -> None:
+        """The operator has changed the scenario from the next slot on. Raises RunError if it cannot be written."""
+        self.folder.amend(scenario)
+        with suppress(NoAnswer):  # of a class that is asked again at the end, too, where that is reported
+            self._keeper.amend(scenario)
+
+    def take(self, source: str, message: Reader, steering: Steering) -> None:
+        """Take a message of telemetry or of the journal.
 
         Raises MalformedMessage, Gap or Contradiction.
         """
         slots = self._intake.take(source, message, steering)
         if slots is None:
-            return False
+            return
         scored = self._keeper.add_slots(slots)
         self.folder.add_slots(slots, scored)
         self.view.add_slots(slots, scored)
         self.progress.report(self.done, scored)
-        return True

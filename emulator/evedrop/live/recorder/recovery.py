@@ -48,9 +48,14 @@ def patience_of(longest_outage: float, pace: float, batch: int, program: bool = 
 class Stall:
     """Notices that a run stands still, and ends it when the process that it waits for has done nothing for too long."""
 
-    def __init__(self, patience: float, batch: int, ask: Callable[[], None], clock: Clock = SYSTEM_CLOCK) -> None:
-        """patience: as in `patience_of`; batch: slots of a report; ask: requests the status of every process."""
-        self._patience, self._batch, self._ask = patience, batch, ask
+    def __init__(
+        self, patience: float, batch: int, ask: Callable[[], None], router: str, clock: Clock = SYSTEM_CLOCK
+    ) -> None:
+        """patience: as in `patience_of`; batch: slots of a report; ask: requests the status of every process.
+
+        router: the router or relay through which all answers come.
+        """
+        self._patience, self._batch, self._ask, self._router = patience, batch, ask, router
         self._clock = clock
         self._polled = self._clock.monotonic()
         self._done = 0
@@ -109,8 +114,9 @@ class Stall:
             self._judge(places, unneeded)
 
     def _judge(self, places: Mapping[str, int], unneeded: Collection[str]) -> None:
-        silent = tuple(silent_of(places, self._answers, unneeded))
-        still = self._stalled - max(self._moved[name][1] for name in silent)
+        # If nobody answers, no answer comes through.
+        silent = tuple(silent_of(places, self._answers, unneeded)) if self._answers else (self._router,)
+        still = self._stalled - max(self._moved[name][1] if name in self._moved else 0.0 for name in silent)
         if still > self._patience:
             described = " and ".join(_described(name, self._answers.get(name)) for name in silent)
             raise Silence(
@@ -296,7 +302,7 @@ class Recovery:
         if self._done == 0:
             self._conductor.start()
         self._steering.remind()
-        self._conductor.report_progress(self._done)
+        self._conductor.repeat_progress()
 
     def give_up(self, done: int, complete: bool = False) -> None:
         """Record the outages that are open when the run ends; all slots below `done` are joined.

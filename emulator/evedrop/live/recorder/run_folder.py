@@ -53,9 +53,12 @@ class RunFolder:
             yield
 
     def amend(self, scenario: Scenario) -> None:
-        """Replace the scenario with one that the operator has amended. Raises OSError."""
+        """Replace the scenario with one that the operator has amended. Raises RunError if it cannot be written."""
+        try:
+            write_resolved(self.now, scenario)
+        except OSError as error:
+            raise UnwrittenResults(unwritten(error)) from error
         self._score.scenario = scenario
-        write_resolved(self.now, scenario)
 
     def add_slots(self, slots: Slots, scored: Mapping[str, Scored]) -> None:
         """Add the rows of some slots, and those of the digests that have come."""

@@ -45,7 +45,7 @@ class Access:
         self._default = control.get("default_permission") == "allow"
         self._control = control
         self._limits: Sequence[Mapping[str, Any]] = section(config, "low_pass_filter") or []
-        self._users = _users(section(config, "transport/auth/usrpwd/dictionary_file"))
+        self._users = _users(section(config, "transport/auth/usrpwd"))
         self._rules: dict[Peer, list[tuple[bool, str, str, str]]] = {}
 
     def knows(self, user: str | None, password: str | None) -> bool:
@@ -104,8 +104,10 @@ def section(config: zenoh.Config, path: str) -> Any:
         return None
 
 
-def _users(file: str | None) -> dict[str, str] | None:
-    if file is None:
+def _users(given: Mapping[str, str | None] | None) -> dict[str, str] | None:
+    """User → password of all that may connect; None if nobody is asked for one."""
+    if not given or not any(given.values()):
         return None
-    lines = Path(file).read_text("utf-8").splitlines()
+    file = given["dictionary_file"]
+    lines = [] if file is None else Path(file).read_text("utf-8").splitlines()
     return {user: password for user, _, password in (line.partition(":") for line in lines)}

@@ -18,7 +18,8 @@ from evedrop.system.world import Address
 from evedrop.virtual import notes
 from evedrop.virtual.scheduler import VirtualScheduler, VirtualTask
 from evedrop.virtual.zenoh.access import Peer, section
-from evedrop.virtual.zenoh.session import Callback, FifoChannel, VirtualSession
+from evedrop.virtual.zenoh.handlers import Callback, FifoChannel
+from evedrop.virtual.zenoh.session import VirtualSession
 from evedrop.virtual.zenoh.transport import End, VirtualConnection
 
 _OPEN_SECONDS = 2e-3
@@ -71,6 +72,7 @@ class VirtualZenoh:
         self._cut: dict[str, float] = {}
         """Process that cannot connect → until when."""
         self._confused: set[str] = set()
+        self._shortened: set[str] = set()
         scheduler.on_stop = self._stopped
 
     # What programs call
@@ -99,7 +101,7 @@ class VirtualZenoh:
                 connected = self._connect(session, place)
                 if not connected and not session.router:
                     raise zenoh.ZError(f"cannot connect to {place}")
-                session.connects_to = place if session.router or session.again < _NEVER_SECONDS else None
+                session.connects_to = place
                 if not connected:
                     self.connect_again(session)
         except zenoh.ZError:
@@ -146,6 +148,8 @@ class VirtualZenoh:
             return False
         if not router.access.knows(session.user, session.password):
             return False
+        if any(end.peer.zid == session.zid for end in router.ends):  # it has not noticed a lost connection yet
+            return False
         mine = End(session, Peer(router.zid, None), to_router=True)
         theirs = End(router, Peer(session.zid, session.user), to_router=session.router)
         VirtualConnection(self.scheduler, mine, theirs)
@@ -157,15 +161,19 @@ class VirtualZenoh:
         return True
 
     def connect_again(self, session: VirtualSession) -> None:
-        """Try to connect a session that has lost its router, until it is connected or closed."""
+        """Try to connect a session that has lost its router: at once, and then from time to time, until it is closed."""
 
         def attempt() -> None:
             if session.is_closed() or not session.task.alive or session.connects_to is None:
                 return
             if session.task.stopped or not self._connect(session, session.connects_to):
-                self.scheduler.at(self.scheduler.now + session.again, attempt)
+                try_after(session.again)
 
-        self.scheduler.at(self.scheduler.now + session.again, attempt)
+        def try_after(seconds: float) -> None:
+            if seconds < _NEVER_SECONDS:
+                self.scheduler.at(self.scheduler.now + seconds, attempt)
+
+        try_after(self.scheduler.random.expovariate(1.0 / _OPEN_SECONDS))
 
     def forget(self, session: VirtualSession) -> None:
         """A session has ended: nobody listens at its endpoints."""
@@ -181,7 +189,7 @@ class VirtualZenoh:
                 self.scheduler.at(self.scheduler.now + session.lease, lambda session=session: self._expire(session))  # type: ignore[misc]
 
     def _expire(self, session: VirtualSession) -> None:
-        if session.task.stopped and session.task.suspended_for(self.scheduler.now) >= session.lease:
+        if session.task.stopped and self.scheduler.now >= session.task.since + session.lease:
             for end in [*session.ends]:
                 end.connection.close("nothing came for the lease")
 
@@ -192,6 +200,11 @@ class VirtualZenoh:
             if session.name == process:
                 for end in [*session.ends]:
                     yield end.connection
+
+    @property
+    def clients(self) -> list[str]:
+        """The processes that have a session and are no router."""
+        return [*dict.fromkeys(session.name for session in self._sessions if not session.router)]
 
     def cut(self, process: str, seconds: float | None) -> bool:
         """Cut the connections of a process, which cannot be made again, nor for the first time, for some time, or for good."""
@@ -220,17 +233,33 @@ class VirtualZenoh:
 
     def confuse(self, process: str) -> bool:
         """Let the next message to a process arrive at the subscriber of another key."""
-        hit = any(session.name == process for session in self._sessions)
-        if hit:
-            self._confused.add(process)
-        return hit
+        return self._mark(process, self._confused)
 
     def confused(self, session: VirtualSession) -> bool:
         """Whether the message that a session gets now is to arrive at the wrong subscriber."""
-        if session.name in self._confused:
-            self._confused.remove(session.name)
-            return True
-        return False
+        return self._unmark(session, self._confused)
+
+    def shorten(self, process: str) -> bool:
+        """Let half of the next message to a process arrive."""
+        return self._mark(process, self._shortened)
+
+    def shortened(self, session: VirtualSession) -> bool:
+        """Whether half of the message that a session gets now is to arrive."""
+        return self._unmark(session, self._shortened)
+
+    def _mark(self, process: str, marked: set[str]) -> bool:
+        """Mark a process, if it has a session."""
+        hit = any(session.name == process for session in self._sessions)
+        if hit:
+            marked.add(process)
+        return hit
+
+    @staticmethod
+    def _unmark(session: VirtualSession, marked: set[str]) -> bool:
+        """Whether the process of a session was marked."""
+        hit = session.name in marked
+        marked.discard(session.name)
+        return hit
 
 
 _NEVER_SECONDS = 86_400.0

@@ -106,10 +106,10 @@ class WhoKnowsWhat(ViewPanel):
         for shown, path, knows in zip(self.scene.receivers, self._lanes.paths, self._knowledge, strict=True):
             peer = slots.peers[shown.name]
             distances = self._distance.of(slots.x, peer.x_hat)
-            changes = [*knows.changes(slots.first, knowledge(self.scene, slots.x, peer.x_hat, peer.P), distances)]
-            if changes:
-                k, codes = zip(*changes, strict=True)
-                yield Column(path, np.array(k, np.int64), states(knows.lane, codes))
+            levels = knowledge(self.scene, slots.x, peer.x_hat, peer.P)
+            k, codes = knows.changes(slots.first, levels, distances)
+            if len(k):
+                yield Column(path, k, states(knows.lane, codes))
 
 
 _PACKETS_PATH = "packets"

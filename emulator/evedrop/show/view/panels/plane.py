@@ -167,16 +167,18 @@ class StatePlane(ViewPanel):
             yield Column(_point(name), k[at], rr.Points2D.columns(positions=places[name]))
         for i, shown in enumerate(self.scene.receivers):
             peer = slots.peers[shown.name]
-            outlines = np.clip(ellipses(peer.x_hat[at], peer.P[at]), low[:, None], high[:, None])
-            outlines = np.where(inside(positions[shown.name][at], low, high)[:, None, None], outlines, truth[:, None])
+            seen = inside(positions[shown.name][at], low, high)
+            outlines = np.repeat(truth[:, None], _CORNERS + 1, axis=1)
+            drawn = ellipses(peer.x_hat[at[seen]], peer.P[at[seen]])
+            outlines[seen] = np.clip(drawn, low[seen, None], high[seen, None])
             yield Column(_ellipse(shown.name), k[at], rr.LineStrips2D.columns(strips=line_strips(outlines)))
             distances = self._distance.of(slots.x[at], peer.x_hat[at])
             offs = [f"{self._distance.text(distance)} off" for distance in distances.tolist()]
             below = rr.Points2D.columns(positions=labels_below(places[shown.name], low, high), labels=offs)
             yield Column(_off(shown.name), k[at], below)
             if i > 0:
-                seen = truth, positions[shown.name][at], low, high
-                yield from self._far(shown.name, k[at], seen, places[shown.name], distances, labels)
+                looked_at = truth, positions[shown.name][at], low, high
+                yield from self._far(shown.name, k[at], looked_at, places[shown.name], distances, labels)
 
     def _attacked(
         self, slots: SceneSlots, at: NDArray[np.intp], boxes: Points, marks: list[list[tuple[Points, Colour]]]
@@ -309,7 +311,7 @@ def frames(scene: Scene, first: int, count: int) -> NDArray[np.intp]:
 
 def on_plane(states: Floats) -> Points:
     """The first two states, (c, 2), of states (c, n); Rerun's y axis points down, so the second is negated."""
-    return _shown(states[:, :2] * np.array([1.0, -1.0]))
+    return _shown(np.stack([states[:, 0], -states[:, 1]], axis=1))
 
 
 def ellipses(centres: Floats, P: Floats) -> Points:
@@ -322,10 +324,9 @@ def ellipses(centres: Floats, P: Floats) -> Points:
         spread = np.sqrt(np.maximum(P[:, 0, 0], 0.0))
         lean = np.where(spread > 0.0, P[:, 1, 0] / np.where(spread > 0.0, spread, 1.0), 0.0)
         rest = np.sqrt(np.maximum(P[:, 1, 1] - lean * lean, 0.0))
-        across = spread[:, None] * np.cos(angle)
-        along = lean[:, None] * np.cos(angle) + rest[:, None] * np.sin(angle)
-        lines = centres[:, None, :2] + _SIGMAS * np.stack([across, along], axis=2)
-    return _shown(lines * np.array([1.0, -1.0]))
+        x = centres[:, :1] + _SIGMAS * spread[:, None] * np.cos(angle)
+        y = centres[:, 1:2] + _SIGMAS * (lean[:, None] * np.cos(angle) + rest[:, None] * np.sin(angle))
+    return _shown(np.stack([x, -y], axis=2))
 
 
 def inside(points: Points, low: Points, high: Points) -> NDArray[np.bool_]:
@@ -336,8 +337,11 @@ def inside(points: Points, low: Points, high: Points) -> NDArray[np.bool_]:
 
 def within(pieces: Points, low: Points, high: Points, otherwise: Points) -> Points:
     """The pieces of a path, (f, p, 2); one that leaves its frame becomes a dot at a point of `otherwise`, (f, 2)."""
-    stays = np.asarray(np.all((pieces >= low[:, None]) & (pieces <= high[:, None]), axis=(1, 2)))
-    kept: Points = np.where(stays[:, None, None], pieces, otherwise[:, None])
+    # Both coordinates by themselves: numpy is slow along an axis of two.
+    (left, top), (right, bottom) = low.T[..., None], high.T[..., None]
+    x, y = pieces[..., 0], pieces[..., 1]
+    stays = np.all((x >= left) & (x <= right) & (y >= top) & (y <= bottom), axis=1, keepdims=True)
+    kept: Points = np.where(stays[..., None], pieces, otherwise[:, None])
     return kept
 
 
@@ -436,7 +440,7 @@ def apart(centres: Points, others: Sequence[Points], low: Points, high: Points) 
 
 
 def _shown(values: NDArray[Any]) -> Points:
-    points: Points = np.clip(np.nan_to_num(values, nan=_LARGEST), -_LARGEST, _LARGEST).astype(np.float32)
+    points: Points = np.fmax(np.fmin(values, _LARGEST), -_LARGEST).astype(np.float32)  # NaN becomes the largest
     return points
 
 

@@ -6,20 +6,21 @@ operator, and long stretches without a usable packet.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import final
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from evedrop.model.process import Floats
 from evedrop.score.after_start import BatchMeans, leading_states
 from evedrop.score.verdict import Verdict, verdict_so_far
 from evedrop.show.view import lanes
 from evedrop.show.view.column import Column
 from evedrop.show.view.event_log import EventLog, LogLine
 from evedrop.show.view.events import AckWatcher, Event, Watcher
-from evedrop.show.view.lanes import received
+from evedrop.show.view.lanes import received, squares
 from evedrop.show.view.palette import GROUND, LABEL, TRUTH, Colour
 from evedrop.show.view.panels.curves import times_of
 from evedrop.show.view.panels.panel import LEGEND_HEIGHT, VERDICT_HEIGHT, PlacedView, ViewPanel, lanes_height
@@ -47,42 +48,48 @@ class VerdictLine(ViewPanel):
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The verdict on the slots so far, about once a second, if it has changed."""
-        if not self._shown:
-            yield from self._so_far(slots.first)
-        at = 0
+        so_far = {slots.first: self._so_far()} if not self._shown else {}
+        errors, at = self._errors(slots), 0
         while at < slots.count:
             stop = min(slots.count, self._next - slots.first)
-            self._add(slots, slice(at, stop))
+            for name, batches in self._batches.items():
+                batches.add(*(values[at:stop] for values in errors[name]))
             at = stop
             if slots.first + at == self._next:
-                yield from self._so_far(self._next - 1)
+                so_far[self._next - 1] = self._so_far()
                 self._next += self._every
+        yield from self._texts(so_far)
 
-    def _add(self, slots: SceneSlots, some: slice) -> None:
-        for name, batches in self._batches.items():
-            peer = slots.peers[name]
-            apart = (slots.x[some] - peer.x_hat[some])[:, : self._states]
-            batches.add(peer.squared_error[some], np.sum(apart * apart, axis=1))
+    def _errors(self, slots: SceneSlots) -> dict[str, tuple[Floats, Floats]]:
+        """Receiver → its squared errors, and its squared distances, (c,) each."""
+        return {
+            name: (peer.squared_error, squares((slots.x - peer.x_hat)[:, : self._states]))
+            for name, peer in slots.peers.items()
+        }
 
-    def _so_far(self, k: int) -> Iterator[Column]:
+    def _so_far(self) -> str:
         (_, ours), *theirs = self._batches.items()
         scene = self.scene
         verdict = verdict_so_far(ours, theirs, scene.unit, scene.noise, scene.trials, of_estimate=scene.of_estimate)
-        yield from self._text(k, "" if verdict is None else f"{verdict.sentence}, so far")
+        return "" if verdict is None else f"{verdict.sentence}, so far"
 
     def conclusion(self, k: int, verdict: Verdict) -> Iterator[Column]:
         """The verdict on the run."""
-        yield from self._text(k, verdict.sentence)
+        yield from self._texts({k: verdict.sentence})
 
-    def _text(self, k: int, sentence: str) -> Iterator[Column]:
+    def _texts(self, sentences: Mapping[int, str]) -> Iterator[Column]:
+        """The line from some slots on, where it changes; sentences: slot → what is said of secrecy, in order."""
         trials = self.scene.trials
         of = "" if trials == 1 else f" · curves: means of {trials:,} trials, everything else: the first of them"
         title = f"**{_plain(self.scene.title)}**{of}"
-        text = f"#### {_plain(sentence)}\n\n{title}" if sentence else f"### {title}"
-        if text != self._shown:
-            self._shown = text
-            documents = rr.TextDocument.columns(text=[text], media_type=["text/markdown"])
-            yield Column(_TITLE_PATH, np.array([k], np.int64), documents)
+        new = dict[int, str]()
+        for k, sentence in sentences.items():
+            text = f"#### {_plain(sentence)}\n\n{title}" if sentence else f"### {title}"
+            if text != self._shown:
+                self._shown = new[k] = text
+        if new:
+            documents = rr.TextDocument.columns(text=[*new.values()], media_type=["text/markdown"] * len(new))
+            yield Column(_TITLE_PATH, np.array([*new], np.int64), documents)
 
 
 def _plain(text: str) -> str:

@@ -1,0 +1,111 @@
+"""Wires of the simulated campaign: drawn from a seed, played again by it, and judged by what their receivers got."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
+from typing import Any
+
+import pytest
+
+from evedrop.errors import UsageError
+from evedrop.virtual.cases import case_of
+from evedrop.virtual.faults import CutConnection, CutPower, FillDisk, KillProcess, StopProcess
+from evedrop.wire.publications import _Way
+from evedrop.wire.running_link import RunningLink
+from evedrop.wire.tallies import LinkTally
+from tests.virtual import simulated
+from tests.virtual.wire_cases import BASE, DISK, EVERY, WIRE, SimulatedWireCase
+
+PLAIN = SimulatedWireCase(1, (), starts=2, seconds=10.0)
+NUMBERED, TALLIED, MESSAGE = RunningLink._counted, LinkTally.add, _Way.message
+
+
+@pytest.mark.parametrize("seed", range(EVERY, 9 * EVERY, EVERY))
+def test_a_wire_of_a_seed_keeps_its_promises(seed: int) -> None:
+    """It is the same case each time, and can be written down."""
+    case = simulated.any_case(seed)
+    assert isinstance(case, SimulatedWireCase)
+    assert simulated.read_case(case.to_text()) == case == simulated.read_case(str(seed))
+    assert simulated.play(case).misses == ()
+
+
+def test_a_seed_decides_a_wire_again() -> None:
+    """To the last event; another seed is another wire."""
+    case = SimulatedWireCase(3, (KillProcess(WIRE, 300), CutConnection(BASE, 700, 2.0)), starts=2, seconds=10.0)
+    first, again, other = case.play(), case.play(), replace(case, seed=4).play()
+    assert first.run.digest == again.run.digest != other.run.digest
+    assert first.misses == again.misses == ()
+
+
+def test_other_seeds_are_runs_as_before() -> None:
+    """The wires take none of the draws of runs."""
+    assert simulated.any_case(EVERY + 1) == case_of(EVERY + 1)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        KillProcess(WIRE, 0),
+        StopProcess(WIRE, 0, 15.0),
+        CutConnection(BASE, 0, 1.0),
+        FillDisk(DISK, 0, 3.0),
+        CutPower(DISK, 0),
+    ],
+    ids=lambda fault: fault.kind,
+)
+def test_a_fault_at_any_moment_breaks_no_promise(fault: Any) -> None:
+    """Also while the wire starts, and while it ends."""
+    for after in (30, 300, 850):
+        assert replace(PLAIN, faults=(replace(fault, after=after),)).play().misses == (), after
+
+
+def swallowing() -> Callable[..., Any]:
+    """A wire that loses a message now and then."""
+    numbers = count(1)
+    return lambda *arguments: (lambda: None) if next(numbers) % 20 == 0 else MESSAGE(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "mistake", "miss"),
+    [
+        (_Way, "message", swallowing(), "messages never arrived that the journal calls delivered"),
+        (_Way, "message", lambda way, sample, _, by: MESSAGE(way, sample, 2, by), "arrived 2 times"),
+        (RunningLink, "_counted", lambda *_: 0, "with gaps at [] and twice [0, 1, 2]"),
+        (
+            LinkTally,
+            "add",
+            lambda tally, some: TALLIED(tally, some[1:]),
+            "status 3, although nothing of this may end a wire",
+        ),
+    ],
+)
+def test_a_mistake_of_the_wire_is_seen(
+    place: type, name: str, mistake: Callable[..., Any], miss: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where nothing is disturbed."""
+    assert PLAIN.play().misses == ()
+    monkeypatch.setattr(place, name, mistake)
+    assert any(miss in found for found in PLAIN.play().misses)
+
+
+def test_a_failing_wire_is_shrunk_and_shown(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What has nothing to do with the mistake is left out, and the diagram has the wire and its programs."""
+    monkeypatch.setattr(RunningLink, "_counted", lambda *_: 0)
+    case = SimulatedWireCase(5, (CutConnection(BASE, 300, 1.0),), starts=3, seconds=10.0)
+    smaller = simulated.shrunk(case, case.play().misses)
+    assert smaller == replace(case, faults=(), starts=2, seconds=1.0)
+    assert not simulated.show(smaller)
+    printed = capsys.readouterr().out
+    assert f"--case '{smaller.to_text()}'" in printed
+    assert all(name in printed for name in ("wire", "robot", "base", "MISS the journal numbers"))
+
+
+@pytest.mark.parametrize("text", ['{"starts": 2}', '{"seed": 1, "starts": 1, "seconds": 1.0, "faults": [["melt"]]}'])
+def test_what_is_no_wire_is_refused(text: str) -> None:
+    """In the words of an error of usage."""
+    with pytest.raises(UsageError, match="not a case"):
+        simulated.read_case(text)
