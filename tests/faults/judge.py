@@ -239,7 +239,7 @@ def _folders(run: Run) -> list[Path]:
 
 def _of_results(status: int, run: Run, hits: Mapping[Fault, float], reference: RunReference) -> Iterator[str]:
     disk, limited = any(map(_of_disk, hits)), any(map(_of_limits, hits))
-    folders = {name: one for folder in (run.out, run.renamed) for name, one in reference.of_folders(folder).items()}
+    folders = {place: due for folder in (run.out, run.renamed) for place, due in reference.of_folders(folder).items()}
     written = [folder for folder in folders if any(_has_rows(path) for path in folder.glob("**/*.parquet"))]
     for folder, expected in folders.items():
         try:

@@ -1,4 +1,4 @@
-"""Ten mistakes, and what the simulated world says of each: the texts in docs/maintainers/failures.
+"""Writes docs/maintainers/failures: for each of ten mistakes, a case of the simulated world that shows it.
 
     python -m tests.virtual.failures                                writes all texts again, after a change
     python -m tests.virtual.failures NAME "the mutant" SEED         writes a new one, of a seed that notices the mutant

@@ -1487,7 +1487,7 @@ def test_a_querier_can_ask_for_all_answers_of_a_key(net: Network) -> None:
 
 @behaviour
 def test_a_question_can_be_answered_with_an_error(net: Network) -> None:
-    """Which says why, and is no answer of its key."""
+    """The error says why; it is not an answer of the key."""
     asker, server = pair(net)
 
     def refuse(query: Any) -> None:

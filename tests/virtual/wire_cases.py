@@ -26,6 +26,7 @@ import zenoh
 
 from evedrop.cli.simulated import program
 from evedrop.errors import EvedropError, Interrupted, UsageError
+from evedrop.system.lacks import report_refusal
 from evedrop.system.output import say
 from evedrop.system.world import world
 from evedrop.virtual import notes
@@ -301,13 +302,12 @@ def _wire(folder: Path, seconds: float) -> int:
         say(error.illustrated)
         return error.exit_status
     except OSError as error:
-        say(f"{error.filename}: {error.strerror}; free some space, or check its permissions")
-        return UsageError.exit_status
+        return report_refusal(error)
 
 
-def _connected(side: str) -> Any:
-    """A session at a side, once the wire listens there."""
-    config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": [ENDPOINTS[side]]}}))
+def connected(endpoint: str) -> Any:
+    """A session at a side of a wire, once it listens there."""
+    config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint]}}))
     while True:
         try:
             return world().zenoh.open(config)
@@ -317,7 +317,7 @@ def _connected(side: str) -> Any:
 
 def _listen(course: _Course) -> int:
     """The program at the base."""
-    session = _connected(BASE)
+    session = connected(ENDPOINTS[BASE])
     for key in KEYS:
         session.declare_subscriber(key, lambda sample, key=key: course.got.append((key, len(sample.payload))))
     while True:
@@ -326,7 +326,7 @@ def _listen(course: _Course) -> int:
 
 def _send(numbers: Iterator[int], course: _Course) -> int:
     """The program at the robot: the length of a message is its number."""
-    session = _connected(ROBOT)
+    session = connected(ENDPOINTS[ROBOT])
     for number in numbers:
         for key in KEYS:
             course.sent.add((key, number))

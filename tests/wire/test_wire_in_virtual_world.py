@@ -21,6 +21,7 @@ from evedrop.virtual.world import EPOCH
 from evedrop.wire.journal import journal_tables
 from evedrop.wire.plan import Side, WireEvent, WirePlan
 from evedrop.wire.run import run_wire
+from tests.virtual.wire_cases import connected
 from tests.wire.wire_at_work import LOSSY, PERFECT, link, plan_of
 
 HOUR = 3600.0
@@ -58,16 +59,6 @@ class Outcome:
         return [row for row in self.journal.to_pylist() if all(row[name] == value for name, value in values.items())]
 
 
-def connected(side: str) -> Any:
-    """A session of a program at a side, once the wire listens there."""
-    config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": [ENDPOINTS[side]]}}))
-    while True:
-        try:
-            return world().zenoh.open(config)
-        except zenoh.ZError:
-            world().sleep(0.1)
-
-
 Program = Callable[[], int]
 
 
@@ -96,13 +87,13 @@ def run(
             if source != side:
                 outcome.got[side, str(sample.key_expr)].append(n)
 
-        with connected(side) as session:
+        with connected(ENDPOINTS[side]) as session:
             session.declare_subscriber("**", take)
             world().sleep(2.0 * seconds)
         return 0
 
     def send(side: str) -> int:
-        with connected(side) as session:
+        with connected(ENDPOINTS[side]) as session:
             world().sleep(2.0)
             for n in range(count):
                 for key in KEYS:
@@ -188,14 +179,14 @@ def test_tokens_and_queries_cross(tmp_path: Path) -> None:
     answers: list[str] = []
 
     def serve() -> int:
-        with connected("base") as session:
+        with connected(ENDPOINTS["base"]) as session:
             session.declare_queryable("service", lambda query: (query.reply("service", b"answer"), query.drop()))
             session.liveliness().declare_token("here")
             world().sleep(20.0)
         return 0
 
     def ask() -> int:
-        with connected("robot") as session:
+        with connected(ENDPOINTS["robot"]) as session:
             session.liveliness().declare_subscriber(
                 "**",
                 lambda sample: seen.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)),

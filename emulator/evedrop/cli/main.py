@@ -18,7 +18,7 @@ from evedrop.cli.tables import written_tables
 from evedrop.cli.words import words_of_commands
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.system.files import shown
-from evedrop.system.lacks import lack_of, refuse_scipy_without_room
+from evedrop.system.lacks import lack_of, refuse_scipy_without_room, report_refusal
 from evedrop.system.output import say, standard_streams, warn
 
 if TYPE_CHECKING:
@@ -90,11 +90,7 @@ def _status_of_command(given: list[str], parser: Parser | None) -> int:
         if lack_of(error) is not None:
             raise
         sys.stdout.flush()
-        if error.filename is None:
-            say(f"{error}; free system resources and try again")
-            return RunError.exit_status
-        say(f"{error.filename}: {error.strerror}; free some space, or check its permissions")
-        return UsageError.exit_status
+        return report_refusal(error)
 
 
 def _resuming(given: Sequence[str], options: argparse.Namespace, folder: str) -> str:

@@ -13,6 +13,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import final
 
+from evedrop.errors import RunError, UsageError
+from evedrop.system.output import say
 from evedrop.system.world import world
 
 _SCIPY_BYTES, _THREAD_BYTES = 160_000_000, 45_000_000
@@ -58,6 +60,15 @@ class _ScipyFinder:
         """Called before each import. Raises MemoryError."""
         if name == "scipy" and not _has_room():
             raise MemoryError
+
+
+def report_refusal(error: OSError) -> int:
+    """Say what the system refused to a command, if it is not a lack; returns the command's exit status."""
+    if error.filename is None:
+        say(f"{error}; free system resources and try again")
+        return RunError.exit_status
+    say(f"{error.filename}: {error.strerror}; free some space, or check its permissions")
+    return UsageError.exit_status
 
 
 def refuse_scipy_without_room() -> None:

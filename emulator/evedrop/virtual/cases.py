@@ -142,8 +142,8 @@ class CaseDraw:
                 tables["acknowledgements"] |= {"attack": "critical", "jammer": "eve0"}
         if chance(0.2):
             tables |= _LOOP
-            told = {"period": some.randint(1, 4), "acts_on": some.choice(["truth", "estimate"])}
-            tables["controller"] = {**tables["controller"], **told}
+            loop = {"period": some.randint(1, 4), "acts_on": some.choice(["truth", "estimate"])}
+            tables["controller"] = {**tables["controller"], **loop}
             tables["legitimate"]["knows_input"] = chance(0.7)
         if chance(0.15):
             tables["network"] = {"routers": 2}

@@ -52,11 +52,16 @@ class Disturbance(ABC):
     """Whether it changes the scenario of the run, which then has other results."""
     cuts_off: ClassVar[bool] = False
     """Whether all that it does is to cut its target off from the others."""
+    only_target: ClassVar[str]
+    """What it hits, if that is the same in every run."""
+    harmless: ClassVar[bool | None] = None
+    """Whether a run always survives it, or need not; None: it survives a short one."""
 
     @classmethod
-    @abstractmethod
     def targets(cls, scenario: Scenario) -> Sequence[str]:
         """What it may hit in a run of a scenario; a name that comes twice is drawn twice as often."""
+        del scenario
+        return [cls.only_target]
 
     @abstractmethod
     def strike(self, world: SimulatedWorld) -> bool:
@@ -64,6 +69,8 @@ class Disturbance(ABC):
 
     def survived(self, longest_outage: float) -> bool:
         """Whether the run must go on to its end as if nothing had happened."""
+        if self.harmless is not None:
+            return self.harmless
         return self.seconds is not None and self.seconds < longest_outage / 2.0
 
     def ends_at_once(self, process: str) -> bool:

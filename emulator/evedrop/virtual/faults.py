@@ -39,7 +39,16 @@ class _OfProcess(Disturbance):
         return [LAUNCHER, *FORK_SERVERS, *processes_of(scenario), ROUTER, SENSOR, RECORDER]
 
 
-class _Kill(_OfProcess):
+class _EndProcess(_OfProcess):
+    """Its target ends."""
+
+    def survived(self, longest_outage: float) -> bool:
+        """Whether it is a router, which the launcher starts again."""
+        del longest_outage
+        return self.target in ROUTERS
+
+
+class _Kill(_EndProcess):
     """Its target is killed."""
 
     @property
@@ -51,11 +60,6 @@ class _Kill(_OfProcess):
         """The target, and the recorder of a launcher."""
         killed = {self.target, *([RECORDER] if self.target == LAUNCHER else [])}
         return process in killed or super().ends_at_once(process)
-
-    def survived(self, longest_outage: float) -> bool:
-        """Whether it is a router, which the launcher starts again."""
-        del longest_outage
-        return self.target in ROUTERS
 
 
 @final
@@ -81,7 +85,7 @@ class StopAndKillProcess(_Kill):
         return _suspend(world, self.target, self.seconds, signal.SIGKILL)
 
 
-class _Signal(_OfProcess):
+class _Signal(_EndProcess):
     """A signal that ends a run if its launcher gets it."""
 
     number: ClassVar[signal.Signals]
@@ -94,11 +98,6 @@ class _Signal(_OfProcess):
     def strike(self, world: SimulatedWorld) -> bool:
         """Ask it to end."""
         return _signal(world, self.target, self.number)
-
-    def survived(self, longest_outage: float) -> bool:
-        """Whether it is a router, which the launcher starts again."""
-        del longest_outage
-        return self.target in ROUTERS
 
 
 @final
@@ -208,15 +207,11 @@ class SlowConnection(_OfConnection):
     """Everything takes longer on the connection of a process."""
 
     kind, share = "slow", 9
+    harmless = True
 
     def disturb(self, zenoh: VirtualZenoh, target: str) -> bool:
         """Make it slow."""
         return zenoh.slow(target, self.seconds)
-
-    def survived(self, longest_outage: float) -> bool:
-        """It always is."""
-        del longest_outage
-        return True
 
 
 @final
@@ -224,16 +219,11 @@ class ConfuseKeys(_OfConnection):
     """The next message to a process arrives at the subscriber of another key of it."""
 
     kind, share = "confuse", 9
-    lasts = False
+    lasts, harmless = False, True  # the message names its key
 
     def disturb(self, zenoh: VirtualZenoh, target: str) -> bool:
         """Confuse its keys once."""
         return zenoh.confuse(target)
-
-    def survived(self, longest_outage: float) -> bool:
-        """It always is: the message names its key."""
-        del longest_outage
-        return True
 
 
 @final
@@ -249,26 +239,26 @@ class ShortenMessage(_OfConnection):
 
     @property
     def blamed(self) -> tuple[str, ...]:
-        """Whoever sent it."""
+        """The sender, which depends on the message."""
         return ("broke the protocol",)
 
 
-class DiskDisturbance(Disturbance):
-    """Something goes wrong with the disk, at the next operation of any process."""
+class _OfFiles(Disturbance):
+    """Something happens to files that the run writes."""
 
-    fault: ClassVar[DiskFault]
-    lacking = True
+    lacking, harmless = True, False
 
     @property
     def statuses(self) -> frozenset[int]:
         """Those of any failure, and that of a file which cannot be used."""
         return super().statuses | {UsageError.exit_status}
 
-    @classmethod
-    def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """There is one disk."""
-        del scenario
-        return [DISK]
+
+class DiskDisturbance(_OfFiles):
+    """Something goes wrong with the disk, at the next operation of any process."""
+
+    only_target = DISK
+    fault: ClassVar[DiskFault]
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Let it go wrong."""
@@ -278,11 +268,6 @@ class DiskDisturbance(Disturbance):
         if self.seconds is not None:
             world.scheduler.at(world.scheduler.now + self.seconds, disk.make_room)
         return True
-
-    def survived(self, longest_outage: float) -> bool:
-        """It may end a run."""
-        del longest_outage
-        return False
 
     @property
     def blamed(self) -> tuple[str, ...]:
@@ -320,12 +305,7 @@ class ShortenWrite(DiskDisturbance):
     """Half of a write arrives, and the program is told so."""
 
     kind, share = "shorten a write to", 2
-    fault = DiskFault.SHORT
-
-    def survived(self, longest_outage: float) -> bool:
-        """The program writes the rest."""
-        del longest_outage
-        return True
+    fault, harmless = DiskFault.SHORT, True  # the program writes the rest
 
 
 @final
@@ -350,26 +330,10 @@ class CutPower(DiskDisturbance):
         return True
 
 
-class _OfResults(Disturbance):
+class _OfResults(_OfFiles):
     """Somebody else does something to the results folder of a run that goes on."""
 
-    lacking = True
-
-    @property
-    def statuses(self) -> frozenset[int]:
-        """Those of any failure, and that of a file which cannot be used."""
-        return super().statuses | {UsageError.exit_status}
-
-    @classmethod
-    def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """There is one folder."""
-        del scenario
-        return ["results"]
-
-    def survived(self, longest_outage: float) -> bool:
-        """It may end a run."""
-        del longest_outage
-        return False
+    only_target = "results"
 
     @property
     def blamed(self) -> tuple[str, ...]:

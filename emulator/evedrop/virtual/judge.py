@@ -88,7 +88,7 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
 def _is_worse_for_others(fault: Disturbance) -> bool:
     """Whether because of it a run may not survive another fault.
 
-    To a recorder that nothing reaches, whoever was cut off before seems to stay so; without a fork server, no router is started
+    A recorder that nothing reaches does not see that others are connected again, and without a fork server no router is started
     again.
     """
     return fault.target in FORK_SERVERS or (fault.cuts_off and fault.target in (RECORDER, EVERYBODY))

@@ -16,14 +16,9 @@ if TYPE_CHECKING:
 
 
 class _Lack(Disturbance):
-    """There is too little of something: whoever needs it then ends, and says what it lacks."""
+    """There is too little of something: a process that needs it ends, and says what it lacks."""
 
-    lacking = True
-
-    def survived(self, longest_outage: float) -> bool:
-        """It may end a run."""
-        del longest_outage
-        return False
+    lacking, harmless = True, False
 
     @property
     def blamed(self) -> tuple[str, ...]:
@@ -41,13 +36,7 @@ class LackThreads(_Lack):
     """No thread and no process can be started for some time, or any more."""
 
     kind, share = "take the threads of", 3
-    lasts = True
-
-    @classmethod
-    def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """There is one machine."""
-        del scenario
-        return ["machine"]
+    lasts, only_target = True, "machine"
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Let it have none."""

@@ -57,7 +57,7 @@ def said_in(message: bytes) -> str:
     try:
         unpacker.skip()
         fields = unpacker.unpack()
-    except (ValueError, TypeError, msgpack.UnpackException):  # whoever wrote it
+    except (ValueError, TypeError, msgpack.UnpackException):  # a stranger's, or a shortened one
         return ""
     if not isinstance(fields, dict):
         return ""

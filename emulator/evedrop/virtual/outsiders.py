@@ -27,7 +27,6 @@ from evedrop.virtual.disturbance import LAUNCHER, Disturbance
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld
 
-RUN = "run"
 _AGAIN_SECONDS = 0.5
 _LISTENS_SECONDS = 1.0
 _LARGEST_GARBAGE = 3 << 20
@@ -38,6 +37,7 @@ class _Outsider(Disturbance):
 
     program: ClassVar[str]
     """What its process is called."""
+    only_target, harmless = "run", True
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Begin it."""
@@ -47,11 +47,6 @@ class _Outsider(Disturbance):
     @abstractmethod
     def _act(self, world: SimulatedWorld) -> int:
         """What it does; returns its exit status."""
-
-    def survived(self, longest_outage: float) -> bool:
-        """It always is."""
-        del longest_outage
-        return True
 
 
 class _Command(_Outsider):
@@ -74,12 +69,6 @@ class AskStatus(_Command):
 
     kind, share = "ask for the status of", 1
 
-    @classmethod
-    def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """There is one run."""
-        del scenario
-        return [RUN]
-
     def _act(self, world: SimulatedWorld) -> int:
         self._type(world, "status")
         return 0
@@ -91,12 +80,6 @@ class PauseRun(_Command):
 
     kind, share = "pause", 2
     lasts, for_good = True, False
-
-    @classmethod
-    def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """There is one run."""
-        del scenario
-        return [RUN]
 
     def _act(self, world: SimulatedWorld) -> int:
         self._type(world, "pause")
@@ -150,12 +133,6 @@ class LetStrangerIn(_Outsider):
 
     kind, share = "let a stranger into", 3
     program = "stranger"
-
-    @classmethod
-    def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """There is one run."""
-        del scenario
-        return [RUN]
 
     def _act(self, world: SimulatedWorld) -> int:
         try:

@@ -109,5 +109,5 @@ class Gate(PacketReader):
         return update.belief(self.process, k, belief, action, heard.z)
 
 
-SCHEME, LOSS_MODEL, STRATEGY = (f"{__name__}:{one.__name__}" for one in (Flipped, EverySecond, Gate))
+SCHEME, LOSS_MODEL, STRATEGY = (f"{__name__}:{own.__name__}" for own in (Flipped, EverySecond, Gate))
 """Their names in a scenario."""

@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO, cast, final
 
-from evedrop.errors import EvedropError, RunError, UsageError
+from evedrop.errors import EvedropError, RunError
 from evedrop.live.launch.briefs import MOST_SLOTS_AHEAD
 from evedrop.live.launch.launcher import launch
 from evedrop.scenario.progress_events import ProgressEvent
 from evedrop.scenario.tables import Scenario
-from evedrop.system.lacks import lack_of
+from evedrop.system.lacks import lack_of, report_refusal
 from evedrop.system.output import say
 from evedrop.system.world import inside
 from evedrop.virtual.disk import VirtualDisk
@@ -124,8 +124,7 @@ def run_in(world: SimulatedWorld, scenario: Scenario, ahead: int = MOST_SLOTS_AH
                 return RunError.exit_status
             if not isinstance(error, OSError):
                 raise
-            say(f"{error.filename}: {error.strerror}; free some space, or check its permissions")
-            return UsageError.exit_status
+            return report_refusal(error)
 
     with world.entered():
         process = world.machine.begin("launcher", launcher)

@@ -207,14 +207,14 @@ def test_a_run_is_complete_when_its_controller_has_reported_too() -> None:
     while joiner.take_slots() is not None:
         pass
     assert joiner.done == SLOTS
-    assert joiner.progress == 0
+    assert joiner.settled == 0
     assert not joiner.complete(SLOTS)
     for start, stop in ((0, 200), (200, SLOTS)):
         seconds = np.arange(start, stop, 2) / 1000.0
         ended = {block: digests[block] for block in BLOCKS.ended(start, stop)}
         message = Reader("evedrop/r/telemetry/controller", Decisions(start, stop - start, seconds, ended).pack())
         assert np.array_equal(joiner.add_decisions(message), seconds)
-        assert joiner.reported("controller") == joiner.progress == stop
+        assert joiner.reported("controller") == joiner.settled == stop
     assert joiner.complete(SLOTS)
     assert not joiner.complete(SLOTS + 1)
     assert sorted(joiner.digests["controller"]) == [0, 256]

@@ -88,7 +88,7 @@ class Conductor:
         session.asked(keys.control(RECORDER), self.questions.put)
         self._commands = {name: session.publisher(keys.control(name)) for name in self._present}
         self._progress = session.publisher(keys.progress(RECORDER))
-        self._reported = 0
+        self._settled = 0
 
     @property
     def missing(self) -> list[str]:
@@ -169,14 +169,14 @@ class Conductor:
             if self._present[name]:
                 self.send_to(name, command)
 
-    def report_progress(self, done: int) -> None:
-        """Tell the sensor that all slots below `done` are scored, and reported by the controller."""
-        self._reported = done
+    def report_progress(self, settled: int) -> None:
+        """Tell the sensor that all slots below `settled` are scored, and reported by the controller."""
+        self._settled = settled
         self.repeat_progress()
 
     def repeat_progress(self) -> None:
-        """Tell the sensor once more."""
-        self._progress(Progress(self._reported).pack())
+        """Send the last progress again, which may have been lost."""
+        self._progress(Progress(self._settled).pack())
 
     def end(self, patience: float) -> None:
         """Tell all processes that the run is over, repeatedly until they have left; the routers after all others.

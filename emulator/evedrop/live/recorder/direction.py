@@ -69,10 +69,10 @@ class Direction:
         if is_process_status(message):
             self._stall.add_answer(source, read_process_status(message, self._run.score.scenario.slots))
             return
-        before = self._run.reported
+        before = self._run.settled
         self._run.take(source, message, self._steering)
-        if self._run.reported > before:
-            self._conductor.report_progress(self._run.reported)
+        if self._run.settled > before:
+            self._conductor.report_progress(self._run.settled)
 
     def steer(self) -> None:
         """Take the launcher's confirmations and the operator's questions, and carry out due events."""
@@ -91,7 +91,7 @@ class Direction:
         present = set(self._run.score.scenario.digested) - self._conductor.absent
         # Slots are joined without the controller's reports, until the sensor waits for them.
         flow = self._brief.flow
-        owed = self._run.score.all_joined or done - self._run.reported >= flow.window - flow.batch
+        owed = self._run.score.all_joined or done - self._run.settled >= flow.window - flow.batch
         unneeded = () if owed else (CONTROLLER,)
         missing = bool(self._conductor.missing)
         self._stall.poll(done, lambda: self._run.places(present), unneeded, held=held, missing=missing)

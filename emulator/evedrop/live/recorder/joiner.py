@@ -72,7 +72,7 @@ class Joiner:
         return self._done
 
     @property
-    def progress(self) -> int:
+    def settled(self) -> int:
         """The first slot that has not been returned, or that a controller has not reported: all earlier reports are here."""
         return self._done if self._period is None else min(self._done, self._decided)
 

@@ -38,9 +38,9 @@ class RecordedRun:
         return self._intake.joiner.done
 
     @property
-    def reported(self) -> int:
+    def settled(self) -> int:
         """The first slot that is not scored, or that a controller has not reported."""
-        return self._intake.joiner.progress
+        return self._intake.joiner.settled
 
     @property
     def complete(self) -> bool:

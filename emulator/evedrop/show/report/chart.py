@@ -1,27 +1,31 @@
 """Charts with a logarithmic axis for the page, and the means of neighbours that a chart of a long run draws.
 
-They are SVG that takes its inks and its font from the page; matplotlib would take as long as a small study. Long rows of numbers
-are taken piece by piece, in a few groups of neighbours, so that memory does not grow with their length.
+matplotlib draws them as SVG that takes its inks and its font from the page. Long rows of numbers are taken piece by piece, in a
+few groups of neighbours, so that memory does not grow with their length.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator, Sequence
+import re
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import Any, final
-from unicodedata import east_asian_width
+from io import StringIO
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Codes, Flags
+from evedrop.model.receiver import Codes
 from evedrop.show.report.page import made, printable
 from evedrop.show.view.error_floor import ErrorAxis, floor_words
-from evedrop.show.view.label_places import label_places
+from evedrop.show.view.figure_style import drawing
+from evedrop.show.view.label_places import end_of, label_places
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class _Groups:
@@ -96,16 +100,11 @@ class GroupCounts(_Groups):
 
 POINTS = 400
 """The most points of a curve."""
-_WIDTH, _HEIGHT = 691.0, 223.0
-_TOP, _BOTTOM = 8.0, 203.0
-"""The ends of the y axis."""
-_GAP, _TITLE, _TEXT = 7.0, 16.0, 9.0
-"""Between axes and words; the room for the title of the y axis; and the height of letters."""
-_LETTER = 5.7
-"""The width of a letter: a page may have any font."""
-_INK, _DIM, _LINE = "var(--ink)", "var(--dim)", "var(--line)"
-"""Inks of the page, which are others in its dark theme and on paper."""
-_MOST_TICKS = 9
+_WIDTH, _HEIGHT = 9.6, 3.1  # inches
+_INK, _DIM, _LINE = "#16191d", "#5a6068", "#d5d9de"
+_THEME: Mapping[str, str] = {_INK: "var(--ink)", _DIM: "var(--dim)", _LINE: "var(--line)"}
+"""Ink of the drawing → that of the page, which is another one in its dark theme and on paper."""
+_DOTTED = (0, (0.1, 3.0))
 _MOST_LABELS, _LABEL_GAP = (
     12,
     0.075,
@@ -159,161 +158,116 @@ class LogChart:
             return None
         above = f"{self.y_name}; {floor_words(self.floor)}" if axis.below else self.y_name
         names = [(curve.name, curve.colour) for curve in curves] if len(curves) > _MOST_LABELS else []
-        drawing = _DrawnChart(self, curves, axis)
-        return made("chart", self.label, above, drawing.svg, self.x_name, names)
+        return made("chart", self.label, above, self._drawing(curves, axis), self.x_name, names)
 
-    @property
-    def ends(self) -> tuple[float, float]:
-        """The ends of the x axis, with room for marks."""
-        if self.x_words is not None:
-            return -0.5, len(self.x_words) - 0.5
+    def _drawing(self, curves: Sequence[Curve], axis: ErrorAxis) -> Markup:
+        style = {
+            "axes.edgecolor": _LINE,
+            "axes.grid.axis": "y",
+            "grid.color": _LINE,
+            "path.simplify": False,
+            "svg.fonttype": "none",
+            "svg.hashsalt": self.label,
+            "text.parse_math": False,
+            "axes.labelsize": 9.0,
+            "xtick.bottom": False,
+            "xtick.labelcolor": _DIM,
+            "ytick.left": False,
+            "ytick.labelcolor": _DIM,
+        }
+        svg = StringIO()
+        with warnings.catch_warnings(), np.errstate(over="ignore"), drawing(_WIDTH, _HEIGHT, style) as figure:
+            warnings.filterwarnings("ignore", message="Glyph")  # the page's font draws it
+            axes = figure.subplots()
+            self._set_axes(axes, curves, axis)
+            for curve in curves:
+                _draw(axes, curve, axis)
+            for curve in curves:  # over the curves, so that it stays visible
+                if curve.theory is not None:
+                    axes.plot(
+                        curve.x,
+                        axis.inside(curve.theory),
+                        color=_INK,
+                        linestyle=_DOTTED,
+                        linewidth=1.3,
+                        dash_capstyle="round",
+                        clip_on=False,
+                    )
+            if len(curves) <= _MOST_LABELS:
+                _label(axes, curves)
+            figure.savefig(svg, format="svg", transparent=True, metadata={"Date": None})
+        return _embedded(svg.getvalue())
+
+    def _set_axes(self, axes: Axes, curves: Sequence[Curve], axis: ErrorAxis) -> None:
+        from matplotlib.ticker import LogLocator  # noqa: PLC0415 - with the figure
+
         x = np.concatenate([curve.x for curve in self.curves])
         left, right = (float(x.min()), float(x.max())) if self.x_range is None else self.x_range
-        room = 0.04 * (right - left) if any(curve.bars for curve in self.curves) else 0.0
+        if self.x_words is not None:
+            axes.set_xticks(range(len(self.x_words)), list(map(printable, self.x_words)))
+            left, right = -0.5, len(self.x_words) - 0.5
+        else:
+            axes.xaxis.set_major_formatter(lambda at, _: f"{round(at, 12):,g}")
+        room = 0.04 * (right - left) if self.x_words is None and any(curve.bars for curve in curves) else 0.0
         room = room or (0.0 if right > left else 0.5)
-        return left - room, right + room
+        axes.set_xlim(left - room, right + room)
+        axes.set_ylabel(printable(self.y_axis), color=_DIM)
+        if not self.linear:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if axis.high / axis.low < _CLOSE else (1,)))
+        axes.set_ylim(axis.low, axis.high)
+        axes.yaxis.set_major_formatter(lambda at, _: f"{at:g}")
+        axes.minorticks_off()
+        for line in axes.get_ygridlines():
+            line.set_clip_on(False)
 
 
-@final
-class _DrawnChart:
-    """Draws a chart. Nothing is clipped, for everything is inside."""
-
-    def __init__(self, chart: LogChart, curves: Sequence[Curve], axis: ErrorAxis) -> None:
-        self._chart, self._curves, self._axis = chart, curves, axis
-        self._names = [printable(curve.name) for curve in curves] if len(curves) <= _MOST_LABELS else []
-        self._heights = {f"{at:g}": at for at in _round(axis) if axis.low <= at <= axis.high}
-        self._left = _TITLE + _GAP + _LETTER * max(map(len, self._heights))
-        self._right = _WIDTH - 3 * _GAP - _LETTER * max(map(_width, self._names), default=0)
-
-    @property
-    def svg(self) -> Markup:
-        """The drawing."""
-        parts = [*self._axes(), *(part for curve in self._curves for part in self._drawn(curve))]
-        for curve in self._curves:  # over the curves, so that it stays visible
-            if curve.theory is not None:
-                dotted = f"stroke: {_INK}; stroke-width: 1.3; stroke-dasharray: 0.1 3.9; stroke-linecap: round"
-                parts.append(self._line(curve.x, self._axis.inside(curve.theory), dotted))
-        parts += self._labels()
-        size = Markup('<svg viewBox="0 0 {:g} {:g}" aria-hidden="true" focusable="false">\n{}\n</svg>')
-        return size.format(_WIDTH, _HEIGHT, Markup("\n").join(parts))
-
-    def _axes(self) -> Iterator[Markup]:
-        (first, last), words = self._chart.ends, self._chart.x_words
-        for name, at in self._heights.items():
-            y = self._y(np.array([at]))[0]
-            yield _path([[(self._left, y), (self._right, y)]], f"stroke: {_LINE}; stroke-width: 0.6")
-            yield _text(self._left - _GAP, y, name, "end", _DIM)
-        corners = [(self._left, _TOP), (self._left, _BOTTOM), (self._right, _BOTTOM)]
-        for side in pairwise(corners):
-            yield _path([side], f"stroke: {_LINE}; stroke-width: 0.7")
-        places = {f"{round(at, 12):,g}": at for at in _steps(first, last)}
-        for name, at in places.items() if words is None else zip(words, range(len(words)), strict=True):
-            yield _text(self._x(np.array([at]))[0], _BOTTOM + _GAP + _TEXT / 2, printable(name), "middle", _DIM)
-        title = _text(0.0, 0.0, printable(self._chart.y_axis), "middle", _DIM)
-        turned = Markup('<g transform="translate({:.1f} {:.1f}) rotate(-90)">{}</g>')
-        yield turned.format(_TEXT, (_TOP + _BOTTOM) / 2, title)
-
-    def _drawn(self, curve: Curve) -> Iterator[Markup]:
-        """A curve with its band; a value that is not finite interrupts it."""
-        x, y = curve.x, self._axis.inside(curve.y)
-        finite = np.isfinite(y)
-        if curve.low is not None and curve.high is not None:
-            low, high = self._axis.inside(curve.low), self._axis.inside(curve.high)
-            bounded = finite & np.isfinite(low) & np.isfinite(high)
-            if curve.bars:
-                ends = zip(*(self._points(x, side)[bounded & (low < high)] for side in (low, high)), strict=True)
-                yield _path(ends, f"stroke: {curve.colour}; stroke-width: 2")
-            else:
-                edges = [self._points(x, side) for side in (low, high)]
-                around = [np.concatenate([edges[0][run], edges[1][run][::-1]]) for run in _runs(bounded)]
-                yield _path(around, f"fill: {curve.colour}; fill-opacity: 0.25; stroke: none")
-        if not curve.bars:
-            yield self._line(x, y, f"stroke: {curve.colour}; stroke-width: 2")
-        alone = [
-            run.start for run in _runs(finite) if run.stop - run.start == 1
-        ]  # a line through one point cannot be seen
-        for left, top in self._points(x, y)[finite if curve.bars else alone]:
-            dot = Markup('<circle cx="{:.2f}" cy="{:.2f}" r="{}" style="fill: {}"/>')
-            yield dot.format(left, top, 3.75 if curve.bars else 2.5, curve.colour)
-
-    def _line(self, x: Floats, y: Floats, style: str) -> Markup:
-        points = self._points(x, y)
-        return _path([points[run] for run in _runs(np.isfinite(y)) if run.stop - run.start > 1], style)
-
-    def _labels(self) -> Iterator[Markup]:
-        """The name of each curve to the right of its end, in its order, with a mark of its colour; none covers another."""
-        ends = [self._end(curve.y) for curve in self._curves[: len(self._names)]]
-        places = label_places([(_BOTTOM - end) / (_BOTTOM - _TOP) for end in ends], _LABEL_GAP)
-        for curve, name, place in zip(self._curves, self._names, places, strict=False):
-            y = _BOTTOM - place * (_BOTTOM - _TOP)
-            yield _text(self._right + 0.5 * _GAP, y, "■", "start", curve.colour)
-            yield _text(self._right + 2.4 * _GAP, y, name, "start", _INK)
-
-    def _end(self, heights: Floats) -> float:
-        """Where a curve of these heights ends; at the lower end of the axis if it has none."""
-        finite = heights[np.isfinite(heights)]
-        return float(self._y(self._axis.inside(finite[-1:]))[0]) if finite.size else _BOTTOM
-
-    def _points(self, x: Floats, y: Floats) -> Floats:
-        """Values of the axes on the drawing, (c, 2)."""
-        return np.stack([self._x(x), self._y(y)], axis=1)
-
-    def _x(self, values: Floats) -> Floats:
-        first, last = self._chart.ends
-        return self._left + (values - first) / (last - first) * (self._right - self._left)
-
-    def _y(self, values: Floats) -> Floats:
-        ends = np.array([self._axis.low, self._axis.high])
-        low, high = ends if self._chart.linear else np.log10(ends)
-        heights = values if self._chart.linear else np.log10(values)
-        places: Floats = _BOTTOM - (heights - low) / (high - low) * (_BOTTOM - _TOP)
-        return places
-
-
-def _path(lines: Iterable[Iterable[Any]], style: str) -> Markup:
-    """Lines through points, as one path."""
-    drawn = " ".join("M " + " L ".join(f"{x:.2f} {y:.2f}" for x, y in line) for line in lines)
-    return Markup('<path d="{}" style="fill: none; {}"/>').format(drawn, style)
-
-
-def _text(x: float, y: float, text: str, anchor: str, ink: str) -> Markup:
-    """A line of text, half a letter's height above and below y."""
-    style = f"font-size: {_TEXT:g}px; text-anchor: {anchor}; fill: {ink}"
-    return Markup('<text x="{:.2f}" y="{:.2f}" style="{}">{}</text>').format(x, y + 0.36 * _TEXT, style, text)
-
-
-def _width(text: str) -> int:
-    """How many letters wide a text is."""
-    return sum(2 if east_asian_width(letter) in "FW" else 1 for letter in text)
-
-
-def _runs(there: Flags) -> list[slice]:
-    """The longest stretches of neighbours that are there, (c,)."""
-    edges = np.flatnonzero(np.diff(there, prepend=False, append=False))
-    return [slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
-
-
-def _steps(low: float, high: float) -> list[float]:
-    """Round numbers at equal distances, from low to high."""
-    least = (high - low) / _MOST_TICKS
-    power = 10.0 ** math.floor(math.log10(least))
-    step = next(step for step in (power, 2 * power, 2.5 * power, 5 * power, 10 * power) if step >= least)
-    return [step * i for i in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
-
-
-def _round(axis: ErrorAxis) -> list[float]:
-    """Numbers at an axis: round ones if it begins at 0, otherwise powers of ten, and others if there are few of them."""
-    if axis.low == 0.0:
-        return _steps(axis.low, axis.high)
-    first, last = math.floor(math.log10(axis.low)), math.floor(math.log10(axis.high))
-    factors = (1, 2, 5) if axis.high / axis.low < _CLOSE else (1,)
-    every = math.ceil((last - first + 1) / _MOST_TICKS)
-    return [float(f"{factor}e{power}") for power in range(first - first % every, last + 1, every) for factor in factors]
+def _draw(axes: Axes, curve: Curve, axis: ErrorAxis) -> None:
+    """Draw a curve; a value that is not finite interrupts it. Nothing is clipped, for everything is inside."""
+    x, y, ink = curve.x, axis.inside(curve.y), curve.colour
+    finite = np.isfinite(curve.y)
+    if curve.low is not None and curve.high is not None:
+        low, high = axis.inside(curve.low), axis.inside(curve.high)
+        bounded = finite & np.isfinite(low) & np.isfinite(high)
+        if curve.bars:
+            bounded &= low < high
+            axes.vlines(x[bounded], low[bounded], high[bounded], colors=ink, linewidths=2.0, clip_on=False)
+        else:
+            axes.fill_between(x, low, high, where=bounded, color=ink, alpha=0.25, linewidth=0.0, clip_on=False)
+    if not curve.bars:
+        axes.plot(x, y, color=ink, linewidth=2.0, clip_on=False)
+    between = np.concatenate([[False], finite, [False]])
+    marked = finite if curve.bars else finite & ~between[:-2] & ~between[2:]  # a line through one point cannot be seen
+    if marked.any():
+        axes.plot(x[marked], y[marked], "o", color=ink, markersize=6.5 if curve.bars else 4.0, clip_on=False)
 
 
 def _linear_axis(heights: Sequence[Floats]) -> ErrorAxis | None:
     finite = np.concatenate([np.empty(0), *(part[np.isfinite(part)] for part in heights)])
     return ErrorAxis(0.0, 1.05 * float(finite.max(initial=0.0)) or 1.0, below=False) if finite.size else None
+
+
+def _label(axes: Axes, curves: Sequence[Curve]) -> None:
+    """Write the name of each curve to the right of its end, in its order, with a mark of its colour; none covers another."""
+    ends = [end_of(axes, curve.y) for curve in curves]
+    for curve, place in zip(curves, label_places(ends, _LABEL_GAP), strict=True):
+        axes.text(1.005, place, "■", color=curve.colour, fontsize=9.0, va="center", transform=axes.transAxes)
+        axes.text(1.027, place, printable(curve.name), color=_INK, fontsize=9.0, va="center", transform=axes.transAxes)
+
+
+def _embedded(svg: str) -> Markup:
+    """A drawing of matplotlib as a part of a page: in its inks and its font, and without names of its groups."""
+    size = re.search(r'viewBox="[^"]*"', svg)
+    assert size is not None  # noqa: S101 - matplotlib writes it
+    groups = svg[svg.index('<g id="figure_1">') : svg.rindex("</svg>")]
+    groups = re.sub(r'<g id="[\w.]+_\d+">', "<g>", groups).replace("xlink:href=", "href=")
+    groups = re.sub(r'(<text style="[^"]*)font-family: [^;"]*; ', r"\1", groups)
+    groups = re.sub(
+        r'(<text style=")font: ([\d.]+px)[^;"]*', r"\1font-size: \2", groups
+    )  # matplotlib 3.10 writes it so
+    for ink, of_page in _THEME.items():
+        groups = groups.replace(f": {ink}", f": {of_page}")
+    return Markup(f'<svg {size[0]} aria-hidden="true" focusable="false">\n{groups}</svg>')  # noqa: S704 - escaped by matplotlib
 
 
 def _thinned(curve: Curve) -> Curve:

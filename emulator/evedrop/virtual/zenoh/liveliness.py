@@ -130,7 +130,7 @@ class Liveliness:
             end.send(TransportFrame("declare_liveliness_subscriber", key, number=1))
 
     def take(self, end: End, frame: TransportFrame) -> None:
-        """Deal with what an end says of tokens, if access control lets it in."""
+        """Take a message about tokens from an end, if access control allows it."""
         watches = frame.kind == "declare_liveliness_subscriber"
         message, key = frame.kind if watches else "liveliness_token", frame.key
         if not self._session.access.allows(end.peer, "ingress", message, key):
