@@ -49,9 +49,12 @@ def mutated(mutant: Mutant, text: str) -> str:
 
 
 def copy_with(mutant: Mutant, folder: Path) -> None:
-    """Put a copy of the package with the mistake into a folder, which is then put on PYTHONPATH."""
+    """Put a copy of the package with the mistake into a folder, which is then put on PYTHONPATH.
+
+    What Python has compiled is copied too, except of the file with the mistake: to compile it all takes seconds.
+    """
     source = folder / "evedrop"
-    shutil.copytree(PACKAGE, source, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(PACKAGE, source, ignore=shutil.ignore_patterns(f"{Path(mutant.file).stem}.*.pyc"))
     path = source / mutant.file
     path.write_text(mutated(mutant, path.read_text(encoding="utf-8")), encoding="utf-8")
 

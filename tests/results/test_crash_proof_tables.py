@@ -396,6 +396,9 @@ def test_the_end_of_a_run_without_metrics_keeps_its_rows(tmp_path: Path) -> None
     why = "recorder was ended by signal 9 (the metrics are as of slot 0; the tables have more)"
     assert (results.summary["ended"], results.summary["slots"]) == (why, 10)
     assert results.slots.num_rows == 10 * len(scenario.receivers)
+    note_end(folder, scenario, "the recorder has failed")  # as the launcher says after the recorder has noted it
+    why = "the recorder has failed (the metrics are as of slot 0; the tables have more)"
+    assert (Results.read(folder).summary["ended"], Results.read(folder).summary["slots"]) == (why, 10)
 
 
 def test_the_end_of_a_killed_run_says_which_slot_its_metrics_are_of(tmp_path: Path) -> None:

@@ -110,7 +110,16 @@ def test_a_mistake_says_where_what_and_what_instead(case: str, golden: Golden) -
     golden("check", mistakes)
 
 
-@pytest.mark.parametrize("noise", [[[-1.0, 0.1]], [[1.0], [1.0]], [[-1.0, 0.0], [0.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]])
+@pytest.mark.parametrize(
+    "noise",
+    [
+        [[-1.0, 0.1]],
+        [[1.0], [1.0]],
+        [[1.0, 0.0], [0.0]],
+        [[-1.0, 0.0], [0.0, 1.0]],
+        [[1.0, 0.5], [0.0, 1.0]],
+    ],
+)
 def test_a_plants_noise_that_is_no_covariance_is_the_only_mistake(noise: list[list[float]]) -> None:
     """No filter is computed with it, so nothing is said of the filter's measurements."""
     (line,) = mistakes_of(checked, changed(MEASURED, plant__noise=noise), "file")

@@ -209,8 +209,10 @@ class Network(ABC):
         """Start a process; return once it has declared everything."""
 
     @abstractmethod
-    def until(self, condition: Callable[[], Any], awaited: str = "what the behaviour promises") -> Any:
-        """Wait for a condition; returns its value."""
+    def until(
+        self, condition: Callable[[], Any], awaited: str = "what the behaviour promises", limit: float = _LIMIT
+    ) -> Any:
+        """Wait for a condition, for so many seconds at most; returns its value."""
 
     @abstractmethod
     def thread(self, work: Callable[[], object]) -> Any:
@@ -239,6 +241,10 @@ class Network(ABC):
     @abstractmethod
     def flap(self, client: str) -> None:
         """Cut the connection of a client, which can be made again at once."""
+
+    @abstractmethod
+    def make_stale(self, client: str) -> None:
+        """Make it possible that a message to a client comes to the wrong subscriber."""
 
     @abstractmethod
     def silence(self, client: str) -> None:
@@ -292,9 +298,11 @@ class RealNetwork(Network):
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
 
-    def until(self, condition: Callable[[], Any], awaited: str = "what the behaviour promises") -> Any:
+    def until(
+        self, condition: Callable[[], Any], awaited: str = "what the behaviour promises", limit: float = _LIMIT
+    ) -> Any:
         """Wait for a condition; returns its value."""
-        return wait_until(condition, awaited, _LIMIT)
+        return wait_until(condition, awaited, limit)
 
     def thread(self, work: Callable[[], object]) -> threading.Thread:
         """Start a thread."""
@@ -327,6 +335,10 @@ class RealNetwork(Network):
     def flap(self, client: str) -> None:
         """Cut a client off for a moment."""
         self._cables[client].flap()
+
+    def make_stale(self, client: str) -> None:
+        """Zenoh keeps numbers of keys from before a connection was made again."""
+        self.flap(client)
 
     def silence(self, client: str) -> None:
         """Let nothing through."""
@@ -405,9 +417,11 @@ class SimulatedNetwork(Network):
             raise result[0]
         return result[0]
 
-    def until(self, condition: Callable[[], Any], awaited: str = "what the behaviour promises") -> Any:
+    def until(
+        self, condition: Callable[[], Any], awaited: str = "what the behaviour promises", limit: float = _LIMIT
+    ) -> Any:
         """Wait for a condition; returns its value."""
-        deadline = self._scheduler.now + _LIMIT
+        deadline = self._scheduler.now + limit
         while not (result := condition()):
             assert self._scheduler.now < deadline, f"no {awaited}"
             self._scheduler.sleep(_POLL_SECONDS)
@@ -442,6 +456,10 @@ class SimulatedNetwork(Network):
     def flap(self, client: str) -> None:
         """Cut a client off for a moment."""
         self.zenoh.cut(client, 0.0)
+
+    def make_stale(self, client: str) -> None:
+        """What flapping does now and then is done by itself here."""
+        self.zenoh.confuse(client)
 
     def silence(self, client: str) -> None:
         """Let nothing through."""

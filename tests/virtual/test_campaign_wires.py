@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
@@ -10,13 +11,17 @@ from typing import Any
 import pytest
 
 from evedrop.errors import UsageError
+from evedrop.scenario.words import toml_text
 from evedrop.virtual.cases import case_of
 from evedrop.virtual.faults import CutConnection, CutPower, FillDisk, KillProcess, StopProcess
+from evedrop.wire.file import wire_of
 from evedrop.wire.publications import _Way
 from evedrop.wire.running_link import RunningLink
 from evedrop.wire.tallies import LinkTally
 from tests.virtual import simulated
-from tests.virtual.wire_cases import BASE, DISK, EVERY, WIRE, SimulatedWireCase
+from tests.virtual.wire_cases import EVERY, WIRE, SimulatedWireCase
+from tests.virtual.wire_draws import BASE, MISTAKES, TEXTS, file_of
+from tests.virtual.wire_judge import DISK
 
 PLAIN = SimulatedWireCase(1, (), starts=2, seconds=10.0)
 NUMBERED, TALLIED, MESSAGE = RunningLink._counted, LinkTally.add, _Way.message
@@ -59,6 +64,31 @@ def test_a_fault_at_any_moment_breaks_no_promise(fault: Any) -> None:
     """Also while the wire starts, and while it ends."""
     for after in (30, 300, 850):
         assert replace(PLAIN, faults=(replace(fault, after=after),)).play().misses == (), after
+
+
+@pytest.mark.parametrize("mistake", [*MISTAKES, *TEXTS])
+def test_every_mistake_of_a_file_is_named(mistake: str) -> None:
+    """With the status of a wrong use, and nothing is left; without the mistake, the file is a wire."""
+    tables = file_of(random.Random(1), 1.0)  # noqa: S311 - to be repeated
+    case = SimulatedWireCase(1, (), file=toml_text(tables), programs=(), mistake=mistake)
+    assert simulated.read_case(case.to_text()) == case
+    assert case.play().misses == ()
+    assert wire_of(tables).links
+
+
+def test_a_mistake_that_is_not_named_is_seen() -> None:
+    """What an error must name is really looked for."""
+    case = SimulatedWireCase(1, (), seconds=1.0, mistake="a negative seed")
+    assert case.play().misses == ()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(MISTAKES, "a negative seed", lambda _: "link.7.keys")
+        assert any("status 0 for a file with a mistake" in miss for miss in case.play().misses)
+
+
+def test_a_link_is_fitted_whose_messages_were_heard_at_once() -> None:
+    """A wire that was suspended for most of its time: there is no time between its messages, and so no rate."""
+    case = replace(PLAIN, faults=(StopProcess(WIRE, 30, 15.0),))
+    assert case.play().misses == ()
 
 
 def swallowing() -> Callable[..., Any]:

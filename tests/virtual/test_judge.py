@@ -11,8 +11,9 @@ from evedrop.scenario.progress_events import RunProgress
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import Disturbance
-from evedrop.virtual.faults import InterruptProcess, KillProcess, StopProcess
+from evedrop.virtual.faults import ConfuseKeys, InterruptProcess, KillProcess, StopProcess
 from evedrop.virtual.judge import misses
+from evedrop.virtual.notes import PutMessage
 from evedrop.virtual.reference import RunReference
 from evedrop.virtual.run import SimulatedRun
 
@@ -32,12 +33,12 @@ KILLED = KillProcess("legitimate", 50)
 TOLD = InterruptProcess("launcher", 60)
 
 
-def judged(folder: Path, struck: Mapping[Disturbance, float], **run: object) -> list[str]:
-    """What the judge says of a run that has no results."""
-    (folder / "temporary").mkdir()
+def judged(folder: Path, struck: Mapping[Disturbance, float], ahead: int = 8, **run: object) -> list[str]:
+    """What the judge says of a run that has no results; ahead: how far the sensor may be ahead."""
+    (folder / "temporary").mkdir(parents=True)
     faults = tuple(struck)
     ended = SimulatedRun(folder / "results", **run)  # type: ignore[arg-type]
-    return misses(SimulatedCase(1, SCENARIO, faults), ended, struck, REFERENCE, folder / "temporary")
+    return misses(SimulatedCase(1, SCENARIO, faults, ahead), ended, struck, REFERENCE, {"": folder / "temporary"})
 
 
 @pytest.mark.parametrize(("seconds", "late"), [(56.0, False), (58.0, True)])
@@ -61,3 +62,30 @@ def test_a_launcher_that_goes_on_after_a_signal_is_a_miss(moment: float, ignored
     found = judged(tmp_path, {TOLD: 0.5}, status=0, told=told)
     assert "there are no results" in found
     assert any("went on to its end" in miss for miss in found) == ignored
+
+
+@pytest.mark.parametrize(("sent", "wrong"), [("2-7", False), ("2-8", True)])
+def test_a_sensor_that_leaves_its_window_is_a_miss(sent: str, wrong: bool, tmp_path: Path) -> None:
+    """All processes have done slots 0 to 3, and the window has four slots."""
+    done = [PutMessage(0.1, f"progress/{name}", "4") for name in ("legitimate", "recorder")]
+    found = judged(tmp_path, {KILLED: 0.5}, 4, status=3, put=[*done, PutMessage(0.2, "uplink", sent)])
+    assert ("slot 8 is sent while slot 4 is not done, in a window of 4" in found) == wrong
+
+
+def test_a_command_that_is_sent_again_in_a_quiet_run_is_a_miss(tmp_path: Path) -> None:
+    """Nothing was lost that could be sent again."""
+    twice = [PutMessage(0.1, "control/sensor", "start")] * 2
+    assert "'start' is sent to sensor, 2 times, although nothing happens to the run" in judged(tmp_path, {}, put=twice)
+    assert not any("is sent" in miss for miss in judged(tmp_path / "again", {KILLED: 0.5}, put=twice))
+
+
+@pytest.mark.parametrize(("target", "most"), [("recorder", 21.0), ("everybody", 36.0)])
+def test_a_fault_that_everybody_has_may_cost_two(target: str, most: float, tmp_path: Path) -> None:
+    """A second of slots, five of any run, and fifteen for each."""
+    found = judged(tmp_path, {ConfuseKeys(target, 60): 0.5}, seconds=most + 0.1)
+    assert f"the run took {most + 0.1:.1f} s, and not {most:.1f} s at most" in found
+
+
+def test_a_quiet_run_ends_soon(tmp_path: Path) -> None:
+    """A second and a half after its slots."""
+    assert "the run took 2.6 s, and not 2.5 s at most" in judged(tmp_path, {}, seconds=2.6)

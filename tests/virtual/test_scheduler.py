@@ -8,6 +8,7 @@ from queue import Empty
 
 import pytest
 
+from evedrop.virtual.pipes import Pipe
 from evedrop.virtual.scheduler import (
     Stuck,
     VirtualCondition,
@@ -287,3 +288,99 @@ def test_something_happens_after_so_many_events() -> None:
 
     finish(scheduler, started(scheduler, "process", work))
     assert at == [5]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_an_error_is_raised_in_a_thread_that_waits(seed: int) -> None:
+    """At once, and only once: what it waited for then reaches others."""
+    scheduler = VirtualScheduler(seed)
+    queue, caught = VirtualQueue(scheduler), list[float]()
+
+    def waits() -> None:
+        try:
+            queue.get()
+        except KeyboardInterrupt:
+            caught.append(scheduler.now)
+        scheduler.sleep(1.0)
+        caught.append(scheduler.now)
+
+    task = started(scheduler, "program", waits)
+    scheduler.at(5.0, lambda: scheduler.raise_in(task.threads[0], KeyboardInterrupt()))
+    scheduler.at(5.5, lambda: queue.put("late"))
+    finish(scheduler, task)
+    assert caught == [5.0, 6.0]
+    assert queue.get_nowait() == "late"
+
+
+def test_an_error_that_comes_between_waits_is_raised_at_the_next() -> None:
+    """As a signal is that comes while a program calculates."""
+    scheduler = VirtualScheduler(1)
+    caught: list[str] = []
+
+    def calculates() -> None:
+        scheduler.raise_in(task.threads[0], KeyboardInterrupt())
+        caught.append("goes on")
+        try:
+            scheduler.sleep(1.0)
+        except KeyboardInterrupt:
+            caught.append("raised")
+
+    task = started(scheduler, "program", calculates)
+    finish(scheduler, task)
+    assert caught == ["goes on", "raised"]
+
+
+def test_a_process_that_hangs_has_other_threads() -> None:
+    """Only its first one does not go on, until it hangs no more."""
+    scheduler = VirtualScheduler(1)
+    done: dict[str, float] = {}
+
+    def first() -> None:
+        scheduler.sleep(1.0)
+        done["first"] = scheduler.now
+
+    def second() -> None:
+        scheduler.sleep(1.0)
+        done["second"] = scheduler.now
+
+    task = started(scheduler, "program", first, second)
+    scheduler.hang(task.threads[0], 5.0)
+    finish(scheduler, task)
+    assert done == {"first": 6.0, "second": 1.0}  # it hung before it began to sleep
+
+
+def test_the_end_of_a_pipe_comes_when_all_who_write_have_closed_it() -> None:
+    """A process that inherits it keeps it open."""
+    scheduler = VirtualScheduler(1)
+    pipe = Pipe(scheduler)
+    end = pipe.end()
+    inherited = end.again()
+    read: list[bytes] = []
+
+    def reads() -> None:
+        while data := pipe.read(10):
+            read.append(data)
+
+    def writes() -> None:
+        with end:
+            end.write(b"a")
+        end.close()
+        scheduler.sleep(1.0)
+        inherited.write(b"b")
+        inherited.close()
+
+    finish(scheduler, started(scheduler, "programs", reads, writes))
+    assert b"".join(read) == b"ab"
+
+
+def test_a_full_pipe_is_waited_for_as_long_as_its_writer_says() -> None:
+    """And says how much it took."""
+    scheduler = VirtualScheduler(1)
+    taken: list[int] = []
+
+    def writes() -> None:
+        taken.append(Pipe(scheduler).write(bytes(100_000), 3.0))
+
+    finish(scheduler, started(scheduler, "program", writes))
+    assert taken == [1 << 16]
+    assert scheduler.now == 3.0

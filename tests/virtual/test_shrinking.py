@@ -21,7 +21,7 @@ MISS = "trials lacks 3 of 9 rows"
 
 def where(condition: Callable[[SimulatedCase], bool]) -> SimulatedCase:
     """The case of the first seed for which this holds."""
-    return next(case for case in map(case_of, range(1, 500)) if condition(case))
+    return next(case for case in map(case_of, range(1, 5000)) if condition(case))
 
 
 LARGE = replace(
@@ -196,6 +196,7 @@ def test_a_recorder_that_forgets_rows_is_shown_by_a_run_without_anything(monkeyp
     assert misses_of(shrunk.case) == ()
 
 
+@pytest.mark.long
 def test_a_recorder_that_never_asks_again_is_shown_by_one_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     """A process is cut off before it has reported."""
     case = where(

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -1501,6 +1502,21 @@ def test_a_question_can_be_answered_with_an_error(net: Network) -> None:
 
 
 @behaviour
+def test_a_question_can_be_answered_with_a_deletion(net: Network) -> None:
+    """It has a key, and what comes with it, but no payload."""
+    asker, server = pair(net)
+
+    def delete(query: Any) -> None:
+        query.reply_del("a/b", attachment=b"why")
+        query.drop()
+
+    net.kept.append(server.declare_queryable("a/b", delete))
+    [reply] = net.until(lambda: [*asker.get("a/b", timeout=60.0)])
+    assert (reply.ok.kind, str(reply.ok.key_expr)) == (zenoh.SampleKind.DELETE, "a/b")
+    assert (reply.ok.payload.to_bytes(), reply.ok.attachment.to_bytes()) == (b"", b"why")
+
+
+@behaviour
 def test_a_session_answers_its_own_questions(net: Network) -> None:
     """Once, though its router asks it as well."""
     net.router()
@@ -1868,3 +1884,58 @@ def test_a_router_waits_for_the_one_that_it_links_with(net: Network) -> None:
     assert not connected(relay)
     net.router()
     net.until(lambda: connected(relay))
+
+
+@pytest.mark.long
+@behaviour
+def test_a_connection_that_flaps_brings_messages_to_the_wrong_subscriber(net: Network) -> None:
+    """One in many thousand, which says that it is of that subscriber's key (1.9.0 to 1.10.2): only its payload can tell.
+
+    Where this fails, a message that names another key need not be looked for any more.
+    """
+    router = net.router()
+    wrong: list[tuple[str, str]] = []
+    over = net.event()
+
+    def subscribe(client: Any, key: str) -> None:
+        def take(sample: Any) -> None:
+            named = sample.payload.to_bytes().decode()
+            if named != key:
+                wrong.append((named, str(sample.key_expr)))
+
+        net.kept.append(client.declare_subscriber(key, take))
+
+    def put(publishers: Mapping[str, Any]) -> None:
+        while not over.is_set():
+            for key, declared in publishers.items():
+                declared.put(key.encode())
+            net.pause(1e-3)
+
+    def declared(session: Any, *keys: str) -> dict[str, Any]:
+        return {key: session.declare_publisher(key, congestion_control=BLOCK) for key in keys}
+
+    names, sent = [f"client{i}" for i in range(5)], dict[str, Any]()
+    threads = []
+    for name in names:
+        client = net.client(name, cable=True, retry=True)
+        for kind in ("control", "downlink"):
+            subscribe(client, f"{kind}/{name}")
+            net.kept.append(router.declare_subscriber(f"{kind} back/{name}", lambda _: None))
+        sent |= declared(router, f"control/{name}", f"downlink/{name}")
+        threads.append(net.thread(partial(put, declared(client, f"control back/{name}", f"downlink back/{name}"))))
+    threads.append(net.thread(partial(put, sent)))
+
+    def happened() -> bool:
+        for _ in range(12):
+            for name in names:
+                net.make_stale(name)
+            net.pause(0.02)
+        net.pause(0.2)
+        return len(wrong) > 0
+
+    net.until(happened, "message at the wrong subscriber", 600.0)
+    over.set()
+    for thread in threads:
+        thread.join()
+    for named, shown in wrong:
+        assert {named.partition("/")[0], shown.partition("/")[0]} == {"control", "downlink"}

@@ -21,7 +21,7 @@ from evedrop.virtual.world import EPOCH
 from evedrop.wire.journal import journal_tables
 from evedrop.wire.plan import Side, WireEvent, WirePlan
 from evedrop.wire.run import run_wire
-from tests.virtual.wire_cases import connected
+from tests.virtual.wire_programs import connected
 from tests.wire.wire_at_work import LOSSY, PERFECT, link, plan_of
 
 HOUR = 3600.0

@@ -6,6 +6,7 @@ Source: docs/results.md, while a run goes on.
 from __future__ import annotations
 
 import contextlib
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,7 +32,7 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
     """
     left_behind = is_unfinished(folder)
     rows = last_round(folder)
-    how = noted(how, age_of_metrics(folder))
+    how = noted(how, age_of_metrics(folder) or _age_told(folder))
     try:
         summary = replace(Results.read(folder).typed_summary, ended=how)
     except UsageError:  # there are no metrics
@@ -51,6 +52,14 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
             finish(folder)
     write_summary(folder, summary)
     return summary
+
+
+def _age_told(folder: Path) -> str:
+    """What a summary that is written already says of the age of its metrics: its recorder has noted the end before."""
+    with contextlib.suppress(UsageError):
+        told = re.search(r" \(the metrics are as of [^()]*\)", Results.read(folder).typed_summary.ended)
+        return "" if told is None else told[0]
+    return ""
 
 
 def noted(how: str, note: str) -> str:

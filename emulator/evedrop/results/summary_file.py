@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from evedrop.results.crash_proof_tables import forget
@@ -26,7 +27,7 @@ def write_summary(folder: Path, summary: Summary) -> None:
 
 def summary_text(summary: Summary) -> str:
     """The text of a summary's file."""
-    return json.dumps(plain(summary.as_dict()), indent=1, ensure_ascii=False) + "\n"
+    return msgspec.json.format(json.dumps(plain(summary.as_dict()), ensure_ascii=False), indent=1) + "\n"
 
 
 def plain(value: Any) -> Any:

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from contextlib import suppress
 from io import BufferedWriter, FileIO, TextIOWrapper
 from pathlib import Path
-from typing import Any, final
+from typing import IO, Any, final
 
 _FILE_MODE = 0o600
 _POPULATE = getattr(mmap, "MAP_POPULATE", 0)
@@ -48,6 +48,10 @@ class Disk(ABC):
     @abstractmethod
     def let_go(self, descriptor: int) -> None:
         """Close a folder."""
+
+    @abstractmethod
+    def again(self, file: IO[bytes]) -> IO[bytes]:
+        """The same open file, without a buffer, to be closed on its own."""
 
     @abstractmethod
     def sync(self, path: Path) -> None:
@@ -108,6 +112,10 @@ class RealDisk(Disk):
     def let_go(self, descriptor: int) -> None:
         """Close a folder."""
         os.close(descriptor)
+
+    def again(self, file: IO[bytes]) -> IO[bytes]:
+        """The same open file."""
+        return os.fdopen(os.dup(file.fileno()), "ab", buffering=0)
 
     def sync(self, path: Path) -> None:
         """Wait for the disk."""

@@ -27,6 +27,7 @@ from evedrop.system.signals import (
     SHOW_STACKS,
     heeded,
     leave_on_signals,
+    raise_on_signals,
     stop_on_signals,
     stop_or_leave_on_signals,
     told_when_suspended,
@@ -65,6 +66,10 @@ class ThisProcess(ABC):
     @abstractmethod
     def stop_or_leave_on_signals(self, leave: Callable[[], object]) -> AbstractContextManager[ThreadEvent]:
         """An event that the first of these signals sets while the block runs; a second one calls `leave`, which exits."""
+
+    @abstractmethod
+    def raise_on_signals(self) -> AbstractContextManager[None]:
+        """Let the first of these signals raise KeyboardInterrupt on the thread of the block, while it runs."""
 
     @abstractmethod
     def on_thread_failure(self, handle: Callable[[BaseException], object]) -> None:
@@ -156,6 +161,10 @@ class RealProcess(ThisProcess):
     def stop_or_leave_on_signals(self, leave: Callable[[], object]) -> AbstractContextManager[ThreadEvent]:
         """An event that the first signal sets; has no effect outside the main thread."""
         return stop_or_leave_on_signals(leave)
+
+    def raise_on_signals(self) -> AbstractContextManager[None]:
+        """Let the first of these signals raise KeyboardInterrupt; has no effect outside the main thread."""
+        return raise_on_signals()
 
     def on_thread_failure(self, handle: Callable[[BaseException], object]) -> None:
         """Call this when an error ends a thread."""

@@ -8,8 +8,10 @@ So `threading`, `queue`, `time`, `signal` and the ends of processes are used her
 
 from __future__ import annotations
 
+import os
 import secrets
 import socket
+import tempfile
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -17,7 +19,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, TypeVar, final
+from typing import IO, Any, TypeVar, final
 
 from evedrop.system.disk import REAL_DISK, Disk
 from evedrop.system.this_process import REAL_PROCESS, ThisProcess
@@ -78,6 +80,14 @@ class World(ABC):
     @abstractmethod
     def expect_free(self, host: str, port: int) -> None:
         """Raise OSError unless this machine can listen at this port."""
+
+    @abstractmethod
+    def pipe(self) -> tuple[IO[bytes], IO[bytes]]:
+        """The two ends of a pipe, which other processes can inherit: to read from, and to write to. Raises OSError."""
+
+    @abstractmethod
+    def temporary_folder(self) -> Path:
+        """Where temporary files are made. Raises OSError if there is no such folder."""
 
     @abstractmethod
     def is_suspended(self, pid: int) -> bool:
@@ -158,6 +168,15 @@ class RealWorld(World):
         with socket.socket(family, kind, protocol) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
+
+    def pipe(self) -> tuple[IO[bytes], IO[bytes]]:
+        """A pipe of the system."""
+        read, write = os.pipe()
+        return os.fdopen(read, "rb", buffering=0), os.fdopen(write, "wb")
+
+    def temporary_folder(self) -> Path:
+        """That of the environment."""
+        return Path(tempfile.gettempdir())
 
     def is_suspended(self, pid: int) -> bool:
         """Whether it is suspended, by Linux."""

@@ -18,8 +18,9 @@ from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual import notes
 from evedrop.virtual.cases import SEEDS_OF_A_SCENARIO, SimulatedCase, case_of, scenario_of
-from evedrop.virtual.disturbance import Disturbance
+from evedrop.virtual.disturbance import Disturbance, processes_of
 from evedrop.virtual.judge import misses
+from evedrop.virtual.moments import EVENTS, is_counted
 from evedrop.virtual.processes import Program
 from evedrop.virtual.reference import RunReference, in_memory
 from evedrop.virtual.run import SimulatedRun, SimulatedWorld, run_in
@@ -63,12 +64,18 @@ def play_case(
         temporary = world.disk.root / "temporary"
         temporary.mkdir(0o700)
         for fault in case.faults:
-            world.scheduler.after(fault.after, partial(_strike, fault, world, struck))
+            _plan(fault, case.scenario, world, struck)
+        hosts_file = None
+        if case.hosts is not None:
+            world.add_hosts(machine, case.hosts.oddities)
+            hosts_file = folder / "hosts.toml"
+            hosts_file.write_text(case.hosts.text(case.scenario))
         with _temporary(temporary):
-            run = run_in(world, case.scenario, case.ahead)
+            run = run_in(world, case.scenario, case.ahead, hosts_file)
+        temporaries = {"": temporary, **{host.name: host.temporary for host in world.hosts or ()}}
         if any(fault.amends for fault in struck):
             reference = _amended(reference, case.scenario, run.folder, folder / "amended")
-        return PlayedCase(case, run, struck, tuple(misses(case, run, struck, reference, temporary)))
+        return PlayedCase(case, run, struck, tuple(misses(case, run, struck, reference, temporaries)))
 
 
 @lru_cache(maxsize=1)
@@ -86,6 +93,16 @@ def _amended(reference: RunReference, scenario: Scenario, results: Path, folder:
             first = min(act.at for event in added for act in event.acts())
             return in_memory(amended, folder).after(first, reference)
     return reference
+
+
+def _plan(fault: Disturbance, scenario: Scenario, world: SimulatedWorld, struck: dict[Disturbance, float]) -> None:
+    """Let a fault strike at its moment."""
+    act = partial(_strike, fault, world, struck)
+    if fault.moment == EVENTS:
+        world.scheduler.after(fault.after, act)
+    else:
+        counts = partial(is_counted, fault.moment, fault.target, fault.target in processes_of(scenario))
+        world.scheduler.after_some(fault.after, counts, act)
 
 
 def _strike(fault: Disturbance, world: SimulatedWorld, struck: dict[Disturbance, float]) -> None:

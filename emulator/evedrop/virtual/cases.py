@@ -22,17 +22,21 @@ from evedrop.scenario.loading import Scenario
 from evedrop.virtual import own_classes
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import KINDS, faults_of
+from evedrop.virtual.drawn_hosts import DrawnHosts, drawn_hosts, kind_with
+from evedrop.virtual.rare_faults import RARE_KINDS, rare_faults
 
-SEEDS_OF_A_SCENARIO = 3
+SEEDS_OF_A_SCENARIO = 6
 """How many seeds after each other play the same scenario: the same trials in memory are computed once for all of them."""
-_MOST_SLOTS, _MOST_TRIALS = 80, 4
+_MOST_SLOTS, _MOST_TRIALS = 40, 4
 _AHEAD = (2, 3, 5, 8, 16, 40, MOST_SLOTS_AHEAD)
+_LIMITED = 0.6
+"""The fraction of the runs with enough slots in which the sensor has to wait for the others."""
 _COSTLY: Mapping[str, Mapping[str, Any]] = {"learning-em": {"keeps": 4}, "learning-particle": {"particles": 4}}
 """Strategies that take longer than all other processes of a run together → how they take less."""
 _MOST_BLOCKS = 40
 """How often the sensor may have to wait, where it need not be ahead of others by little."""
 _PACES = (0.001, 0.01, 0.1, 0.3)
-"""Seconds of a slot: a run of half a minute is written to the disk while it goes on."""
+"""Seconds of a slot: a run of half a minute is written to the disk while it goes on, and outlasts the longest outage."""
 _OWN = 0.03
 """The fraction of classes that are not built in."""
 _UNSTABLE, _STABLE = 1.02, 0.9
@@ -51,6 +55,8 @@ class SimulatedCase:
     faults: tuple[Disturbance, ...]
     ahead: int = MOST_SLOTS_AHEAD
     """How many slots the sensor may be ahead: the flow control of a run of a hundred thousand slots fits into a few."""
+    hosts: DrawnHosts | None = None
+    """The other hosts, if there are any."""
 
     def __str__(self) -> str:
         scenario = self.scenario
@@ -58,14 +64,15 @@ class SimulatedCase:
         faults = "; ".join(map(str, self.faults)) or "no fault"
         return (
             f"{scenario.encoding.spec['scheme']} against {eves}, {scenario.slots} slots of {scenario.trials}, "
-            f"{self.ahead} ahead: {faults}"
+            f"{self.ahead} ahead{'' if self.hosts is None else f', {self.hosts}'}: {faults}"
         )
 
     def to_text(self) -> str:
         """The case in one line, from which `case_from` makes it again."""
         faults = [[fault.kind, *astuple(fault)] for fault in self.faults]
         tables = self.scenario.as_tables()
-        return json.dumps({"seed": self.seed, "ahead": self.ahead, "faults": faults, "scenario": tables})
+        hosts = {} if self.hosts is None else {"hosts": self.hosts.as_lists()}
+        return json.dumps({"seed": self.seed, "ahead": self.ahead, "faults": faults, **hosts, "scenario": tables})
 
 
 def case_from(text: str) -> SimulatedCase:
@@ -74,9 +81,12 @@ def case_from(text: str) -> SimulatedCase:
         described = json.loads(text)
         if isinstance(described, int):
             return case_of(described)
-        faults = tuple(KINDS[kind](*rest) for kind, *rest in described["faults"])
+        faults = tuple(
+            (kind_with(kind, rest[0]) or {**KINDS, **RARE_KINDS}[kind])(*rest) for kind, *rest in described["faults"]
+        )
         scenario, ahead = Scenario(described["scenario"]), described.get("ahead", MOST_SLOTS_AHEAD)
-        return SimulatedCase(described["seed"], scenario, faults, ahead)
+        hosts = DrawnHosts.of_lists(described["hosts"]) if "hosts" in described else None
+        return SimulatedCase(described["seed"], scenario, faults, ahead, hosts)
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(f"not a case ({type(error).__name__}: {error}); expected a seed or a shrunk case") from error
 
@@ -85,8 +95,11 @@ def case_of(seed: int) -> SimulatedCase:
     """The case of a seed, and of nothing else."""
     scenario = scenario_of(seed // SEEDS_OF_A_SCENARIO)
     source = random.Random(f"case {seed}")  # noqa: S311 - to be repeated, not to be secret
-    ahead = source.choice(_AHEAD)
-    return SimulatedCase(seed, scenario, faults_of(source, scenario, ahead), ahead)
+    few = [ahead for ahead in _AHEAD if 2 * ahead <= scenario.slots]
+    ahead = source.choice(few if few and source.random() < _LIMITED else _AHEAD)
+    hosts, of_hosts = drawn_hosts(seed, scenario)
+    faults = (*faults_of(source, scenario, ahead), *of_hosts, *rare_faults(seed, scenario, ahead))
+    return SimulatedCase(seed, scenario, faults, ahead, hosts)
 
 
 @lru_cache(maxsize=1)
@@ -125,7 +138,7 @@ class CaseDraw:
         trials = some.randint(1, _MOST_TRIALS)
         tables: dict[str, Any] = {
             "title": "Drawn",
-            "slots": round(_MOST_SLOTS ** some.random()),
+            "slots": round(_MOST_SLOTS ** some.random() ** 0.7),
             "seed": some.getrandbits(32),
             "trials": trials,
             "record_trials": some.randint(1, trials),
@@ -133,13 +146,13 @@ class CaseDraw:
             "pace": some.choice(_PACES) if chance(0.3) else 0.0,
             "process": self._process(),
             "encoding": self._encoding(),
-            "legitimate": {"link": self._link(), **({"window": some.randint(1, 4)} if chance(0.3) else {})},
+            "legitimate": self._receiver(),
             "eavesdroppers": {f"eve{i}": self._eavesdropper() for i in range(some.randint(0, 3))},
         }
         if SCHEMES[tables["encoding"]["scheme"]].needs_acknowledgements:
             tables["acknowledgements"] = {"link": {"quality": self._quality()}}
-            if chance(0.3) and tables["eavesdroppers"]:
-                tables["acknowledgements"] |= {"attack": "critical", "jammer": "eve0"}
+            if chance(0.6) and tables["eavesdroppers"]:
+                tables["acknowledgements"] |= {"attack": some.choice(["critical", "hijack"]), "jammer": "eve0"}
         if chance(0.2):
             tables |= _LOOP
             loop = {"period": some.randint(1, 4), "acts_on": some.choice(["truth", "estimate"])}
@@ -149,7 +162,7 @@ class CaseDraw:
             tables["network"] = {"routers": 2}
         if chance(0.15) and trials > 1 and "network" not in tables:
             tables["shards"] = 2
-        if chance(0.3):
+        if chance(0.5):
             tables["event"] = [self._event(tables) for _ in range(some.randint(1, 3))]
         return tables
 
@@ -172,10 +185,13 @@ class CaseDraw:
             name = self.random.choice([cheap for cheap in names if cheap not in _COSTLY])
         if self._chance(_OWN / 3.0):  # it is asked in a process of its own, which takes a second
             name = own_classes.STRATEGY
-        table = {"strategy": name, "link": self._link(), **STRATEGIES[name].parameters, **_COSTLY.get(name, {})}
-        if self._chance(0.2):
-            table["window"] = self.random.randint(1, 4)
-        return table
+        return {"strategy": name, **self._receiver(), **STRATEGIES[name].parameters, **_COSTLY.get(name, {})}
+
+    def _receiver(self) -> dict[str, Any]:
+        """The link of a receiver, and for how long a late packet is of use to it."""
+        link = self._link()
+        waits = self._chance(0.7 if "delay" in link else 0.1)
+        return {"link": link, **({"window": self.random.randint(1, 4)} if waits else {})}
 
     def _link(self) -> dict[str, Any]:
         link: dict[str, Any] = {}
@@ -198,7 +214,7 @@ class CaseDraw:
         receiver = some.choice(["legitimate", *tables["eavesdroppers"]])
         first = some.randrange(slots)
         span = {"from": first, "to": some.randint(first + 1, slots)}
-        kind = some.choice(["set", "kill", "pause", "cut"])
+        kind = some.choice(["set", "kill", "kill", "pause", "pause", "cut"])
         if kind == "set":
             return {"at": first, "link": receiver, "set": {"quality": self._quality()}}
         return {**span, kind: receiver, **({"state": some.choice(["prior", "last"])} if kind == "kill" else {})}

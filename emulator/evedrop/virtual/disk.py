@@ -21,7 +21,7 @@ from enum import Enum
 from functools import partial
 from io import FileIO
 from pathlib import Path
-from typing import Any, final
+from typing import IO, Any, final
 
 from evedrop.system.disk import Disk, RealDisk, private_opener
 from evedrop.virtual import notes
@@ -79,8 +79,10 @@ class _Change:
 class VirtualDisk(Disk):
     """A disk for the programs of a simulated world. What others than they do to its files is on the disk at once."""
 
-    def __init__(self, scheduler: VirtualScheduler, root: Path, faults: DiskFaults = lambda _: None) -> None:
-        """root: an empty folder of this user, below which the programs write; faults: what goes wrong."""
+    def __init__(
+        self, scheduler: VirtualScheduler, root: Path, faults: DiskFaults = lambda _: None, host: str = ""
+    ) -> None:
+        """root: an empty folder of this user, below which the programs write; faults: what goes wrong; host: whose disk it is."""
         self.root = root / "disk"
         """The folder below which the programs write."""
         self.faults = faults
@@ -89,7 +91,7 @@ class VirtualDisk(Disk):
         self.room: int | None = None
         """How many bytes there is room for; None: for any number."""
         self._refuses_once = False
-        self._scheduler = scheduler
+        self._scheduler, self._host = scheduler, host
         self._kept = root / "removed"
         self._real = RealDisk()
         self._folders: dict[int, Callable[[], object]] = {}
@@ -106,12 +108,12 @@ class VirtualDisk(Disk):
         self.room, self._refuses_once = None, False
 
     def power_cut(self) -> None:
-        """Kill all processes, and leave what the disk has by chance. Never returns if a program calls it."""
+        """Kill all processes of its host, and leave what the disk has by chance. Never returns if a program calls it."""
         scheduler = self._scheduler
         scheduler.note("power cut")
         mine = None if scheduler.current is None else scheduler.current.task
         for task in scheduler.tasks:
-            if task is not mine:
+            if task is not mine and task.host == self._host:
                 scheduler.end(task, _KILLED)
         self._lose()
         if mine is not None:
@@ -267,6 +269,14 @@ class VirtualDisk(Disk):
         if task is not None:
             task.held.remove(self._folders.pop(descriptor))
         os.close(descriptor)
+
+    def again(self, file: IO[bytes]) -> IO[bytes]:
+        """The same open file, which the end of the process closes."""
+        again = self._real.again(file)
+        task = self.caller()
+        if task is not None:
+            task.held.append(again.close)
+        return again
 
     def sync(self, path: Path) -> None:
         """Have the whole file on the disk, and all names."""

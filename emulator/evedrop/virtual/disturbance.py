@@ -10,9 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from evedrop.errors import RunError
+from evedrop.errors import RunError, UsageError
 from evedrop.names import CONTROLLER, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.scenario.tables import Scenario
+from evedrop.virtual.host_parts import host_of
+from evedrop.virtual.moments import EVENTS
 from evedrop.virtual.processes import FORK_SERVERS
 
 if TYPE_CHECKING:
@@ -33,15 +35,18 @@ class Disturbance(ABC):
     target: str
     """The process that it hits."""
     after: int
-    """The number of events in the world after which it strikes."""
+    """The number of events in the world, or of those that `moment` names, after which it strikes."""
     seconds: float | None = None
     """How long it lasts; None for good, or where it does not last."""
+    moment: str = EVENTS
+    """What `after` counts, such as "barriers"."""
 
     kind: ClassVar[str]
     share: ClassVar[float]
     """How often it is drawn, in comparison with others: a process can be hit at any message, and a disk at few moments."""
     lasts: ClassVar[bool] = False
     """Whether it has a duration."""
+    most_seconds: ClassVar[float] = 10.0
     for_good: ClassVar[bool] = True
     """Whether it may last for good, if it lasts."""
     lacking: ClassVar[bool] = False
@@ -82,6 +87,8 @@ class Disturbance(ABC):
         """What a failure that it causes may name: who is cut off cannot tell who is at fault."""
         if self.target in FORK_SERVERS:
             return ("fork server",)
+        if host := host_of(self.target):
+            return (f"host {host}",)
         return (self.target, *(ROUTERS if self.target in (RECORDER, EVERYBODY, *ROUTERS) else ()))
 
     @property
@@ -92,7 +99,7 @@ class Disturbance(ABC):
     @property
     def statuses(self) -> frozenset[int]:
         """The exit statuses with which a run may end because of it."""
-        return frozenset({RunError.exit_status})
+        return frozenset({RunError.exit_status, *([UsageError.exit_status] if host_of(self.target) else [])})
 
     @property
     def awaited_seconds(self) -> float:
@@ -101,7 +108,7 @@ class Disturbance(ABC):
 
     def __str__(self) -> str:
         lasting = "" if not self.lasts else " for good" if self.seconds is None else f" for {self.seconds:.2f} s"
-        return f"{self.kind} {self.target}{lasting} after {self.after} events"
+        return f"{self.kind} {self.target}{lasting} after {self.after} {self.moment}"
 
 
 def processes_of(scenario: Scenario) -> tuple[str, ...]:

@@ -6,16 +6,28 @@ Source: docs/maintainers/simulated-world.md.
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from math import log10
 
+from evedrop.live.launch.briefs import flow_of
 from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual import faults, lacks, outsiders
-from evedrop.virtual.disturbance import Disturbance, processes_of
+from evedrop.virtual.disturbance import ROUTERS, Disturbance, processes_of
+from evedrop.virtual.moments import BARRIERS, COMMANDS, EVENTS, LOSSES
 
 _MOST_FAULTS = 3
 _LATE = 0.5
 """The fraction of faults that strike at any moment of a run; the others strike rather at its beginning."""
+_LOSING = 0.5
+"""The fraction of faults that are short, and lose messages while the sensor sends its own."""
+_LOSSES = (faults.CutConnection, faults.CutConnection, faults.FlapConnection, faults.ConfuseKeys, faults.KillProcess)
+_NOTABLE = 0.4
+"""The fraction of the other faults that strike when a command is sent, a barrier, or when a connection has been lost."""
+_COUNTS: Mapping[str, Sequence[int]] = {COMMANDS: (1, 1, 2, 2, 3, 4, 5), BARRIERS: (1, 1, 2, 3), LOSSES: (1, 1, 2)}
+"""Moment → how many of its kind there may be until a fault strikes."""
+_SOON, _SOON_EVENTS = 0.4, 50
+"""The fraction of further faults that strike soon after an earlier one, and within how many events."""
 _FIRST = 20
 """Events, of the starts of the first processes, before which no fault strikes."""
 _OF_PROCESS, _OF_SLOT = 8, 1.2
@@ -29,6 +41,7 @@ KINDS: Mapping[str, type[Disturbance]] = {
         faults.HangUpProcess,
         faults.StopProcess,
         faults.StopAndKillProcess,
+        faults.HangProcess,
         faults.CutConnection,
         faults.FlapConnection,
         faults.FreezeConnection,
@@ -53,12 +66,17 @@ KINDS: Mapping[str, type[Disturbance]] = {
 }
 
 
+def is_answered(scenario: Scenario) -> bool:
+    """Whether the sensor waits in each slot for what others answer."""
+    return scenario.controller is not None or SCHEMES[scenario.encoding.spec["scheme"]].needs_acknowledgements
+
+
 def events_of(scenario: Scenario, ahead: int) -> float:
     """About how many events a run has; ahead: how many slots the sensor may be ahead.
 
     A message carries some slots, unless each slot waits for an answer or for its time.
     """
-    answered = scenario.controller is not None or SCHEMES[scenario.encoding.spec["scheme"]].needs_acknowledgements
+    answered = is_answered(scenario)
     messages = scenario.slots if answered or scenario.pace else scenario.slots * 4.0 / ahead
     processes = len(processes_of(scenario))
     return scenario.shards * processes * (_OF_PROCESS + messages * (2.0 if answered else _OF_SLOT))
@@ -67,14 +85,45 @@ def events_of(scenario: Scenario, ahead: int) -> float:
 def faults_of(source: random.Random, scenario: Scenario, ahead: int) -> tuple[Disturbance, ...]:
     """The faults of a case; ahead: as in `events_of`."""
     last = max(2.0 * _FIRST, events_of(scenario, ahead))
-    drawn = []
+    drawn: list[Disturbance] = []
     for _ in range(source.choice([0, 1, 1, 1, 2, _MOST_FAULTS])):
+        if source.random() < _LOSING:
+            drawn.append(_loss(source, scenario, ahead))
+            continue
         [kind] = source.choices([*KINDS.values()], [kind.share for kind in KINDS.values()])
         target = source.choice(kind.targets(scenario))
         seconds = None
         if kind.lasts and (not kind.for_good or source.random() < 0.85):
-            seconds = round(10.0 ** source.uniform(-2.0, 1.0), 3)
+            seconds = round(10.0 ** source.uniform(-2.0, log10(kind.most_seconds)), 3)
+        before = next((fault for fault in reversed(drawn) if fault.moment == EVENTS), None)
+        if source.random() < _NOTABLE:
+            moment = source.choice(
+                [COMMANDS, COMMANDS, *[BARRIERS] * bool(scenario.timeline.holds), *[LOSSES] * bool(drawn)]
+            )
+            drawn.append(kind(target, source.choice(_COUNTS[moment]), seconds, moment))
+            continue
         uniform = source.random() < _LATE
         after = int(source.uniform(_FIRST, last) if uniform else _FIRST * (last / _FIRST) ** source.random())
+        if before is not None and source.random() < _SOON:
+            after = before.after + int(_SOON_EVENTS ** source.random())
         drawn.append(kind(target, after, seconds))
     return tuple(drawn)
+
+
+def _loss(source: random.Random, scenario: Scenario, ahead: int) -> Disturbance:
+    """A short fault that loses messages while the sensor sends its own."""
+    kind = source.choice(_LOSSES)
+    hubs = [name for name in processes_of(scenario) if name in ROUTERS]
+    target = source.choice(hubs if kind is faults.KillProcess else kind.targets(scenario))
+    seconds = round(10.0 ** source.uniform(-2.0, 0.0), 3) if kind.lasts else None
+    flow = flow_of(scenario, ahead)
+    slots = {
+        "messages of the sensor": 1 if is_answered(scenario) or scenario.pace else flow.message,
+        "messages of progress": flow.batch,
+    }
+    if SCHEMES[scenario.encoding.spec["scheme"]].needs_acknowledgements:
+        slots["acknowledgements"] = 1
+    if scenario.controller is not None:
+        slots["inputs"] = scenario.controller.period
+    moment = source.choice([*slots])
+    return kind(target, source.randint(1, -(-scenario.slots // slots[moment])), seconds, moment)

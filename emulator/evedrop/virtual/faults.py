@@ -17,6 +17,7 @@ from evedrop.names import RECORDER, ROUTER, SENSOR
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.disk import DiskFault
 from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance, processes_of
+from evedrop.virtual.host_parts import host_of
 from evedrop.virtual.processes import FORK_SERVERS
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 DISK = "disk"
 _SILENCE_SECONDS = 120.0
 """For which a launcher waits for a fork server that is suspended; it waits less for any other process."""
+_TELLS_SECONDS = 4.0
+"""Within which a fork server is sure to tell its launcher in time that a process has ended."""
 _FLAP_SECONDS = 0.05
 """Between two cuts of a connection that flaps."""
 
@@ -84,6 +87,10 @@ class StopAndKillProcess(_Kill):
         """Suspend it, and kill it later."""
         return _suspend(world, self.target, self.seconds, signal.SIGKILL)
 
+    def survived(self, longest_outage: float) -> bool:
+        """Whether it is a router, and not suspended for too long."""
+        return super().survived(longest_outage) and Disturbance.survived(self, longest_outage)
+
 
 class _Signal(_EndProcess):
     """A signal that ends a run if its launcher gets it."""
@@ -138,10 +145,46 @@ class StopProcess(_OfProcess):
         """Suspend it."""
         return _suspend(world, self.target, self.seconds, signal.SIGCONT)
 
+    def survived(self, longest_outage: float) -> bool:
+        """A fork server has some seconds to tell of the end of a process."""
+        tells = self.target not in FORK_SERVERS or (self.seconds is not None and self.seconds < _TELLS_SECONDS)
+        return tells and super().survived(longest_outage)
+
+    @property
+    def named_first(self) -> bool:
+        """Not if it is the program on a host: who waits in vain for a process there cannot know."""
+        return super().named_first and not host_of(self.target)
+
     @property
     def awaited_seconds(self) -> float:
         """That of a fork server, if it is for good."""
         return _SILENCE_SECONDS if self.seconds is None else 0.0
+
+
+@final
+class HangProcess(Disturbance):
+    """The thread that does a process's work does not go on for some time, as on a disk that does not answer; others do."""
+
+    kind, share = "hang", 12
+    lasts, cuts_off = True, True
+
+    @classmethod
+    def targets(cls, scenario: Scenario) -> Sequence[str]:
+        """All processes but the recorder, which the launcher lets write for as long as it takes."""
+        return [name for name in processes_of(scenario) if name != RECORDER]
+
+    @property
+    def blamed(self) -> tuple[str, ...]:
+        """It; or who waits for what comes from it, directly or not, is as silent, and says on what it waits."""
+        return (*super().blamed, "waits on ", "has not sent", "did not report")
+
+    def strike(self, world: SimulatedWorld) -> bool:
+        """Hold it up."""
+        process = world.process(self.target)
+        if process is None:
+            return False
+        world.scheduler.hang(process.task.threads[0], self.seconds)
+        return True
 
 
 class _OfConnection(Disturbance):
@@ -230,12 +273,12 @@ class ConfuseKeys(_OfConnection):
 class ShortenMessage(_OfConnection):
     """Half of the next message to a process arrives, as from a program that is not the right one."""
 
-    kind, share = "shorten a message to", 4
+    kind, share = "shorten a message to", 6
     lasts = cuts_off = False
 
     def disturb(self, zenoh: VirtualZenoh, target: str) -> bool:
         """Let half of one arrive."""
-        return zenoh.shorten(target)
+        return zenoh.change(target, lambda message: message[: len(message) // 2])
 
     @property
     def blamed(self) -> tuple[str, ...]:
@@ -312,7 +355,7 @@ class ShortenWrite(DiskDisturbance):
 class CutPower(DiskDisturbance):
     """Everything ends, and the disk keeps what it has."""
 
-    kind, share = "cut the power of", 3
+    kind, share = "cut the power of", 8
 
     @property
     def statuses(self) -> frozenset[int]:

@@ -7,6 +7,7 @@ Source: docs/maintainers/simulated-world.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,17 +19,29 @@ from evedrop.results.reading import Results
 from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance
+from evedrop.virtual.faults import CutConnection
+from evedrop.virtual.host_faults import LosePower
+from evedrop.virtual.host_parts import host_of
 from evedrop.virtual.processes import FORK_SERVERS
 from evedrop.virtual.reference import RunReference, tables_of
 from evedrop.virtual.results import wrong_outages, wrong_summary, wrong_tables
 from evedrop.virtual.run import SimulatedRun
+from evedrop.virtual.traffic import wrong_messages
 
 _HEEDED_SECONDS = 1.0
 """After a signal to the launcher, a run that has slots to come does not complete."""
-_USUAL_SECONDS, _FAULT_SECONDS = 5.0, 15.0
-"""That a run takes besides those of its slots, and that each fault may cost besides those that it lasts."""
+_USUAL_SECONDS, _QUIET_SECONDS = 5.0, 1.5
+"""That a run takes besides those of its slots, and that a run takes to which nothing happens."""
+_FAULT_SECONDS, _BRIEF_SECONDS = 15.0, 6.0
+"""That each fault may cost besides those that it lasts, and one of a second or less."""
+_SUSPENDED_SECONDS = 3.0
+"""That the end of a run takes if a receiver is suspended."""
+_NOTICED_SECONDS = 0.1
+"""Within which a connection that is cut is noticed."""
 _PATIENCES = 2.0
 """How many times the longest outage a run may wait before it gives up."""
+_HOSTS_SECONDS = 180.0
+"""For which a run also waits for other hosts, and processes there for others."""
 _GOES_ON = ("control.json", "unfinished")
 """What the folder of a run that goes on has, and that of a run that has ended has not."""
 
@@ -38,21 +51,28 @@ def misses(
     run: SimulatedRun,
     struck: Mapping[Disturbance, float],
     reference: RunReference,
-    temporary: Path,
+    temporaries: Mapping[str, Path],
 ) -> list[str]:
     """The broken promises; struck: the faults that hit something, each with its moment; reference: the same trials in memory.
 
-    temporary: the folder of temporary files.
+    temporaries: host → its folder of temporary files; that of the launcher has no name.
     """
     if run.stuck is not None:
         return [f"stuck: {run.stuck}"]
-    broken = [f"{name} is left" for name in run.left]
+    killed = min((at for fault, at in struck.items() if fault.ends_at_once(LAUNCHER)), default=math.inf)
+    unheard = {  # suspended when nobody was left to let them go on
+        fault.target for fault, at in struck.items() if fault.kind == "stop" and fault.seconds is None and at >= killed
+    }
+    broken = [f"{name} is left" for name in run.left if name not in unheard]
     broken += [f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors]
     broken += _of_status(case, run, struck, reference.status)
     broken += _of_time(case, run, struck)
     if not any(fault.ends_at_once(LAUNCHER) for fault in struck) and not run.suspended:
-        broken += [f"{path.name} is left" for path in sorted(temporary.iterdir())]
+        broken += [f"{path.name} is left" for path in sorted(temporaries[""].iterdir())]
+    for host in temporaries.keys() - {"", *(host_of(fault.target) for fault in struck if isinstance(fault, LosePower))}:
+        broken += [f"{path.name} is left on {host}" for path in sorted(temporaries[host].iterdir())]
     broken += _of_logs(run)
+    broken += wrong_messages(case, run.put, disturbed=bool(struck))
     if not any(fault.destroys for fault in struck):
         broken += _of_files(run, struck)
         broken += _of_results(run, struck, reference)
@@ -66,20 +86,28 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
     fatal = [fault for fault in struck if not fault.survived(case.scenario.longest_outage)]
     if run.suspended:
         return
-    if status == good:
+    refused = None if case.hosts is None else case.hosts.refused(case.scenario)
+    if refused is not None and (status == UsageError.exit_status or not fatal):
+        if status != UsageError.exit_status or (refused not in run.said and not fatal):
+            yield f"status {status}, although the run cannot begin ({refused}): {complaint}"
+    elif status == good:
         yield from _of_ignored_signals(case, run, {fault: struck[fault] for fault in fatal})
     elif not fatal:
         yield f"status {status}, although nothing of this may end a run: {complaint}"
     elif not any(status in fault.statuses for fault in fatal):
         yield f"status {status}, by which none of this ends a run: {complaint}"
     elif status == RunError.exit_status:
-        first = min(struck[fault] for fault in fatal)  # what comes later hits a run that fails already
+        first = min(struck[fault] for fault in fatal)  # what comes later, or lasts until then, hits a run that fails
         counted = [
             fault
             for fault in struck
-            if fault in fatal or struck[fault] >= first or any(map(_is_worse_for_others, fatal))
+            if fault in fatal
+            or struck[fault] + (fault.seconds or 0.0) >= first
+            or any(map(_is_worse_for_others, fatal))
         ]
         blamed = [word for fault in counted for word in fault.blamed]
+        if case.hosts is not None:
+            blamed += [name for fault in counted for name in case.hosts.processes_on(host_of(fault.target))]
         said = complaint if all(fault.named_first for fault in fatal) else run.said
         if not any(word in said for word in blamed):
             yield f"the failure names none of {', '.join(blamed)}: {complaint or '(nothing was said)'}"
@@ -106,14 +134,22 @@ def _of_ignored_signals(case: SimulatedCase, run: SimulatedRun, fatal: Mapping[D
 def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
     """Whether the run ended as soon as it could: a wake-up that is lost, and a wait that is too long, cost nothing but time."""
     scenario = case.scenario
-    most = scenario.slots * scenario.pace + _USUAL_SECONDS
+    most = scenario.slots * scenario.pace + (_USUAL_SECONDS if struck or case.hosts is not None else _QUIET_SECONDS)
+    if any(away.stop >= scenario.slots for outages in scenario.timeline.outages.values() for away in outages):
+        most += _SUSPENDED_SECONDS
     for fault in struck:
-        most += _FAULT_SECONDS + (fault.seconds or 0.0)
+        brief = fault.seconds is not None and fault.seconds <= 1.0
+        most += (_BRIEF_SECONDS if brief else _FAULT_SECONDS) + (fault.seconds or 0.0)
+        if fault.target == EVERYBODY or scenario.timeline.holds:  # what was lost may have to be asked for twice
+            most += _FAULT_SECONDS
     if any(not fault.survived(scenario.longest_outage) for fault in struck):
         most += _PATIENCES * scenario.longest_outage + LAUNCHED_PATIENCE
     most += max((fault.awaited_seconds for fault in struck), default=0.0)
-    if run.seconds > most and not run.suspended:
-        yield f"the run took {run.seconds:.1f} s, and not {most:.1f} s at most"
+    took = run.seconds if case.hosts is None else run.ended  # programs on other hosts may wait for a launcher
+    if case.hosts is not None and any(not fault.survived(scenario.longest_outage) for fault in struck):
+        most += _HOSTS_SECONDS
+    if took > most and not run.suspended:
+        yield f"the run took {took:.1f} s, and not {most:.1f} s at most"
 
 
 def _progress(run: SimulatedRun) -> Iterator[tuple[float, int]]:
@@ -165,6 +201,10 @@ def _of_results(run: SimulatedRun, struck: Mapping[Disturbance, float], referenc
         yield from wrong_summary(summary, expected, done)
         if not done and summary["ended"] == "complete" and run.status not in (None, KILLED, Interrupted.exit_status):
             yield f"status {run.status}, and the summary says complete"
+        # Rows are on the disk before the first process is told that the run is over.
+        is_over = reference.shards == 1 and any(message.said == "end" for message in run.put)
+        if is_over and summary["slots"] < reference.scenario.slots:
+            yield f"all slots were done, and the summary has {summary['slots']}"
         if not any(fault.ends_at_once(RECORDER) for fault in struck):
             yield from _of_course(run, struck, summary, expected, whole)
 
@@ -180,11 +220,40 @@ def _of_course(
     told = max((done for _, done in _progress(run)), default=0)
     if summary["slots"] < told and whole:
         yield f"{told} slots were done, and the summary has {summary['slots']}"
+    yield from _of_cuts(run, struck, summary, reference)
     outages = [event for _, event in run.told if isinstance(event, ConnectionOutage)] if whole else []
     yield from wrong_outages(summary, reference, frozenset((event.process, event.slot) for event in outages))
     for entry in summary["outages"]:
         if not any(_explains(fault, entry["process"]) for fault in struck):
             yield f"an outage of {entry['process']} at slot {entry['slot']}, and no fault caused one"
+
+
+def _of_cuts(
+    run: SimulatedRun, struck: Mapping[Disturbance, float], summary: Mapping[str, Any], reference: RunReference
+) -> Iterator[str]:
+    """Whether a process that was cut off while the run went on is said to have been; so is it with a router, or the recorder.
+
+    Not if something else happens, too: who is cut off already cannot be cut off.
+    """
+    scenario = reference.scenario
+    fault, at = next(iter(struck.items()), (None, 0.0))
+    if not isinstance(fault, CutConnection) or len(struck) > 1 or run.status != reference.status or scenario.shards > 1:
+        return
+    begun = any(message.said == "start" and message.at < at for message in run.put)
+    goes_on = any(
+        message.key == f"progress/{RECORDER}"
+        and message.at > at + _NOTICED_SECONDS
+        and scenario.slots not in message.slots
+        for message in run.put
+    )
+    steady = not scenario.timeline.outages.get(fault.target)
+    if (
+        begun
+        and goes_on
+        and steady
+        and not {entry["process"] for entry in summary["outages"]} & {fault.target, *ROUTERS, RECORDER}
+    ):
+        yield f"the summary lists no outage of {fault.target}, which was cut off"
 
 
 def _explains(fault: Disturbance, process: str) -> bool:
@@ -195,4 +264,9 @@ def _explains(fault: Disturbance, process: str) -> bool:
     Routers, and the recorder, stand for all that were connected to them.
     """
     hubs = (*ROUTERS, RECORDER)
-    return not fault.cuts_off or fault.target in (process, EVERYBODY, *hubs, *FORK_SERVERS) or process in hubs
+    return (
+        not fault.cuts_off
+        or bool(host_of(fault.target))
+        or fault.target in (process, EVERYBODY, *hubs, *FORK_SERVERS)
+        or process in hubs
+    )

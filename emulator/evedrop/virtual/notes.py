@@ -8,6 +8,9 @@ Source: docs/maintainers/simulated-world.md, a failing seed.
 
 from __future__ import annotations
 
+import re
+from typing import NamedTuple
+
 import msgpack
 
 STARTS = "starts"
@@ -41,6 +44,10 @@ WRITES = "changes"
 """Process, what it does to a file (writes, renames, …), name of the file."""
 
 
+BY_HAND = "by hand"
+"""The last words in the name of a process that is not the run's: somebody has started it beside the run."""
+
+
 def key_within(key: str) -> str:
     """A run's key without the run: `evedrop/RUN/control/sensor` is `control/sensor`; any other key as it is."""
     parts = key.split("/", 2)
@@ -66,3 +73,22 @@ def said_in(message: bytes) -> str:
     if isinstance(first, int) and isinstance(slots, int):
         words.append(f"{first}-{first + slots - 1}" if slots > 1 else str(first))
     return " ".join(words)
+
+
+_SLOTS = re.compile(r"(\d+)(?:-(\d+))?")
+
+
+class PutMessage(NamedTuple):
+    """A message that somebody has put."""
+
+    at: float
+    """Virtual seconds."""
+    key: str
+    said: str
+    """As `said_in` says it."""
+
+    @property
+    def slots(self) -> range:
+        """Those that it is of; empty for a command, or a barrier."""
+        match = _SLOTS.fullmatch(self.said)
+        return range(0) if match is None else range(int(match[1]), int(match[2] or match[1]) + 1)

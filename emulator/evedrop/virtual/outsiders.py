@@ -49,7 +49,7 @@ class _Outsider(Disturbance):
         """What it does; returns its exit status."""
 
 
-class _Command(_Outsider):
+class OperatorCommand(_Outsider):
     """Somebody types commands."""
 
     program = "operator"
@@ -64,7 +64,7 @@ class _Command(_Outsider):
 
 
 @final
-class AskStatus(_Command):
+class AskStatus(OperatorCommand):
     """`evedrop status`."""
 
     kind, share = "ask for the status of", 1
@@ -75,22 +75,24 @@ class AskStatus(_Command):
 
 
 @final
-class PauseRun(_Command):
+class PauseRun(OperatorCommand):
     """`evedrop pause`, a step, and `evedrop resume` after some time, as often as needed."""
 
-    kind, share = "pause", 2
-    lasts, for_good = True, False
+    kind, share = "pause", 3
+    lasts, for_good, most_seconds = True, False, 100.0
 
     def _act(self, world: SimulatedWorld) -> int:
         self._type(world, "pause")
-        here().sleep(self.seconds or 0.0)
+        until = here().monotonic() + (self.seconds or 0.0)
+        while here().monotonic() < until and world.process(LAUNCHER) is not None:
+            here().sleep(min(_AGAIN_SECONDS, until - here().monotonic()))
         self._type(world, "step", "1")
         while not self._type(world, "resume") and world.process(LAUNCHER) is not None:
             here().sleep(_AGAIN_SECONDS)
         return 0
 
 
-class _Change(_Command):
+class _Change(OperatorCommand):
     """The link of a receiver changes; the run's scenario has that as an event."""
 
     amends = True

@@ -6,7 +6,7 @@ Source: docs/maintainers/simulated-world.md.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Self, final
 
@@ -26,16 +26,21 @@ class Pipe:
         self._readers: deque[Waiter] = deque()
         self._writers: deque[Waiter] = deque()
         self._written, self._read = True, True
+        self._open_ends = 0
 
-    def write(self, data: bytes) -> int:
-        """Write bytes, and wait while the pipe is full. Raises BrokenPipeError if nobody reads them."""
+    def write(self, data: bytes, seconds: float | None = None) -> int:
+        """Write bytes, and wait while the pipe is full. Raises BrokenPipeError if nobody reads them.
+
+        seconds: for how long to wait for room; None: as long as it takes. Returns how many bytes were written.
+        """
         left = memoryview(data)
         while left:
             if not self._read:
                 raise BrokenPipeError(32, "Broken pipe")
             room = _ROOM - len(self._held)
             if room == 0:
-                self._scheduler.wait(self._writers)
+                if not self._scheduler.wait(self._writers, seconds):
+                    return len(data) - len(left)
                 continue
             self._held += left[:room]
             left = left[room:]
@@ -67,6 +72,50 @@ class Pipe:
         self._read = False
         self._scheduler.wake(self._writers)
 
+    def end(self) -> WritingEnd:
+        """One more end to write to: the reader gets the end of the pipe once all of them are closed."""
+        self._open_ends += 1
+        return WritingEnd(self, self._close_end)
+
+    def _close_end(self) -> None:
+        self._open_ends -= 1
+        if self._open_ends == 0:
+            self.close_writing()
+
+
+@final
+class WritingEnd:
+    """An end of a pipe that other processes can inherit."""
+
+    def __init__(self, pipe: Pipe, close: Callable[[], object]) -> None:
+        self._pipe, self._close = pipe, close
+        self._open = True
+
+    def again(self) -> WritingEnd:
+        """The same end for a process that inherits it."""
+        return self._pipe.end()
+
+    def write(self, data: bytes) -> int:
+        """Write bytes."""
+        return self._pipe.write(data)
+
+    def flush(self) -> None:
+        """Everything is written already."""
+
+    def close(self) -> None:
+        """Close it, once."""
+        if self._open:
+            self._open = False
+            self._close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
 
 @final
 class PipeFile:
@@ -78,6 +127,10 @@ class PipeFile:
     def write(self, data: bytes) -> int:
         """Write bytes."""
         return self._pipe.write(data)
+
+    def read(self, most: int) -> bytes:
+        """Wait for bytes; none at the end."""
+        return self._pipe.read(most)
 
     def flush(self) -> None:
         """Everything is written already."""

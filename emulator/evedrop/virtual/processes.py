@@ -23,7 +23,7 @@ from evedrop.system.signals import AGAIN_SECONDS, INTERRUPTED
 from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import ThreadEvent
 from evedrop.virtual import notes
-from evedrop.virtual.pipes import Pipe, PipeFile
+from evedrop.virtual.pipes import Pipe, PipeFile, WritingEnd
 from evedrop.virtual.scheduler import Ended, VirtualEvent, VirtualQueue, VirtualScheduler, VirtualTask, Waiter
 
 Program = Callable[[Sequence[str]], int]
@@ -44,7 +44,7 @@ class VirtualProcess(ThisProcess):
         self,
         scheduler: VirtualScheduler,
         task: VirtualTask,
-        log: BinaryIO | None = None,
+        log: BinaryIO | WritingEnd | None = None,
         stdin: Pipe | None = None,
         stdout: Pipe | None = None,
     ) -> None:
@@ -141,6 +141,22 @@ class VirtualProcess(ThisProcess):
         finally:
             self._handle = before
 
+    @contextmanager
+    def raise_on_signals(self) -> Iterator[None]:
+        """Let the first of these signals raise KeyboardInterrupt on the thread of the block."""
+        thread, before = self._scheduler.current, self._handle
+        assert thread is not None  # noqa: S101 - only programs call this
+
+        def interrupt() -> None:
+            self._handle = lambda: None
+            self._scheduler.raise_in(thread, KeyboardInterrupt())
+
+        self._handle = interrupt
+        try:
+            yield
+        finally:
+            self._handle = before
+
     def on_thread_failure(self, handle: Callable[[BaseException], object]) -> None:
         """Call this when an error ends a thread."""
         self.task.on_failure = handle
@@ -226,7 +242,7 @@ class _Files:
     """A pipe to a simulated process, its log, and perhaps a pipe from it."""
 
     def __init__(self, scheduler: VirtualScheduler, log: IO[bytes], tells: bool, number: int) -> None:
-        self.log = os.fdopen(os.dup(log.fileno()), "ab", buffering=0)
+        self.log = log.again() if isinstance(log, WritingEnd) else os.fdopen(os.dup(log.fileno()), "ab", buffering=0)
         self.to, self.back = Pipe(scheduler), Pipe(scheduler) if tells else None
         self.stdin = cast("IO[bytes]", PipeFile(self.to))
         self.stdout = None if self.back is None else cast("IO[bytes]", PipeFile(self.back))
@@ -248,9 +264,10 @@ class VirtualForkServer:
         self._requests, self._reports = VirtualQueue(self._scheduler), VirtualQueue(self._scheduler)
         self._files: dict[int, _Files] = {}
         self._launcher = machine.current
-        self.process = machine.begin(name, self._serve)
+        self.process = VirtualProcess(self._scheduler, self._scheduler.process(name))
         self.process.task.held.append(lambda: self._reports.put((b"", [])))
-        self._launcher.task.held.append(self.shut)
+        self._launcher.task.held.append(self.shut)  # before it starts, because its launcher may end meanwhile
+        machine.begin(name, self._serve, self.process)
 
     def files(self, log: IO[bytes], tells: bool) -> StandardFiles:
         """Simulated pipes."""
@@ -328,15 +345,16 @@ class VirtualMachine:
         """program: what `evedrop` is on this machine."""
         self.scheduler, self.program = scheduler, program
         self._of: dict[VirtualTask, VirtualProcess] = {}
-        self.logs: list[IO[bytes]] = []
+        self.logs: list[BinaryIO | WritingEnd] = []
         """All logs, also of processes that never began."""
         self.no_threads_until = 0.0
         """Until when no thread and no process can be started."""
 
     @property
     def lacks_threads(self) -> bool:
-        """Whether no thread and no process can be started now."""
-        return self.scheduler.now < self.no_threads_until
+        """Whether no thread and no process of the launcher's machine can be started now."""
+        thread = self.scheduler.current
+        return self.scheduler.now < self.no_threads_until and (thread is None or not thread.task.host)
 
     def admit_thread(self) -> None:
         """The current process starts a thread. Raises RuntimeError if it cannot, in the words of Python, or MemoryError."""
@@ -391,11 +409,11 @@ class VirtualMachine:
         return process
 
     @contextmanager
-    def starter(self, stop: ThreadEvent | None = None) -> Iterator[Starter]:
-        """Starts processes by two fork servers, as on a real machine: one for recorders, one for all others."""
+    def starter(self, stop: ThreadEvent | None = None, names: Sequence[str] = FORK_SERVERS) -> Iterator[Starter]:
+        """Starts processes by fork servers, as on a real machine: the last one starts recorders, the first one all others."""
         with ExitStack() as stack:
             servers = []
-            for name in FORK_SERVERS:
+            for name in names:
                 server = ForkServer(VirtualForkServer(self, name))
                 stack.callback(server.close)
                 servers.append(server)

@@ -8,20 +8,24 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO, cast, final
 
-from evedrop.errors import EvedropError, RunError
 from evedrop.live.launch.briefs import MOST_SLOTS_AHEAD
+from evedrop.live.launch.hosts_file import load_hosts
 from evedrop.live.launch.launcher import launch
+from evedrop.names import RELAY, ROUTER
 from evedrop.scenario.progress_events import ProgressEvent
 from evedrop.scenario.tables import Scenario
-from evedrop.system.lacks import lack_of, report_refusal
-from evedrop.system.output import say
 from evedrop.system.world import inside
+from evedrop.virtual import notes
 from evedrop.virtual.disk import VirtualDisk
+from evedrop.virtual.endings import status_of
+from evedrop.virtual.host_parts import LISTENS, SESSION
+from evedrop.virtual.notes import PutMessage
+from evedrop.virtual.other_hosts import OtherHosts
 from evedrop.virtual.processes import ProcessOutput, Program, VirtualMachine, VirtualProcess
 from evedrop.virtual.scheduler import Occurrence, Stuck, VirtualScheduler
 from evedrop.virtual.world import VirtualWorld
@@ -33,6 +37,14 @@ _ROUTER, _RELAY = "tcp/127.0.0.1:17460", "tcp/127.0.0.1:17461"
 """Where two routers listen: encryption is not simulated."""
 _LEAVE_SECONDS = 60.0
 """Virtual seconds for processes whose launcher has ended, or was killed, to write what they have and to end."""
+
+
+_LEAVE_HOSTS_SECONDS = 700.0
+"""The same for programs on other hosts, which wait ten minutes for a launcher that is silent."""
+
+
+_CLEAN_SECONDS = 1.0
+"""In which a host removes the files of a program that was killed."""
 
 
 @final
@@ -56,11 +68,15 @@ class SimulatedRun:
     """Why it did not end, if so."""
     errors: list[tuple[str, BaseException]] = field(default_factory=list)
     """Thread → the exception that nobody caught."""
+    ended: float = 0.0
+    """When its launcher ended, in virtual seconds."""
     seconds: float = 0.0
-    """Virtual seconds."""
+    """Virtual seconds until all processes had ended."""
     events: int = 0
     digest: str = ""
     """The hash of all events."""
+    put: list[PutMessage] = field(default_factory=list)
+    """The messages that all processes have put."""
     happened: list[Occurrence] = field(default_factory=list)
     """All events, if they were kept."""
 
@@ -75,6 +91,14 @@ class SimulatedWorld:
         self.machine = VirtualMachine(self.scheduler, program)
         self.zenoh = VirtualZenoh(self.scheduler)
         self.disk = VirtualDisk(self.scheduler, root)
+        self.scenario: Scenario | None = None
+        """What is run there."""
+        self.told: list[tuple[float, ProgressEvent]] = []
+        """The events that its launcher got."""
+        self.places: Mapping[str, str] = {}
+        """Router → where it listens, if that is at a port."""
+        self.hosts: OtherHosts | None = None
+        """The other hosts, if there are any."""
         self.results, self.renamed = self.disk.root / "results", self.disk.root / "renamed"
         """Where the results of a run are, and where somebody else may move them."""
         self.world = VirtualWorld(self.scheduler, self.machine, self.zenoh, self.disk)
@@ -92,51 +116,65 @@ class SimulatedWorld:
             stack.callback(self.scheduler.take_down)
             yield
 
+    def add_hosts(self, root: Path, oddities: Mapping[str, str]) -> OtherHosts:
+        """Add other hosts; root, oddities: as for `OtherHosts`."""
+        self.hosts = OtherHosts(self.machine, self.zenoh, self.world.disks, root, oddities)
+        return self.hosts
+
     def process(self, name: str) -> VirtualProcess | None:
         """The latest process of this name, if it runs."""
         running = [process for process in self.machine.processes if process.task.name == name and process.task.alive]
         return running[-1] if running else None
 
 
-def run_in(world: SimulatedWorld, scenario: Scenario, ahead: int = MOST_SLOTS_AHEAD) -> SimulatedRun:
-    """Run a scenario live in a simulated world; ahead: as for `launch`."""
+def run_in(
+    world: SimulatedWorld, scenario: Scenario, ahead: int = MOST_SLOTS_AHEAD, hosts_file: Path | None = None
+) -> SimulatedRun:
+    """Run a scenario live in a simulated world; ahead: as for `launch`.
+
+    hosts_file: that of `--hosts`, if the world has other hosts.
+    """
     run = SimulatedRun(world.results)
+    world.scenario, world.told = scenario, run.told
+    world.places = LISTENS if hosts_file is not None else {ROUTER: _ROUTER, RELAY: _RELAY} if scenario.relayed else {}
     scheduler = world.scheduler
 
+    def watch(name: str, what: str, words: tuple[object, ...]) -> None:
+        if what == notes.PUT and not name.endswith(notes.BY_HAND):
+            run.put.append(PutMessage(scheduler.now, str(words[0]), str(words[2])))
+
+    scheduler.watchers.append(watch)
+
     def launcher() -> int:
-        try:
-            return launch(
-                scenario,
-                world.results,
-                "off",
-                _ROUTER if scenario.relayed else None,
-                lambda event: run.told.append((scheduler.now, event)),
-                _RELAY if scenario.relayed else None,
-                starters=world.machine.starter,
-                ahead=ahead,
-            ).status
-        except EvedropError as error:
-            say(error.illustrated)
-            return error.exit_status
-        except BaseException as error:  # as the command line does
-            if (lack := lack_of(error)) is not None:
-                say(lack)
-                return RunError.exit_status
-            if not isinstance(error, OSError):
-                raise
-            return report_refusal(error)
+        return launch(
+            scenario,
+            world.results,
+            "off",
+            _ROUTER if scenario.relayed else None,
+            lambda event: run.told.append((scheduler.now, event)),
+            _RELAY if scenario.relayed else None,
+            hosts=None if hosts_file is None else load_hosts(hosts_file, scenario),
+            starters=world.machine.starter,
+            ssh=None if world.hosts is None else world.hosts.ssh,
+            ahead=ahead,
+        ).status
 
     with world.entered():
-        process = world.machine.begin("launcher", launcher)
+        process = world.machine.begin("launcher", lambda: status_of(launcher))
         try:
             scheduler.run(MOST_SECONDS, lambda: not process.task.alive)
             ended = scheduler.now
+            leave = _LEAVE_SECONDS if world.hosts is None else _LEAVE_HOSTS_SECONDS
             with contextlib.suppress(Stuck):
-                scheduler.run(ended + _LEAVE_SECONDS, lambda: not _alive(world))
+                scheduler.run(ended + leave, lambda: not _alive(world))
+                if world.hosts is not None:
+                    scheduler.run(scheduler.now + _CLEAN_SECONDS, lambda: False)
         except Stuck as why:
+            ended = scheduler.now
             run.suspended = process.task.stopped  # the processes of a run that has failed wait for it to end them
             run.stuck = None if run.suspended else str(why)
         run.status, run.said, run.left = process.task.status, process.printed, [] if run.suspended else _alive(world)
+        run.ended = ended
         run.errors, run.seconds, run.events = scheduler.errors, scheduler.now, scheduler.events
         run.digest, run.happened = scheduler.digest, scheduler.happened
         run.folder = world.renamed if world.renamed.is_dir() else world.results
@@ -144,4 +182,6 @@ def run_in(world: SimulatedWorld, scenario: Scenario, ahead: int = MOST_SLOTS_AH
 
 
 def _alive(world: SimulatedWorld) -> list[str]:
-    return [process.task.name for process in world.machine.processes if process.task.alive]
+    """All processes that run, but those of other programs."""
+    names = [process.task.name for process in world.machine.processes if process.task.alive]
+    return [name for name in names if not name.startswith(SESSION)]

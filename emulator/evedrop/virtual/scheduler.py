@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from queue import Empty
 from types import TracebackType
 from typing import Any, TypeVar, final
@@ -27,6 +28,8 @@ from evedrop.virtual import notes
 T = TypeVar("T")
 _INTERRUPTED = 0.1
 """The fraction of the places where a thread touches something shared at which another one goes on first."""
+_TICK = 1e-9
+"""The shortest time limit, in seconds, as with real clocks: time must pass while a thread waits for what is due in less."""
 _MOST_THROWS = 1000
 """How often a thread that is taken down may catch that."""
 _UNENDING: list[Any] = []
@@ -60,6 +63,10 @@ class VirtualTask:
     name: str
     number: int
     """Its process id."""
+    host: str = ""
+    """The machine that it is on; empty for that of the launcher."""
+    clock: float = 0.0
+    """By how many seconds its machine's clock is fast."""
     alive: bool = True
     stopped: bool = False
     """Whether it is suspended, as by SIGSTOP."""
@@ -109,6 +116,14 @@ class VirtualThread:
         self.name, self.task, self._scheduler, self._work, self._admit = name, task, scheduler, work, admit
         self.ident: int | None = None
         self.over = False
+        self.waiter: Waiter | None = None
+        """As which it waits, or has waited last."""
+        self.raises: BaseException | None = None
+        """What it raises when it goes on."""
+        self.hangs = False
+        """Whether it does not go on, although its process does."""
+        self.held_up: list[Waiter] = []
+        """It itself, if it was to go on meanwhile."""
         self._joining: deque[Waiter] = deque()
         self.greenlet: Any = None
 
@@ -171,6 +186,8 @@ class VirtualScheduler:
         self.tasks: list[VirtualTask] = []
         self.on_stop: Callable[[VirtualTask], object] = lambda _: None
         """What else happens when a process is suspended."""
+        self.watchers: list[Callable[[str, str, tuple[object, ...]], object]] = []
+        """Are called with each note: whose it is, its word, and the others."""
         self._plans: list[tuple[int, int, Callable[[], object]]] = []
         """After how many events something is to happen to the world."""
 
@@ -191,12 +208,16 @@ class VirtualScheduler:
         self._hash.update(repr((round(self.now, 9), name, what, words)).encode())
         if self._keep:
             self.happened.append(Occurrence(self.now, name, what, words))
+        for watch in self.watchers:
+            watch(name, what, words)
 
     # Processes and threads
 
-    def process(self, name: str) -> VirtualTask:
-        """A new process without threads."""
-        task = VirtualTask(name, self.number())
+    def process(self, name: str, host: str | None = None) -> VirtualTask:
+        """A new process without threads; host: its machine, by default that of who starts it."""
+        if host is None:
+            host = "" if self.current is None else self.current.task.host
+        task = VirtualTask(name, self.number(), host)
         self.tasks.append(task)
         return task
 
@@ -249,6 +270,17 @@ class VirtualScheduler:
             self._ready += task.waiting
             task.waiting = []
 
+    def hang(self, thread: VirtualThread, seconds: float | None) -> None:
+        """Let a thread not go on for some time, or for good, while the others of its process do."""
+        thread.hangs = True
+        if seconds is not None:
+            self.at(self.now + seconds, partial(self._end_hang, thread))
+
+    def _end_hang(self, thread: VirtualThread) -> None:
+        thread.hangs = False
+        self._ready += thread.held_up
+        thread.held_up = []
+
     def failed(self, thread: str, error: BaseException) -> None:
         """An exception that nobody caught has ended a thread."""
         self.errors.append((thread, error))
@@ -270,21 +302,32 @@ class VirtualScheduler:
         self.hub.switch()
         if not current.task.alive:
             raise Ended
+        if current.raises is not None:
+            error, current.raises = current.raises, None
+            raise error
+
+    def raise_in(self, thread: VirtualThread, error: BaseException) -> None:
+        """Let a thread raise an error where it waits, or where it is interrupted or waits next."""
+        thread.raises = error
+        if thread.waiter is not None and not thread.waiter.gone:
+            thread.waiter.gone = True
+            self._ready.append(thread.waiter)
 
     def wait(self, place: deque[Waiter], timeout: float | None = None) -> bool:
         """Wait until woken up at this place, or for `timeout` seconds; returns whether it was woken up."""
         current = self._running
-        waiter = Waiter(current)
+        waiter = current.waiter = Waiter(current)
         place.append(waiter)
         if timeout is not None:
-            self.at(self.now + max(0.0, timeout), waiter)
+            self.at(self.now + (max(timeout, _TICK) if timeout > 0.0 else 0.0), waiter)
         self._switch(current)
         return waiter.value
 
     def sleep(self, seconds: float) -> None:
         """Let time pass."""
         current = self._running
-        self.at(self.now + max(0.0, seconds), Waiter(current))
+        current.waiter = Waiter(current)
+        self.at(self.now + max(0.0, seconds), current.waiter)
         self._switch(current)
 
     def wake(self, place: deque[Waiter], most: int | None = None) -> int:
@@ -305,6 +348,21 @@ class VirtualScheduler:
     def after(self, events: int, act: Callable[[], object]) -> None:
         """Once this many events have happened, do something to the world, between the turns of threads."""
         heapq.heappush(self._plans, (events, self.number(), act))
+
+    def after_some(
+        self, count: int, counts: Callable[[str, tuple[object, ...]], bool], act: Callable[[], object]
+    ) -> None:
+        """Once so many notes that count have been made, do something to the world; counts: whether one does, by its words."""
+        left = count
+
+        def watch(_: str, what: str, words: tuple[object, ...]) -> None:
+            nonlocal left
+            if left and counts(what, words):
+                left -= 1
+                if not left:
+                    self.after(self.events, act)
+
+        self.watchers.append(watch)
 
     def run(self, until: float, done: Callable[[], bool]) -> None:
         """Let everything happen until `done`. Raises Stuck if that is not before this moment, or cannot be any more."""
@@ -337,9 +395,9 @@ class VirtualScheduler:
         task = thread.task
         if not task.alive or thread.over:
             return
-        if task.stopped:
+        if task.stopped or thread.hangs:
             waiter = next_one if isinstance(next_one, Waiter) else Waiter(thread)
-            task.waiting.append(waiter)
+            (task.waiting if task.stopped else thread.held_up).append(waiter)
             return
         self.current = thread
         thread.greenlet.switch()

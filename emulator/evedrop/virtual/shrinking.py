@@ -19,6 +19,8 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario.loading import Scenario
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import Disturbance, processes_of
+from evedrop.virtual.drawn_hosts import DrawnHosts
+from evedrop.virtual.host_parts import host_of
 
 Tables = dict[str, Any]
 
@@ -246,6 +248,18 @@ def _simpler_process(case: SimulatedCase) -> Iterator[SimulatedCase]:
         yield from _changed(case, {"seed": None})
 
 
+def _fewer_hosts(case: SimulatedCase) -> Iterator[SimulatedCase]:
+    if case.hosts is not None:
+        for hosts in case.hosts.smaller():
+            yield _with_hosts(case, hosts)
+
+
+def _with_hosts(case: SimulatedCase, hosts: DrawnHosts | None) -> SimulatedCase:
+    """The case with other hosts, and without faults of those that are no longer there."""
+    there = {"", *(() if hosts is None else hosts.oddities)}
+    return replace(case, hosts=hosts, faults=tuple(fault for fault in case.faults if host_of(fault.target) in there))
+
+
 def _rounder_faults(case: SimulatedCase) -> Iterator[SimulatedCase]:
     for i, fault in enumerate(case.faults):
         for rounder in _rounder(fault):
@@ -265,6 +279,7 @@ def _rounder(fault: Disturbance) -> Iterator[Disturbance]:
 
 _REDUCTIONS = (
     _fewer_faults,
+    _fewer_hosts,
     _fewer_eavesdroppers,
     _fewer_slots,
     _fewer_trials,
@@ -298,7 +313,8 @@ def _changed(case: SimulatedCase, changes: Mapping[str, Any]) -> Iterator[Simula
     except ScenarioError:
         return
     gone = {*processes_of(case.scenario)} - {*processes_of(scenario)}
-    yield replace(case, scenario=scenario, faults=tuple(fault for fault in case.faults if fault.target not in gone))
+    smaller = replace(case, scenario=scenario, faults=tuple(fault for fault in case.faults if fault.target not in gone))
+    yield smaller if case.hosts is None else _with_hosts(smaller, case.hosts.fitting(scenario))
 
 
 def _fit(tables: Tables) -> None:

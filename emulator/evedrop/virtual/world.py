@@ -6,13 +6,17 @@ Source: docs/maintainers/simulated-world.md.
 from __future__ import annotations
 
 import socket
+import tempfile
 from collections.abc import Callable
-from typing import Any, cast, final
+from pathlib import Path
+from typing import IO, Any, cast, final
 
 from evedrop.system.disk import Disk
 from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import Condition, Lock, Queue, Thread, ThreadEvent
 from evedrop.system.world import Address, World
+from evedrop.virtual.disk import VirtualDisk
+from evedrop.virtual.pipes import Pipe, PipeFile
 from evedrop.virtual.processes import VirtualMachine
 from evedrop.virtual.scheduler import (
     VirtualCondition,
@@ -22,6 +26,8 @@ from evedrop.virtual.scheduler import (
     VirtualScheduler,
 )
 
+TEMPORARY = "temporary"
+"""The folder for temporary files on the disk of another host."""
 EPOCH = 1_767_225_600.0
 """The virtual clock of every machine at the beginning: 2026-01-01."""
 
@@ -33,14 +39,17 @@ class VirtualWorld(World):
     def __init__(self, scheduler: VirtualScheduler, machine: VirtualMachine, zenoh: Any, disk: Disk) -> None:
         self.scheduler, self.machine, self._disk = scheduler, machine, disk
         self._zenoh = zenoh
+        self.disks: dict[str, VirtualDisk] = {}
+        """Other host → its disk."""
 
     def monotonic(self) -> float:
         """Virtual seconds."""
         return self.scheduler.now
 
     def time(self) -> float:
-        """Virtual seconds since 1970."""
-        return EPOCH + self.scheduler.now
+        """Virtual seconds since 1970, by the clock of the current process."""
+        thread = self.scheduler.current
+        return EPOCH + self.scheduler.now + (0.0 if thread is None else thread.task.clock)
 
     def is_suspended(self, pid: int) -> bool:
         """Whether it is."""
@@ -88,6 +97,16 @@ class VirtualWorld(World):
         """Raise OSError if a router listens there."""
         self._zenoh.expect_free((host, port))
 
+    def pipe(self) -> tuple[IO[bytes], IO[bytes]]:
+        """A pipe between simulated processes."""
+        pipe = Pipe(self.scheduler)
+        return cast("IO[bytes]", PipeFile(pipe)), cast("IO[bytes]", pipe.end())
+
+    def temporary_folder(self) -> Path:
+        """That of the machine of the current process."""
+        disk = self._other_disk
+        return Path(tempfile.gettempdir()) if disk is None else disk.root / TEMPORARY
+
     @property
     def process(self) -> ThisProcess:
         """The process of the current thread."""
@@ -95,8 +114,13 @@ class VirtualWorld(World):
 
     @property
     def disk(self) -> Disk:
-        """The disk, simulated or not."""
-        return self._disk
+        """The disk, simulated or not, of the machine of the current process."""
+        return self._other_disk or self._disk
+
+    @property
+    def _other_disk(self) -> VirtualDisk | None:
+        thread = self.scheduler.current
+        return None if thread is None else self.disks.get(thread.task.host)
 
     @property
     def zenoh(self) -> Any:

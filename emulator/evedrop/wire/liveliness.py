@@ -88,13 +88,13 @@ class LivelinessRelay:
                 elsewhere = (self._held[other] for other in self._sides if name in self._joined[other])
                 wanted = set[str]().union(*elsewhere) - self._held[name]
                 mirrored = self._mirrored[name]
-                for key in mirrored.keys() - wanted:
+                for key in sorted(mirrored.keys() - wanted):
                     mirrored.pop(key).undeclare()
                     if self._lives(name, key):
                         self._held[name].add(key)
                         self._noted(name, key)
                         self._changed()
-                for key in wanted - mirrored.keys():
+                for key in sorted(wanted - mirrored.keys()):
                     self._doubtful[name].add(key)
                     mirrored[key] = side.session.liveliness().declare_token(key)
 

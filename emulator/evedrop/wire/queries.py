@@ -139,11 +139,11 @@ class QueryRelay:
                 if self._link(name, other, expression) is not None
             }
             mirrored = self._mirrored[name]
-            for key in mirrored.keys() - wanted.keys():
+            for key in sorted(mirrored.keys() - wanted.keys()):
                 with self._lock:
                     _, queryable = mirrored.pop(key)
                 queryable.undeclare()
-            for key in wanted.keys() - mirrored.keys():
+            for key in sorted(wanted.keys() - mirrored.keys()):
                 queryable = session.declare_queryable(
                     wanted[key], self._taker(name, key), complete=True, allowed_origin=_REMOTE
                 )

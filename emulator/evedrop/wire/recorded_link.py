@@ -99,13 +99,14 @@ class _LinkRows:
         follows = (np.diff(streams) == 0) & (np.diff(n) == 1)
         heard = _floats(rows["time"])[order]
         goes_on = np.concatenate([[False], follows & decided[:-1]])
+        apart = float(np.median(np.diff(heard)[follows])) if follows.any() else 0.0
         survived = ~np.isin(fates, [WireFate.LOST])
         delivered, corrupted = decided & (fates == WireFate.DELIVERED), fates == WireFate.CORRUPTED
         series = MessageSeries(
             survived[decided].astype(np.uint8),
             parts=int((decided & ~goes_on).sum()),
             repeated=int((_flags(rows["again"])[order] & delivered).sum()),
-            seconds=float(np.median(np.diff(heard)[follows])) if follows.any() else None,
+            seconds=apart or None,  # a wire that was suspended hears most of them at once
         )
         check_parts(name, series, "cuts, queues and limits hide what the loss model did in between")
         self._note_changes(rows)

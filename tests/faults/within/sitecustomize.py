@@ -62,7 +62,7 @@ if LAUNCHES or (CONFUSED and "evedrop.fork_server" in sys.orig_argv):
 
         def begun(host: Any, *given: Any) -> None:
             begin(host, *given)
-            host.heard = os.dup(host._output_file.fileno())  # ours outlives that of the connection
+            host.heard = os.dup(host._ssh.output_file.fileno())  # ours outlives that of the connection
 
         def closed(host: Any, deadline: float) -> None:
             close(host, deadline)

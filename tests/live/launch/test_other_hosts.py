@@ -14,10 +14,12 @@ from typing import Any
 import pytest
 
 from evedrop.errors import RunError, UsageError
+from evedrop.live.launch import other_hosts
 from evedrop.live.launch.hosts_file import HostTable
 from evedrop.live.launch.other_hosts import (
     MOST_NOISE,
     Greeting,
+    HostedProcess,
     LauncherHeartbeat,
     Order,
     ProcessEnded,
@@ -28,6 +30,7 @@ from evedrop.live.launch.other_hosts import (
     order_in,
     own_version,
 )
+from evedrop.live.launch.ssh_client import SystemSsh
 from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST
 from evedrop.live.protocol.brief import brief_from
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
@@ -159,9 +162,30 @@ def test_an_ssh_that_takes_nothing_is_ended(connect: Connect, tmp_path: Path, mo
     monkeypatch.setattr("evedrop.live.launch.other_hosts._SEND_SECONDS", 0.2)
     host = connect(GREETING)
     ready(host)
-    os.kill(host._ssh.pid, signal.SIGSTOP)
+    assert isinstance(host._ssh, SystemSsh)
+    os.kill(host._ssh.process.pid, signal.SIGSTOP)
     path = brief_of_eve(modules="/srv/" + "x" * 1_000_000).write(tmp_path)
     with (tmp_path / "eve.log").open("wb") as file:
         process = host.start(7, path, file, {})
     assert process.wait(LIMIT) == CONNECTION_LOST
+    host.close(time.monotonic() + LIMIT)
+
+
+def test_a_launcher_without_memory_for_what_a_host_says_loses_its_processes(
+    connect: Connect, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once, also if there is none for a process's last word: it would wait for ever for a host that nobody listens to."""
+
+    def refuse(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(other_hosts, "answer_in", refuse)
+    monkeypatch.setattr(LastWord, "leave", refuse)
+    host = connect(GREETING, GREETING)
+    wait_until(host._lost.is_set, "the loss of the host")
+    assert "there is not enough memory" in host._ending()
+    with (tmp_path / "eve.log").open("wb") as log:
+        process = HostedProcess(7, host, log, str(tmp_path / "last word"))
+        process.lose(host._ending())
+    assert process.poll() == CONNECTION_LOST
     host.close(time.monotonic() + LIMIT)

@@ -72,11 +72,7 @@ def test_a_process_has_its_files_in_the_private_folder(tmp_path: Path) -> None:
         log.write(b"a line\n")
         return Process()
 
-    def send(text: memoryview) -> int:
-        sent.append(bytes(text[:10]))  # a pipe may take less than it is given
-        return len(sent[-1])
-
-    host = HostProcesses(tmp_path, start, send)
+    host = HostProcesses(tmp_path, start, sent.append)
     given = replace(brief_of_eve(state_file="/launcher/eve.state"), last_word="/launcher/eve.last-word")
     word = LastWord(Cause.NO_CONNECTION, "why")
     word.leave(tmp_path / "eve.last-word")  # of an earlier start
@@ -102,11 +98,7 @@ def test_what_the_program_itself_ends_is_not_reported(tmp_path: Path) -> None:
     sent: list[bytes] = []
     process = Process()
 
-    def send(text: memoryview) -> int:
-        sent.append(bytes(text))
-        return len(text)
-
-    host = HostProcesses(tmp_path, lambda *_: process, send)
+    host = HostProcesses(tmp_path, lambda *_: process, sent.append)
     before = threading.active_count()
     host.obey(ORDER)
     host.end()
@@ -121,11 +113,7 @@ def test_a_process_that_cannot_be_started_is_reported(folder: str, why: str, tmp
     """The launcher gets the reason for the log, and an end; the host goes on, and no file stays open."""
     sent: list[bytes] = []
 
-    def send(text: memoryview) -> int:
-        sent.append(bytes(text))
-        return len(text)
-
-    host = HostProcesses(tmp_path / folder, unable, send)
+    host = HostProcesses(tmp_path / folder, unable, sent.append)
     before = os.listdir("/proc/self/fd")
     host.obey(ORDER)
     assert os.listdir("/proc/self/fd") == before
@@ -146,11 +134,7 @@ def test_a_process_whose_fork_server_is_gone_is_reported_as_lost_with_it(number:
     def start(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
         raise OSError(number, "its fork server is gone")
 
-    def send(text: memoryview) -> int:
-        sent.append(bytes(text))
-        return len(text)
-
-    HostProcesses(tmp_path, start, send).obey(ORDER)
+    HostProcesses(tmp_path, start, sent.append).obey(ORDER)
     assert answer_in(sent[-1]) == ProcessEnded(7, FORK_SERVER_LOST)
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rerun.chunk import RrdReader
+from rerun.chunk import Chunk, RrdReader
 
 from evedrop.results.folder import UNFINISHED
 from evedrop.show.view.column import TIMELINE
@@ -74,20 +74,41 @@ def recorded(recording: ViewRecording, slots: int) -> None:
     wait_until(lambda: recording._recorded >= slots and not recording._waiting, f"{slots} slots on file")
 
 
+def given_at_once(followed: Followed, file: Path) -> list[Chunk]:
+    """The chunks that a viewer is given as soon as it comes: those that are on file."""
+    pieces, content = followed.pieces(), b""
+    wait_until(lambda: followed._opened().spans is not None, "positions")
+    spans = followed._opened().spans
+    assert spans
+    while len(content) < sum(end - start for start, end in spans):
+        content += next(pieces)
+    file.write_bytes(content)
+    return [*RrdReader(file).stream()]
+
+
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_late_viewer_gets_large_chunks_and_every_row_once(run: Simulated, tmp_path: Path) -> None:
-    """It has fewer chunks than a viewer that followed from slot 0 on, and both have every row of the recording, once."""
+    """It has fewer chunks than a viewer that followed from slot 0 on, and both have every row of the recording, once.
+
+    Whenever it comes, the recording so far is at most a thousand chunks, with the styles before all others.
+    """
     path = tmp_path / "recording.rrd"
     followed = Followed(path)
     first = Watcher(followed, tmp_path / "first.rrd")
     recording = ViewRecording(path, run.scene, live=True)
+    recording._period = 0.001  # the batches of ten slots do not come at their pace
     late: list[Watcher] = []
     for slots in run.chunks(10):
         recording.add(slots)
         recorded(recording, slots.first + slots.count)
-        if slots.first in {0, 50, 990, 1000, 2150}:
+        if slots.first in {50, 990, 2150}:
             late.append(Watcher(followed, tmp_path / f"{slots.first}.rrd"))
             wait_until(lambda: late[-1].bytes > 0, "what a late viewer reads")
+        if slots.first in {980, 1990, 2290}:
+            chunks = given_at_once(followed, tmp_path / "late.rrd")
+            assert len(chunks) <= 1000
+            static = [chunk.is_static for chunk in chunks]
+            assert static == sorted(static, reverse=True)
     recording.note(SLOTS - 1, "INFO", "the last line")
     assert recording.close()
     last = Watcher(followed, tmp_path / "last.rrd")
@@ -99,31 +120,6 @@ def test_a_late_viewer_gets_large_chunks_and_every_row_once(run: Simulated, tmp_
     assert chunks_of(path) < 300
     assert chunks_of(tmp_path / "first.rrd") > 1000
     assert chunks_of(last.all()) == chunks_of(path)
-
-
-def test_what_a_late_viewer_reads_at_once_has_few_chunks(run: Simulated, tmp_path: Path) -> None:
-    """Whenever it comes, the recording so far is at most a thousand chunks, with the styles before all others."""
-    path = tmp_path / "recording.rrd"
-    followed = Followed(path)
-    recording = ViewRecording(path, run.scene, live=True)
-    for slots in run.chunks(10):
-        recording.add(slots)
-        recorded(recording, slots.first + slots.count)
-        if slots.first in {980, 1990, 2290}:
-            pieces = followed.pieces()
-            content = b""
-            wait_until(lambda: followed._opened().spans is not None, "positions")
-            spans = followed._opened().spans
-            assert spans
-            while len(content) < sum(end - start for start, end in spans):
-                content += next(pieces)
-            (tmp_path / "late.rrd").write_bytes(content)
-            with pytest.warns(match="no footer"):
-                chunks = [*RrdReader(tmp_path / "late.rrd").stream()]
-            assert len(chunks) <= 1000
-            static = [chunk.is_static for chunk in chunks]
-            assert static == sorted(static, reverse=True)
-    assert recording.close()
 
 
 def test_a_viewer_that_comes_when_the_files_are_removed_reads_the_recording(run: Simulated, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -81,6 +82,7 @@ def process(options: argparse.Namespace) -> int:
         world().process.leave_on_signals()
     world().process.on_thread_failure(_end_of_thread)
     brief = read_brief(options.brief, options.role)
+    world().process.on_thread_failure(partial(_end_of_thread, last_word=brief.last_word))
     if brief.ends_with_stdin:  # started by a launcher, which writes another brief if it restarts the process
         options.brief.unlink(missing_ok=True)  # its keys should not stay on disk
         world().process.continue_when_parent_dies()
@@ -101,15 +103,19 @@ def process(options: argparse.Namespace) -> int:
         raise
 
 
-def _end_of_thread(error: BaseException) -> None:
+def _end_of_thread(error: BaseException, last_word: str | None = None) -> None:
     """End the process, because an error has ended one of its threads: it would wait for ever for what that thread does."""
     import traceback
 
+    from evedrop.live.protocol.last_word import LastWord
     from evedrop.system.lacks import lack_of
     from evedrop.system.output import say
     from evedrop.system.world import world
 
-    if (lack := lack_of(error)) is not None:
+    if isinstance(error, EvedropError):  # such as a message that breaks the protocol
+        LastWord.about(error).leave(last_word)
+        say(error.illustrated)
+    elif (lack := lack_of(error)) is not None:
         say(lack)
     else:
         traceback.print_exception(error)
@@ -269,6 +275,8 @@ def host(options: argparse.Namespace) -> int:
     from evedrop.live.launch.other_hosts import serve_launcher
 
     del options
+    if sys.stdin is None or sys.stdin.isatty():
+        raise UsageError("`evedrop host` is started by `evedrop run SCENARIO --hosts FILE`, over ssh; use that command")
     serve_launcher()
     return 0
 

@@ -16,16 +16,9 @@ import errno
 import importlib.metadata
 import itertools
 import json
-import os
-import select
 import shlex
-import shutil
-import signal
-import subprocess
-import sys
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Annotated, Any, final
@@ -35,6 +28,7 @@ from msgspec import Meta, Struct, convert, to_builtins
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.hosts_file import HostsPlan, HostTable
 from evedrop.live.launch.private_folder import private_folder
+from evedrop.live.launch.ssh_client import SshClient, SystemSsh
 from evedrop.live.launch.starter import (
     CONNECTION_LOST,
     FORK_SERVER_LOST,
@@ -48,9 +42,9 @@ from evedrop.live.protocol.brief import AnyBrief, ImportingPart, ReceiverPart, b
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 from evedrop.system.environment import own_environment
 from evedrop.system.fields import NotNegative, Slot
-from evedrop.system.parents import continue_when_parent_dies, signalled_when_parent_dies
+from evedrop.system.lacks import lack_of
 from evedrop.system.processes import kill, wait_for
-from evedrop.system.signals import raise_on_signals
+from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import ThreadEvent
 from evedrop.system.waiting import Alarm
 from evedrop.system.world import world
@@ -161,7 +155,7 @@ ANSWER_SECONDS = 60.0
 _END_SECONDS = 8.0  # for a host to end its processes; they take three at most
 _SEND_SECONDS = 10.0  # for ssh to take some bytes; a suspended one takes none
 _POLL_SECONDS = 0.05
-_MOST_SAID = 2**20
+_MOST_BYTES = 2**16
 _ALIVE_SECONDS = 3
 _BEAT_SECONDS = 30.0
 _SILENCE_SECONDS = 600.0  # after which a host considers a silent launcher gone; a user may suspend it for a while
@@ -182,10 +176,10 @@ _OPTIONS = (
 class HostedProcess(ReportedProcess):
     """A process on another host."""
 
-    def __init__(self, number: int, host: SshHost, log: int, last_word: str | None) -> None:
+    def __init__(self, number: int, host: SshHost, log: IO[bytes], last_word: str | None) -> None:
         """number: distinguishes it from all other processes of the run.
 
-        log: the file descriptor of its log, which it owns; last_word: the launcher's file for its last word.
+        log: its log, which it closes; last_word: the launcher's file for its last word.
         """
         super().__init__(number)
         self._host, self._log, self._last_word = host, log, last_word
@@ -193,7 +187,7 @@ class HostedProcess(ReportedProcess):
     def write(self, text: str) -> None:
         """Write to its log."""
         with contextlib.suppress(OSError):  # the disk is full
-            os.write(self._log, text.encode())
+            self._log.write(text.encode())
 
     def lose(self, why: str) -> None:
         """Note that it was lost with its host, and write why into its log."""
@@ -203,11 +197,12 @@ class HostedProcess(ReportedProcess):
     def end(self, status: int, last_word: LastWord | None) -> None:
         """Note that it ended with this status and this last word."""
         if last_word is not None:
-            last_word.leave(self._last_word)
+            with contextlib.suppress(MemoryError):  # who waits for it must hear of its end
+                last_word.leave(self._last_word)
         self.ended(status)
 
     def _close(self) -> None:
-        os.close(self._log)
+        self._log.close()
 
     def send_signal(self, sig: int) -> None:
         """Send a signal to it, if it still runs."""
@@ -226,27 +221,22 @@ class SshHost:
         config: Path | None,
         longest_outage: float,
         beat_seconds: float = _BEAT_SECONDS,
+        ssh: Callable[[Sequence[str]], SshClient] = SystemSsh,
     ) -> None:
         """Begin to connect. Raises UsageError if there is no ssh.
 
-        longest_outage: seconds for which a process of the run may be cut off. beat_seconds: between two heartbeats.
+        longest_outage: seconds for which a process of the run may be cut off. beat_seconds: between two heartbeats. ssh: starts
+        a client with a command.
         """
         self.name, self._table, self._beat_seconds = name, table, beat_seconds
         self._sending, self._guard = world().lock(), world().lock()
         self._processes: dict[int, HostedProcess] = {}
         self._version = ""
+        self._lack: str | None = None
         self._answered, self._lost = world().event(), world().event()
-        self._output_file = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the connection
         try:
-            self._ssh = subprocess.Popen(
-                _ended_with_us(ssh_command(table, config, longest_outage)),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._output_file,
-                start_new_session=True,  # Ctrl-C in the terminal must reach only the launcher
-            )
+            self._ssh = ssh(ssh_command(table, config, longest_outage))
         except OSError as error:
-            self._output_file.close()
             raise UsageError(f"ssh cannot be started ({error.strerror}); install OpenSSH's client") from error
         self._reader = world().thread(self._follow, name=f"host {name}")
         self._reader.start()
@@ -282,7 +272,7 @@ class SshHost:
         world().disk.remove(path)  # its keys should not stay on disk
         if self._table.modules is not None and isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
             brief = replace(brief, part=replace(brief.part, modules=self._table.modules))
-        process = HostedProcess(number, self, os.dup(log.fileno()), brief.last_word)
+        process = HostedProcess(number, self, world().disk.again(log), brief.last_word)
         with self._guard:
             if self._lost.is_set():
                 process.ended(CONNECTION_LOST)
@@ -295,35 +285,32 @@ class SshHost:
 
     def send(self, order: Order) -> None:
         """Send an order; harmless if the connection is lost, which ends all processes there. Ends an ssh that takes nothing."""
-        assert self._ssh.stdin is not None  # noqa: S101 - it was started with a pipe
         with self._sending, contextlib.suppress(OSError, ValueError):
-            handle, left = self._ssh.stdin.fileno(), line_of(order)
-            os.set_blocking(handle, False)
-            room = select.poll()
-            room.register(handle, select.POLLOUT)
-            while left:
-                if not room.poll(1000 * _SEND_SECONDS):
-                    self._ssh.kill()
-                    return
-                left = left[os.write(handle, left) :]
+            if not self._ssh.send(line_of(order), _SEND_SECONDS):
+                self._ssh.kill()
 
     def hang_up(self) -> None:
         """Close the connection: the processes there end. Does not wait."""
-        assert self._ssh.stdin is not None  # noqa: S101 - it was started with a pipe
         with self._sending, contextlib.suppress(OSError):
-            self._ssh.stdin.close()
+            self._ssh.hang_up()
 
     def close(self, deadline: float) -> None:
         """Wait until ssh has ended, and end it at the deadline."""
         self.hang_up()
         kill(*wait_for([self._ssh], deadline - world().monotonic()))
         self._reader.join(_END_SECONDS)  # it reads the end of the connection at once, and may then wait for ssh as long
-        self._output_file.close()
+        self._ssh.close()
 
     def _follow(self) -> None:
         """Read the host's messages until the connection ends; all processes there have ended then."""
-        assert self._ssh.stdout is not None  # noqa: S101 - it was started with a pipe
-        with self._ssh.stdout as answers, contextlib.suppress(ValueError, OSError):
+        try:
+            self._read()
+        except MemoryError as error:
+            self._lack = lack_of(error)
+        self._lose()
+
+    def _read(self) -> None:
+        with self._ssh.answers as answers, contextlib.suppress(ValueError, OSError):
             for line in itertools.islice(answers, MOST_NOISE):  # of the login shell
                 with contextlib.suppress(ValueError):
                     self._version = greeting_in(line).evedrop
@@ -333,7 +320,6 @@ class SshHost:
             self._answered.set()
             for line in answers:
                 self._take(answer_in(line))
-        self._lose()
 
     def _take(self, answer: Answer) -> None:
         with self._guard:
@@ -369,10 +355,10 @@ class SshHost:
         return f"host {self.name}"
 
     def _reason(self) -> str:
-        """The last line that ssh printed, or its exit status."""
-        # Not by reading the file: ssh writes at the same position in it.
-        output = os.pread(self._output_file.fileno(), _MOST_SAID, 0).decode("utf-8", "replace")
-        lines = [line.strip() for line in output.splitlines() if line.strip()]
+        """What this machine lacks, or the last line that ssh printed, or its exit status."""
+        if self._lack is not None:
+            return self._lack
+        lines = [line.strip() for line in self._ssh.said.splitlines() if line.strip()]
         status = self._ssh.poll()
         if lines:
             return lines[-1]
@@ -402,17 +388,6 @@ def ssh_command(table: HostTable, config: Path | None, longest_outage: float) ->
     return ["ssh", *given, *_OPTIONS, *alive, *ssh_words(table), f"{folder}exec {shlex.join([*table.command, 'host'])}"]
 
 
-def _ended_with_us(command: list[str]) -> list[str]:
-    """The same command, whose process the system kills when this one dies: ssh would wait for a host that hangs, or hang itself.
-
-    Raises FileNotFoundError if there is no such program.
-    """
-    program = shutil.which(command[0])
-    if program is None:
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
-    return signalled_when_parent_dies([program, *command[1:]], signal.SIGKILL)
-
-
 @final
 class SshStarter:
     """Starts each process on its host, and those without one by another starter."""
@@ -431,10 +406,16 @@ class SshStarter:
 
 
 @contextmanager
-def ssh_starter(plan: HostsPlan, here: Starter, stop: ThreadEvent, longest_outage: float) -> Iterator[Starter]:
+def ssh_starter(
+    plan: HostsPlan,
+    here: Starter,
+    stop: ThreadEvent,
+    longest_outage: float,
+    ssh: Callable[[Sequence[str]], SshClient] = SystemSsh,
+) -> Iterator[Starter]:
     """A starter that is connected to all of these hosts; ends all processes on them at the end of the block.
 
-    longest_outage: as for `SshHost`. Raises UsageError if a host cannot be used, Interrupted if stopped meanwhile.
+    longest_outage, ssh: as for `SshHost`. Raises UsageError if a host cannot be used, Interrupted if stopped meanwhile.
     """
     with ExitStack() as stack:
         hosts: dict[str, SshHost] = {}
@@ -448,7 +429,7 @@ def ssh_starter(plan: HostsPlan, here: Starter, stop: ThreadEvent, longest_outag
 
         stack.callback(close)
         for name, table in plan.hosts.items():
-            hosts[name] = SshHost(name, table, plan.ssh_config, longest_outage)
+            hosts[name] = SshHost(name, table, plan.ssh_config, longest_outage, ssh=ssh)
         deadline = world().monotonic() + ANSWER_SECONDS
         for host in hosts.values():
             host.wait_until_ready(deadline, stop)
@@ -458,22 +439,20 @@ def ssh_starter(plan: HostsPlan, here: Starter, stop: ThreadEvent, longest_outag
 _LAST_LINES_SECONDS = 1.0  # for the last lines of a process that has ended, whose own children may hold its log open
 
 
-def serve_launcher() -> None:
-    """Carry out the launcher's orders until it closes standard input.
+def serve_launcher(starter: Callable[[], AbstractContextManager[Starter]] = preloaded_without_recorder) -> None:
+    """Carry out the launcher's orders until it closes standard input; starter: gives what starts processes.
 
-    Raises UsageError if no launcher gives orders, RunError for one that is malformed; all processes are then ended.
+    Raises RunError for an order that is malformed; all processes are then ended.
     """
-    if sys.stdin is None or sys.stdin.isatty():
-        raise UsageError("`evedrop host` is started by `evedrop run SCENARIO --hosts FILE`, over ssh; use that command")
-    continue_when_parent_dies()  # if suspended, once the connection, whose process on this host is the parent, is closed
-    os.umask(0o077)
-    answers = os.fdopen(os.dup(1), "wb", buffering=0)
-    os.dup2(2, 1)  # so that nothing else can write between the messages
-    with raise_on_signals(), private_folder() as private, preloaded_without_recorder() as start:
-        host, silence = HostProcesses(private, start, answers.write), _Silence()
+    this = world().process
+    this.continue_when_parent_dies()  # if suspended, once the connection, whose process on this host is the parent, is closed
+    this.keep_files_private()
+    this.keep_events_apart(launched=True)
+    with this.raise_on_signals(), private_folder() as private, starter() as start:
+        host, silence = HostProcesses(private, start, this.send_event), _Silence()
         try:
             host.answer(Greeting(own_version()))
-            for line in sys.stdin.buffer:
+            for line in _lines_of(this):
                 try:
                     order = order_in(line)
                     silence.heard(order)
@@ -487,13 +466,22 @@ def serve_launcher() -> None:
             host.end()
 
 
+def _lines_of(process: ThisProcess) -> Iterator[bytes]:
+    """The lines that come on the standard input of a process; one that the end cuts off is no line."""
+    rest = b""
+    while data := process.read_input(_MOST_BYTES):
+        *lines, rest = (rest + data).split(b"\n")
+        yield from lines
+
+
 @final
 class _Silence:
     """Ends this program when the launcher has been silent for long: its host may be gone, and the connection seem open."""
 
     def __init__(self) -> None:
         self._alarm = Alarm(world().process.interrupt)
-        self._seconds = 0.0
+        self._seconds = _SILENCE_SECONDS
+        self._alarm.set(self._seconds)  # the connection may die before anything came
 
     def heard(self, order: Order) -> None:
         """Note that an order came. A heartbeat says how long the launcher may be silent from now on."""
@@ -506,10 +494,10 @@ class _Silence:
 class HostProcesses:
     """The processes of a launcher on this host.
 
-    private: the folder for their files; send: writes bytes to the launcher.
+    private: the folder for their files; send: sends a line to the launcher.
     """
 
-    def __init__(self, private: Path, start: Starter, send: Any) -> None:
+    def __init__(self, private: Path, start: Starter, send: Callable[[bytes], object]) -> None:
         self._private, self._start, self._send = private, start, send
         self._sending = world().lock()
         self._ending = False
@@ -518,9 +506,7 @@ class HostProcesses:
     def answer(self, message: Greeting | Answer) -> None:
         """Send a message to the launcher; harmless if it is gone."""
         with self._sending, contextlib.suppress(OSError):
-            left = memoryview(line_of(message))
-            while left:
-                left = left[self._send(left) :]
+            self._send(line_of(message))
 
     def obey(self, order: Order) -> None:
         """Start a process, or send a signal to one. Raises ValueError for an unusable brief, and a name that no file can have."""
@@ -542,14 +528,14 @@ class HostProcesses:
         environment = {**own_environment(), **order.environment}
         if "TMPDIR" in order.environment:
             environment["TMPDIR"] = str(self._private)
-        read, write = os.pipe()
+        lines, log = world().pipe()
         try:
-            with os.fdopen(write, "wb") as log:
+            with log:
                 path = brief.write(self._private)
                 world().disk.remove(last_word_file(self._private, brief.process), missing_ok=True)
                 self._processes[number] = self._start(brief.role, path, log, environment)
         except OSError as error:
-            os.close(read)
+            lines.close()
             self.answer(LogText(number, f"evedrop: {brief.process} cannot be started ({error})\n"))
             gone = error.errno in (errno.ESRCH, errno.ETIMEDOUT)  # its fork server, whose host is to blame
             self.answer(ProcessEnded(number, FORK_SERVER_LOST if gone else 1))
@@ -557,7 +543,7 @@ class HostProcesses:
         events = self._processes[number].stdout
         if events is not None:
             events.close()  # the launcher waits for no router on another host
-        world().thread(self._follow, number, brief.process, read, name=f"log of {brief.process}").start()
+        world().thread(self._follow, number, brief.process, lines, name=f"log of {brief.process}").start()
 
     def _with_local_files(self, brief: AnyBrief) -> AnyBrief:
         """The same brief with the files of the process in the private folder of this host."""
@@ -568,7 +554,7 @@ class HostProcesses:
         state_file = str((self._private / f"{brief.process}.state").absolute())
         return replace(brief, part=replace(brief.part, state_file=state_file))
 
-    def _follow(self, number: int, name: str, log: int) -> None:
+    def _follow(self, number: int, name: str, log: IO[bytes]) -> None:
         """Send what a process writes to its log, and how it ended."""
         reader = world().thread(self._read, number, log, name="log")
         reader.start()
@@ -580,7 +566,7 @@ class HostProcesses:
         if not self._ending:
             self.answer(ProcessEnded(number, status, read_last_word(last_word_file(self._private, name))))
 
-    def _read(self, number: int, log: int) -> None:
-        with os.fdopen(log, "rb", buffering=0) as lines:
-            while text := lines.read(65536):
+    def _read(self, number: int, log: IO[bytes]) -> None:
+        with log as lines:
+            while text := lines.read(_MOST_BYTES):
                 self.answer(LogText(number, text.decode("utf-8", "replace")))

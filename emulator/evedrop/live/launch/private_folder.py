@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -33,7 +32,7 @@ def private_folder(where: Path | None = None) -> Iterator[Path]:
     """
     with contextlib.ExitStack() as stack:
         try:
-            where = (where or Path(tempfile.gettempdir())).absolute()
+            where = (where or world().temporary_folder()).absolute()
             _sweep(where)
             folder = where / f"{_PREFIX}{world().token(8).hex()}"
             stack.enter_context(world().process.removed_with_it(folder))

@@ -30,6 +30,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from evedrop.errors import BriefError
 from evedrop.live.protocol.brief import Identity
 from evedrop.live.protocol.keys import ZenohConfig
+from evedrop.system.world import world
 
 _BEFORE = datetime.timedelta(days=1)  # so that a host whose clock is slow or set to another time zone can take part
 _VALID = datetime.timedelta(days=30)
@@ -46,7 +47,7 @@ class Authority:
 
     def __init__(self, run: str, now: datetime.datetime | None = None) -> None:
         """now: the start of its validity; by default, the present time."""
-        begin = now or datetime.datetime.now(datetime.UTC)
+        begin = now or _now()
         self._from, self._until = begin - _BEFORE, begin + _VALID
         self._key = ec.generate_private_key(ec.SECP256R1())
         self._name = _named(authority_name(run))
@@ -126,7 +127,7 @@ _AGAIN = "write the briefs again with `evedrop brief`, all of them"
 
 def check_identity(identity: Identity, process: str, now: datetime.datetime | None = None) -> None:
     """Raise BriefError unless a process can use this identity now; now: by default, the clock's time."""
-    now = now or datetime.datetime.now(datetime.UTC)
+    now = now or _now()
     try:
         authority = x509.load_pem_x509_certificate(identity.authority.encode())
         certificate = x509.load_pem_x509_certificate(identity.certificate.encode())
@@ -155,6 +156,10 @@ def check_identity(identity: Identity, process: str, now: datetime.datetime | No
             f"identity.certificate expired {end:%Y-%m-%d %H:%M} UTC, and this host's clock says {now:%Y-%m-%d %H:%M} UTC; "
             f"{_AGAIN}, or set this host's clock"
         )
+
+
+def _now() -> datetime.datetime:
+    return datetime.datetime.fromtimestamp(world().time(), datetime.UTC)
 
 
 def name_of(certificate: x509.Certificate) -> str:

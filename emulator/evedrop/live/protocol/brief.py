@@ -17,10 +17,11 @@ import os
 from base64 import b64decode, b64encode
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, TypeGuard, TypeVar
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 
@@ -140,13 +141,16 @@ class RouterPart:
         _expect_kinds(self.limits)
 
     def expect_usable(self, brief: AnyBrief) -> None:
-        """Make the links, and look for the keys of their streams."""
+        """Make the links, also as they are after each change, and look for the keys of their streams."""
         for name, schedule in self.links.items():
             brief.expect_keys(streams_of(name, schedule))
-            with _using(f"part.links.{name}"):
-                schedule.expect_possible()
-                keys = brief.stream_keys
-                Link(schedule, name, {stream: keys[stream] for stream in streams_of(name, schedule)}, brief.batch)
+            keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, schedule)}
+            later = [change.settings for change in schedule.changes if change.settings is not None]
+            for settings in (schedule.settings, *later):
+                with _using(f"part.links.{name}"):
+                    at_first = replace(schedule, settings=settings)
+                    at_first.expect_possible()
+                    Link(at_first, name, keys, brief.batch)
         if self.acknowledgements is not None:
             brief.expect_keys([f"link/{ACKNOWLEDGEMENTS}"])
             if self.acknowledgements.attack not in ATTACKS:
@@ -546,7 +550,7 @@ class Brief(Generic[P_co]):
     @property
     def text(self) -> str:
         """The brief as JSON."""
-        return json.dumps(self, default=plain, indent=1)
+        return msgspec.json.format(json.dumps(self, default=plain), indent=1)
 
     def write(self, directory: Path) -> Path:
         """Write `<process>.json`, readable by its owner only."""

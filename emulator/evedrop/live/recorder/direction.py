@@ -80,7 +80,7 @@ class Direction:
             self._steering.done(int(self._confirmations.get_nowait()))
         while not self._conductor.questions.empty():
             self._answer(self._conductor.questions.get_nowait())
-        self._steering.carry_on(self._run.done)
+        self._steering.carry_on(self._run.done, lambda: self._run.places(self._present))
         self._run.view.note(self._steering.events)
 
     def look_after(self) -> None:
@@ -88,13 +88,17 @@ class Direction:
         done, at = self._run.done, self._steering.at
         self._recovery.poll(done)
         held = at is not None and done >= at
-        present = set(self._run.score.scenario.digested) - self._conductor.absent
         # Slots are joined without the controller's reports, until the sensor waits for them.
         flow = self._brief.flow
         owed = self._run.score.all_joined or done - self._run.settled >= flow.window - flow.batch
         unneeded = () if owed else (CONTROLLER,)
         missing = bool(self._conductor.missing)
-        self._stall.poll(done, lambda: self._run.places(present), unneeded, held=held, missing=missing)
+        self._stall.poll(done, lambda: self._run.places(self._present), unneeded, held=held, missing=missing)
+
+    @property
+    def _present(self) -> list[str]:
+        """The processes that report, and that are not away because the scenario says so."""
+        return [name for name in self._run.score.scenario.digested if name not in self._conductor.absent]
 
     def dismiss(self) -> None:
         """Remove the control file of the run, which is over, answer all open questions, and close open outages."""

@@ -76,7 +76,7 @@ class RunFolder:
         """Save the results so far, from time to time. Raises RunError if they cannot be written."""
         try:
             with suppress(NoAnswer):  # reported at the end; rows are written before the summary is computed
-                self._writer.checkpoint(self._at, self._so_far)
+                self._writer.checkpoint(self._at, self._so_far, lambda: self._digest_rows.write(self._writer))
         except OSError as error:
             raise UnwrittenResults(unwritten(error)) from error
 

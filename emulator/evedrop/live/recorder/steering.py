@@ -128,15 +128,16 @@ class Steering:
             self._asked = True
             self._conductor.send_to(SENSOR, Hold())
 
-    def carry_on(self, reported: int) -> None:
+    def carry_on(self, reported: int, places: Callable[[], Mapping[str, int]] = dict) -> None:
         """Carry out as many events as possible, given that all slots below `reported` are joined.
 
-        Raises RunError if they do not become possible in time.
+        places: process → the first slot that it has not reported. Raises RunError if they do not become possible in time.
         """
         if self.at is None:
             return
         if reported < self.at:
-            self._fail(f"not every process has reported all slots below {self.at}")
+            behind = [name for name, k in places().items() if k < self.at]
+            self._fail(f"{' and '.join(behind) or 'a process'} did not report all slots before it")
             return
         while self._settled():
             if self._pending and not self._may(self._pending[0]):

@@ -6,6 +6,7 @@ Its account has the outcomes of its packets, slot by slot, and the distributions
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -76,6 +77,9 @@ class ReceiverOutage(NamedTuple):
     """Whether it continues from its last belief; otherwise from the prior of the slot in which it went away."""
 
 
+_NUMBERS = frozenset({"reorder", "duplicate", "corrupt", "rate", "queue"})
+
+
 @dataclass(frozen=True)
 class Change:
     """From slot `at` on, a link has other settings, or it is cut or healed."""
@@ -107,6 +111,14 @@ class LinkSchedule:
         expect_slots(self.window, *(change.at for change in self.changes), *outages)
         if self.window > MOST_SLOTS or not isinstance(self.settings.get("loss"), Mapping):
             raise ValueError(f"its window is above {MOST_SLOTS} slots, or its settings have no loss")
+        for name in _NUMBERS & self.settings.keys():
+            value = self.settings[name]
+            if not isinstance(value, (int, float)) or not 0.0 <= value < math.inf:
+                raise ValueError(f"{name} is {value!r:.40}, expected a number of at least 0")
+        if self.settings.get("rate") and "queue" not in self.settings:
+            raise ValueError("it has a rate, and no queue")
+        if (delay := self.settings.get("delay")) is not None:
+            delay_of(delay)
 
 
 def streams_of(receiver: str, schedule: LinkSchedule) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ Source: docs/maintainers/simulated-world.md.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -47,6 +48,8 @@ class Access:
         self._limits: Sequence[Mapping[str, Any]] = section(config, "low_pass_filter") or []
         self._users = _users(section(config, "transport/auth/usrpwd"))
         self._rules: dict[Peer, list[tuple[bool, str, str, str]]] = {}
+        self._allowed: dict[tuple[Peer, str, str, str], bool] = {}
+        self._most: dict[tuple[str, str], float] = {}
 
     def knows(self, user: str | None, password: str | None) -> bool:
         """Whether a user may connect."""
@@ -56,6 +59,13 @@ class Access:
         """Whether a message from (`ingress`) or to (`egress`) a peer passes."""
         if not self._enabled:
             return True
+        asked = peer, flow, message, key
+        allowed = self._allowed.get(asked)
+        if allowed is None:
+            allowed = self._allowed[asked] = self._by_rules(*asked)
+        return allowed
+
+    def _by_rules(self, peer: Peer, flow: str, message: str, key: str) -> bool:
         rules = self._rules.get(peer)
         if rules is None:
             rules = self._rules[peer] = self._of(peer)
@@ -69,11 +79,15 @@ class Access:
 
     def has_room(self, message: str, key: str, size: int) -> bool:
         """Whether a message that comes in is small enough."""
-        return all(
-            size <= limit["size_limit"]
-            for limit in self._limits
-            if message in limit["messages"] and any(includes(keys, key) for keys in limit["key_exprs"])
-        )
+        most = self._most.get((message, key))
+        if most is None:
+            limits = (
+                limit["size_limit"]
+                for limit in self._limits
+                if message in limit["messages"] and any(includes(keys, key) for keys in limit["key_exprs"])
+            )
+            most = self._most[message, key] = min(limits, default=math.inf)
+        return size <= most
 
     def _of(self, peer: Peer) -> list[tuple[bool, str, str, str]]:
         subjects = {entry["id"] for entry in self._control["subjects"] if _matches(entry, peer)}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Self, final
@@ -71,8 +71,13 @@ class VirtualZenoh:
         self._sessions: list[VirtualSession] = []
         self._cut: dict[str, float] = {}
         """Process that cannot connect → until when."""
+        self._unplugged: dict[str, float] = {}
+        """Host that is cut off from all others → until when."""
         self._confused: set[str] = set()
-        self._shortened: set[str] = set()
+        self._changes: dict[str, Callable[[bytes], bytes]] = {}
+        """Process → what becomes of the next message to it."""
+        self._occupied: set[Address] = set()
+        """Addresses at which other programs listen."""
         scheduler.on_stop = self._stopped
 
     # What programs call
@@ -91,7 +96,7 @@ class VirtualZenoh:
         self._sessions.append(session)
         try:
             for place in self._listens_at(session, config):
-                if place in self._routers:
+                if place in self._routers or _address(place) in self._occupied:
                     raise zenoh.ZError(f"{place} is in use")
                 self._routers[place] = session
                 session.places.append(place)
@@ -114,13 +119,14 @@ class VirtualZenoh:
         thread = self.scheduler.current
         assert thread is not None  # noqa: S101 - only programs dial
         self.scheduler.sleep(self.scheduler.random.expovariate(1.0 / _OPEN_SECONDS))
-        if not any(_address(place) == address for place in self._routers) or self._is_cut(thread.task):
+        router = next((router for place, router in self._routers.items() if _address(place) == address), None)
+        if router is None or self._is_cut(thread.task, router.task):
             raise ConnectionRefusedError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
         return _Link(self.scheduler)
 
     def expect_free(self, address: Address) -> None:
         """Raise OSError if something listens at an address."""
-        if any(_address(place) == address for place in self._routers):
+        if address in self._occupied or any(_address(place) == address for place in self._routers):
             raise OSError(errno.EADDRINUSE, os.strerror(errno.EADDRINUSE))
 
     # Connections
@@ -132,8 +138,9 @@ class VirtualZenoh:
         places = section(config, "listen/endpoints") or []
         return list(places["router"] if isinstance(places, dict) else places)
 
-    def _is_cut(self, task: VirtualTask) -> bool:
-        return self._cut.get(task.name, 0.0) > self.scheduler.now
+    def _is_cut(self, task: VirtualTask, router: VirtualTask) -> bool:
+        unplugged = [self._unplugged.get(one.host, 0.0) for one in (task, router) if task.host != router.host]
+        return max(self._cut.get(task.name, 0.0), *unplugged, 0.0) > self.scheduler.now
 
     def _wait_while_suspended(self, place: str, seconds: float) -> None:
         """The system takes connections for a router that is suspended; it answers once it goes on."""
@@ -144,7 +151,7 @@ class VirtualZenoh:
     def _connect(self, session: VirtualSession, place: str) -> bool:
         """Connect a session with the router at an endpoint; returns whether it is connected."""
         router = self._routers.get(place)
-        if router is None or router is session or router.task.stopped or self._is_cut(session.task):
+        if router is None or router is session or router.task.stopped or self._is_cut(session.task, router.task):
             return False
         if not router.access.knows(session.user, session.password):
             return False
@@ -223,6 +230,14 @@ class VirtualZenoh:
             self._cut[process] = float("inf") if seconds is None else self.scheduler.now + seconds
         return hit
 
+    def unplug(self, host: str, seconds: float | None) -> None:
+        """Let nothing through between the processes of a host and all others for some time, or for good."""
+        self._unplugged[host] = float("inf") if seconds is None else self.scheduler.now + seconds
+        for session in self._sessions:
+            for end in [*session.ends] if session.task.host == host else ():
+                if end.other.session.task.host != host:
+                    end.connection.freeze(seconds, min(one.session.lease for one in end.connection.ends))
+
     def slow(self, process: str, seconds: float | None) -> bool:
         """Make everything on the connections of a process take longer for some time, or for good."""
         hit = False
@@ -239,13 +254,21 @@ class VirtualZenoh:
         """Whether the message that a session gets now is to arrive at the wrong subscriber."""
         return self._unmark(session, self._confused)
 
-    def shorten(self, process: str) -> bool:
-        """Let half of the next message to a process arrive."""
-        return self._mark(process, self._shortened)
+    def change(self, process: str, change: Callable[[bytes], bytes]) -> bool:
+        """Let the next message to a process be another one when it arrives."""
+        hit = any(session.name == process for session in self._sessions)
+        if hit:
+            self._changes[process] = change
+        return hit
 
-    def shortened(self, session: VirtualSession) -> bool:
-        """Whether half of the message that a session gets now is to arrive."""
-        return self._unmark(session, self._shortened)
+    def changed(self, session: VirtualSession, message: bytes) -> bytes:
+        """What arrives at a session of a message."""
+        change = self._changes.pop(session.name, None)
+        return message if change is None else change(message)
+
+    def occupy(self, place: str) -> None:
+        """Let another program listen at an endpoint, so that no router can."""
+        self._occupied.add(_address(place))
 
     def _mark(self, process: str, marked: set[str]) -> bool:
         """Mark a process, if it has a session."""

@@ -75,6 +75,10 @@ class VirtualQuery:
         """Answer it. Raises ZError if the session is closed."""
         self._answer("reply", str(key), payload, details)
 
+    def reply_del(self, key: str, **details: Any) -> None:
+        """Answer that what was on a key is deleted. Raises ZError if the session is closed."""
+        self._answer("reply", str(key), b"", {**details, "kind": zenoh.SampleKind.DELETE})
+
     def reply_err(self, payload: bytes | str | zenoh.ZBytes, **details: Any) -> None:
         """Say why there is no answer. Raises ZError if the session is closed."""
         self._answer("error", self.key_expr, payload, details)

@@ -144,8 +144,8 @@ class Network(Protocol):
     def confused(self, session: VirtualSession) -> bool:
         """Whether the message that a session gets now is to arrive at the wrong subscriber."""
 
-    def shortened(self, session: VirtualSession) -> bool:
-        """Whether half of the message that a session gets now is to arrive."""
+    def changed(self, session: VirtualSession, message: bytes) -> bytes:
+        """What arrives at a session of a message."""
 
     def connect_again(self, session: VirtualSession) -> None:
         """Try to connect a session that has lost its router."""
@@ -394,8 +394,8 @@ class VirtualSession:
 
     def _pass_on(self, source: End | None, frame: TransportFrame, *, remote: bool = False) -> None:
         """Give a message to the readers here, unless it is for others only, and to the ends that read it."""
-        if source is not None and self.network.shortened(self):
-            frame = frame._replace(payload=frame.payload[: len(frame.payload) // 2])
+        if source is not None:
+            frame = frame._replace(payload=self.network.changed(self, frame.payload))
         if source is not None and self.network.confused(self):
             self._confuse(frame)
         else:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, final
 import zenoh
 
 from evedrop.virtual import notes
-from evedrop.virtual.scheduler import VirtualQueue, VirtualScheduler, Waiter
+from evedrop.virtual.scheduler import VirtualQueue, VirtualScheduler, VirtualTask, Waiter
 from evedrop.virtual.zenoh.access import Peer
 
 _DELAY_SECONDS = 1e-4
@@ -67,6 +67,7 @@ class EndOwner(Protocol):
     """The part of a session that its ends use."""
 
     scheduler: VirtualScheduler
+    task: VirtualTask
     name: str
     """Of its process."""
     patience: float

@@ -1,0 +1,65 @@
+"""What the messages of a simulated run must be like, whatever happened to it: who sends what, how far ahead, and how often.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+from evedrop.live.launch.briefs import flow_of
+from evedrop.names import RECORDER
+from evedrop.scenario.tables import Scenario
+from evedrop.virtual.cases import SimulatedCase
+from evedrop.virtual.notes import PutMessage
+
+
+def wrong_messages(case: SimulatedCase, put: list[PutMessage], *, disturbed: bool) -> Iterator[str]:
+    """What is wrong with the messages of a run; disturbed: whether anything has happened to it."""
+    scenario = case.scenario
+    if scenario.shards == 1:
+        yield from _too_far_ahead(scenario, flow_of(scenario, case.ahead).window, put)
+    yield from _to_the_absent(scenario, put)
+    late = scenario.pace > 0 and any(scenario.link(name).delay for name in scenario.receivers)
+    if not disturbed and not late:  # a packet may be under way for so long that it is asked for again
+        yield from _sent_again(put, scenario.shards)
+
+
+def _too_far_ahead(scenario: Scenario, window: int, put: list[PutMessage]) -> Iterator[str]:
+    """The first packet that the sensor sends although a process that it waits for is a window behind."""
+    done = dict.fromkeys((*scenario.receivers, RECORDER), 0)
+    for message in put:
+        kind, _, name = message.key.partition("/")
+        if kind == "progress" and message.slots:
+            done[name] = max(done[name], message.slots[0])
+        elif kind == "uplink" and message.said.startswith("hold "):  # it goes on when all have done the slots before
+            done = {name: max(slot, int(message.said.split()[1])) for name, slot in done.items()}
+        elif kind == "uplink" and message.slots:
+            first, last = message.slots[0], message.slots[-1]
+            behind = min(slot for name, slot in done.items() if name == RECORDER or not _is_away(scenario, name, first))
+            if last >= behind + window:
+                yield f"slot {last} is sent while slot {behind} is not done, in a window of {window}"
+                return
+
+
+def _to_the_absent(scenario: Scenario, put: list[PutMessage]) -> Iterator[str]:
+    """The first delivery to a receiver that is away."""
+    for message in put:
+        kind, _, name = message.key.partition("/")
+        if kind == "downlink" and any(_is_away(scenario, name, slot) for slot in message.slots):
+            yield f"slots {message.said} are delivered to {name}, which is away"
+            return
+
+
+def _is_away(scenario: Scenario, name: str, slot: int) -> bool:
+    return any(away.start <= slot < away.stop for away in scenario.timeline.outages[name])
+
+
+def _sent_again(put: list[PutMessage], shards: int) -> Iterator[str]:
+    """The first command that is sent again in a run to which nothing happens."""
+    commands = Counter((message.key, message.said) for message in put if message.key.startswith("control/"))
+    for (key, said), count in commands.items():
+        if said.startswith("again") or count > shards:
+            yield f"{said!r} is sent to {key.partition('/')[2]}, {count} times, although nothing happens to the run"
+            return

@@ -1,0 +1,170 @@
+"""Runs with processes on other hosts in the simulated world."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from evedrop.cli.simulated import program
+from evedrop.scenario.tables import Scenario
+from evedrop.virtual import faults, host_faults
+from evedrop.virtual.campaign import PlayedCase, play_case
+from evedrop.virtual.cases import SimulatedCase, case_from, case_of
+from evedrop.virtual.disturbance import Disturbance
+from evedrop.virtual.drawn_hosts import MISTAKES, DrawnHost, DrawnHosts
+from evedrop.virtual.host_parts import part_on
+from evedrop.virtual.other_hosts import ODDITIES
+
+SCENARIO = Scenario(
+    {
+        "title": "A run on several hosts",
+        "slots": 40,
+        "pace": 0.1,
+        "longest_outage": 10.0,
+        "process": {"A": [[1.0]], "Q": [[0.01]], "initial_covariance": [[1.0]]},
+        "encoding": {"scheme": "plain"},
+        "legitimate": {"link": {"quality": 0.9}},
+        "eavesdroppers": {"eve": {"strategy": "naive", "link": {"quality": 0.9}}},
+    }
+)
+RELAYED = Scenario({**SCENARIO.as_tables(), "network": {"routers": 2}})
+HOSTS = DrawnHosts((DrawnHost("alpha", ("router", "sensor")), DrawnHost("beta", ("eve",))))
+CONNECTS, GREETED, RUNS = 5, 30, 150
+"""Events after which ssh connects, after which hosts have answered, and after which all processes are there."""
+
+
+def played(*struck: Disturbance, hosts: DrawnHosts = HOSTS, scenario: Scenario = SCENARIO) -> PlayedCase:
+    """The run with these faults; it keeps its promises."""
+    done = play_case(SimulatedCase(1, scenario, struck, hosts=hosts), program, keep=True)
+    assert done.misses == ()
+    assert set(done.struck) == set(struck)
+    return done
+
+
+def test_a_run_on_hosts_is_the_run_in_memory() -> None:
+    """Each process is on its host, which has its own fork server and folder; all hosts are left clean."""
+    run = played().run
+    assert (run.status, run.left) == (0, [])
+    starts = {one.words[0]: one.process for one in run.happened if one.what == "starts"}
+    assert starts["sensor"] == starts["router"] == "fork server of host alpha"
+    assert starts["eve"] == "fork server of host beta"
+    assert starts["legitimate"] == "fork server"
+
+
+@pytest.mark.parametrize(
+    ("fault", "status", "said"),
+    [
+        (faults.KillProcess("ssh of host beta", RUNS), 3, "eve was lost: the connection with host beta ended: "),
+        (faults.KillProcess("sshd of host beta", RUNS), 3, "Connection to beta closed by remote host."),
+        (faults.KillProcess("evedrop host of host beta", RUNS), 3, "the connection with host beta ended"),
+        (faults.TerminateProcess("evedrop host of host beta", RUNS), 3, "the connection with host beta ended"),
+        (faults.KillProcess("fork server of host beta", RUNS), 3, "the fork server on host beta ended"),
+        (faults.StopProcess("evedrop host of host beta", RUNS), 0, ""),
+        (faults.StopProcess("ssh of host beta", RUNS), 0, ""),
+        (faults.StopProcess("sshd of host beta", RUNS), 0, ""),
+        (faults.KillProcess("router", RUNS), 0, ""),
+        (host_faults.CutSsh("connection of host beta", RUNS), 3, "host beta"),
+        (host_faults.FreezeSsh("connection of host beta", RUNS, 3.0), 0, ""),
+        (host_faults.UnplugHost("machine of host beta", RUNS, 3.0), 0, ""),
+        (host_faults.UnplugHost("machine of host beta", RUNS), 3, "host beta"),
+        (host_faults.LosePower("machine of host beta", RUNS), 3, "eve"),
+        (host_faults.LosePower("machine of host alpha", RUNS), 3, "host alpha"),
+        (host_faults.FillHostDisk("disk of host beta", GREETED), 3, "eve cannot be started"),
+        (faults.KillProcess("ssh of host beta", CONNECTS), 2, "host beta: ssh ended with status -9; try `ssh beta"),
+        (host_faults.LosePower("machine of host beta", CONNECTS), 2, "host beta: "),
+    ],
+    ids=str,
+)
+def test_a_run_ends_as_it_must(fault: Disturbance, status: int, said: str) -> None:
+    """It names the host, and nothing is left on any of them."""
+    run = played(fault).run
+    assert (run.status, said in run.said) == (status, True), run.said
+
+
+def test_a_host_that_hears_nothing_from_the_beginning_ends() -> None:
+    """The connection seems open, and not even the first heartbeat comes."""
+    run = played(host_faults.FreezeSsh("connection of host beta", 6), hosts=DrawnHosts(HOSTS.hosts[1:])).run
+    assert run.status == 2
+    assert run.ended < 60.0
+    assert 600.0 < run.seconds < 610.0
+
+
+def test_the_fork_server_of_a_host_that_ends_takes_its_processes_along() -> None:
+    """Those of other hosts end as after any failure."""
+    happened = played(faults.KillProcess("fork server of host alpha", RUNS)).run.happened
+    ends = {one.words[0]: one.words[1] for one in happened if one.what == "ends"}
+    assert ends["sensor"] == ends["router"] == -9
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_hosts_file_with_a_mistake_names_it(mistake: str) -> None:
+    """And nothing is started."""
+    wrong = replace(HOSTS, mistake=mistake)
+    if mistake == "no folder of classes":
+        own = {"strategy": "evedrop.virtual.own_classes:Gate", "link": {"quality": 0.9}}
+        scenario = Scenario({**SCENARIO.as_tables(), "eavesdroppers": {"eve": own}})
+    else:
+        scenario = RELAYED if MISTAKES[mistake].right.startswith("[relay]") else SCENARIO
+    run = played(hosts=wrong, scenario=scenario).run
+    assert run.status == 2
+    assert MISTAKES[mistake].said in run.said
+    assert not any(one.what == "starts" and "ssh" in str(one.words[0]) for one in run.happened)
+
+
+def test_a_run_in_shards_stays_on_one_machine() -> None:
+    """It says so."""
+    run = played(scenario=Scenario({**SCENARIO.as_tables(), "trials": 2, "shards": 2})).run
+    assert (run.status, "hosts carry one run" in run.said) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("oddity", "said"),
+    [
+        ("no evedrop", "host beta: sh: 1: exec: evedrop: not found; try `ssh beta evedrop --version`"),
+        ("another version", "host beta: evedrop 0.0.1 is installed there"),
+        ("refuses ssh", "host beta: ssh: connect to host beta port 22: Connection refused"),
+        ("a shell that only talks", "host beta: "),
+        ("a chatty shell", ""),
+    ],
+)
+def test_a_host_that_cannot_be_used_is_named(oddity: str, said: str) -> None:
+    """With a remedy, and nothing is started on the others; what a login shell prints does no harm."""
+    hosts = DrawnHosts((HOSTS.hosts[0], DrawnHost("beta", ("eve",), oddity)))
+    run = played(hosts=hosts).run
+    assert (run.status == 0) == ODDITIES[oddity]
+    assert said in run.said
+
+
+def test_hosts_are_written_down() -> None:
+    """With their oddities, mistakes and faults."""
+    cases = [case for case in map(case_of, range(1, 400)) if case.hosts is not None]
+    assert len(cases) > 20
+    assert any(host.detailed for case in cases if case.hosts for host in case.hosts.hosts)
+    for case in cases:
+        assert case_from(case.to_text()) == case
+
+
+def test_a_case_without_hosts_is_the_smallest() -> None:
+    """Then those with fewer hosts, mistakes, oddities and processes; each is another one."""
+    hosts = DrawnHosts(
+        (DrawnHost("alpha", ("router", "sensor"), "a chatty shell", True), DrawnHost("beta", ("eve",))), "x"
+    )
+    smaller = [*hosts.smaller()]
+    assert smaller[0] is None
+    assert hosts not in smaller
+    assert len({*smaller}) == len(smaller) > 6
+
+
+def test_hosts_fit_a_smaller_scenario() -> None:
+    """A host without processes is left out."""
+    tables = {**SCENARIO.as_tables(), "eavesdroppers": {}}
+    fitting = HOSTS.fitting(Scenario(tables))
+    assert fitting == DrawnHosts((HOSTS.hosts[0],))
+    assert DrawnHosts((DrawnHost("beta", ("eve",)),)).fitting(Scenario(tables)) is None
+
+
+def test_a_part_has_the_name_of_its_host() -> None:
+    """And a fault that hits nothing says so."""
+    done = play_case(SimulatedCase(1, SCENARIO, (host_faults.CutSsh(part_on("connection", "beta"), RUNS),)), program)
+    assert done.struck == {}

@@ -1,0 +1,383 @@
+"""Says what must hold of a simulated wire: its journal is true to what its receivers got, and its fates are those of its models.
+
+What a fault may take is left out: messages that were on their way when it struck, and records that the disk refused.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from typing import Any, Protocol, final
+
+import zenoh
+
+from evedrop.errors import Interrupted, UsageError
+from evedrop.model.slot.link import NEVER, Fates, Link, LinkSchedule, streams_of
+from evedrop.model.streams import Batch, root_of_seed
+from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, WireSummary
+from evedrop.scenario.receivers import wire_stream_key
+from evedrop.virtual.disturbance import Disturbance
+from evedrop.virtual.faults import (
+    CutPower,
+    DiskDisturbance,
+    FreezeConnection,
+    InterruptProcess,
+    KillProcess,
+    SlowConnection,
+    StopProcess,
+)
+from evedrop.virtual.processes import VirtualProcess
+from evedrop.virtual.run import SimulatedRun
+from evedrop.virtual.world import EPOCH
+from evedrop.wire.file import load_wire, resolved_wire
+from evedrop.wire.journal import journal_tables
+from evedrop.wire.liveliness import joined
+from evedrop.wire.plan import WireLink, WirePlan, numbered_as
+from evedrop.wire.records import REASONS, WireFate
+from tests.faults.wires import wrong_numbers, wrong_summary
+from tests.virtual.wire_programs import Course, Message, WireProgram, gid_of, ros_key, ros_token, service, stream_of
+
+Row = dict[str, Any]
+DISK = "disk"
+_LEASE = 10.0
+_DOUBT = 7.0
+"""For how long after a further start, or after a connection may be made again, a reader may still be away."""
+_ARRIVING, _LEAVING = 1.0, 1.0
+"""Seconds after a program has begun, and before its end, in which messages may miss it."""
+_STEADY_SECONDS = 3.0
+"""For which programs and wire must be there together, so that all tokens are known."""
+_TIMEOUT_BYTES = 7
+"""Of the answer with which Zenoh says that a time limit is over."""
+_CUT = {"cut", "overflow", "too_large", "looped"}
+"""Reasons that come before what the models of a link decide."""
+
+
+class JudgedCase(Protocol):
+    """The part of a case that is judged."""
+
+    @property
+    def seconds(self) -> float:
+        """For which each start runs."""
+
+    @property
+    def operations(self) -> tuple[tuple[float, str], ...]:
+        """What operators type."""
+
+
+@final
+class WireJudge:
+    """Says what must hold and does not."""
+
+    def __init__(
+        self, case: JudgedCase, plan: WirePlan, course: Course, run: SimulatedRun, struck: Mapping[Disturbance, float]
+    ) -> None:
+        self._case, self._plan, self._course, self._run, self._struck = case, plan, course, run, struck
+        self._disk = any(isinstance(fault, DiskDisturbance) for fault in struck)
+        self._killed = any(isinstance(fault, KillProcess) for fault in struck) or self._disk
+        self._targets = {link.name: link.target for link in plan.links}
+
+    def misses(self) -> Iterator[str]:
+        """The broken promises."""
+        run, course = self._run, self._course
+        if run.stuck is not None:
+            yield f"stuck: {run.stuck}"
+            return
+        yield from (f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors)
+        yield from (line for line in run.said.splitlines() if "Traceback" in line or "report this" in line)
+        for process in course.processes:
+            yield from self._of_status(process)
+        try:
+            starts = range(1, len(course.begun) + 1)
+            rows = {
+                number: [row for table in journal_tables(run.folder, number, True) for row in table.to_pylist()]
+                for number in starts
+            }
+        except UsageError as error:
+            if not self._disk:
+                yield f"the journal cannot be read: {error}"
+            return
+        if self._disk:  # which may not have the name of a key
+            rows = {number: [row for row in some if not _has_no_name(row)] for number, some in rows.items()}
+        flat = [row for some in rows.values() for row in some]
+        yield from self._wrong_fates(flat)
+        if not self._disk:
+            yield from wrong_numbers(_numbered(rows))
+        yield from self._true_to_receivers(flat)
+        yield from self._wrong_senders(flat)
+        if run.status in {0, 1} and not self._disk:
+            start = WireSummary.read(run.folder / WIRE_SUMMARY_FILE).start
+            if start != len(rows) and not any(
+                isinstance(fault, KillProcess | InterruptProcess) for fault in self._struck
+            ):
+                yield f"the summary is that of start {start} of {len(rows)}"
+            yield from wrong_summary(run.folder, rows[start], start)
+            yield from self._of_end()
+        if not self._struck:
+            yield from self._of_operators()
+            yield from self._of_tokens()
+        if not self._killed:
+            yield from self._of_readers(len(flat))
+
+    def _of_status(self, process: VirtualProcess) -> Iterator[str]:
+        status = process.task.status
+        interrupts = sum(isinstance(fault, InterruptProcess) for fault in self._struck)
+        if status == -signal.SIGKILL:
+            if not any(isinstance(fault, KillProcess | CutPower) for fault in self._struck):
+                yield "the wire was killed by something else"
+        elif status == Interrupted.exit_status:
+            if interrupts < ("interrupted again" in process.printed) + 1:
+                yield f"status 130 after {interrupts} signals: {process.printed.strip()[-300:]}"
+        elif status == 1 and self._plan.expectations and "FAILED" in process.printed:
+            return
+        elif status != 0 and not self._disk:
+            yield f"status {status}, although nothing of this may end a wire: {process.printed.strip()[-300:]}"
+        elif status != 0 and not any(
+            word in process.printed for word in ("cannot be", "could not be", "disk", "space")
+        ):
+            yield f"status {status} names no disk: {process.printed.strip()[-300:]}"
+
+    def _of_end(self) -> Iterator[str]:
+        """Nothing is left behind, the exit status tells whether expectations held, and wire.toml is the wire."""
+        folder = self._run.folder
+        yield from (f"{path.relative_to(folder)} is left" for path in sorted(folder.rglob("*.new")))
+        if (folder / "control.json").exists():
+            yield "control.json is left"
+        summary = WireSummary.read(folder / WIRE_SUMMARY_FILE)
+        if bool(summary.failed_expectations) != (self._run.status == 1):
+            yield f"status {self._run.status} with {summary.failed_expectations} failed expectations"
+        if resolved_wire(load_wire(folder / WIRE_FILE)) != resolved_wire(self._plan):
+            yield "wire.toml is another wire"
+
+    def _wrong_fates(self, rows: list[Row]) -> Iterator[str]:
+        """Message n of each stream has the fate that its link's models decide, whatever happened to the wire before."""
+        changed = {event.link for event in self._plan.events if event.settings is not None}
+        changed |= {words.split()[1] for _, words in self._case.operations if words.startswith("link") and "=" in words}
+        streams: dict[tuple[str, str, str], dict[int, Row]] = defaultdict(dict)
+        for row in rows:
+            if row["link"] is not None and row["n"] is not None:
+                streams[row["link"], stream_of(row["kind"]), numbered_as(row["key"])][row["n"]] = row
+        for (name, kind, key), of_stream in sorted(streams.items()):
+            link = self._plan.named(name)
+            if self._plan.is_lossless(zenoh.KeyExpr(key)):
+                lost = [n for n, row in of_stream.items() if row["reason"] in {"loss", "corrupted", "cut", "overflow"}]
+                if lost:
+                    yield f"{len(lost)} messages of {key} are lost, which must never be"
+            elif name not in changed:
+                yield from self._wrong_stream(link, kind, key, of_stream)
+
+    def _wrong_stream(self, link: WireLink, kind: str, key: str, rows: Mapping[int, Row]) -> Iterator[str]:
+        fates = fates_by_model(link, self._plan.seed, kind, key, max(rows) + 1)
+        wrong, wrong_delays = [], []
+        for n, row in sorted(rows.items()):
+            code = WireFate(int(fates.codes[n, 0]))
+            if row["reason"] in _CUT:
+                continue
+            if row["reason"] != REASONS.get(code) and (
+                code is not WireFate.DELIVERED or row["reason"] in {"loss", "corrupted"}
+            ):
+                wrong.append(n)
+            if row["fate"] != "delivered" or "rate" in link.settings or link.ordered:
+                continue
+            delay = 0.0 if fates.delays is None or fates.rests is None else float(fates.delays[n, 0] + fates.rests[n])
+            again = fates.again is not None and bool(fates.again[n, 0])
+            if (row["delay"], row["again"]) != (delay, again):
+                wrong_delays.append(n)
+        if wrong:
+            yield f"{len(wrong)} fates of {key} are not those of its model, first of message {wrong[0]} on {link.name}"
+        if wrong_delays:
+            yield f"{len(wrong_delays)} delays of {key} are not those of its model, first of message {wrong_delays[0]}"
+
+    def _true_to_receivers(self, rows: list[Row]) -> Iterator[str]:
+        """What arrived is in the journal as delivered, and what it calls delivered has arrived, unless a fault took it."""
+        got, of_message = self._course.got, defaultdict[Message, list[Row]](list)
+        for row in rows:
+            if row["link"] is not None and row["key"] is not None and not _is_timeout(row):
+                of_message[self._message(row)].append(row)
+        strangers = [
+            row
+            for row in rows
+            if row["key"] is not None
+            and (stream_of(row["kind"]), row["key"], row["size"]) not in self._course.sent
+            and not _is_timeout(row)
+        ]
+        if strangers:
+            one = min((row["key"], row["size"]) for row in strangers)
+            yield f"the journal has {len(strangers)} messages that nobody sent, such as {one}"
+        if twice := [message for message, some in of_message.items() if len(some) > 1 and message.kind != "reply"]:
+            yield f"the journal has {len(twice)} messages twice, such as {min(twice)}"
+        unwritten, wrong, often = [], defaultdict[str, list[Message]](list), []
+        for message, times in sorted(got.items()):
+            some = of_message.get(message, [])
+            fates = {row["reason"] or "delivered" for row in some}
+            if not some:
+                unwritten.append(message)
+            elif fates.isdisjoint({"delivered", "underway"} if self._killed else {"delivered"}):
+                wrong[min(fates)].append(message)
+            elif times > _copies(some):
+                often.append(f"{message} arrived {times} times")
+        if unwritten and not self._disk:
+            yield f"{len(unwritten)} messages arrived that the journal does not have, such as {min(unwritten)}"
+        for fate, messages in sorted(wrong.items()):
+            yield f"{len(messages)} messages arrived that the journal calls {fate}, such as {min(messages)}"
+        yield from often[:1]
+        missing = [*self._missing(of_message)]
+        if missing:
+            yield f"{len(missing)} messages never arrived that the journal calls delivered, such as {min(missing)}"
+
+    def _missing(self, of_message: Mapping[Message, list[Row]]) -> Iterator[tuple[str, str, int, float]]:
+        """Messages that were delivered while a program was there, and that it did not get as often."""
+        doubts = [*self._doubts()]
+        cuts = [at for fault, at in self._struck.items() if isinstance(fault, CutPower)]  # programs ended there, too
+        for message, rows in of_message.items():
+            delivered = [row for row in rows if row["fate"] == "delivered"]
+            if not delivered or self._course.got[message] >= _copies(delivered):
+                continue
+            times = [time for row in delivered for time in (row["time"] - EPOCH, row["time"] + row["delay"] - EPOCH)]
+            present = any(
+                since + _ARRIVING <= min(times)
+                and max(times)
+                <= min([end - _LEAVING for end in (*until, *cuts) if end >= since], default=self._run.seconds)
+                for program, since, until in self._course.here
+                if program.side == message.side and _hears(program, message.kind, message.key)
+            )
+            if present and not any(first <= time <= last for time in times for first, last in doubts):
+                yield message.kind, message.key, message.size, round(min(times), 3)
+
+    def _message(self, row: Row) -> Message:
+        return Message(stream_of(row["kind"]), self._targets[row["link"]], row["key"], row["size"])
+
+    def _doubts(self) -> Iterator[tuple[float, float]]:
+        """When messages that the wire handed over may have been lost on their way to their reader."""
+        for begun in self._course.begun[1:]:
+            yield begun, begun + _DOUBT
+        for fault, at in self._struck.items():
+            if isinstance(fault, SlowConnection):
+                continue
+            lasting = 0.0 if fault.kind in ("kill", "interrupt") or fault.target == DISK else fault.seconds
+            lease = _LEASE if isinstance(fault, FreezeConnection | StopProcess) else 0.0
+            yield at - 0.5, float("inf") if lasting is None else at + lasting + lease + _DOUBT
+
+    def _wrong_senders(self, rows: list[Row]) -> Iterator[str]:
+        """Messages of ROS 2 have the gid of their publisher, and its numbers."""
+        gids = {ros_key(side): gid_of(ros_token(side, side, "MP")) for side in self._plan.sides}
+        wrong = [row for row in rows if row["key"] in gids and row["source"] != gids[row["key"]]]
+        if wrong and not self._disk:
+            yield f"{len(wrong)} messages of {wrong[0]['key']} have another sender, such as {wrong[0]['source']}"
+
+    def _of_operators(self) -> Iterator[str]:
+        """What an operator asks for is done, or refused in words."""
+        for words, status in self._course.typed:
+            if status not in {0, UsageError.exit_status}:
+                yield f"{words!r} ends with status {status}"
+
+    def _of_tokens(self) -> Iterator[str]:
+        """A token is seen at the sides at which it must be, and nowhere else."""
+        to = joined(self._plan)
+        held = [(program, token) for program, *_ in self._course.here for token in program.tokens()]
+        blinks = [(program, token) for program, *_ in self._course.here for token in program.objects("blink")]
+        shown = {(side, token) for program, token in [*held, *blinks] for side in (program.side, *to[program.side])}
+        if strange := sorted(self._course.alive - shown):
+            yield f"{len(strange)} tokens are seen where they must not be, such as {strange[0]}"
+        end = self._course.begun[0] + self._case.seconds
+        steady = {
+            program.side: program
+            for program, since, until in self._course.here
+            if since + _STEADY_SECONDS < end and (not until or until[0] > since + _STEADY_SECONDS)
+        }
+        together = max((since for _, since, _ in self._course.here), default=0.0) + _STEADY_SECONDS
+        if together > min((until[0] for *_, until in self._course.here if until), default=end) or together > end:
+            return
+        for holder in steady.values():
+            for token in holder.tokens():
+                for side in to[holder.side]:
+                    lets = side in steady and _watches(steady[side], token) and self._lets(side, holder.side, token)
+                    if lets and (side, token) not in self._course.alive:
+                        yield f"the token {token} of {holder.side} is not seen at {side}"
+
+    def _lets(self, side: str, other: str, token: str) -> bool:
+        """Whether both sides allow a token."""
+        return all(
+            any(zenoh.KeyExpr(key).intersects(zenoh.KeyExpr(token)) for key in self._plan.sides[name].keys)
+            or self._plan.sides[name].keys == ("**",)
+            for name in (side, other)
+        )
+
+    def _of_readers(self, rows: int) -> Iterator[str]:
+        """What commands say of the folder afterwards."""
+        for words, status, said in self._course.read:
+            if status not in ({0, UsageError.exit_status} if words == "links" else {0}):
+                yield f"{words} ends with status {status}: {said.strip()[-300:]}"
+        told = "".join(said for words, _, said in self._course.read if words == "export")
+        if told and f"{rows:,} messages are in" not in told and not self._disk:
+            yield f"the journal has {rows} rows, and {told.strip()}"
+
+
+def _is_timeout(row: Row) -> bool:
+    """Whether a reply only says that a time limit is over."""
+    return bool(row["kind"] == "reply" and row["size"] == _TIMEOUT_BYTES)
+
+
+def _copies(rows: Iterable[Row]) -> int:
+    return sum(2 if row["again"] else 1 for row in rows)
+
+
+def _numbered(rows: Mapping[int, list[Row]]) -> dict[int, list[Row]]:
+    """The rows with numbers; deletions are numbered as publications."""
+    return {
+        start: [{**row, "kind": stream_of(row["kind"])} for row in some if row["n"] is not None]
+        for start, some in rows.items()
+    }
+
+
+def _hears(program: WireProgram, kind: str, key: str) -> bool:
+    """Whether a program gets messages of a kind and key."""
+    if kind == "put":
+        keys = program.objects("listen")
+    elif kind == "query":
+        keys = program.answered()
+    else:
+        keys = [*program.objects("ask"), *map(service, program.objects("call"))]
+    return any(_meet(one, key) for one in keys)
+
+
+def _watches(program: WireProgram, token: str) -> bool:
+    return any(_meet(tokens, token) for tokens in program.objects("watch"))
+
+
+@cache
+def _meet(one: str, other: str) -> bool:
+    return bool(zenoh.KeyExpr(one).intersects(zenoh.KeyExpr(other)))
+
+
+def fates_by_model(link: WireLink, seed: int, kind: str, key: str, count: int) -> Fates:
+    """What the models of a link decide about the first messages of a stream, in one go."""
+    settings = {name: value for name, value in link.settings.items() if name not in ("rate", "queue")}
+    schedule = LinkSchedule(settings, NEVER - 1, correlation=link.correlation)
+    root = root_of_seed(seed)
+    keys = {name: wire_stream_key(root, name, kind, key) for name in streams_of(link.name, schedule)}
+    return Link(schedule, link.name, keys, Batch(NEVER, 1)).fates(range(count))
+
+
+def broken_misses(course: Course, run: SimulatedRun, named: tuple[str, ...]) -> Iterator[str]:
+    """What must hold of a wire whose file has a mistake: it is named, with the status of a wrong use, and nothing is left."""
+    if run.stuck is not None:
+        yield f"stuck: {run.stuck}"
+    yield from (f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors)
+    [process] = course.processes
+    if run.status != UsageError.exit_status:
+        yield f"status {run.status} for a file with a mistake: {process.printed.strip()[-300:]}"
+    yield from (
+        f"the message does not name {name}: {process.printed.strip()[-300:]}"
+        for name in named
+        if name not in process.printed
+    )
+    if run.folder.exists():
+        yield f"{run.folder.name} is left"
+
+
+def _has_no_name(row: Row) -> bool:
+    return str(row["key"]).startswith("unknown key ")
