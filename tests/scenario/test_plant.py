@@ -229,6 +229,12 @@ def test_all_mistakes_are_told_at_once() -> None:
     assert both == ["plant.input_units"], "a table with a mistake of its own is not compared with others"
 
 
+def test_rows_of_different_lengths_are_the_plants_mistake_alone() -> None:
+    """No controller is asked about such a plant."""
+    (line,) = mistakes_of(checked, changed(LOOP, plant__noise=[[1e-4, 0.0], [0.0]]), "file")
+    assert line == "plant.noise: has a row that is not of 2 numbers; expected 2 × 2, as A is"
+
+
 def test_states_are_deviations_from_the_reference() -> None:
     """Start and limits of the states are levels in the file, and deviations in the plant."""
     scenario = checked(changed(LOOP), "file")

@@ -13,9 +13,9 @@ SEEDS, HASH = range(1, 31), "7427a018f2454888"
 _PLAY = """
 from evedrop.results.reading import Results
 from evedrop.virtual import campaign
-from tests.virtual.simulated import program
+from tests.virtual.simulated import played, program
 campaign.misses = lambda case, run, *rest: [run.digest, Results.read(run.folder).summary["outages"]]
-print(campaign.play(1002, program).misses)
+print(campaign.play(1002, program).misses, played(1104)[2])
 """
 
 
@@ -28,7 +28,10 @@ def test_seeds_give_the_same_events_on_every_machine() -> None:
 
 
 def test_the_order_of_texts_in_sets_decides_nothing() -> None:
-    """The router of this run ends while others watch it: who heard first of whose end was in the order of a set."""
+    """The router of a run ends while others watch it: who heard first of whose end was in the order of a set.
+
+    A wire mirrors several keys at once: their order was that of a set.
+    """
     said = {
         subprocess.run(
             [sys.executable, "-c", _PLAY],
@@ -38,6 +41,6 @@ def test_the_order_of_texts_in_sets_decides_nothing() -> None:
             check=True,
             timeout=60,
         ).stdout
-        for seed in ("0", "3", "4", "5")
+        for seed in ("0", "3", "4", "7")
     }
     assert len(said) == 1

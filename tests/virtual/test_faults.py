@@ -10,36 +10,17 @@ from evedrop.cli.simulated import program
 from evedrop.results.reading import Results
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual import campaign, faults, judge, lacks, notes, outsiders
-from evedrop.virtual.campaign import PlayedCase, play_case
+from evedrop.virtual.campaign import play_case
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, LAUNCHER, Disturbance
 from evedrop.virtual.moments import COMMANDS
 from evedrop.virtual.reference import RunReference
 from evedrop.virtual.run import SimulatedRun
 from evedrop.virtual.zenoh.access import Access
+from tests.virtual.disturbed_runs import SCENARIO, disturbed
 
-SCENARIO = Scenario(
-    {
-        "title": "A run that is disturbed",
-        "slots": 40,
-        "pace": 0.1,
-        "longest_outage": 10.0,
-        "process": {"A": [[1.0]], "Q": [[0.01]], "initial_covariance": [[1.0]]},
-        "encoding": {"scheme": "plain"},
-        "legitimate": {"link": {"quality": 0.9}},
-        "eavesdroppers": {"eve": {"strategy": "naive", "link": {"quality": 0.9}}},
-    }
-)
 STARTS, RUNS = 26, 90
 """Events after which processes are being started, and after which all are there."""
-
-
-def disturbed(*struck: Disturbance) -> PlayedCase:
-    """The run with these faults."""
-    played = play_case(SimulatedCase(1, SCENARIO, struck), program, keep=True)
-    assert played.misses == ()
-    assert set(played.struck) == set(struck)
-    return played
 
 
 @pytest.mark.parametrize(
@@ -78,7 +59,9 @@ def test_a_connection_that_flaps_is_cut_more_than_once() -> None:
     """And made again each time."""
     happened = disturbed(faults.FlapConnection("eve", RUNS, 3.0)).run.happened
     cuts = [
-        one for one in happened if one.what == notes.DISCONNECTS and one.words[0] == "eve" and "is cut" in one.words
+        note
+        for note in happened
+        if note.what == notes.DISCONNECTS and note.words[0] == "eve" and "is cut" in note.words
     ]
     assert len(cuts) > 1
 
@@ -86,7 +69,7 @@ def test_a_connection_that_flaps_is_cut_more_than_once() -> None:
 def test_everybody_is_cut_off() -> None:
     """All but the router."""
     happened = disturbed(faults.CutConnection(EVERYBODY, RUNS, 0.5)).run.happened
-    cut = {one.words[0] for one in happened if one.what == notes.DISCONNECTS and "is cut" in one.words}
+    cut = {note.words[0] for note in happened if note.what == notes.DISCONNECTS and "is cut" in note.words}
     assert cut == {"sensor", "legitimate", "eve", "recorder"}
 
 

@@ -34,7 +34,7 @@ TOLD = InterruptProcess("launcher", 60)
 
 
 def judged(folder: Path, struck: Mapping[Disturbance, float], ahead: int = 8, **run: object) -> list[str]:
-    """What the judge says of a run that has no results; ahead: how far the sensor may be ahead."""
+    """The misses of a run without results; ahead: how far the sensor may be ahead."""
     (folder / "temporary").mkdir(parents=True)
     faults = tuple(struck)
     ended = SimulatedRun(folder / "results", **run)  # type: ignore[arg-type]
@@ -44,8 +44,10 @@ def judged(folder: Path, struck: Mapping[Disturbance, float], ahead: int = 8, **
 @pytest.mark.parametrize(("seconds", "late"), [(56.0, False), (58.0, True)])
 def test_a_run_that_ends_late_is_a_miss(seconds: float, late: bool, tmp_path: Path) -> None:
     """1 s of slots, 5 of any run, 15 of a fault, twice the longest outage, and 30 for processes that do not appear."""
-    found = judged(tmp_path, {KILLED: 0.5}, status=3, said="evedrop: legitimate was ended by signal 9", seconds=seconds)
-    assert found == (["the run took 58.0 s, and not 57.0 s at most"] if late else [])
+    broken = judged(
+        tmp_path, {KILLED: 0.5}, status=3, said="evedrop: legitimate was ended by signal 9", seconds=seconds
+    )
+    assert broken == (["the run took 58.0 s, and not 57.0 s at most"] if late else [])
 
 
 def test_a_fork_server_that_is_suspended_may_cost_two_minutes(tmp_path: Path) -> None:
@@ -59,17 +61,17 @@ def test_a_fork_server_that_is_suspended_may_cost_two_minutes(tmp_path: Path) ->
 def test_a_launcher_that_goes_on_after_a_signal_is_a_miss(moment: float, ignored: bool, tmp_path: Path) -> None:
     """A second after it was told to end, no more slots are done."""
     told = [(moment, RunProgress(5, 1.0, "slots/s", {}))]
-    found = judged(tmp_path, {TOLD: 0.5}, status=0, told=told)
-    assert "there are no results" in found
-    assert any("went on to its end" in miss for miss in found) == ignored
+    broken = judged(tmp_path, {TOLD: 0.5}, status=0, told=told)
+    assert "there are no results" in broken
+    assert any("went on to its end" in miss for miss in broken) == ignored
 
 
 @pytest.mark.parametrize(("sent", "wrong"), [("2-7", False), ("2-8", True)])
 def test_a_sensor_that_leaves_its_window_is_a_miss(sent: str, wrong: bool, tmp_path: Path) -> None:
     """All processes have done slots 0 to 3, and the window has four slots."""
     done = [PutMessage(0.1, f"progress/{name}", "4") for name in ("legitimate", "recorder")]
-    found = judged(tmp_path, {KILLED: 0.5}, 4, status=3, put=[*done, PutMessage(0.2, "uplink", sent)])
-    assert ("slot 8 is sent while slot 4 is not done, in a window of 4" in found) == wrong
+    broken = judged(tmp_path, {KILLED: 0.5}, 4, status=3, put=[*done, PutMessage(0.2, "uplink", sent)])
+    assert ("slot 8 is sent while slot 4 is not done, in a window of 4" in broken) == wrong
 
 
 def test_a_command_that_is_sent_again_in_a_quiet_run_is_a_miss(tmp_path: Path) -> None:
@@ -82,8 +84,8 @@ def test_a_command_that_is_sent_again_in_a_quiet_run_is_a_miss(tmp_path: Path) -
 @pytest.mark.parametrize(("target", "most"), [("recorder", 21.0), ("everybody", 36.0)])
 def test_a_fault_that_everybody_has_may_cost_two(target: str, most: float, tmp_path: Path) -> None:
     """A second of slots, five of any run, and fifteen for each."""
-    found = judged(tmp_path, {ConfuseKeys(target, 60): 0.5}, seconds=most + 0.1)
-    assert f"the run took {most + 0.1:.1f} s, and not {most:.1f} s at most" in found
+    broken = judged(tmp_path, {ConfuseKeys(target, 60): 0.5}, seconds=most + 0.1)
+    assert f"the run took {most + 0.1:.1f} s, and not {most:.1f} s at most" in broken
 
 
 def test_a_quiet_run_ends_soon(tmp_path: Path) -> None:

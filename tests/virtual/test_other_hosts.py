@@ -15,38 +15,23 @@ from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_hosts import MISTAKES, DrawnHost, DrawnHosts
 from evedrop.virtual.host_parts import part_on
 from evedrop.virtual.other_hosts import ODDITIES
+from tests.virtual.disturbed_runs import RELAYED, SCENARIO, disturbed
 
-SCENARIO = Scenario(
-    {
-        "title": "A run on several hosts",
-        "slots": 40,
-        "pace": 0.1,
-        "longest_outage": 10.0,
-        "process": {"A": [[1.0]], "Q": [[0.01]], "initial_covariance": [[1.0]]},
-        "encoding": {"scheme": "plain"},
-        "legitimate": {"link": {"quality": 0.9}},
-        "eavesdroppers": {"eve": {"strategy": "naive", "link": {"quality": 0.9}}},
-    }
-)
-RELAYED = Scenario({**SCENARIO.as_tables(), "network": {"routers": 2}})
 HOSTS = DrawnHosts((DrawnHost("alpha", ("router", "sensor")), DrawnHost("beta", ("eve",))))
 CONNECTS, GREETED, RUNS = 5, 30, 150
 """Events after which ssh connects, after which hosts have answered, and after which all processes are there."""
 
 
 def played(*struck: Disturbance, hosts: DrawnHosts = HOSTS, scenario: Scenario = SCENARIO) -> PlayedCase:
-    """The run with these faults; it keeps its promises."""
-    done = play_case(SimulatedCase(1, scenario, struck, hosts=hosts), program, keep=True)
-    assert done.misses == ()
-    assert set(done.struck) == set(struck)
-    return done
+    """The run on hosts with these faults."""
+    return disturbed(*struck, hosts=hosts, scenario=scenario)
 
 
 def test_a_run_on_hosts_is_the_run_in_memory() -> None:
     """Each process is on its host, which has its own fork server and folder; all hosts are left clean."""
     run = played().run
     assert (run.status, run.left) == (0, [])
-    starts = {one.words[0]: one.process for one in run.happened if one.what == "starts"}
+    starts = {note.words[0]: note.process for note in run.happened if note.what == "starts"}
     assert starts["sensor"] == starts["router"] == "fork server of host alpha"
     assert starts["eve"] == "fork server of host beta"
     assert starts["legitimate"] == "fork server"
@@ -93,7 +78,7 @@ def test_a_host_that_hears_nothing_from_the_beginning_ends() -> None:
 def test_the_fork_server_of_a_host_that_ends_takes_its_processes_along() -> None:
     """Those of other hosts end as after any failure."""
     happened = played(faults.KillProcess("fork server of host alpha", RUNS)).run.happened
-    ends = {one.words[0]: one.words[1] for one in happened if one.what == "ends"}
+    ends = {note.words[0]: note.words[1] for note in happened if note.what == "ends"}
     assert ends["sensor"] == ends["router"] == -9
 
 
@@ -108,8 +93,8 @@ def test_a_hosts_file_with_a_mistake_names_it(mistake: str) -> None:
         scenario = RELAYED if MISTAKES[mistake].right.startswith("[relay]") else SCENARIO
     run = played(hosts=wrong, scenario=scenario).run
     assert run.status == 2
-    assert MISTAKES[mistake].said in run.said
-    assert not any(one.what == "starts" and "ssh" in str(one.words[0]) for one in run.happened)
+    assert MISTAKES[mistake].message in run.said
+    assert not any(note.what == "starts" and "ssh" in str(note.words[0]) for note in run.happened)
 
 
 def test_a_run_in_shards_stays_on_one_machine() -> None:

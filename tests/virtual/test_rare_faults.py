@@ -7,40 +7,18 @@ import random
 import msgpack
 import pytest
 
-from evedrop.cli.simulated import program
 from evedrop.live.protocol.codec import enclosed, pack
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual import notes
 from evedrop.virtual.broken_messages import BreakMessage, broken
 from evedrop.virtual.by_hand import RunByHand, WriteBriefs
-from evedrop.virtual.campaign import PlayedCase, play_case
-from evedrop.virtual.cases import SimulatedCase, case_from, case_of
+from evedrop.virtual.cases import case_from, case_of
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.rare_faults import RARE_KINDS, ReadMetrics, SteerRun, TakePort
+from tests.virtual.disturbed_runs import RELAYED, SCENARIO, disturbed
 
-SCENARIO = Scenario(
-    {
-        "title": "A run that is disturbed",
-        "slots": 40,
-        "pace": 0.1,
-        "longest_outage": 10.0,
-        "process": {"A": [[1.0]], "Q": [[0.01]], "initial_covariance": [[1.0]]},
-        "encoding": {"scheme": "plain"},
-        "legitimate": {"link": {"quality": 0.9}},
-        "eavesdroppers": {"eve": {"strategy": "naive", "link": {"quality": 0.9}}},
-    }
-)
-RELAYED = Scenario({**SCENARIO.as_tables(), "network": {"routers": 2}})
 RUNS = 90
 """Events after which all processes are there."""
-
-
-def disturbed(fault: Disturbance, scenario: Scenario = SCENARIO, seed: int = 1) -> PlayedCase:
-    """The run with this fault, which hits it; it keeps its promises."""
-    played = play_case(SimulatedCase(seed, scenario, (fault,)), program, keep=True)
-    assert played.misses == ()
-    assert [*played.struck] == [fault]
-    return played
 
 
 @pytest.mark.parametrize(
@@ -59,7 +37,7 @@ def disturbed(fault: Disturbance, scenario: Scenario = SCENARIO, seed: int = 1) 
 )
 def test_a_run_ends_as_it_must(fault: Disturbance, scenario: Scenario, status: int, said: str) -> None:
     """With the right status and words."""
-    run = disturbed(fault, scenario).run
+    run = disturbed(fault, scenario=scenario).run
     assert (run.status, said in run.said) == (status, True), run.said
 
 
@@ -67,7 +45,7 @@ def test_a_run_ends_as_it_must(fault: Disturbance, scenario: Scenario, status: i
 def test_a_wrong_brief_ends_its_process_alone(seed: int) -> None:
     """Whichever entry is wrong: the run goes on."""
     played = disturbed(WriteBriefs("briefs", RUNS), seed=seed)
-    ends = [one.words for one in played.run.happened if one.what == notes.ENDS and one.words[0] == "by hand"]
+    ends = [note.words for note in played.run.happened if note.what == notes.ENDS and note.words[0] == "by hand"]
     assert len(ends) == 4
     assert {status for _, status in ends} <= {2, 3, -9}
     assert played.run.status == 0
@@ -84,8 +62,8 @@ def test_a_wrong_brief_ends_its_process_alone(seed: int) -> None:
 )
 def test_a_run_by_hand_ends_as_it_must(what: str, status: int) -> None:
     """Beside the other one."""
-    happened = disturbed(RunByHand(what, RUNS), Scenario({**SCENARIO.as_tables(), "slots": 20})).run.happened
-    ends = {one.words[0]: one.words[1] for one in happened if one.what == notes.ENDS}
+    happened = disturbed(RunByHand(what, RUNS), scenario=Scenario({**SCENARIO.as_tables(), "slots": 20})).run.happened
+    ends = {note.words[0]: note.words[1] for note in happened if note.what == notes.ENDS}
     assert ends["recorder by hand"] == status
     assert ends["recorder"] == 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from itertools import pairwise
 from queue import Empty
@@ -17,6 +18,7 @@ from evedrop.virtual.scheduler import (
     VirtualQueue,
     VirtualScheduler,
     VirtualTask,
+    Waiter,
 )
 
 SEEDS = range(20)
@@ -384,3 +386,22 @@ def test_a_full_pipe_is_waited_for_as_long_as_its_writer_says() -> None:
     finish(scheduler, started(scheduler, "program", writes))
     assert taken == [1 << 16]
     assert scheduler.now == 3.0
+
+
+def test_a_wait_for_less_than_the_clock_can_measure_ends() -> None:
+    """0.1 s after 5 s are 5.1 s, which is 4e-16 s less than 0.1 s later: less than the next number after 5.1."""
+    scheduler = VirtualScheduler(1)
+    ended: list[float] = []
+
+    def waits() -> None:
+        scheduler.sleep(5.0)
+        began, place = scheduler.now, deque[Waiter]()
+        for _ in range(100):
+            left = 0.1 - (scheduler.now - began)
+            if left <= 0.0:
+                ended.append(scheduler.now)
+                return
+            scheduler.wait(place, left)
+
+    finish(scheduler, started(scheduler, "program", waits))
+    assert ended == [pytest.approx(5.1)]

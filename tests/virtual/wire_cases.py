@@ -166,7 +166,8 @@ class SimulatedWireCase:
         }
         if (self.file, self.programs, self.operations, self.mistake) != (USUAL_FILE, USUAL_PROGRAMS, (), ""):
             programs = [
-                {"side": one.side, "does": one.does, "after": one.after, "until": one.until} for one in self.programs
+                {"side": drawn.side, "does": drawn.does, "after": drawn.after, "until": drawn.until}
+                for drawn in self.programs
             ]
             described |= {
                 "file": self.file,
@@ -191,19 +192,19 @@ class SimulatedWireCase:
         if self.file != USUAL_FILE:
             for tables in without_a_part(self.tables):
                 sides = tables["side"]
-                programs = tuple(one for one in self.programs if one.side in sides)
+                programs = tuple(drawn for drawn in self.programs if drawn.side in sides)
                 yield replace(self, file=toml_text(tables), programs=programs)
 
     def _fewer_programs(self) -> Iterator[tuple[WireProgram, ...]]:
         if self.programs == USUAL_PROGRAMS:
             return
-        for i, one in enumerate(self.programs):
+        for i, drawn in enumerate(self.programs):
             before, after = self.programs[:i], self.programs[i + 1 :]
             yield (*before, *after)
-            for at in range(len(one.does)):
-                yield (*before, replace(one, does=(*one.does[:at], *one.does[at + 1 :])), *after)
-            if one.after or one.until is not None:
-                yield (*before, replace(one, after=0.0, until=None), *after)
+            for at in range(len(drawn.does)):
+                yield (*before, replace(drawn, does=(*drawn.does[:at], *drawn.does[at + 1 :])), *after)
+            if drawn.after or drawn.until is not None:
+                yield (*before, replace(drawn, after=0.0, until=None), *after)
 
     def play(self, keep: bool = False) -> PlayedWire:
         """Play it, and judge it; keep: whether to keep all events."""
@@ -246,7 +247,7 @@ class SimulatedWireCase:
         work_of_wire = partial(_refused if self.mistake else _wire, file, run.folder, self.seconds)
         sides = self.tables["side"]
         every = len(self.programs)  # no two messages have the same number
-        numbers = {one: count(first, every) for first, one in enumerate(self.programs, 1)}
+        numbers = {drawn: count(first, every) for first, drawn in enumerate(self.programs, 1)}
         with simulated.entered():
             try:
                 if any("connect" in side for side in sides.values()):
@@ -257,12 +258,12 @@ class SimulatedWireCase:
                     course.begun.append(scheduler.now)
                     wire = begin(WIRE, work_of_wire)
                     course.processes.append(wire)
-                    for place, one in enumerate(self.programs):
-                        if simulated.process(one.side) is None:
-                            side = sides[one.side]
-                            endpoint = OUTSIDE if "connect" in side else ENDPOINTS[one.side]
-                            work = ProgramAtWork(one, place, numbers[one], course)
-                            begin(one.side, partial(work.run, endpoint, side.get("users"), EPOCH))
+                    for place, drawn in enumerate(self.programs):
+                        if simulated.process(drawn.side) is None:
+                            side = sides[drawn.side]
+                            endpoint = OUTSIDE if "connect" in side else ENDPOINTS[drawn.side]
+                            work = ProgramAtWork(drawn, place, numbers[drawn], course)
+                            begin(drawn.side, partial(work.run, endpoint, side.get("users"), EPOCH))
                     scheduler.run(scheduler.now + longest, lambda wire=wire: not wire.task.alive)  # type: ignore[misc]
                     simulated.disk.make_room()
                     moment = scheduler.now + _AGAIN
@@ -272,7 +273,10 @@ class SimulatedWireCase:
                     self._read(simulated, course, run.folder)
             except Stuck as why:
                 run.stuck = str(why)
-            run.status, run.said = course.processes[-1].task.status, "".join(one.printed for one in course.processes)
+            run.status, run.said = (
+                course.processes[-1].task.status,
+                "".join(process.printed for process in course.processes),
+            )
             run.errors, run.seconds, run.events = scheduler.errors, scheduler.now, scheduler.events
             run.digest, run.happened = scheduler.digest, scheduler.happened
 

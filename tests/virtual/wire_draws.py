@@ -135,7 +135,7 @@ def _event(draw: random.Random, names: tuple[str, ...], links: list[Tables], sec
     )
     link = draw.choice(links)
     change = draw.choice(({"quality": 0.3}, {"delay": {"model": "constant", "value": "10 ms"}}, {"rate": "4 kB/s"}))
-    if "correlation" in link or any(link["name"] == one.get("correlation", {}).get("with") for one in links):
+    if "correlation" in link or any(link["name"] == other.get("correlation", {}).get("with") for other in links):
         change = {"duplicate": 0.5}
     happens: tuple[Tables, ...] = (
         {"partition": draw.sample(names, 2)},

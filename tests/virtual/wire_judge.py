@@ -10,7 +10,6 @@ from __future__ import annotations
 import signal
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from functools import cache
 from typing import Any, Protocol, final
 
 import zenoh
@@ -33,6 +32,7 @@ from evedrop.virtual.faults import (
 from evedrop.virtual.processes import VirtualProcess
 from evedrop.virtual.run import SimulatedRun
 from evedrop.virtual.world import EPOCH
+from evedrop.virtual.zenoh.access import intersects
 from evedrop.wire.file import load_wire, resolved_wire
 from evedrop.wire.journal import journal_tables
 from evedrop.wire.liveliness import joined
@@ -205,8 +205,8 @@ class WireJudge:
             and not _is_timeout(row)
         ]
         if strangers:
-            one = min((row["key"], row["size"]) for row in strangers)
-            yield f"the journal has {len(strangers)} messages that nobody sent, such as {one}"
+            example = min((row["key"], row["size"]) for row in strangers)
+            yield f"the journal has {len(strangers)} messages that nobody sent, such as {example}"
         if twice := [message for message, some in of_message.items() if len(some) > 1 and message.kind != "reply"]:
             yield f"the journal has {len(twice)} messages twice, such as {min(twice)}"
         unwritten, wrong, often = [], defaultdict[str, list[Message]](list), []
@@ -307,7 +307,7 @@ class WireJudge:
         )
 
     def _of_readers(self, rows: int) -> Iterator[str]:
-        """What commands say of the folder afterwards."""
+        """Check the output of commands that read the folder afterwards."""
         for words, status, said in self._course.read:
             if status not in ({0, UsageError.exit_status} if words == "links" else {0}):
                 yield f"{words} ends with status {status}: {said.strip()[-300:]}"
@@ -341,16 +341,11 @@ def _hears(program: WireProgram, kind: str, key: str) -> bool:
         keys = program.answered()
     else:
         keys = [*program.objects("ask"), *map(service, program.objects("call"))]
-    return any(_meet(one, key) for one in keys)
+    return any(intersects(pattern, key) for pattern in keys)
 
 
 def _watches(program: WireProgram, token: str) -> bool:
-    return any(_meet(tokens, token) for tokens in program.objects("watch"))
-
-
-@cache
-def _meet(one: str, other: str) -> bool:
-    return bool(zenoh.KeyExpr(one).intersects(zenoh.KeyExpr(other)))
+    return any(intersects(tokens, token) for tokens in program.objects("watch"))
 
 
 def fates_by_model(link: WireLink, seed: int, kind: str, key: str, count: int) -> Fates:

@@ -302,5 +302,6 @@ def stream_of(kind: str) -> str:
 def programs_of(described: Sequence[Mapping[str, Any]]) -> tuple[WireProgram, ...]:
     """The programs that `described` has written."""
     return tuple(
-        WireProgram(one["side"], tuple(one["does"]), one.get("after", 0.0), one.get("until")) for one in described
+        WireProgram(entry["side"], tuple(entry["does"]), entry.get("after", 0.0), entry.get("until"))
+        for entry in described
     )

@@ -40,11 +40,15 @@ def plan_of(settings: Mapping[str, Any], seed: int = 7) -> WirePlan:
 
 
 def carried(
-    folder: Path, plan: WirePlan, counts: Mapping[str, int], hidden: Mapping[int, WireFate] | None = None
+    folder: Path,
+    plan: WirePlan,
+    counts: Mapping[str, int],
+    hidden: Mapping[int, WireFate] | None = None,
+    apart: float = 0.1,
 ) -> None:
-    """A journal of messages of some keys on the link `scan`, ten a second each, as a wire keeps it.
+    """A journal of messages of some keys on the link `scan`, as a wire keeps it.
 
-    hidden: what happened to the n-th message of each key before its loss model.
+    hidden: what happened to the n-th message of each key before its loss model; apart: seconds between messages of a key.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "wire.toml").write_text(resolved_wire(plan))
@@ -56,7 +60,7 @@ def carried(
                 fate = (hidden or {}).get(n, WireFate(fate))
                 kind = Kind.PUT | (AGAIN if again and fate == WireFate.DELIVERED else 0)
                 row = (
-                    1e9 + 0.1 * n,
+                    1e9 + apart * n,
                     n,
                     n + 1,
                     delay,
@@ -194,3 +198,11 @@ def test_a_folder_without_a_journal_is_refused(tmp_path: Path) -> None:
     """As what it is not."""
     with pytest.raises(UsageError, match="is not the folder of a wire"):
         journal_recording(tmp_path)
+
+
+def test_messages_that_were_heard_at_one_moment_have_no_distance(evedrop: Evedrop) -> None:
+    """As by a wire that was suspended; a scenario's slot is not known then."""
+    carried(evedrop.folder / "runs", plan_of(SETTINGS), {"0/scan/a": 500}, apart=0.0)
+    done = evedrop("links", "fit", "runs", "--link", "scan", "--json")
+    assert (done.status, done.err) == (0, "")
+    assert json.loads(done.out)["slot_seconds"] is None

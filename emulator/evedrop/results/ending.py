@@ -55,7 +55,7 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
 
 
 def _age_told(folder: Path) -> str:
-    """What a summary that is written already says of the age of its metrics: its recorder has noted the end before."""
+    """The note on the age of the metrics in the summary of a folder, if the recorder has written one; empty otherwise."""
     with contextlib.suppress(UsageError):
         told = re.search(r" \(the metrics are as of [^()]*\)", Results.read(folder).typed_summary.ended)
         return "" if told is None else told[0]

@@ -20,6 +20,7 @@ from evedrop.scenario.application import APPLICATIONS, ControlledPlant
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, limit_mistakes, noise_mistakes, plant_of
 from evedrop.scenario.process import ProcessTable
+from evedrop.scenario.process_noise import measured_mistakes
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
 
@@ -151,11 +152,7 @@ def _controller_and_plant(
         if values is not None and len(values) != count:
             wrong = True
             yield f"controller.{name}: has {len(values)} entries; expected {count}, {why}"
-    if wrong or m == 0 or (plant.input_matrix is not None and len(plant.input_matrix) != n):
-        return
-    if any(values is not None and len(values) != n for values in (plant.start, plant.state_lower, plant.state_upper)):
-        return
-    if plant.disturbance_matrix is not None and len(plant.disturbance_matrix) != n:
+    if wrong or m == 0 or any(_plant_and_process(plant, process)) or measured_mistakes(plant, n):
         return
     assignment = assignment_of(controller, process.process, plant_of(plant, process.around), slot_seconds)
     for entry, sentence in CONTROLLERS[controller.strategy].objections(assignment):

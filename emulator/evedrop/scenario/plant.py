@@ -70,9 +70,6 @@ class PlantTable(Table):
             if getattr(self, entry) is not None and getattr(self, other) is None:
                 example = as_toml((type(self).model_fields[other].examples or [0])[0])
                 yield other, f"is missing, but {entry} is given; expected {other} = {example}, or neither"
-        for entry in ("noise", "output_matrix", "measurement_noise"):
-            if len({len(row) for row in getattr(self, entry) or ()}) > 1:
-                yield entry, "has rows of different lengths; expected a matrix, whose rows have equally many numbers"
         rows, disturbances = self.disturbance_values, len(self.disturbances)
         if disturbances and rows is None:
             yield "disturbance_file", 'is missing; expected disturbance_file = "day.csv", or disturbance_values'

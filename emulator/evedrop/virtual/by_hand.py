@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import random
 import signal
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
@@ -59,18 +60,10 @@ _WRONG: Sequence[Any] = (None, True, -1, 2**70, float("inf"), "", "x", "/nowhere
 """What an entry of a brief is replaced with."""
 
 
-@final
-class WriteBriefs(Disturbance):
-    """`evedrop brief`, and a process that is started with one of the briefs, in which an entry may be wrong."""
+class _ByHand(Disturbance):
+    """Somebody does something beside the run, in a folder of its own."""
 
-    kind, share = "write", 3
-    harmless, awaited_seconds = True, 60.0
-
-    @classmethod
-    def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """What is written: mostly what somebody could use."""
-        del scenario
-        return [*[*_OPTIONS] * 3, *_WRONG_OPTIONS]
+    harmless = True
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Let somebody do it, who gives up if the disk does not take it."""
@@ -82,6 +75,24 @@ class WriteBriefs(Disturbance):
 
         world.machine.begin("somebody", act)
         return True
+
+    @abstractmethod
+    def _act(self, world: SimulatedWorld) -> int:
+        """Do it; returns the exit status. Raises OSError."""
+
+
+@final
+class WriteBriefs(_ByHand):
+    """`evedrop brief`, and a process that is started with one of the briefs, in which an entry may be wrong."""
+
+    kind, share = "write", 3
+    awaited_seconds = 60.0
+
+    @classmethod
+    def targets(cls, scenario: Scenario) -> Sequence[str]:
+        """What is written: mostly what somebody could use."""
+        del scenario
+        return [*[*_OPTIONS] * 3, *_WRONG_OPTIONS]
 
     def _act(self, world: SimulatedWorld) -> int:
         scenario, folder = world.scenario, world.disk.root / f"by hand {self.after}"
@@ -156,11 +167,12 @@ class WriteBriefs(Disturbance):
 
 
 @final
-class RunByHand(Disturbance):
+class RunByHand(_ByHand):
     """The same scenario is run beside the run, all of whose processes somebody starts by hand, in any order."""
 
     kind, share = "start by hand", 2
-    harmless = True
+    awaited_seconds = 60.0
+    """Its processes wait for one that is missing, or that an event has ended: no launcher starts it again."""
 
     @classmethod
     def targets(cls, scenario: Scenario) -> Sequence[str]:
@@ -173,22 +185,6 @@ class RunByHand(Disturbance):
             "a run that is interrupted",
             "a run with a wrong password",
         ]
-
-    @property
-    def awaited_seconds(self) -> float:
-        """Its processes wait for one that is missing, or that an event has ended: no launcher starts it again."""
-        return 60.0
-
-    def strike(self, world: SimulatedWorld) -> bool:
-        """Let somebody do it, who gives up if the disk does not take it."""
-
-        def act() -> int:
-            with suppress(OSError):
-                return self._act(world)
-            return 1
-
-        world.machine.begin("somebody", act)
-        return True
 
     def _act(self, world: SimulatedWorld) -> int:
         scenario, folder = world.scenario, world.disk.root / f"by hand {self.after}"

@@ -48,8 +48,8 @@ class Mistake(NamedTuple):
     right: str
     """What is replaced, where it occurs."""
     wrong: str
-    said: str
-    """What the run says."""
+    message: str
+    """Part of what the run prints."""
 
 
 _ROUTER = f'listen = "{LISTENS[ROUTER]}"'
@@ -140,7 +140,7 @@ class DrawnHosts:
     def refused(self, scenario: Scenario) -> str | None:
         """A text that a run says which cannot begin because of its hosts; None if it can."""
         if self.mistake and MISTAKES[self.mistake].right in self._right(scenario):
-            return MISTAKES[self.mistake].said
+            return MISTAKES[self.mistake].message
         if scenario.shards > 1:
             return "hosts carry one run"
         return next((f"host {host.name}: " for host in self.hosts if not ODDITIES.get(host.oddity, True)), None)
@@ -174,14 +174,14 @@ class DrawnHosts:
             fewer = [replace(host, processes=tuple(rest)) for rest in _without_each(host.processes) if rest]
             if len(self.hosts) > 1:
                 yield replace(self, hosts=(*others[0], *others[1]))
-            for one in (*plainer, *fewer):
-                if one != host:
-                    yield replace(self, hosts=(*others[0], one, *others[1]))
+            for smaller in (*plainer, *fewer):
+                if smaller != host:
+                    yield replace(self, hosts=(*others[0], smaller, *others[1]))
 
     def fitting(self, scenario: Scenario) -> DrawnHosts | None:
         """The same with the processes that a scenario has; None if no host has any."""
         there = processes_of(scenario)
-        kept = [replace(host, processes=tuple(one for one in host.processes if one in there)) for host in self.hosts]
+        kept = [replace(host, processes=tuple(name for name in host.processes if name in there)) for host in self.hosts]
         hosts = tuple(host for host in kept if host.processes)
         return replace(self, hosts=hosts) if hosts else None
 

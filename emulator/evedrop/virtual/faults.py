@@ -305,11 +305,7 @@ class DiskDisturbance(_OfFiles):
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Let it go wrong."""
-        disk = world.disk
-        at = disk.operations + 1
-        disk.faults = lambda operation: self.fault if operation == at else None
-        if self.seconds is not None:
-            world.scheduler.at(world.scheduler.now + self.seconds, disk.make_room)
+        world.disk.fail_next(self.fault, self.seconds)
         return True
 
     @property

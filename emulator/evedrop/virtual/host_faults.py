@@ -107,11 +107,8 @@ class FillHostDisk(HostDisturbance):
 
     def disturb(self, world: SimulatedWorld, host: OtherHost) -> None:
         """Fill it."""
-        disk = host.disk
-        at = disk.operations + 1
-        disk.faults = lambda operation: DiskFault.FULL if operation == at else None
-        if self.seconds is not None:
-            world.scheduler.at(world.scheduler.now + self.seconds, disk.make_room)
+        del world
+        host.disk.fail_next(DiskFault.FULL, self.seconds)
 
     @property
     def blamed(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from queue import Empty
 from typing import IO, cast, final
 
-from evedrop.live.launch.other_hosts import Greeting, line_of, serve_launcher
+from evedrop.live.launch.other_hosts import SILENCE_SECONDS, Greeting, line_of, serve_launcher
 from evedrop.live.launch.ssh_client import SshClient
 from evedrop.live.launch.starter import Starter
 from evedrop.system.waiting import Alarm
@@ -31,8 +31,6 @@ _CONNECT_SECONDS, _DELAY_SECONDS = 0.2, 1e-3
 _ALIVE_SECONDS = 3.0
 """How often ssh asks whether the server is still there."""
 _FAILED = 255
-_SILENCE_SECONDS = 600.0
-"""After which a program of another version ends, as ours does, if it hears nothing."""
 """The status of an ssh whose connection failed."""
 _MOST_BYTES = 1 << 15
 _LOST = "lost"
@@ -186,7 +184,7 @@ class OtherHost:
             return 127
         if self.oddity == "another version":
             process.send_event(line_of(Greeting(OTHER_VERSION)))
-            Alarm(lambda: process.signal(signal.SIGKILL)).set(_SILENCE_SECONDS)
+            Alarm(lambda: process.signal(signal.SIGKILL)).set(SILENCE_SECONDS)
             while process.read_input(_MOST_BYTES):
                 pass
             return 0

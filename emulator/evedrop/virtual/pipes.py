@@ -5,10 +5,12 @@ Source: docs/maintainers/simulated-world.md.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from types import TracebackType
-from typing import Self, final
+from typing import final
 
 from evedrop.virtual.scheduler import VirtualScheduler, Waiter
 
@@ -83,43 +85,8 @@ class Pipe:
             self.close_writing()
 
 
-@final
-class WritingEnd:
-    """An end of a pipe that other processes can inherit."""
-
-    def __init__(self, pipe: Pipe, close: Callable[[], object]) -> None:
-        self._pipe, self._close = pipe, close
-        self._open = True
-
-    def again(self) -> WritingEnd:
-        """The same end for a process that inherits it."""
-        return self._pipe.end()
-
-    def write(self, data: bytes) -> int:
-        """Write bytes."""
-        return self._pipe.write(data)
-
-    def flush(self) -> None:
-        """Everything is written already."""
-
-    def close(self) -> None:
-        """Close it, once."""
-        if self._open:
-            self._open = False
-            self._close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-@final
-class PipeFile:
-    """An end of a pipe as a file object."""
+class _End(AbstractContextManager["_End"]):
+    """An end of a pipe as a file object, which is closed at the end of a block."""
 
     def __init__(self, pipe: Pipe) -> None:
         self._pipe = pipe
@@ -128,25 +95,50 @@ class PipeFile:
         """Write bytes."""
         return self._pipe.write(data)
 
-    def read(self, most: int) -> bytes:
-        """Wait for bytes; none at the end."""
-        return self._pipe.read(most)
-
     def flush(self) -> None:
         """Everything is written already."""
 
+    @abstractmethod
     def close(self) -> None:
         """Close this end."""
-        self._pipe.close_writing()
-        self._pipe.close_reading()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+@final
+class WritingEnd(_End):
+    """An end of a pipe that other processes can inherit."""
+
+    def __init__(self, pipe: Pipe, close: Callable[[], object]) -> None:
+        super().__init__(pipe)
+        self._close, self._open = close, True
+
+    def again(self) -> WritingEnd:
+        """The same end for a process that inherits it."""
+        return self._pipe.end()
+
+    def close(self) -> None:
+        """Close it, once."""
+        if self._open:
+            self._open = False
+            self._close()
+
+
+@final
+class PipeFile(_End):
+    """Either end of a pipe, or both."""
+
+    def read(self, most: int) -> bytes:
+        """Wait for bytes; none at the end."""
+        return self._pipe.read(most)
+
+    def close(self) -> None:
+        """Close this end."""
+        self._pipe.close_writing()
+        self._pipe.close_reading()
 
     def __iter__(self) -> Iterator[bytes]:
         """The lines that come."""

@@ -16,6 +16,7 @@ from typing import TextIO, cast, final
 from evedrop.live.launch.briefs import MOST_SLOTS_AHEAD
 from evedrop.live.launch.hosts_file import load_hosts
 from evedrop.live.launch.launcher import launch
+from evedrop.live.launch.other_hosts import SILENCE_SECONDS
 from evedrop.names import RELAY, ROUTER
 from evedrop.scenario.progress_events import ProgressEvent
 from evedrop.scenario.tables import Scenario
@@ -37,12 +38,8 @@ _ROUTER, _RELAY = "tcp/127.0.0.1:17460", "tcp/127.0.0.1:17461"
 """Where two routers listen: encryption is not simulated."""
 _LEAVE_SECONDS = 60.0
 """Virtual seconds for processes whose launcher has ended, or was killed, to write what they have and to end."""
-
-
-_LEAVE_HOSTS_SECONDS = 700.0
-"""The same for programs on other hosts, which wait ten minutes for a launcher that is silent."""
-
-
+_LEAVE_HOSTS_SECONDS = SILENCE_SECONDS + 100.0
+"""The same for programs on other hosts, which wait for a launcher that is silent."""
 _CLEAN_SECONDS = 1.0
 """In which a host removes the files of a program that was killed."""
 

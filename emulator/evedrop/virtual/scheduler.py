@@ -214,7 +214,7 @@ class VirtualScheduler:
     # Processes and threads
 
     def process(self, name: str, host: str | None = None) -> VirtualTask:
-        """A new process without threads; host: its machine, by default that of who starts it."""
+        """A new process without threads; host: its machine, by default that of the process that starts it."""
         if host is None:
             host = "" if self.current is None else self.current.task.host
         task = VirtualTask(name, self.number(), host)

@@ -28,6 +28,7 @@ from evedrop.live.network.session import client_config, router_address_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol.brief import AnyBrief, Identity, RecorderPart, read_brief
 from evedrop.system.ports import free_port
+from evedrop.system.world import RealWorld
 from tests.conftest import wait_until
 from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
 from tests.messages import packet
@@ -283,6 +284,13 @@ def test_an_identity_that_fits_is_taken() -> None:
     """From a day before the authority was made, for clocks that are late, until 30 days after."""
     for now in (NOW - DAY, NOW, NOW + 30 * DAY):
         check_identity(EVES, EVE, now)
+
+
+def test_the_clock_is_that_of_the_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In which time may be simulated."""
+    monkeypatch.setattr(RealWorld, "time", lambda _: (NOW + 31 * DAY).timestamp())
+    with pytest.raises(BriefError, match=r"expired 2026-06-03 12:00 UTC.*says 2026-06-04 12:00 UTC"):
+        check_identity(EVES, EVE)
 
 
 def test_a_router_whose_clock_is_wrong_is_told_apart(stage: Bench) -> None:

@@ -87,9 +87,9 @@ class Run:
         """The sensor holds before slot k, and then everybody has reported; what the others were told."""
         self.conductor.told()
         self.steering.held(k)
-        self.steering.carry_on(k - 1)
+        self.steering.carry_on(k - 1, dict)
         assert self.conductor.told() == [], "something was done before everybody had reported"
-        self.steering.carry_on(k)
+        self.steering.carry_on(k, dict)
         return self.conductor.told()
 
     @property
@@ -173,15 +173,15 @@ def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
     assert run.holds(30) == []
     assert run.events == []
     run.steering.left("smart", 30)
-    run.steering.carry_on(30)
+    run.steering.carry_on(30, dict)
     assert [type(event) for event in run.progress] == [ProcessRequest]
     asked = run.asks("link", event=SET)
-    run.steering.carry_on(30)
+    run.steering.carry_on(30, dict)
     assert run.conductor.told() == []
     assert asked.answers == []
     run.steering.done(1)
     run.conductor.away.add("smart")
-    run.steering.carry_on(30)
+    run.steering.carry_on(30, dict)
     assert [type(sent) for _, sent in run.conductor.told()] == [LinkChange, Go, Go]
     assert asked.answers[0].slot == 30
     assert [event[1] for event in run.events] == ["kill smart", "link legitimate: quality = 0.2"]
@@ -204,12 +204,12 @@ def test_a_pause_lasts_until_it_is_ended() -> None:
     assert first.answers == [Answer(12, "held before slot 12")]
     second = run.asks("pause")
     changed = run.asks("link", event=SET)
-    run.steering.carry_on(12)
+    run.steering.carry_on(12, dict)
     assert [type(sent) for _, sent in run.conductor.told()] == [LinkChange]
     assert second.answers == [Answer(12, "held already, before slot 12")]
     assert changed.answers[0].slot == 12
     resumed = run.asks("resume")
-    run.steering.carry_on(12)
+    run.steering.carry_on(12, dict)
     assert run.conductor.told() == go(12)
     assert resumed.answers == [Answer(12, "the run goes on with slot 12")]
     assert [event[1] for event in run.events] == ["pause the run", "link legitimate: quality = 0.2", "resume the run"]
@@ -223,12 +223,12 @@ def test_a_run_may_begin_paused() -> None:
     assert (run.steering.paused, run.events) == (True, [(0, "pause the run", "operator"), (0, "cut smart", "scenario")])
     assert Held(0) in run.progress
     stepped = run.asks("step", slots=3)
-    run.steering.carry_on(0)
+    run.steering.carry_on(0, dict)
     assert run.conductor.told() == go(0, until=3)
     assert run.holds(3) == []
     assert stepped.answers == [Answer(3, "slots 0 to 2 passed; held before slot 3")]
     run.asks("resume")
-    run.steering.carry_on(3)
+    run.steering.carry_on(3, dict)
     assert run.conductor.told() == go(3)
 
 
@@ -245,7 +245,7 @@ def test_a_step_lets_slots_pass_and_holds_again() -> None:
     run.asks("pause")
     run.holds(12)
     stepped = run.asks("step", slots=5)
-    run.steering.carry_on(12)
+    run.steering.carry_on(12, dict)
     assert run.conductor.told() == go(12, until=17)
     assert run.holds(14) == go(14, until=17)
     changed = run.asks("link", event=SET)
@@ -288,7 +288,7 @@ def test_a_pause_ends_a_step() -> None:
     assert run.holds(22) == []
     assert stepped.answers == [Answer(22, "slots 20 to 21 passed; the run was paused before the step was over")]
     run.asks("resume")
-    run.steering.carry_on(22)
+    run.steering.carry_on(22, dict)
     assert run.holds(30) == go(30)
 
 
@@ -338,7 +338,7 @@ def test_a_pause_before_the_last_slot_holds() -> None:
     run.asks("pause")
     assert run.holds(SLOTS - 1) == []
     run.asks("resume")
-    run.steering.carry_on(SLOTS - 1)
+    run.steering.carry_on(SLOTS - 1, dict)
     assert run.conductor.told() == go(SLOTS - 1)
 
 
@@ -354,7 +354,7 @@ def test_what_was_said_is_said_once_more() -> None:
     run.steering.held(20)
     run.steering.remind()
     assert run.conductor.told() == []
-    run.steering.carry_on(20)
+    run.steering.carry_on(20, dict)
     run.conductor.told()
     run.steering.remind()
     assert run.conductor.told() == go(20, until=29)
@@ -366,7 +366,7 @@ def test_a_router_that_missed_a_go_hears_it_while_the_sensor_holds_again() -> No
     run.asks("pause")
     run.holds(12)
     run.asks("resume")
-    run.steering.carry_on(12)
+    run.steering.carry_on(12, dict)
     assert run.conductor.told() == go(12)
     run.steering.held(40)
     run.steering.remind()
@@ -380,7 +380,7 @@ def test_a_hold_that_is_told_once_more_is_one_hold() -> None:
     run.holds(12)
     run.steering.held(12)
     run.asks("resume")
-    run.steering.carry_on(12)
+    run.steering.carry_on(12, dict)
     assert run.conductor.told() == go(12)
     run.steering.held(12)
     assert run.steering.at is None

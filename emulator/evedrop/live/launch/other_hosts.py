@@ -158,7 +158,8 @@ _POLL_SECONDS = 0.05
 _MOST_BYTES = 2**16
 _ALIVE_SECONDS = 3
 _BEAT_SECONDS = 30.0
-_SILENCE_SECONDS = 600.0  # after which a host considers a silent launcher gone; a user may suspend it for a while
+SILENCE_SECONDS = 600.0
+"""After which a host considers a silent launcher gone; a user may suspend it for a while."""
 _OPTIONS = (
     "-T",
     *("-o", "BatchMode=yes"),  # never ask for a password or a key
@@ -246,7 +247,7 @@ class SshHost:
         """Tell the host from time to time that this launcher is still there."""
         while not self._lost.wait(self._beat_seconds if self._answered.is_set() else _POLL_SECONDS):
             if self._answered.is_set():
-                self.send(LauncherHeartbeat(_SILENCE_SECONDS))
+                self.send(LauncherHeartbeat(SILENCE_SECONDS))
 
     def wait_until_ready(self, deadline: float, stop: ThreadEvent) -> None:
         """Wait until Evedrop answers there. Raises UsageError if it does not, or has another version; Interrupted if stopped."""
@@ -480,7 +481,7 @@ class _Silence:
 
     def __init__(self) -> None:
         self._alarm = Alarm(world().process.interrupt)
-        self._seconds = _SILENCE_SECONDS
+        self._seconds = SILENCE_SECONDS
         self._alarm.set(self._seconds)  # the connection may die before anything came
 
     def heard(self, order: Order) -> None:

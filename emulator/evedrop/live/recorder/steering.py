@@ -128,7 +128,7 @@ class Steering:
             self._asked = True
             self._conductor.send_to(SENSOR, Hold())
 
-    def carry_on(self, reported: int, places: Callable[[], Mapping[str, int]] = dict) -> None:
+    def carry_on(self, reported: int, places: Callable[[], Mapping[str, int]]) -> None:
         """Carry out as many events as possible, given that all slots below `reported` are joined.
 
         places: process → the first slot that it has not reported. Raises RunError if they do not become possible in time.
@@ -137,7 +137,7 @@ class Steering:
             return
         if reported < self.at:
             behind = [name for name, k in places().items() if k < self.at]
-            self._fail(f"{' and '.join(behind) or 'a process'} did not report all slots before it")
+            self._fail(f"{' and '.join(behind)} did not report all slots before it")
             return
         while self._settled():
             if self._pending and not self._may(self._pending[0]):

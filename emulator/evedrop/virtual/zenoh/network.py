@@ -139,7 +139,7 @@ class VirtualZenoh:
         return list(places["router"] if isinstance(places, dict) else places)
 
     def _is_cut(self, task: VirtualTask, router: VirtualTask) -> bool:
-        unplugged = [self._unplugged.get(one.host, 0.0) for one in (task, router) if task.host != router.host]
+        unplugged = [self._unplugged.get(end.host, 0.0) for end in (task, router) if task.host != router.host]
         return max(self._cut.get(task.name, 0.0), *unplugged, 0.0) > self.scheduler.now
 
     def _wait_while_suspended(self, place: str, seconds: float) -> None:
@@ -236,7 +236,7 @@ class VirtualZenoh:
         for session in self._sessions:
             for end in [*session.ends] if session.task.host == host else ():
                 if end.other.session.task.host != host:
-                    end.connection.freeze(seconds, min(one.session.lease for one in end.connection.ends))
+                    end.connection.freeze(seconds, min(side.session.lease for side in end.connection.ends))
 
     def slow(self, process: str, seconds: float | None) -> bool:
         """Make everything on the connections of a process take longer for some time, or for good."""
