@@ -194,6 +194,25 @@ def test_who_waits_is_woken_up_by_what_it_waits_for() -> None:
         assert scheduler.now == 2.0
 
 
+def test_no_notification_is_lost_between_the_lock_and_the_wait() -> None:
+    """Who gives up the lock of a condition waits at once, however often it has taken the lock; a change comes before or after."""
+    for seed in range(100):
+        scheduler = VirtualScheduler(seed)
+        condition, ready = VirtualCondition(scheduler), list[str]()
+
+        def take(condition: VirtualCondition = condition, ready: list[str] = ready) -> None:
+            with condition, condition:
+                while not ready:
+                    condition.wait()
+
+        def give(condition: VirtualCondition = condition, ready: list[str] = ready) -> None:
+            with condition:
+                ready.append("ready")
+                condition.notify_all()
+
+        finish(scheduler, started(scheduler, "process", take, give))
+
+
 def test_a_killed_process_does_nothing_more() -> None:
     """No `finally` of it runs while anybody looks; what the system releases is released."""
     scheduler = VirtualScheduler(1)

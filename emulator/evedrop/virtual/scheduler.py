@@ -451,11 +451,16 @@ class VirtualLock:
         """Give it back."""
         if self._holder is None:
             return
-        self._depth -= 1
-        if self._depth == 0:
-            self._holder = None
-            self._scheduler.wake(self.waiting, 1)
+        if self._depth == 1:
+            self.give_up()
             self._scheduler.interruptible()
+        else:
+            self._depth -= 1
+
+    def give_up(self) -> None:
+        """Give it back, however often it was taken; no other thread goes on before the current one waits."""
+        self._holder, self._depth = None, 0
+        self._scheduler.wake(self.waiting, 1)
 
     def held_by_me(self) -> bool:
         """Whether the current thread has it."""
@@ -489,7 +494,7 @@ class VirtualCondition:
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until notified."""
-        self._lock.release()
+        self._lock.give_up()
         try:
             return self._scheduler.wait(self._waiting, timeout)
         finally:

@@ -80,6 +80,7 @@ def process(options: argparse.Namespace) -> int:
     world().process.show_stacks()
     if options.role != "recorder":  # the recorder ends the run in order
         world().process.leave_on_signals()
+    world().process.on_thread_failure(_end_of_thread)  # also of one that starts before the brief is read
     brief = read_brief(options.brief, options.role)
     world().process.on_thread_failure(partial(_end_of_thread, last_word=brief.last_word))
     if brief.ends_with_stdin:  # started by a launcher, which writes another brief if it restarts the process
@@ -102,7 +103,7 @@ def process(options: argparse.Namespace) -> int:
         raise
 
 
-def _end_of_thread(error: BaseException, last_word: str | None) -> None:
+def _end_of_thread(error: BaseException, last_word: str | None = None) -> None:
     """End the process, because an error has ended one of its threads: it would wait for ever for what that thread does."""
     import traceback
 

@@ -19,6 +19,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import final
 
 from evedrop.errors import Silence
+from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again, ProcessStatus
 from evedrop.live.protocol.keys import writer_of
@@ -175,6 +176,7 @@ def silent_of(
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated; the wait doubles each time
 _IDLE_SECONDS = 10.0  # for which a run may stand still without a known reason before a round is tried
+_HELD_SECONDS = READY_SECONDS / 8.0  # the same while a run is held: there is time for three rounds, each twice as long
 _LONGEST_SECONDS = 30.0
 _REACH_SECONDS = 2.0  # for which a round waits for processes that are back to subscribe to their commands again
 
@@ -242,6 +244,8 @@ class Recovery:
         if self._done < self._target:
             return max(_SOON_SECONDS, min(usual, self._patience / 8.0))
         idle = min(_IDLE_SECONDS, max(1.0, self._flow.longest_outage / 3.0))
+        if self._steering.at is not None:
+            idle = min(idle, _HELD_SECONDS)
         return min(max(idle, usual), self._patience / 2.0)
 
     def _go_on(self, done: int, now: float) -> None:
