@@ -23,6 +23,7 @@ class Network:
     keys, allowance, patience, router_id = RunKeys(RUN), 2**20, 1.0, "id"
 
     def __init__(self) -> None:
+        self.stop = Stop()
         self.reads: dict[str, Callable[[bytes], None]] = {}
         self.watches: dict[str, Callable[[bool], None]] = {}
         self.told: dict[str, int] = dict.fromkeys(NAMES, 0)
@@ -84,11 +85,14 @@ def network() -> Network:
     return Network()
 
 
-def ended(network: Network, patience: float = 30.0) -> tuple[Conductor, float]:
-    """The conductor of a run that has told its end, and the seconds that this took."""
+def ended(network: Network, patience: float = 30.0, *missing: str) -> tuple[Conductor, float]:
+    """The conductor of a run that has told its end, and the seconds that this took; missing: processes that are cut off."""
     clock = TestClock()
-    conductor = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True, clock=clock)  # type: ignore[arg-type]
+    conductor = Conductor(network, ("legitimate", "smart"), network.stop, relayed=True, clock=clock)  # type: ignore[arg-type]
     conductor.assemble()
+    for name in missing:
+        network.watches[name](False)
+        assert conductor.next_message() is None
     began = clock.now
     conductor.end(patience)
     return conductor, clock.now - began
@@ -133,14 +137,23 @@ def test_a_process_that_was_never_told_is_waited_for(network: Network) -> None:
         network.ends("sensor")
         network.watches["smart"](True)
 
-    conductor = Conductor(network, ("legitimate", "smart"), Stop(), relayed=True, clock=TestClock())  # type: ignore[arg-type]
-    conductor.assemble()
-    network.watches["smart"](False)
     network.does["sensor"] = gone
-    assert conductor.next_message() is None
-    conductor.end(30.0)
+    conductor, _ = ended(network, 30.0, "smart")
     assert network.told["smart"] == 1
     assert "smart" in conductor.misdelivered
+
+
+def test_nobody_is_waited_for_once_the_recorder_is_told_to_end(network: Network) -> None:
+    """The others are told; a launcher kills a recorder that does not begin to write the results."""
+
+    def interrupted(_: int) -> None:
+        network.stop.want()
+        network.ends("sensor")
+
+    network.does["sensor"] = interrupted
+    _, seconds = ended(network, 30.0, "smart")
+    assert network.told == dict.fromkeys(NAMES, 1) | {"smart": 0}
+    assert seconds < 1.0
 
 
 @pytest.mark.parametrize("name", ["router", "relay"])

@@ -41,12 +41,17 @@ class Stop:
         """The run must end."""
         self.wanted = True
 
+    @property
+    def asked(self) -> bool:
+        """Whether the run was told to end."""
+        return self.wanted or self._orphaned()
+
     def check(self, patience: float = 0.0) -> None:
         """Raise Interrupted if the run was told to end, or is told within `patience` seconds."""
         deadline = self._clock.monotonic() + patience
-        while not (asked := self.wanted or self._orphaned()) and self._clock.monotonic() < deadline:
+        while not self.asked and self._clock.monotonic() < deadline:
             self._clock.sleep(0.01)
-        if asked:
+        if self.asked:
             raise Interrupted
 
 
@@ -181,7 +186,8 @@ class Conductor:
     def end(self, patience: float) -> None:
         """Tell all processes that the run is over, repeatedly until they have left; the routers after all others.
 
-        patience: how many seconds to wait for the others: some may be cut off just now.
+        patience: how many seconds to wait for the others: some may be cut off just now. They are told once more, and not waited
+        for, if this process is told to end: its launcher may kill it before the results are written.
         """
         others = [name for name in self._present if name not in {ROUTER, RELAY} and name not in self.absent]
         told: set[str] = set()
@@ -197,6 +203,8 @@ class Conductor:
                     if self._present[name]:
                         self.send_to(name, EndRun())
                         told.add(name)
+            if self._stop.asked:
+                break
             self._hear_out(self._next())
         # The relay after the router: the router's messages pass through it.
         for name in (ROUTER, RELAY):
