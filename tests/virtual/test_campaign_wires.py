@@ -18,13 +18,17 @@ from evedrop.wire.file import wire_of
 from evedrop.wire.publications import _Way
 from evedrop.wire.running_link import RunningLink
 from evedrop.wire.tallies import LinkTally
+from evedrop.wire.time_steps import StepCounter
 from tests.virtual import simulated
+from tests.virtual.small_limits import LIMITS
 from tests.virtual.wire_cases import EVERY, WIRE, SimulatedWireCase
-from tests.virtual.wire_draws import BASE, MISTAKES, TEXTS, file_of
+from tests.virtual.wire_commands import REPLAY, REPLAY_FILE, VIEW, VIEW_FILE
+from tests.virtual.wire_draws import BASE, file_of
 from tests.virtual.wire_judge import DISK
+from tests.virtual.wire_mistakes import MISTAKES, TRIALS
 
 PLAIN = SimulatedWireCase(1, (), starts=2, seconds=10.0)
-NUMBERED, TALLIED, MESSAGE = RunningLink._counted, LinkTally.add, _Way.message
+NUMBERED, TALLIED, MESSAGE, COUNTED = RunningLink._counted, LinkTally.add, _Way.message, StepCounter.add
 
 
 @pytest.mark.parametrize("seed", range(EVERY, 9 * EVERY, EVERY))
@@ -66,11 +70,11 @@ def test_a_fault_at_any_moment_breaks_no_promise(fault: Any) -> None:
         assert replace(PLAIN, faults=(replace(fault, after=after),)).play().misses == (), after
 
 
-@pytest.mark.parametrize("mistake", [*MISTAKES, *TEXTS])
-def test_every_mistake_of_a_file_is_named(mistake: str) -> None:
-    """With the status of a wrong use, and nothing is left; without the mistake, the file is a wire."""
+@pytest.mark.parametrize("trial", TRIALS)
+def test_what_may_be_in_a_file_is_named(trial: str) -> None:
+    """A mistake with the status of a wrong use, and nothing is left; without it, the file is a wire."""
     tables = file_of(random.Random(1), 1.0)  # noqa: S311 - to be repeated
-    case = SimulatedWireCase(1, (), file=toml_text(tables), programs=(), mistake=mistake)
+    case = SimulatedWireCase(1, (), file=toml_text(tables), programs=(), trials=(trial,))
     assert simulated.read_case(case.to_text()) == case
     assert case.play().misses == ()
     assert wire_of(tables).links
@@ -78,11 +82,11 @@ def test_every_mistake_of_a_file_is_named(mistake: str) -> None:
 
 def test_a_mistake_that_is_not_named_is_seen() -> None:
     """What an error must name is really looked for."""
-    case = SimulatedWireCase(1, (), seconds=1.0, mistake="a negative seed")
+    case = SimulatedWireCase(1, (), seconds=1.0, trials=("a negative seed",))
     assert case.play().misses == ()
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(MISTAKES, "a negative seed", lambda _: "link.7.keys")
-        assert any("status 0 for a file with a mistake" in miss for miss in case.play().misses)
+        assert any("status 0 for a file with a negative seed" in miss for miss in case.play().misses)
 
 
 def test_a_link_is_fitted_whose_messages_were_heard_at_once() -> None:
@@ -118,6 +122,23 @@ def test_a_mistake_of_the_wire_is_seen(
     assert PLAIN.play().misses == ()
     monkeypatch.setattr(place, name, mistake)
     assert any(miss in found for found in PLAIN.play().misses)
+
+
+def test_recordings_count_what_the_journal_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The view that the wire records, and the one that is made of its journal; one that forgets a message is seen."""
+    case = replace(PLAIN, starts=1, further=(VIEW, REPLAY))
+    assert simulated.read_case(case.to_text()) == case
+    assert case.play().misses == ()
+    monkeypatch.setattr(StepCounter, "add", lambda counter, rows: COUNTED(counter, rows[1:]))
+    assert sorted(miss.partition(" counts ")[0] for miss in case.play().misses) == [REPLAY_FILE, VIEW_FILE]
+
+
+@pytest.mark.parametrize("limit", LIMITS)
+def test_small_limits_break_no_promise(limit: str) -> None:
+    """What they drop is in the journal, with the reason."""
+    case = replace(SimulatedWireCase.of(8 * EVERY), further=())
+    limited = replace(case, further=(limit,))
+    assert limited.play().misses == case.play().misses == ()
 
 
 def test_a_failing_wire_is_shrunk_and_shown(

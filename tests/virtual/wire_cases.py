@@ -1,6 +1,7 @@
 """Cases in which a wire is disturbed between programs in the simulated world: its journal is true to what its receivers got.
 
-The wire is the command, with a file that is drawn, and is started one to three times in one folder; or its file has a mistake.
+The wire is the command, with a file that is drawn, and is started one to three times in one folder; or files with
+mistakes are refused.
 Afterwards other commands read the folder.
 
 Source: docs/maintainers/simulated-world.md.
@@ -20,14 +21,9 @@ from itertools import count
 from pathlib import Path
 from typing import Any, final
 
-import zenoh
-
 from evedrop.cli.simulated import program
-from evedrop.errors import EvedropError, UsageError
+from evedrop.errors import UsageError
 from evedrop.scenario.words import toml_text
-from evedrop.system.lacks import report_refusal
-from evedrop.system.output import say
-from evedrop.system.world import world
 from evedrop.virtual import notes
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import KINDS
@@ -35,23 +31,23 @@ from evedrop.virtual.faults import DiskDisturbance
 from evedrop.virtual.run import SimulatedRun, SimulatedWorld
 from evedrop.virtual.scheduler import Stuck
 from evedrop.virtual.world import EPOCH
-from evedrop.wire.file import load_wire, wire_of
-from evedrop.wire.run import run_wire
+from evedrop.wire.file import wire_of
 from tests.faults.wires import FILE
+from tests.virtual.small_limits import small_limits
+from tests.virtual.wire_commands import FURTHER, VIEW, readers, route, run_the_wire, type_words
 from tests.virtual.wire_draws import (
     BASE,
     ENDPOINTS,
-    MISTAKES,
     OUTSIDE,
     ROBOT,
-    TEXTS,
     Tables,
     drawn_operations,
     drawn_programs,
     file_of,
     without_a_part,
 )
-from tests.virtual.wire_judge import DISK, WireJudge, broken_misses
+from tests.virtual.wire_judge import DISK, WireJudge
+from tests.virtual.wire_mistakes import TRIALS, tried
 from tests.virtual.wire_programs import Course, ProgramAtWork, WireProgram, programs_of
 
 EVERY = 12
@@ -64,7 +60,9 @@ _GROUPS = ((_TARGETS, 0.5), (_CONNECTIONS, 0.3), (_DISK, 0.2))
 _FIRST, _PER_SECOND = 20, 80
 """Events before which no fault strikes, and about how many there are in a second."""
 _BROKEN = 0.15
-"""The fraction of files with a mistake."""
+"""The fraction of cases that only try what may be in a file."""
+_TRIALS = 8
+"""How many of it each of them tries."""
 _AGAIN = 0.5
 """After the end of the wire, until it is started again, or its programs are asked what they got."""
 _END_SECONDS = 120.0
@@ -110,21 +108,24 @@ class SimulatedWireCase:
     programs: tuple[WireProgram, ...] = USUAL_PROGRAMS
     operations: tuple[tuple[float, str], ...] = ()
     """What operators type, and how many seconds after the first start."""
-    mistake: str = ""
-    """What is wrong in the file, in words of `MISTAKES` or `TEXTS`; empty: nothing."""
+    trials: tuple[str, ...] = ()
+    """What is put into the file, once each, in words of `TRIALS`; then no wire is run."""
+    further: tuple[str, ...] = ()
+    """What else is done, in words of `FURTHER`."""
 
     def __str__(self) -> str:
-        if self.mistake:
-            return f"a wire whose file has {self.mistake}"
+        if self.trials:
+            return f"a wire whose file has {', '.join(self.trials)}"
         faults = "; ".join(map(str, self.faults)) or "no fault"
         typed = "".join(f"; at {at:g} s: {words}" for at, words in self.operations)
+        typed += "".join(f"; {what}" for what in self.further)
         return (
             f"a wire, {self.starts} times for {self.seconds:g} s: {faults}{typed}; {'; '.join(map(str, self.programs))}"
         )
 
     @property
     def tables(self) -> Tables:
-        """Those of its file, without its mistake."""
+        """Those of its file, without what is tried."""
         return tomllib.loads(self.file)
 
     @classmethod
@@ -135,10 +136,12 @@ class SimulatedWireCase:
         tables = file_of(draw, seconds)
         file = toml_text(tables)
         if draw.random() < _BROKEN:
-            return cls(seed, (), 1, seconds, file, (), (), draw.choice([*MISTAKES, *TEXTS]))
+            return cls(seed, (), 1, seconds, file, (), (), tuple(draw.sample(TRIALS, _TRIALS)))
         programs = drawn_programs(draw, tables, seconds)
         operations = drawn_operations(draw, tables, seconds)
-        return cls(seed, _faults(draw, starts * seconds), starts, seconds, file, programs, operations)
+        faults = _faults(draw, starts * seconds)
+        further = tuple(what for what, chance in FURTHER.items() if draw.random() < chance)
+        return cls(seed, faults, starts, seconds, file, programs, operations, (), further)
 
     @classmethod
     def read(cls, text: str) -> SimulatedWireCase:
@@ -147,10 +150,11 @@ class SimulatedWireCase:
             described = json.loads(text)
             faults = tuple(KINDS[kind](*rest) for kind, *rest in described["faults"])
             case = cls(described["seed"], faults, described["starts"], described["seconds"])
+            case = replace(case, further=tuple(described.get("further", ())))
             if "file" in described:
                 operations = tuple((at, words) for at, words in described["operations"])
-                programs, mistake = programs_of(described["programs"]), described["mistake"]
-                case = replace(case, file=described["file"], programs=programs, operations=operations, mistake=mistake)
+                programs, trials = programs_of(described["programs"]), tuple(described["trials"])
+                case = replace(case, file=described["file"], programs=programs, operations=operations, trials=trials)
         except (ValueError, TypeError, KeyError) as error:
             raise UsageError(f"not a case ({type(error).__name__}: {error}); expected that of a wire") from error
         return case
@@ -164,7 +168,7 @@ class SimulatedWireCase:
             "starts": self.starts,
             "seconds": self.seconds,
         }
-        if (self.file, self.programs, self.operations, self.mistake) != (USUAL_FILE, USUAL_PROGRAMS, (), ""):
+        if (self.file, self.programs, self.operations, self.trials) != (USUAL_FILE, USUAL_PROGRAMS, (), ()):
             programs = [
                 {"side": drawn.side, "does": drawn.does, "after": drawn.after, "until": drawn.until}
                 for drawn in self.programs
@@ -173,8 +177,10 @@ class SimulatedWireCase:
                 "file": self.file,
                 "programs": programs,
                 "operations": self.operations,
-                "mistake": self.mistake,
+                "trials": self.trials,
             }
+        if self.further:
+            described["further"] = self.further
         return json.dumps(described)
 
     def smaller(self) -> Iterator[SimulatedWireCase]:
@@ -186,6 +192,10 @@ class SimulatedWireCase:
         for seconds in (1.0, 3.0, 10.0, 20.0):
             if seconds < self.seconds:
                 yield replace(self, seconds=seconds)
+        for i in range(len(self.trials) if len(self.trials) > 1 else 0):
+            yield replace(self, trials=(*self.trials[:i], *self.trials[i + 1 :]))
+        for i in range(len(self.further)):
+            yield replace(self, further=(*self.further[:i], *self.further[i + 1 :]))
         for i in range(len(self.operations)):
             yield replace(self, operations=(*self.operations[:i], *self.operations[i + 1 :]))
         yield from (replace(self, programs=fewer) for fewer in self._fewer_programs())
@@ -216,44 +226,40 @@ class SimulatedWireCase:
             for fault in self.faults:
                 simulated.scheduler.after(fault.after, partial(_strike, fault, simulated, struck))
             run = SimulatedRun(simulated.disk.root / "wire")
-            named = self._write(simulated.disk.root / _FILE)
-            self._carry_out(simulated, course, run)
-            if self.mistake:
-                return PlayedWire(self, run, tuple(broken_misses(course, run, named)))
-            judge = WireJudge(self, wire_of(self.tables), course, run, struck)
-            return PlayedWire(self, run, tuple(judge.misses()))
+            if self.trials:
+                return PlayedWire(self, run, self._tried(simulated, run))
+            (simulated.disk.root / _FILE).write_text(self.file, "utf-8")
+            with small_limits(self.further):
+                self._carry_out(simulated, course, run)
+                judge = WireJudge(self, wire_of(self.tables), course, run, struck)
+                return PlayedWire(self, run, tuple(judge.misses()))
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
-    def _write(self, path: Path) -> tuple[str, ...]:
-        """Write the file, with its mistake; returns what an error must name."""
-        if self.mistake == "not there":
-            return (_FILE,)
-        if self.mistake == "no text":
-            path.write_bytes(b"\xff" + self.file.encode())
-            return (_FILE,)
-        if self.mistake == "cut short":
-            path.write_text(self.file[: self.file.rindex(" = ") + 3], "utf-8")
-            return _FILE, "TOML"
-        tables = self.tables
-        named = (MISTAKES[self.mistake](tables),) if self.mistake else ()
-        path.write_text(toml_text(tables), "utf-8")
-        return named
+    def _tried(self, simulated: SimulatedWorld, run: SimulatedRun) -> tuple[str, ...]:
+        """Give the command files with mistakes; returns the misses."""
+        with simulated.entered():
+            try:
+                misses = [*tried(simulated, simulated.disk.root / _FILE, self.file, self.tables, self.trials)]
+            except Stuck as why:
+                misses = [f"stuck: {why}"]
+        _note_the_end(simulated, run)
+        return (*misses, *(f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors))
 
     def _carry_out(self, simulated: SimulatedWorld, course: Course, run: SimulatedRun) -> None:
         scheduler, begin = simulated.scheduler, simulated.machine.begin
         longest = self.seconds + _END_SECONDS + sum(fault.seconds or 0.0 for fault in self.faults)
         file = simulated.disk.root / _FILE
-        work_of_wire = partial(_refused if self.mistake else _wire, file, run.folder, self.seconds)
+        work_of_wire = partial(run_the_wire, file, run.folder, self.seconds, view=VIEW in self.further)
         sides = self.tables["side"]
         every = len(self.programs)  # no two messages have the same number
         numbers = {drawn: count(first, every) for first, drawn in enumerate(self.programs, 1)}
         with simulated.entered():
             try:
                 if any("connect" in side for side in sides.values()):
-                    begin("router", _route)
+                    begin("router", route)
                 for at, typed in self.operations:
-                    scheduler.at(at, partial(begin, "operator", partial(_type, run.folder, typed, course)))
+                    scheduler.at(at, partial(begin, "operator", partial(type_words, run.folder, typed, course)))
                 for _ in range(self.starts):
                     course.begun.append(scheduler.now)
                     wire = begin(WIRE, work_of_wire)
@@ -269,31 +275,26 @@ class SimulatedWireCase:
                     moment = scheduler.now + _AGAIN
                     scheduler.at(moment, lambda: None)
                     scheduler.run(moment + 1.0, lambda moment=moment: scheduler.now >= moment)  # type: ignore[misc]
-                if not self.mistake:
-                    self._read(simulated, course, run.folder)
+                self._read(simulated, course, run.folder)
             except Stuck as why:
                 run.stuck = str(why)
-            run.status, run.said = (
-                course.processes[-1].task.status,
-                "".join(process.printed for process in course.processes),
-            )
-            run.errors, run.seconds, run.events = scheduler.errors, scheduler.now, scheduler.events
-            run.digest, run.happened = scheduler.digest, scheduler.happened
+            run.status = course.processes[-1].task.status
+            run.said = "".join(process.printed for process in course.processes)
+        _note_the_end(simulated, run)
 
     def _read(self, simulated: SimulatedWorld, course: Course, folder: Path) -> None:
         """Let commands read the folder."""
-        links = [link.name for link in wire_of(self.tables).links]
-        keys = [f"{ROBOT}/data", "ask/robot", "**"]
-        commands = (
-            ["wire", str(folder.parent / _FILE), *keys, "--check"],
-            ["export", str(folder), str(folder.parent / "rows.csv")],
-            *(["links", "fit", str(folder), "--link", name] for name in links[self.seed % 3 : 1 + self.seed % 3]),
-        )
-        for words in commands:
-            reader = simulated.machine.begin("reader", partial(program, words))
+        for name, work in readers(folder, folder.parent / _FILE, wire_of(self.tables), self.seed, self.further):
+            reader = simulated.machine.begin("reader", work)
             now = simulated.scheduler.now
             simulated.scheduler.run(now + _READ_SECONDS, lambda reader=reader: not reader.task.alive)  # type: ignore[misc]
-            course.read.append((words[0], reader.task.status or 0, reader.printed))
+            course.read.append((name, reader.task.status or 0, reader.printed))
+
+
+def _note_the_end(simulated: SimulatedWorld, run: SimulatedRun) -> None:
+    scheduler = simulated.scheduler
+    run.errors, run.seconds, run.events = scheduler.errors, scheduler.now, scheduler.events
+    run.digest, run.happened = scheduler.digest, scheduler.happened
 
 
 def _faults(draw: random.Random, seconds: float) -> tuple[Disturbance, ...]:
@@ -311,35 +312,3 @@ def _strike(fault: Disturbance, simulated: SimulatedWorld, struck: dict[Disturba
     simulated.scheduler.note(notes.FAULT, str(fault))
     if fault.strike(simulated):
         struck[fault] = simulated.scheduler.now
-
-
-def _wire(file: Path, folder: Path, seconds: float) -> int:
-    """The wire, as the command runs it, without its report: pictures take longer than all the rest."""
-    try:
-        return run_wire(load_wire(file), folder, seconds=seconds, say=lambda _: None, complain=say)
-    except EvedropError as error:
-        say(error.illustrated)
-        return error.exit_status
-    except OSError as error:
-        return report_refusal(error)
-
-
-def _refused(file: Path, folder: Path, seconds: float) -> int:
-    """The command, with a file that has a mistake."""
-    return program(["wire", str(file), "--out", str(folder), "--for", f"{seconds:g} s"])
-
-
-def _route() -> int:
-    """The router outside of the wire."""
-    settings = {"mode": "router", "listen": {"endpoints": [OUTSIDE]}}
-    with world().zenoh.open(zenoh.Config.from_json5(json.dumps(settings))):
-        while True:
-            world().sleep(100.0)
-
-
-def _type(folder: Path, words: str, course: Course) -> int:
-    """Somebody types a command."""
-    verb, *rest = words.split()
-    status = program([verb, str(folder), *rest])
-    course.typed.append((words, status))
-    return status

@@ -1,4 +1,4 @@
-"""Draws the file of a simulated wire, the programs at its sides, and mistakes in the file.
+"""Draws the file of a simulated wire and the programs at its sides.
 
 Source: docs/maintainers/simulated-world.md.
 """
@@ -6,7 +6,7 @@ Source: docs/maintainers/simulated-world.md.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from copy import deepcopy
 from typing import Any
 
@@ -239,118 +239,3 @@ def _paths(tables: Tables) -> Iterator[tuple[Any, ...]]:
         yield from (("link", i, entry) for entry in link if entry not in ("name", "from", "to"))
     for name, side in tables["side"].items():
         yield from (("side", name, entry) for entry in side if entry != "listen")
-
-
-def _put(*path: Any, value: Any, named: str = "") -> Callable[[Tables], str]:
-    """A mistake: a value at a place; named: the entry that an error names, if it is another one."""
-
-    def broken(tables: Tables) -> str:
-        inner: Any = tables
-        for name in path[:-1]:
-            inner = inner.setdefault(name, {}) if isinstance(inner, dict) else inner[name]
-        inner[path[-1]] = value
-        return named or ".".join(map(str, path))
-
-    return broken
-
-
-def _add(table: str, entries: Tables, named: str) -> Callable[[Tables], str]:
-    """A mistake: one table more in a list."""
-
-    def broken(tables: Tables) -> str:
-        tables.setdefault(table, []).append(dict(entries))
-        return f"{table}.{len(tables[table]) - 1}.{named}"
-
-    return broken
-
-
-def _remove(*path: Any) -> Callable[[Tables], str]:
-    """A mistake: an entry is missing."""
-
-    def broken(tables: Tables) -> str:
-        inner: Any = tables
-        for name in path[:-1]:
-            inner = inner[name]
-        inner.pop(path[-1], None)
-        return ".".join(map(str, path))
-
-    return broken
-
-
-def _twice(tables: Tables) -> str:
-    tables["link"] = [tables["link"][0], {**tables["link"][0]}, *tables["link"][1:]]
-    return "link.1.name"
-
-
-MISTAKES: dict[str, Callable[[Tables], str]] = {
-    "a missing source": _remove("link", 0, "from"),
-    "no sides": _remove("side"),
-    "an unknown entry": _put("qualty", value=0.5),
-    "an unknown entry of a link": _put("link", 0, "qualty", value=0.5),
-    "an unknown entry of a side": _put("side", ROBOT, "listens", value="x"),
-    "a text for a number": _put("link", 0, "duplicate", value="often"),
-    "a number for a text": _put("link", 0, "from", value=7),
-    "a list for a table": _put("side", value=[ROBOT, BASE]),
-    "a text for a link": _put("link", 0, value="radio"),
-    "a probability above 1": _put("link", 0, "corrupt", value=1.5),
-    "a negative seed": _put("seed", value=-1),
-    "an unknown unit": _put("query_seconds", value="2 weeks"),
-    "a size that is no number": _put("largest", value="big"),
-    "a loss model of another name": _put("link", 0, "loss", value={"model": "gilbert"}),
-    "a delay that is negative": _put("link", 0, "delay", value={"model": "constant", "value": -1.0}),
-    "a delay in an unknown unit": _put("link", 0, "delay", value={"model": "constant", "value": "3 feet"}),
-    "a delay in slots": _put("link", 0, "delay", value={"model": "constant", "value": 1.0, "unit": "slots"}),
-    "a trace that ends": _put("link", 0, "loss", value={"model": "trace", "outcomes": "11", "once": True}),
-    "a recording that is not there": _put("link", 0, "loss", value={"model": "trace", "file": "no.csv"}),
-    "a queue without a rate": _add("link", {"from": ROBOT, "to": BASE, "queue": 10}, "queue"),
-    "a rate in an unknown unit": _put("link", 0, "rate", value="2 boxes/s"),
-    "a link of two orders": _add(
-        "link",
-        {"from": ROBOT, "to": BASE, "delay": {"model": "constant", "value": 1}, "reorder": 0.5, "ordered": True},
-        "reorder",
-    ),
-    "a link to nowhere": _put("link", 0, "to", value="moon"),
-    "a link to its own side": _add("link", {"from": ROBOT, "to": ROBOT}, "to"),
-    "a key that Zenoh refuses": _put("link", 0, "keys", value="//"),
-    "a key that is not canonical": _put("link", 0, "keys", value="a/**/**"),
-    "a name with capitals": _put("link", 0, "name", value="Radio"),
-    "a side with capitals": _put("side", "Moon", value={}),
-    "a link of the same name": _twice,
-    "a correlation with nothing": _put("link", 0, "correlation", value={"with": "nothing", "strength": 0.5}),
-    "a lossy protocol": _put("side", ROBOT, "listen", value="udp/127.0.0.1:1"),
-    "an endpoint without a port": _put("side", ROBOT, "listen", value="tcp/127.0.0.1"),
-    "a port that is too large": _put("side", ROBOT, "listen", value="tcp/127.0.0.1:70000"),
-    "one endpoint twice": _put("side", BASE, "listen", value=ENDPOINTS[ROBOT]),
-    "a connection to itself": _put("side", ROBOT, "connect", value=ENDPOINTS[BASE]),
-    "encryption without certificates": _put(
-        "side", ROBOT, "listen", value="tls/127.0.0.1:17700", named=f"side.{ROBOT}.tls"
-    ),
-    "certificates without encryption": _put("side", ROBOT, "tls", value={"certificate": "a", "key": "b"}),
-    "a user with a colon": _put("side", ROBOT, "users", value={"a:b": "c"}),
-    "an event without a time": _add("event", {"note": "when?"}, "at"),
-    "an event with two times": _add("event", {"at": 1, "from": 2, "note": "when?"}, "at"),
-    "an event that only ends": _add("event", {"at": 1, "to": 2, "note": "when?"}, "to"),
-    "an event that ends before it begins": _add("event", {"from": "2 s", "to": "1 s", "note": "when?"}, "to"),
-    "an event without anything": _add("event", {"at": 1}, ""),
-    "an event of two kinds": _add("event", {"at": 1, "cut": "l0", "note": "both"}, ""),
-    "an event of an unknown link": _add("event", {"at": 1, "cut": "nothing"}, "cut"),
-    "an event that sets nothing": _add("event", {"at": 1, "link": "l0", "set": {}}, "set"),
-    "an event that sets no link": _add("event", {"at": 1, "set": {"quality": 0.5}}, "link"),
-    "an event that sets another entry": _add("event", {"at": 1, "link": "l0", "set": {"tap": True}}, "set.tap"),
-    "an event that sets a wrong value": _add("event", {"at": 1, "link": "l0", "set": {"corrupt": 3.0}}, "set.corrupt"),
-    "a partition of one side": _add("event", {"at": 1, "partition": [ROBOT, ROBOT]}, "partition"),
-    "a partition from nowhere": _add("event", {"at": 1, "partition": [ROBOT, "moon"]}, "partition.1"),
-    "an expectation of an unknown link": _add("expect", {"metric": "nothing.delivery", "above": 0.5}, "metric"),
-    "an expectation of nothing": _add("expect", {}, "metric"),
-    "an expectation of an unknown metric": _add("expect", {"metric": "l0.speed", "above": 0.5}, "metric"),
-    "an expectation without a bound": _add("expect", {"metric": "l0.delivery"}, "below"),
-    "an expectation without a quantile": _add("expect", {"metric": "l0.latency", "below": 1}, "quantile"),
-    "an expectation with a pointless quantile": _add(
-        "expect", {"metric": "l0.delivery", "below": 1, "quantile": 0.5}, "quantile"
-    ),
-    "an expectation of two kinds": _add("expect", {"link": "l0", "below": 0.5}, "below"),
-    "a bound that is no number": _add("expect", {"metric": "l0.delivery", "below": "much"}, "below"),
-}
-"""What may be wrong in a file: each puts it there, and returns the name of the entry that an error must name."""
-TEXTS = ("cut short", "no text", "not there")
-"""What may be wrong with the text of a file."""

@@ -39,6 +39,7 @@ from evedrop.wire.liveliness import joined
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import REASONS, WireFate
 from tests.faults.wires import wrong_numbers, wrong_summary
+from tests.virtual.wire_commands import REPLAY, REPLAY_FILE, VIEW, VIEW_FILE, wrong_recording
 from tests.virtual.wire_programs import Course, Message, WireProgram, gid_of, ros_key, ros_token, service, stream_of
 
 Row = dict[str, Any]
@@ -66,6 +67,10 @@ class JudgedCase(Protocol):
     @property
     def operations(self) -> tuple[tuple[float, str], ...]:
         """What operators type."""
+
+    @property
+    def further(self) -> tuple[str, ...]:
+        """What else is done."""
 
 
 @final
@@ -116,11 +121,15 @@ class WireJudge:
                 yield f"the summary is that of start {start} of {len(rows)}"
             yield from wrong_summary(run.folder, rows[start], start)
             yield from self._of_end()
+            if VIEW in self._case.further:
+                yield from wrong_recording(run.folder.parent / VIEW_FILE, rows[len(rows)])
         if not self._struck:
             yield from self._of_operators()
             yield from self._of_tokens()
         if not self._killed:
             yield from self._of_readers(len(flat))
+            if (REPLAY, 0) in [(name, status) for name, status, _ in course.read]:
+                yield from wrong_recording(run.folder.parent / REPLAY_FILE, rows[len(rows)])
 
     def _of_status(self, process: VirtualProcess) -> Iterator[str]:
         status = process.task.status
@@ -309,7 +318,7 @@ class WireJudge:
     def _of_readers(self, rows: int) -> Iterator[str]:
         """Check the output of commands that read the folder afterwards."""
         for words, status, said in self._course.read:
-            if status not in ({0, UsageError.exit_status} if words == "links" else {0}):
+            if status not in ({0, UsageError.exit_status} if words in {"links", REPLAY} else {0}):
                 yield f"{words} ends with status {status}: {said.strip()[-300:]}"
         told = "".join(said for words, _, said in self._course.read if words == "export")
         if told and f"{rows:,} messages are in" not in told and not self._disk:
@@ -355,23 +364,6 @@ def fates_by_model(link: WireLink, seed: int, kind: str, key: str, count: int) -
     root = root_of_seed(seed)
     keys = {name: wire_stream_key(root, name, kind, key) for name in streams_of(link.name, schedule)}
     return Link(schedule, link.name, keys, Batch(NEVER, 1)).fates(range(count))
-
-
-def broken_misses(course: Course, run: SimulatedRun, named: tuple[str, ...]) -> Iterator[str]:
-    """What must hold of a wire whose file has a mistake: it is named, with the status of a wrong use, and nothing is left."""
-    if run.stuck is not None:
-        yield f"stuck: {run.stuck}"
-    yield from (f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors)
-    [process] = course.processes
-    if run.status != UsageError.exit_status:
-        yield f"status {run.status} for a file with a mistake: {process.printed.strip()[-300:]}"
-    yield from (
-        f"the message does not name {name}: {process.printed.strip()[-300:]}"
-        for name in named
-        if name not in process.printed
-    )
-    if run.folder.exists():
-        yield f"{run.folder.name} is left"
 
 
 def _has_no_name(row: Row) -> bool:

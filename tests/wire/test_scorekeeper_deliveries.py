@@ -187,6 +187,12 @@ def test_variance_of_a_recording_that_begins_anywhere() -> None:
             assert variance > exact
 
 
+def test_a_sample_of_messages_that_are_never_lost_does_not_vary() -> None:
+    """The mean of 7 of 25 messages is rounded to more than 7, which once gave a variance below 0, and ended the wire."""
+    sample = KeyDeliveries({"loss": {"model": "bernoulli", "quality": 1.0}}, [], [range(25)], 7)
+    assert bounds([sample], 7) == pytest.approx((7.0, 7.0), abs=1e-4)
+
+
 def test_a_change_of_the_loss_model_begins_a_new_memory() -> None:
     """Variances on both sides add up; a change of something else leaves them tied."""
     bursts = {"loss": LOSSES["gilbert-elliott"]}

@@ -81,7 +81,7 @@ class KeyDeliveries:
             self.variance += _variance(loss, parts)
         if sampled is not None:  # a sample of a known range: the range varies as a whole, and the sample within it
             fraction = sampled / sum(len(part.slots) for part in self.parts)
-            self.mean *= fraction
+            self.mean = min(self.mean * fraction, sampled)  # the product is rounded
             self.variance = self.variance * fraction**2 + self.mean * (1.0 - self.mean / sampled)
 
     def spectrum(self, z: Spectrum) -> Spectrum | None:

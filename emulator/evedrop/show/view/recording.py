@@ -8,7 +8,6 @@ with one warning, and harms neither the run nor the other panels.
 from __future__ import annotations
 
 import math
-import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -33,6 +32,8 @@ from evedrop.show.view.panels.panel import COLUMNS, ROWS_ABOVE, ROWS_BELOW, SCEN
 from evedrop.show.view.scene import Scene, SceneSlots
 from evedrop.show.view.staged import StagedChunks, chunk_sizes
 from evedrop.system.output import warn
+from evedrop.system.threads import ThreadEvent
+from evedrop.system.world import world
 
 T = TypeVar("T")
 
@@ -239,10 +240,10 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
         self._closing = False
         self._last = False
         """Whether the present call of `_send` is the last one."""
-        self._changed = threading.Condition()
+        self._changed = world().condition()
         self._file = self._stream()
-        begun = threading.Event()
-        self._writer = threading.Thread(target=self._record, args=(path, begun), name="recording", daemon=True)
+        begun = world().event()
+        self._writer = world().thread(self._record, path, begun, name="recording")
         try:
             self._blueprint = self._layout()
         except Exception as error:
@@ -309,7 +310,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
         if self.failure is None:
             self.failure = f"the recording is incomplete: {why}; free some space, or choose another folder"
 
-    def _record(self, path: Path, begun: threading.Event) -> None:
+    def _record(self, path: Path, begun: ThreadEvent) -> None:
         """Begin the file and write it to its end. Rerun never returns from a file that cannot even be begun."""
         if self.failure is None:
             try:

@@ -1,0 +1,98 @@
+"""What runs beside the programs of a simulated wire: the wire itself, a router, operators, and what reads the folder afterwards.
+
+Source: docs/maintainers/simulated-world.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from evedrop.cli.simulated import program
+from evedrop.errors import EvedropError
+from evedrop.system.lacks import report_refusal
+from evedrop.system.output import say
+from evedrop.system.world import world
+from evedrop.wire.file import load_wire
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.run import run_wire
+from tests.virtual.small_limits import LIMITS
+from tests.virtual.wire_draws import OUTSIDE, ROBOT
+from tests.virtual.wire_programs import Course
+from tests.wire.wire_recordings import shown
+
+VIEW, REPLAY = "view", "replay"
+"""What is done besides: the wire records its view; afterwards it is recorded again from the journal."""
+FURTHER = {VIEW: 0.06, REPLAY: 0.06, **dict.fromkeys(LIMITS, 0.12)}
+"""How often each of it is drawn, and each of the limits."""
+VIEW_FILE, REPLAY_FILE = "view.rrd", "replay.rrd"
+
+
+def run_the_wire(file: Path, folder: Path, seconds: float, *, view: bool) -> int:
+    """The wire, as the command runs it, without its report: pictures take longer than all the rest."""
+    shown = str(folder.parent / VIEW_FILE) if view else "off"
+    return _status_of(
+        lambda: run_wire(load_wire(file), folder, seconds=seconds, say=lambda _: None, complain=say, view=shown)
+    )
+
+
+def route() -> int:
+    """The router outside of the wire."""
+    settings = {"mode": "router", "listen": {"endpoints": [OUTSIDE]}}
+    with world().zenoh.open(zenoh.Config.from_json5(json.dumps(settings))):
+        while True:
+            world().sleep(100.0)
+
+
+def type_words(folder: Path, words: str, course: Course) -> int:
+    """Somebody types a command."""
+    verb, *rest = words.split()
+    status = program([verb, str(folder), *rest])
+    course.typed.append((words, status))
+    return status
+
+
+def readers(folder: Path, file: Path, plan: WirePlan, seed: int, further: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
+    """What reads the folder afterwards, each with its name."""
+    beside = folder.parent
+    keys = [f"{ROBOT}/data", "ask/robot", "**"]
+    yield "wire", lambda: program(["wire", str(file), *keys, "--check"])
+    yield "export", lambda: program(["export", str(folder), str(beside / "rows.csv")])
+    for link in plan.links[seed % 3 : 1 + seed % 3]:
+        yield "links", lambda link=link: program(["links", "fit", str(folder), "--link", link.name])
+    if REPLAY in further:
+        yield REPLAY, lambda: _status_of(lambda: _replay(folder, beside / REPLAY_FILE))
+
+
+def wrong_recording(path: Path, rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
+    """The table of a recording counts the messages of the latest start, whose rows these are."""
+    counts = Counter("no link" if row["link"] is None else row["link"] for row in rows)
+    tables = shown(path, "table", "TextDocument:text")
+    lines = [line.split("|") for line in (tables[-1][1][0].splitlines()[2:] if tables else ())]
+    told = {line[1].strip(): int(line[3].replace(",", "")) for line in lines}
+    if told != {**dict.fromkeys(told, 0), **counts}:
+        yield f"{path.name} counts {told}, and the journal {dict(counts)}"
+
+
+def _replay(folder: Path, path: Path) -> int:
+    from evedrop.wire.recording import replay_wire, wire_seconds
+
+    wire_seconds(folder)
+    replay_wire(folder, path)
+    return 0
+
+
+def _status_of(work: Callable[[], int]) -> int:
+    """What a command makes of an error."""
+    try:
+        return work()
+    except EvedropError as error:
+        say(error.illustrated)
+        return error.exit_status
+    except OSError as error:
+        return report_refusal(error)
