@@ -11,19 +11,22 @@ from typing import Any
 import pytest
 
 from evedrop.errors import UsageError
+from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import toml_text
 from evedrop.virtual.cases import case_of
 from evedrop.virtual.faults import CutConnection, CutPower, FillDisk, KillProcess, StopProcess
 from evedrop.wire.file import wire_of
 from evedrop.wire.publications import _Way
+from evedrop.wire.running import RunningWire
 from evedrop.wire.running_link import RunningLink
+from evedrop.wire.scenario_network import over_wire
 from evedrop.wire.tallies import LinkTally
 from evedrop.wire.time_steps import StepCounter
-from tests.virtual import simulated
+from tests.virtual import simulated, wire_scenarios
 from tests.virtual.small_limits import LIMITS
 from tests.virtual.wire_cases import EVERY, WIRE, SimulatedWireCase
-from tests.virtual.wire_commands import REPLAY, REPLAY_FILE, VIEW, VIEW_FILE
-from tests.virtual.wire_draws import BASE, file_of
+from tests.virtual.wire_commands import OPENED, REPLAY, REPLAY_FILE, SCENARIO, VIEW, VIEW_FILE
+from tests.virtual.wire_draws import BASE, ROBOT, file_of
 from tests.virtual.wire_judge import DISK
 from tests.virtual.wire_mistakes import MISTAKES, TRIALS
 
@@ -131,6 +134,31 @@ def test_recordings_count_what_the_journal_has(monkeypatch: pytest.MonkeyPatch) 
     assert case.play().misses == ()
     monkeypatch.setattr(StepCounter, "add", lambda counter, rows: COUNTED(counter, rows[1:]))
     assert sorted(miss.partition(" counts ")[0] for miss in case.play().misses) == [REPLAY_FILE, VIEW_FILE]
+
+
+def test_a_program_opens_the_wire_and_uses_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It steers the wire and reads its journal; a summary that counts a message too many is seen."""
+    case = replace(PLAIN, further=(OPENED,))
+    assert case.play().misses == ()
+    summary = RunningWire.summary
+    monkeypatch.setattr(RunningWire, "summary", lambda wire: {"heard": summary(wire)["heard"] + 1})
+    assert any("the summary heard" in miss for miss in case.play().misses)
+
+
+def test_a_scenario_has_the_links_of_a_wire(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its packets have the fates of the wire's messages; those of a wire with another seed are seen."""
+    radio = {"from": ROBOT, "to": BASE, "quality": 0.5}
+    file = toml_text({"seed": 7, "side": {ROBOT: {}, BASE: {}}, "link": [radio]})
+    cases = [SimulatedWireCase(seed, (), file=file, further=(SCENARIO,)) for seed in range(1, 7)]
+    assert not any(case.play().misses for case in cases)
+
+    def other_seed(scenario: Scenario, *network: Any) -> dict[str, Any]:
+        made = over_wire(scenario, *network)
+        return {**made, "wire": {**made["wire"], "seed": 1}}
+
+    monkeypatch.setattr(wire_scenarios, "over_wire", other_seed)
+    miss = "legitimate does not get the packets that the link robot-base lets through"
+    assert any(miss in case.play().misses for case in cases)
 
 
 @pytest.mark.parametrize("limit", LIMITS)

@@ -20,6 +20,7 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any, final
+from unittest.mock import patch
 
 from evedrop.cli.simulated import program
 from evedrop.errors import UsageError
@@ -34,7 +35,7 @@ from evedrop.virtual.world import EPOCH
 from evedrop.wire.file import wire_of
 from tests.faults.wires import FILE
 from tests.virtual.small_limits import small_limits
-from tests.virtual.wire_commands import FURTHER, VIEW, readers, route, run_the_wire, type_words
+from tests.virtual.wire_commands import FURTHER, OPENED, SCENARIO, VIEW, readers, route, run_the_wire, type_words
 from tests.virtual.wire_draws import (
     BASE,
     ENDPOINTS,
@@ -48,7 +49,9 @@ from tests.virtual.wire_draws import (
 )
 from tests.virtual.wire_judge import DISK, WireJudge
 from tests.virtual.wire_mistakes import TRIALS, tried
+from tests.virtual.wire_opener import open_from_python
 from tests.virtual.wire_programs import Course, ProgramAtWork, WireProgram, programs_of
+from tests.virtual.wire_scenarios import play_over_wire
 
 EVERY = 12
 """One seed of so many is a wire."""
@@ -218,6 +221,11 @@ class SimulatedWireCase:
 
     def play(self, keep: bool = False) -> PlayedWire:
         """Play it, and judge it; keep: whether to keep all events."""
+        misses: tuple[str, ...] = ()
+        if SCENARIO in self.further:
+            played, misses = play_over_wire(wire_of(self.tables), self.seed, keep)
+            if played is not None:
+                return PlayedWire(self, played.run, misses)
         memory = Path("/dev/shm")  # noqa: S108 - folders in it are private
         folder = Path(tempfile.mkdtemp(prefix="simulated-wire-", dir=memory if memory.is_dir() else None))
         try:
@@ -229,10 +237,10 @@ class SimulatedWireCase:
             if self.trials:
                 return PlayedWire(self, run, self._tried(simulated, run))
             (simulated.disk.root / _FILE).write_text(self.file, "utf-8")
-            with small_limits(self.further):
+            with small_limits(self.further), patch.object(tempfile, "tempdir", str(simulated.disk.root)):
                 self._carry_out(simulated, course, run)
                 judge = WireJudge(self, wire_of(self.tables), course, run, struck)
-                return PlayedWire(self, run, tuple(judge.misses()))
+                return PlayedWire(self, run, (*misses, *judge.misses()))
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -250,6 +258,7 @@ class SimulatedWireCase:
         scheduler, begin = simulated.scheduler, simulated.machine.begin
         longest = self.seconds + _END_SECONDS + sum(fault.seconds or 0.0 for fault in self.faults)
         file = simulated.disk.root / _FILE
+        opened = OPENED in self.further
         work_of_wire = partial(run_the_wire, file, run.folder, self.seconds, view=VIEW in self.further)
         sides = self.tables["side"]
         every = len(self.programs)  # no two messages have the same number
@@ -262,14 +271,20 @@ class SimulatedWireCase:
                     scheduler.at(at, partial(begin, "operator", partial(type_words, run.folder, typed, course)))
                 for _ in range(self.starts):
                     course.begun.append(scheduler.now)
-                    wire = begin(WIRE, work_of_wire)
-                    course.processes.append(wire)
+                    if opened:
+                        work = partial(
+                            open_from_python, file, run.folder, self.seconds, WIRE, simulated.machine, course
+                        )
+                        wire = begin("opener", work)
+                    else:
+                        wire = begin(WIRE, work_of_wire)
+                        course.processes.append(wire)
                     for place, drawn in enumerate(self.programs):
                         if simulated.process(drawn.side) is None:
                             side = sides[drawn.side]
                             endpoint = OUTSIDE if "connect" in side else ENDPOINTS[drawn.side]
-                            work = ProgramAtWork(drawn, place, numbers[drawn], course)
-                            begin(drawn.side, partial(work.run, endpoint, side.get("users"), EPOCH))
+                            at_work = ProgramAtWork(drawn, place, numbers[drawn], course)
+                            begin(drawn.side, partial(at_work.run, endpoint, side.get("users"), EPOCH))
                     scheduler.run(scheduler.now + longest, lambda wire=wire: not wire.task.alive)  # type: ignore[misc]
                     simulated.disk.make_room()
                     moment = scheduler.now + _AGAIN
@@ -278,7 +293,7 @@ class SimulatedWireCase:
                 self._read(simulated, course, run.folder)
             except Stuck as why:
                 run.stuck = str(why)
-            run.status = course.processes[-1].task.status
+            run.status = course.processes[-1].task.status if course.processes else None
             run.said = "".join(process.printed for process in course.processes)
         _note_the_end(simulated, run)
 

@@ -26,9 +26,12 @@ from tests.virtual.wire_draws import OUTSIDE, ROBOT
 from tests.virtual.wire_programs import Course
 from tests.wire.wire_recordings import shown
 
-VIEW, REPLAY = "view", "replay"
-"""What is done besides: the wire records its view; afterwards it is recorded again from the journal."""
-FURTHER = {VIEW: 0.06, REPLAY: 0.06, **dict.fromkeys(LIMITS, 0.12)}
+VIEW, REPLAY, OPENED, SCENARIO = "view", "replay", "opened from Python", "scenario"
+"""What is done besides: the wire records its view; afterwards it is recorded again from the journal; a program opens the wire.
+
+Instead, a scenario is run whose links are those of the wire, if one of the drawn ones can have them.
+"""
+FURTHER = {VIEW: 0.06, REPLAY: 0.06, OPENED: 0.1, SCENARIO: 0.12, **dict.fromkeys(LIMITS, 0.12)}
 """How often each of it is drawn, and each of the limits."""
 VIEW_FILE, REPLAY_FILE = "view.rrd", "replay.rrd"
 

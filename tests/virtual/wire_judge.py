@@ -124,6 +124,7 @@ class WireJudge:
             if VIEW in self._case.further:
                 yield from wrong_recording(run.folder.parent / VIEW_FILE, rows[len(rows)])
         if not self._struck:
+            yield from course.doubts
             yield from self._of_operators()
             yield from self._of_tokens()
         if not self._killed:

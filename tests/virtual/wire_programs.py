@@ -65,6 +65,8 @@ class Course:
     """The tokens that were seen at each side, as side and token."""
     typed: list[tuple[str, int]] = field(default_factory=list)
     """Commands of operators, and how they ended."""
+    doubts: list[str] = field(default_factory=list)
+    """What a program that opened the wire expected in vain."""
     read: list[tuple[str, int, str]] = field(default_factory=list)
     """Commands that read the folder afterwards, how they ended, and what they printed."""
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Generic, ParamSpec, Self, TextIO, TypeVar, cast, final
@@ -16,6 +15,7 @@ from typing import Any, BinaryIO, Generic, ParamSpec, Self, TextIO, TypeVar, cas
 from evedrop.errors import RunError, UsageError
 from evedrop.system.signals import INTERRUPTED
 from evedrop.virtual.caller import CallerWorld
+from evedrop.virtual.children import ChildProcess
 from evedrop.virtual.processes import Program, VirtualProcess
 from evedrop.virtual.scheduler import Ended
 from evedrop.wire.plan import WirePlan
@@ -124,7 +124,7 @@ class SimulatedWire(RunningWire):
     """A wire in a simulated process, and programs at it."""
 
     def __init__(self, plan: WirePlan, folder: Path, seconds: float, world: CallerWorld) -> None:
-        super().__init__(plan, folder, seconds)
+        super().__init__(plan, folder, seconds, self._started)
         self.clock = SimulatedClock(world)
         """For the programs, in place of the module `time`."""
         self._world = world
@@ -150,24 +150,12 @@ class SimulatedWire(RunningWire):
                 raise failed
             self._world.expect_no_error()
 
-    def _begin(self, *words: str) -> None:
-        machine = self._world.machine
+    def _started(self, *words: str) -> ChildProcess:
+        """Start the process of the wire."""
         self._world.allow(self._seconds + _PATIENCE)
-        self._wire = machine.begin("wire", partial(machine.program, [*words, "--quiet"]))
-        self._world.trusted.append(self._wire.task)
-
-    @property
-    def is_running(self) -> bool:
-        """Whether the wire is running."""
-        return self._wire.task.alive
-
-    def _stop(self, number: int) -> int:
-        self._wire.signal(number)
-        wait_for_end(self._world, self._wire, _PATIENCE)
-        self._wire.signal(signal.SIGKILL)
-        self._errors = [self._wire.printed]
-        status = self._wire.task.status
-        return -signal.SIGKILL if status is None else status
+        wire = ChildProcess(self._world.machine, "wire", *words)
+        self._world.trusted.append(wire.process.task)
+        return wire
 
 
 @final

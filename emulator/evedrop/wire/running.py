@@ -12,11 +12,11 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import IO, TYPE_CHECKING, Any, Protocol, Self
 
 import zenoh
 
@@ -92,15 +92,47 @@ def described_wire(
     return plan, folder
 
 
+class ProcessOfWire(Protocol):
+    """The part of `subprocess.Popen` that is used here."""
+
+    @property
+    def returncode(self) -> int | None:
+        """Its exit status, as of the latest look."""
+
+    @property
+    def stderr(self) -> IO[str] | None:
+        """Its warnings and errors."""
+
+    def poll(self) -> int | None:
+        """Its exit status; None while it runs."""
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end. Raises subprocess.TimeoutExpired."""
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal to it."""
+
+    def kill(self) -> None:
+        """End it."""
+
+
+Start = Callable[..., ProcessOfWire]
+"""Starts a process of Evedrop with the words of a command."""
+
+
 class RunningWire:
     """A wire in a process of its own; use it as a context manager."""
 
-    def __init__(self, plan: WirePlan, folder: Path, seconds: float = LONGEST_SECONDS) -> None:
+    def __init__(
+        self, plan: WirePlan, folder: Path, seconds: float = LONGEST_SECONDS, start: Start | None = None
+    ) -> None:
+        """start: starts a process of Evedrop with these words; by default one of the machine."""
         self.plan = plan
         self.folder = folder
         """The results folder."""
         self._seconds = seconds
-        self._process: subprocess.Popen[str] | None = None
+        self._start: Start = _started if start is None else start
+        self._process: ProcessOfWire | None = None
         self._endpoints: Mapping[str, Sequence[str]] = {}
         self._errors: list[str] = []
 
@@ -109,15 +141,13 @@ class RunningWire:
         with tempfile.TemporaryDirectory() as given:  # the results folder must be empty, or that of an earlier start
             file = Path(given) / "wire.toml"
             write_private(file, resolved_wire(self.plan))
-            self._begin("wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds:g} s")
+            self._process = self._start(
+                "wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds:g} s", "--quiet"
+            )
+            self._listener = world().thread(self._hear_errors, self._process, name="wire")
+            self._listener.start()
             self._wait()
         return self
-
-    def _begin(self, *words: str) -> None:
-        """Start the process; words: the command."""
-        self._process = process = _started(*words)
-        self._listener = world().thread(self._hear_errors, process, name="wire")
-        self._listener.start()
 
     def _wait(self) -> None:
         """Wait until the wire answers."""
@@ -239,7 +269,7 @@ class RunningWire:
             raise no_run(self.folder, "it ended before it answered")
         return answer
 
-    def _hear_errors(self, process: subprocess.Popen[str]) -> None:
+    def _hear_errors(self, process: ProcessOfWire) -> None:
         assert process.stderr is not None  # noqa: S101 - it is a pipe
         with process.stderr as errors:
             self._errors.extend(line for line in errors if not line.startswith(MARK))
