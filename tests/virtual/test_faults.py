@@ -13,7 +13,7 @@ from evedrop.virtual import campaign, faults, judge, lacks, notes, outsiders
 from evedrop.virtual.campaign import play_case
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, LAUNCHER, Disturbance
-from evedrop.virtual.moments import COMMANDS
+from evedrop.virtual.moments import CHANGES, COMMANDS
 from evedrop.virtual.reference import RunReference
 from evedrop.virtual.run import SimulatedRun
 from evedrop.virtual.zenoh.access import Access
@@ -33,6 +33,9 @@ STARTS, RUNS = 26, 90
         (faults.StopAndKillProcess("eve", RUNS, 0.5), 3, "eve"),
         (faults.HangProcess("eve", RUNS, 2.0), 0, ""),
         (faults.HangProcess("eve", RUNS), 3, "eve: alive, and silent"),
+        (faults.DelayThread("router", RUNS, 0.5), 0, ""),
+        (faults.StopProcess("recorder", RUNS, 20.0), 0, ""),
+        (faults.CutConnection("eve", 3, 0.5, CHANGES), 0, ""),
         (faults.CutConnection("sensor", 1, 0.5, COMMANDS), 0, ""),
         (faults.FlapConnection("eve", RUNS, 0.5), 0, ""),
         (faults.FlapConnection(EVERYBODY, RUNS, 0.5), 0, ""),

@@ -10,8 +10,15 @@ import pytest
 from evedrop.scenario.progress_events import RunProgress
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.cases import SimulatedCase
-from evedrop.virtual.disturbance import Disturbance
-from evedrop.virtual.faults import ConfuseKeys, InterruptProcess, KillProcess, StopProcess
+from evedrop.virtual.disturbance import EVERYBODY, Disturbance
+from evedrop.virtual.faults import (
+    ConfuseKeys,
+    CutConnection,
+    FreezeConnection,
+    InterruptProcess,
+    KillProcess,
+    StopProcess,
+)
 from evedrop.virtual.judge import misses
 from evedrop.virtual.notes import PutMessage
 from evedrop.virtual.reference import RunReference
@@ -48,6 +55,23 @@ def test_a_run_that_ends_late_is_a_miss(seconds: float, late: bool, tmp_path: Pa
         tmp_path, {KILLED: 0.5}, status=3, said="evedrop: legitimate was ended by signal 9", seconds=seconds
     )
     assert broken == (["the run took 58.0 s, and not 57.0 s at most"] if late else [])
+
+
+@pytest.mark.parametrize(("seconds", "kept"), [(0.5, False), (2.0, True)])
+def test_a_process_that_its_launcher_ends_is_a_miss(seconds: float, kept: bool, tmp_path: Path) -> None:
+    """It waited in vain for the end of a run that completes; a router that was suspended for longer is ended."""
+    struck: dict[Disturbance, float] = {CutConnection("sensor", 50, seconds): 0.5}
+    broken = judged(tmp_path, struck, status=0, seconds=2.0, ends={"sensor": (2.0, 130), "router": (2.0, 0)})
+    assert ("the run completes, and sensor ends with status 130" in broken) is not kept
+
+
+@pytest.mark.parametrize(("ended", "late"), [(8.9, False), (9.1, True)])
+def test_a_process_that_goes_on_without_a_connection_is_a_miss(ended: float, late: bool, tmp_path: Path) -> None:
+    """It ends after the longest outage, 4 s until a connection counts as lost, and 1.5 s."""
+    struck: dict[Disturbance, float] = {FreezeConnection(EVERYBODY, 50): 0.5}
+    said = "evedrop: router stopped responding"
+    broken = judged(tmp_path, struck, status=3, said=said, seconds=12.0, ends={"legitimate": (ended, 130)})
+    assert broken == ([f"legitimate does not end, though it has had no connection for {ended - 0.5} s"] if late else [])
 
 
 def test_a_fork_server_that_is_suspended_may_cost_two_minutes(tmp_path: Path) -> None:

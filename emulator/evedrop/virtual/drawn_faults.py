@@ -7,14 +7,28 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping, Sequence
-from math import log10
+from math import ceil, log10
 
 from evedrop.live.launch.briefs import flow_of
 from evedrop.model.schemes import SCHEMES
+from evedrop.names import CONTROLLER, LEGITIMATE, RECORDER, SENSOR
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual import faults, lacks, outsiders
 from evedrop.virtual.disturbance import ROUTERS, Disturbance, processes_of
-from evedrop.virtual.moments import BARRIERS, COMMANDS, EVENTS, LOSSES
+from evedrop.virtual.moments import (
+    ACKNOWLEDGED,
+    BARRIERS,
+    CHANGES,
+    COMMANDS,
+    DECISIONS,
+    EVENTS,
+    FINAL_BELIEFS,
+    INPUTS,
+    LOSSES,
+    OF_SENSOR,
+    PROGRESS,
+    PROGRESS_OF_RECEIVERS,
+)
 
 _MOST_FAULTS = 3
 _LATE = 0.5
@@ -22,9 +36,17 @@ _LATE = 0.5
 _LOSING = 0.5
 """The fraction of faults that are short, and lose messages while the sensor sends its own."""
 _LOSSES = (faults.CutConnection, faults.CutConnection, faults.FlapConnection, faults.ConfuseKeys, faults.KillProcess)
+_CONCERNED = 0.5
+"""The fraction of these that hit a process which sends or reads the messages that are counted."""
 _NOTABLE = 0.4
-"""The fraction of the other faults that strike when a command is sent, a barrier, or when a connection has been lost."""
-_COUNTS: Mapping[str, Sequence[int]] = {COMMANDS: (1, 1, 2, 2, 3, 4, 5), BARRIERS: (1, 1, 2, 3), LOSSES: (1, 1, 2)}
+"""The fraction of the other faults that strike at another moment than after some events."""
+_COUNTS: Mapping[str, Sequence[int]] = {
+    COMMANDS: (1, 1, 2, 2, 3, 4, 5),
+    BARRIERS: (1, 1, 2, 3),
+    LOSSES: (1, 1, 2),
+    FINAL_BELIEFS: (1, 1, 2, 3),
+    CHANGES: range(1, 100),
+}
 """Moment → how many of its kind there may be until a fault strikes."""
 _SOON, _SOON_EVENTS = 0.4, 50
 """The fraction of further faults that strike soon after an earlier one, and within how many events."""
@@ -42,6 +64,7 @@ KINDS: Mapping[str, type[Disturbance]] = {
         faults.StopProcess,
         faults.StopAndKillProcess,
         faults.HangProcess,
+        faults.DelayThread,
         faults.CutConnection,
         faults.FlapConnection,
         faults.FreezeConnection,
@@ -98,7 +121,11 @@ def faults_of(source: random.Random, scenario: Scenario, ahead: int) -> tuple[Di
         before = next((fault for fault in reversed(drawn) if fault.moment == EVENTS), None)
         if source.random() < _NOTABLE:
             moment = source.choice(
-                [COMMANDS, COMMANDS, *[BARRIERS] * bool(scenario.timeline.holds), *[LOSSES] * bool(drawn)]
+                [
+                    *([CHANGES] * 8 if issubclass(kind, faults.DiskDisturbance) else [COMMANDS, COMMANDS, CHANGES]),
+                    *[BARRIERS, FINAL_BELIEFS][: len(_leaves(scenario)) + 1] * bool(scenario.timeline.holds),
+                    *[LOSSES] * bool(drawn),
+                ]
             )
             drawn.append(kind(target, source.choice(_COUNTS[moment]), seconds, moment))
             continue
@@ -113,17 +140,29 @@ def faults_of(source: random.Random, scenario: Scenario, ahead: int) -> tuple[Di
 def _loss(source: random.Random, scenario: Scenario, ahead: int) -> Disturbance:
     """A short fault that loses messages while the sensor sends its own."""
     kind = source.choice(_LOSSES)
-    hubs = [name for name in processes_of(scenario) if name in ROUTERS]
-    target = source.choice(hubs if kind is faults.KillProcess else kind.targets(scenario))
     seconds = round(10.0 ** source.uniform(-2.0, 0.0), 3) if kind.lasts else None
-    flow = flow_of(scenario, ahead)
-    slots = {
-        "messages of the sensor": 1 if is_answered(scenario) or scenario.pace else flow.message,
-        "messages of progress": flow.batch,
+    flow, leaves = flow_of(scenario, ahead), _leaves(scenario)
+    concerned: dict[str, tuple[float, Sequence[str]]] = {
+        OF_SENSOR: (1 if is_answered(scenario) or scenario.pace else flow.message, [SENSOR]),
+        PROGRESS: (flow.batch, [SENSOR, RECORDER]),
+        PROGRESS_OF_RECEIVERS: (flow.batch / len(scenario.receivers), [SENSOR]),
     }
     if SCHEMES[scenario.encoding.spec["scheme"]].needs_acknowledgements:
-        slots["acknowledgements"] = 1
+        concerned[ACKNOWLEDGED] = (1, [LEGITIMATE])
     if scenario.controller is not None:
-        slots["inputs"] = scenario.controller.period
-    moment = source.choice([*slots])
-    return kind(target, source.randint(1, -(-scenario.slots // slots[moment])), seconds, moment)
+        concerned[INPUTS] = (scenario.controller.period, [SENSOR, LEGITIMATE, LEGITIMATE, CONTROLLER])
+        concerned[DECISIONS] = (flow.batch, [RECORDER])
+    if leaves:
+        concerned[FINAL_BELIEFS] = (scenario.slots / len(leaves), [RECORDER, *leaves])
+    moment = source.choice([*concerned])
+    slots, names = concerned[moment]
+    if kind is faults.KillProcess:
+        targets = [name for name in processes_of(scenario) if name in ROUTERS]
+    else:
+        targets = [*names] if source.random() < _CONCERNED else [*kind.targets(scenario)]
+    return kind(source.choice(targets), source.randint(1, ceil(scenario.slots / slots)), seconds, moment)
+
+
+def _leaves(scenario: Scenario) -> list[str]:
+    """The receivers that leave, each as often as it does."""
+    return [name for name, outages in scenario.timeline.outages.items() for _ in outages]

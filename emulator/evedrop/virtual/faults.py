@@ -146,7 +146,9 @@ class StopProcess(_OfProcess):
         return _suspend(world, self.target, self.seconds, signal.SIGCONT)
 
     def survived(self, longest_outage: float) -> bool:
-        """A fork server has some seconds to tell of the end of a process."""
+        """A fork server has some seconds to tell of the end of a process; for a recorder, the time stands still."""
+        if self.target == RECORDER:
+            return self.seconds is not None
         tells = self.target not in FORK_SERVERS or (self.seconds is not None and self.seconds < _TELLS_SECONDS)
         return tells and super().survived(longest_outage)
 
@@ -184,6 +186,24 @@ class HangProcess(Disturbance):
         if process is None:
             return False
         world.scheduler.hang(process.task.threads[0], self.seconds)
+        return True
+
+
+@final
+class DelayThread(_OfProcess):
+    """One of the other threads of a process does not go on for some time, as on a machine that is busy."""
+
+    kind, share = "delay a thread of", 12
+    lasts, for_good, harmless = True, False, True
+    most_seconds = 1.0
+
+    def strike(self, world: SimulatedWorld) -> bool:
+        """Hold one up that the seed chooses."""
+        process = world.process(self.target)
+        others = [] if process is None else [thread for thread in process.task.threads[1:] if not thread.over]
+        if not others:
+            return False
+        world.scheduler.hang(world.scheduler.random.choice(others), self.seconds)
         return True
 
 

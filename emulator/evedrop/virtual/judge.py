@@ -18,7 +18,7 @@ from evedrop.names import RECORDER
 from evedrop.results.reading import Results
 from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
 from evedrop.virtual.cases import SimulatedCase
-from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance
+from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance, processes_of
 from evedrop.virtual.faults import CutConnection
 from evedrop.virtual.host_faults import LosePower
 from evedrop.virtual.host_parts import host_of
@@ -38,6 +38,8 @@ _SUSPENDED_SECONDS = 3.0
 """That the end of a run takes if a receiver is suspended."""
 _NOTICED_SECONDS = 0.1
 """Within which a connection that is cut is noticed."""
+_LEASE_SECONDS, _GIVES_UP_SECONDS = 4.0, 1.5
+"""Until a connection that is frozen counts as lost, and that the end of a process may take which gives up."""
 _PATIENCES = 2.0
 """How many times the longest outage a run may wait before it gives up."""
 _HOSTS_SECONDS = 180.0
@@ -67,6 +69,7 @@ def misses(
     broken += [f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors]
     broken += _of_status(case, run, struck, reference.status)
     broken += _of_time(case, run, struck)
+    broken += _of_ends(case, run, struck)
     if not any(fault.ends_at_once(LAUNCHER) for fault in struck) and not run.suspended:
         broken += [f"{path.name} is left" for path in sorted(temporaries[""].iterdir())]
     for host in temporaries.keys() - {"", *(host_of(fault.target) for fault in struck if isinstance(fault, LosePower))}:
@@ -150,6 +153,28 @@ def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
         most += _HOSTS_SECONDS
     if took > most and not run.suspended:
         yield f"the run took {took:.1f} s, and not {most:.1f} s at most"
+
+
+def _of_ends(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
+    """Whether processes end by themselves, rather than because their launcher ends them.
+
+    They do if the run completes, but for a receiver that is away to the end, and the routers, which wait for it. And they do if
+    all of them are cut off for good.
+    """
+    scenario, faults = case.scenario, list(struck)
+    if case.hosts is not None:
+        return
+    away = any(away.stop >= scenario.slots for outages in scenario.timeline.outages.values() for away in outages)
+    brief = all(fault.survived(scenario.longest_outage) and (fault.seconds or 0.0) <= 1.0 for fault in faults)
+    if run.status == 0 and brief and not away:
+        for name in processes_of(scenario):
+            if (status := run.ends.get(name, (0.0, 0))[1]) != 0:
+                yield f"the run completes, and {name} ends with status {status}"
+    if len(faults) == 1 and faults[0].cuts_off and faults[0].target == EVERYBODY and faults[0].seconds is None:
+        last = struck[faults[0]] + scenario.longest_outage + _LEASE_SECONDS + _GIVES_UP_SECONDS
+        for name in {*processes_of(scenario)} - {*ROUTERS, RECORDER}:
+            if name in run.ends and run.ends[name][0] > last:
+                yield f"{name} does not end, though it has had no connection for {run.ends[name][0] - struck[faults[0]]:.1f} s"
 
 
 def _progress(run: SimulatedRun) -> Iterator[tuple[float, int]]:

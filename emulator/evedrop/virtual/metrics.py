@@ -52,7 +52,7 @@ def _repeatable(
     """
     if all(event["by"] != "operator" for event in events):
         return events
-    again = {(event["slot"], event["event"]) for event in wanted}
+    again = [(event["slot"], event["event"]) for event in wanted]
     kept = [event for event in events if event["by"] != "operator" or (event["slot"], event["event"]) in again]
     same_events = sorted((event["slot"], event["event"]) for event in kept) == sorted(again)
     return wanted if same_events else kept

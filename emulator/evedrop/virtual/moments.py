@@ -5,22 +5,34 @@ Source: docs/maintainers/simulated-world.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
-from evedrop.names import RECORDER
+from evedrop.names import CONTROLLER, RECORDER
 from evedrop.virtual import notes
 
 EVENTS = "events"
 BARRIERS = "barriers"
 COMMANDS = "commands to it"
 LOSSES = "lost connections"
-OF_KEYS: Mapping[str, str] = {
-    "messages of the sensor": "uplink",
-    "messages of progress": f"progress/{RECORDER}",
-    "acknowledgements": "ack/sent",
-    "inputs": "input",
+CHANGES = "changes of the results"
+FINAL_BELIEFS = "final beliefs"
+OF_SENSOR = "messages of the sensor"
+PROGRESS = "messages of progress"
+PROGRESS_OF_RECEIVERS = "messages of progress of receivers"
+ACKNOWLEDGED = "acknowledgements"
+INPUTS = "inputs"
+DECISIONS = "reports of the controller"
+_OF_MESSAGES: Mapping[str, Callable[[str, str], bool]] = {
+    BARRIERS: lambda key, said: key == "uplink" and said.startswith("hold"),
+    FINAL_BELIEFS: lambda _, said: said.startswith("leaves"),
+    OF_SENSOR: lambda key, _: key == "uplink",
+    PROGRESS: lambda key, _: key == f"progress/{RECORDER}",
+    PROGRESS_OF_RECEIVERS: lambda key, _: key.startswith("progress/") and key != f"progress/{RECORDER}",
+    ACKNOWLEDGED: lambda key, _: key == "ack/sent",
+    INPUTS: lambda key, _: key == "input",
+    DECISIONS: lambda key, _: key == f"telemetry/{CONTROLLER}",
 }
-"""Moment → the key of the messages that it counts."""
+"""Moment → whether it counts a message, by its key and what it says."""
 
 
 def is_counted(moment: str, target: str, commanded: bool, what: str, words: tuple[object, ...]) -> bool:
@@ -28,13 +40,13 @@ def is_counted(moment: str, target: str, commanded: bool, what: str, words: tupl
 
     If it is not, every command counts.
     """
-    if moment == LOSSES:
-        return what == notes.DISCONNECTS
+    if what == notes.DISCONNECTS:
+        return moment == LOSSES
+    if what == notes.WRITES:
+        return moment == CHANGES and str(words[2]).startswith("results/")
     if what != notes.PUT:
         return False
     key, _, said = map(str, words)
-    if moment in OF_KEYS:
-        return key == OF_KEYS[moment]
-    if moment == BARRIERS:
-        return key == "uplink" and said.startswith("hold")
-    return key == f"control/{target}" if commanded and target != RECORDER else key.startswith("control/")
+    if moment == COMMANDS:
+        return key == f"control/{target}" if commanded and target != RECORDER else key.startswith("control/")
+    return moment in _OF_MESSAGES and _OF_MESSAGES[moment](key, said)

@@ -55,7 +55,7 @@ def key_within(key: str) -> str:
 
 
 def said_in(message: bytes) -> str:
-    """The command or the slots that a message carries, in few words: "end", "12", "0-27", "hold 28"; empty if neither.
+    """The command or the slots that a message carries, in few words: "end", "12", "0-27", "hold 28", "leaves 5"; or nothing.
 
     message: as it is put, with its envelope.
     """
@@ -69,7 +69,11 @@ def said_in(message: bytes) -> str:
     if not isinstance(fields, dict):
         return ""
     first, slots = fields.get("k"), fields.get("c", 1)
-    words = [str(fields["do"])] if "do" in fields else [word for word in ("hold", "again", "over") if word in fields]
+    words = (
+        [str(fields["do"])]
+        if "do" in fields
+        else [word for word in ("hold", "again", "over", "leaves") if word in fields]
+    )
     if isinstance(first, int) and isinstance(slots, int):
         words.append(f"{first}-{first + slots - 1}" if slots > 1 else str(first))
     return " ".join(words)

@@ -32,8 +32,8 @@ from evedrop.virtual.scheduler import Occurrence, Stuck, VirtualScheduler
 from evedrop.virtual.world import VirtualWorld
 from evedrop.virtual.zenoh import VirtualZenoh
 
-MOST_SECONDS = 3600.0
-"""Virtual seconds within which every run must end, whatever happens to it."""
+MOST_SECONDS = 900.0
+"""Virtual seconds, besides those of its slots, within which every run must end, whatever happens to it."""
 _ROUTER, _RELAY = "tcp/127.0.0.1:17460", "tcp/127.0.0.1:17461"
 """Where two routers listen: encryption is not simulated."""
 _LEAVE_SECONDS = 60.0
@@ -57,6 +57,8 @@ class SimulatedRun:
     """What the launcher wrote to standard error."""
     told: list[tuple[float, ProgressEvent]] = field(default_factory=list)
     """The events that the launcher got, each with its virtual time."""
+    ends: dict[str, tuple[float, int]] = field(default_factory=dict)
+    """Process → when the latest one of this name ended, and its exit status."""
     left: list[str] = field(default_factory=list)
     """Processes that outlived it."""
     suspended: bool = False
@@ -139,6 +141,9 @@ def run_in(
     def watch(name: str, what: str, words: tuple[object, ...]) -> None:
         if what == notes.PUT and not name.endswith(notes.BY_HAND):
             run.put.append(PutMessage(scheduler.now, str(words[0]), str(words[2])))
+        elif what == notes.ENDS:
+            process, status = words
+            run.ends[str(process)] = scheduler.now, int(str(status))
 
     scheduler.watchers.append(watch)
 
@@ -159,7 +164,7 @@ def run_in(
     with world.entered():
         process = world.machine.begin("launcher", lambda: status_of(launcher))
         try:
-            scheduler.run(MOST_SECONDS, lambda: not process.task.alive)
+            scheduler.run(MOST_SECONDS + scenario.slots * scenario.pace, lambda: not process.task.alive)
             ended = scheduler.now
             leave = _LEAVE_SECONDS if world.hosts is None else _LEAVE_HOSTS_SECONDS
             with contextlib.suppress(Stuck):
