@@ -1030,6 +1030,18 @@ def test_a_session_that_does_not_reconnect_stays_open_without_a_router(net: Netw
 
 
 @behaviour
+def test_a_client_may_wait_for_its_router_while_it_opens(net: Network) -> None:
+    """For as long as its configuration says."""
+    opened: list[Any] = []
+    net.thread(lambda: opened.append(net.client("client", retry=True, timeout_ms=60_000)))
+    net.pause(0.2)
+    assert not opened
+    net.router()
+    net.until(lambda: opened)
+    assert connected(opened[0])
+
+
+@behaviour
 def test_a_session_may_reconnect_at_once_whatever_its_retry(net: Network) -> None:
     """Its first attempt does not wait; it fails if the router has not noticed the loss yet, and then there is no other."""
     net.router()

@@ -22,6 +22,7 @@ from evedrop.virtual.disturbance import Disturbance, processes_of
 from evedrop.virtual.judge import misses
 from evedrop.virtual.moments import EVENTS, is_counted
 from evedrop.virtual.processes import Program
+from evedrop.virtual.programs import taken_states
 from evedrop.virtual.reference import RunReference, in_memory
 from evedrop.virtual.run import SimulatedRun, SimulatedWorld, run_in
 
@@ -71,11 +72,20 @@ def play_case(
             hosts_file = folder / "hosts.toml"
             hosts_file.write_text(case.hosts.text(case.scenario))
         with _temporary(temporary):
-            run = run_in(world, case.scenario, case.ahead, hosts_file)
+            run = run_in(world, case.live, case.ahead, hosts_file, begin=partial(_begin_program, case, world))
         temporaries = {"": temporary, **{host.name: host.temporary for host in world.hosts or ()}}
         if any(fault.amends for fault in struck):
             reference = _amended(reference, case.scenario, run.folder, folder / "amended")
-        return PlayedCase(case, run, struck, tuple(misses(case, run, struck, reference, temporaries)))
+        wrong = list[str]()
+        if case.program is not None:
+            taken, wrong = taken_states(run.folder, case.scenario, disturbed=bool(struck))
+            reference = in_memory(taken, folder / "taken")
+        return PlayedCase(case, run, struck, (*wrong, *misses(case, run, struck, reference, temporaries)))
+
+
+def _begin_program(case: SimulatedCase, world: SimulatedWorld) -> None:
+    if case.program is not None:
+        case.program.begin(world, case.scenario)
 
 
 @lru_cache(maxsize=1)

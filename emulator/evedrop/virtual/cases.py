@@ -23,6 +23,7 @@ from evedrop.virtual import own_classes
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import KINDS, faults_of
 from evedrop.virtual.drawn_hosts import DrawnHosts, drawn_hosts, kind_with
+from evedrop.virtual.programs import DrawnProgram, drawn_program, with_states
 from evedrop.virtual.rare_faults import RARE_KINDS, rare_faults
 
 SEEDS_OF_A_SCENARIO = 6
@@ -57,6 +58,8 @@ class SimulatedCase:
     """How many slots the sensor may be ahead: the flow control of a run of a hundred thousand slots fits into a few."""
     hosts: DrawnHosts | None = None
     """The other hosts, if there are any."""
+    program: DrawnProgram | None = None
+    """The program that publishes the states of the scenario; None: they are simulated, or in the scenario."""
 
     def __str__(self) -> str:
         scenario = self.scenario
@@ -64,7 +67,8 @@ class SimulatedCase:
         faults = "; ".join(map(str, self.faults)) or "no fault"
         return (
             f"{scenario.encoding.spec['scheme']} against {eves}, {scenario.slots} slots of {scenario.trials}, "
-            f"{self.ahead} ahead{'' if self.hosts is None else f', {self.hosts}'}: {faults}"
+            f"{self.ahead} ahead{'' if self.hosts is None else f', {self.hosts}'}"
+            f"{'' if self.program is None else f', {self.program}'}: {faults}"
         )
 
     def to_text(self) -> str:
@@ -72,7 +76,15 @@ class SimulatedCase:
         faults = [[fault.kind, *astuple(fault)] for fault in self.faults]
         tables = self.scenario.as_tables()
         hosts = {} if self.hosts is None else {"hosts": self.hosts.as_lists()}
-        return json.dumps({"seed": self.seed, "ahead": self.ahead, "faults": faults, **hosts, "scenario": tables})
+        program = {} if self.program is None else {"program": self.program.as_list()}
+        return json.dumps(
+            {"seed": self.seed, "ahead": self.ahead, "faults": faults, **hosts, **program, "scenario": tables}
+        )
+
+    @property
+    def live(self) -> Scenario:
+        """The scenario as it is run live."""
+        return self.scenario if self.program is None else self.program.scenario(self.scenario)
 
 
 def case_from(text: str) -> SimulatedCase:
@@ -86,7 +98,8 @@ def case_from(text: str) -> SimulatedCase:
         )
         scenario, ahead = Scenario(described["scenario"]), described.get("ahead", MOST_SLOTS_AHEAD)
         hosts = DrawnHosts.of_lists(described["hosts"]) if "hosts" in described else None
-        return SimulatedCase(described["seed"], scenario, faults, ahead, hosts)
+        program = DrawnProgram(*described["program"]) if "program" in described else None
+        return SimulatedCase(described["seed"], scenario, faults, ahead, hosts, program)
     except (ValueError, TypeError, KeyError) as error:
         raise UsageError(f"not a case ({type(error).__name__}: {error}); expected a seed or a shrunk case") from error
 
@@ -99,13 +112,17 @@ def case_of(seed: int) -> SimulatedCase:
     ahead = source.choice(few if few and source.random() < _LIMITED else _AHEAD)
     hosts, of_hosts = drawn_hosts(seed, scenario)
     faults = (*faults_of(source, scenario, ahead), *of_hosts, *rare_faults(seed, scenario, ahead))
-    return SimulatedCase(seed, scenario, faults, ahead, hosts)
+    program = drawn_program(seed, scenario) if hosts is None else None
+    if program is not None:  # what such a run takes is known from its files alone
+        faults = tuple(fault for fault in faults if not (fault.lacking or fault.amends))
+    return SimulatedCase(seed, scenario, faults, ahead, hosts, program)
 
 
 @lru_cache(maxsize=1)
 def scenario_of(number: int) -> Scenario:
     """The scenario that some seeds play."""
-    return CaseDraw(random.Random(f"drawn {number}")).scenario()  # noqa: S311 - to be repeated, not to be secret
+    drawn = CaseDraw(random.Random(f"drawn {number}")).scenario()  # noqa: S311 - to be repeated, not to be secret
+    return with_states(number, drawn)
 
 
 def case_with(scenario: Scenario, seed: int) -> SimulatedCase:

@@ -14,7 +14,7 @@ from typing import Any
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.briefs import LAUNCHED_PATIENCE
-from evedrop.names import RECORDER
+from evedrop.names import RECORDER, SENSOR
 from evedrop.results.reading import Results
 from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
 from evedrop.virtual.cases import SimulatedCase
@@ -75,16 +75,17 @@ def misses(
     for host in temporaries.keys() - {"", *(host_of(fault.target) for fault in struck if isinstance(fault, LosePower))}:
         broken += [f"{path.name} is left on {host}" for path in sorted(temporaries[host].iterdir())]
     broken += _of_logs(run)
-    broken += wrong_messages(case, run.put, disturbed=bool(struck))
+    broken += wrong_messages(case, run.put, disturbed=bool(struck) or _wrong_program(case) is not None)
     if not any(fault.destroys for fault in struck):
         broken += _of_files(run, struck)
-        broken += _of_results(run, struck, reference)
+        broken += _of_results(case, run, struck, reference)
     return broken
 
 
 def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float], good: int) -> Iterator[str]:
     """Whether the exit status, and what is said, tell what happened; good: the status of a run that completes."""
     status = run.status
+    program = _wrong_program(case)
     complaint = next((line for line in run.said.splitlines() if line.strip() and "warning" not in line), "")
     fatal = [fault for fault in struck if not fault.survived(case.scenario.longest_outage)]
     if run.suspended:
@@ -93,6 +94,9 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
     if refused is not None and (status == UsageError.exit_status or not fatal):
         if status != UsageError.exit_status or (refused not in run.said and not fatal):
             yield f"status {status}, although the run cannot begin ({refused}): {complaint}"
+    elif program is not None and not fatal:
+        if status != RunError.exit_status or program not in run.said:
+            yield f"status {status}, although a program is wrong ({program}): {complaint}"
     elif status == good:
         yield from _of_ignored_signals(case, run, {fault: struck[fault] for fault in fatal})
     elif not fatal:
@@ -109,11 +113,18 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
             or any(map(_is_worse_for_others, fatal))
         ]
         blamed = [word for fault in counted for word in fault.blamed]
+        if program is not None:
+            blamed.append(SENSOR)
         if case.hosts is not None:
             blamed += [name for fault in counted for name in case.hosts.processes_on(host_of(fault.target))]
         said = complaint if all(fault.named_first for fault in fatal) else run.said
         if not any(word in said for word in blamed):
             yield f"the failure names none of {', '.join(blamed)}: {complaint or '(nothing was said)'}"
+
+
+def _wrong_program(case: SimulatedCase) -> str | None:
+    """A text that the run prints because a program of states is wrong; None if none is."""
+    return None if case.program is None else case.program.refused
 
 
 def _is_worse_for_others(fault: Disturbance) -> bool:
@@ -140,6 +151,8 @@ def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
     most = scenario.slots * scenario.pace + (_USUAL_SECONDS if struck or case.hosts is not None else _QUIET_SECONDS)
     if any(away.stop >= scenario.slots for outages in scenario.timeline.outages.values() for away in outages):
         most += _SUSPENDED_SECONDS
+    if case.program is not None:
+        most += case.program.seconds(scenario)
     for fault in struck:
         brief = fault.seconds is not None and fault.seconds <= 1.0
         most += (_BRIEF_SECONDS if brief else _FAULT_SECONDS) + (fault.seconds or 0.0)
@@ -203,7 +216,9 @@ def _of_files(run: SimulatedRun, struck: Iterable[Disturbance]) -> Iterator[str]
             yield f"{path.relative_to(run.folder)} is left of the run"
 
 
-def _of_results(run: SimulatedRun, struck: Mapping[Disturbance, float], reference: RunReference) -> Iterator[str]:
+def _of_results(
+    case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float], reference: RunReference
+) -> Iterator[str]:
     """Whether the tables can be read, and have the right rows, and no others, and the summary is of them."""
     done = run.status == reference.status
     lacking = any(fault.lacking for fault in struck)
@@ -231,10 +246,11 @@ def _of_results(run: SimulatedRun, struck: Mapping[Disturbance, float], referenc
         if is_over and summary["slots"] < reference.scenario.slots:
             yield f"all slots were done, and the summary has {summary['slots']}"
         if not any(fault.ends_at_once(RECORDER) for fault in struck):
-            yield from _of_course(run, struck, summary, expected, whole)
+            yield from _of_course(case, run, struck, summary, expected, whole)
 
 
 def _of_course(
+    case: SimulatedCase,
     run: SimulatedRun,
     struck: Mapping[Disturbance, float],
     summary: Mapping[str, Any],
@@ -249,7 +265,8 @@ def _of_course(
     outages = [event for _, event in run.told if isinstance(event, ConnectionOutage)] if whole else []
     yield from wrong_outages(summary, reference, frozenset((event.process, event.slot) for event in outages))
     for entry in summary["outages"]:
-        if not any(_explains(fault, entry["process"]) for fault in struck):
+        failing = _wrong_program(case) is not None and entry["process"] == SENSOR
+        if not failing and not any(_explains(fault, entry["process"]) for fault in struck):
             yield f"an outage of {entry['process']} at slot {entry['slot']}, and no fault caused one"
 
 

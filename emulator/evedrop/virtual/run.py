@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO, cast, final
@@ -127,11 +127,15 @@ class SimulatedWorld:
 
 
 def run_in(
-    world: SimulatedWorld, scenario: Scenario, ahead: int = MOST_SLOTS_AHEAD, hosts_file: Path | None = None
+    world: SimulatedWorld,
+    scenario: Scenario,
+    ahead: int = MOST_SLOTS_AHEAD,
+    hosts_file: Path | None = None,
+    begin: Callable[[], object] = lambda: None,
 ) -> SimulatedRun:
     """Run a scenario live in a simulated world; ahead: as for `launch`.
 
-    hosts_file: that of `--hosts`, if the world has other hosts.
+    hosts_file: that of `--hosts`, if the world has other hosts. begin: begins other programs, before the launcher.
     """
     run = SimulatedRun(world.results)
     world.scenario, world.told = scenario, run.told
@@ -162,6 +166,7 @@ def run_in(
         ).status
 
     with world.entered():
+        begin()
         process = world.machine.begin("launcher", lambda: status_of(launcher))
         try:
             scheduler.run(MOST_SECONDS + scenario.slots * scenario.pace, lambda: not process.task.alive)

@@ -254,6 +254,11 @@ def _fewer_hosts(case: SimulatedCase) -> Iterator[SimulatedCase]:
             yield _with_hosts(case, hosts)
 
 
+def _plainer_program(case: SimulatedCase) -> Iterator[SimulatedCase]:
+    for program in () if case.program is None else case.program.smaller():
+        yield replace(case, program=program)
+
+
 def _with_hosts(case: SimulatedCase, hosts: DrawnHosts | None) -> SimulatedCase:
     """The case with other hosts, and without faults of those that are no longer there."""
     there = {"", *(() if hosts is None else hosts.oddities)}
@@ -280,6 +285,7 @@ def _rounder(fault: Disturbance) -> Iterator[Disturbance]:
 _REDUCTIONS = (
     _fewer_faults,
     _fewer_hosts,
+    _plainer_program,
     _fewer_eavesdroppers,
     _fewer_slots,
     _fewer_trials,
@@ -313,7 +319,9 @@ def _changed(case: SimulatedCase, changes: Mapping[str, Any]) -> Iterator[Simula
     except ScenarioError:
         return
     gone = {*processes_of(case.scenario)} - {*processes_of(scenario)}
-    smaller = replace(case, scenario=scenario, faults=tuple(fault for fault in case.faults if fault.target not in gone))
+    faults = tuple(fault for fault in case.faults if fault.target not in gone)
+    program = case.program if scenario.process.given else None
+    smaller = replace(case, scenario=scenario, faults=faults, program=program)
     yield smaller if case.hosts is None else _with_hosts(smaller, case.hosts.fitting(scenario))
 
 
@@ -330,6 +338,8 @@ def _fit(tables: Tables) -> None:
     acknowledgements = tables.get("acknowledgements", {})
     if acknowledgements.get("jammer", LEGITIMATE) not in names:
         del acknowledgements["attack"], acknowledgements["jammer"]
+    if "state_values" in tables["process"]:
+        tables["process"]["state_values"] = tables["process"]["state_values"][: tables["slots"]]
     if "controller" not in tables:
         tables[LEGITIMATE].pop("knows_input", None)
     if tables.get("shards", 1) > tables["trials"]:

@@ -104,6 +104,10 @@ class VirtualZenoh:
             for place in places:
                 self._wait_while_suspended(place, (section(config, "transport/unicast/open_timeout") or _OPEN_MS) / 1e3)
                 connected = self._connect(session, place)
+                deadline = scheduler.now + (section(config, "connect/timeout_ms") or 0) / 1e3
+                while not connected and not session.router and scheduler.now < deadline:
+                    scheduler.sleep(session.again)
+                    connected = self._connect(session, place)
                 if not connected and not session.router:
                     raise zenoh.ZError(f"cannot connect to {place}")
                 session.connects_to = place
