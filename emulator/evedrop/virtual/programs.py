@@ -37,6 +37,8 @@ _PAUSE_SECONDS, _LATER_SECONDS = 0.02, 0.5
 _PLENTY = 3
 _FLOOD = 100_001
 """More states than a sensor keeps."""
+_NO_FLOOD = 0.9
+"""The fraction of programs with a mistake whose mistake is no flood: one takes as long to play as forty runs."""
 _NO_STATE = "no state came"
 MISTAKES: Mapping[str, str] = {
     "no listener": "cannot connect within 30 s to",
@@ -201,7 +203,10 @@ def drawn_program(seed: int, scenario: Scenario) -> DrawnProgram | None:
         return None
     form, mistake = some.choice(_FORMS), ""
     if some.random() < _MISTAKEN:
-        mistake = some.choice([name for name in MISTAKES if form != "bytes" or name in _OF_BYTES])
+        rare = {"a flood"} if some.random() < _NO_FLOOD else set[str]()
+        mistake = some.choice(
+            [name for name in MISTAKES if name not in rare and (form != "bytes" or name in _OF_BYTES)]
+        )
         form = "bytes" if mistake == "too few bytes" else form
     listens = mistake == "no listener" or some.random() < 0.5
     late = mistake not in {"", "a flood"} and some.random() < 0.5
