@@ -25,7 +25,7 @@ from evedrop.wire.time_steps import StepCounter
 from tests.virtual import simulated, wire_scenarios
 from tests.virtual.small_limits import LIMITS
 from tests.virtual.wire_cases import EVERY, WIRE, SimulatedWireCase
-from tests.virtual.wire_commands import OPENED, REPLAY, REPLAY_FILE, SCENARIO, VIEW, VIEW_FILE
+from tests.virtual.wire_commands import JOINED, MOVED, OPENED, REPLAY, REPLAY_FILE, SCENARIO, VIEW, VIEW_FILE
 from tests.virtual.wire_draws import BASE, ROBOT, file_of
 from tests.virtual.wire_judge import DISK
 from tests.virtual.wire_mistakes import MISTAKES, TRIALS
@@ -159,6 +159,20 @@ def test_a_scenario_has_the_links_of_a_wire(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(wire_scenarios, "over_wire", other_seed)
     miss = "legitimate does not get the packets that the link robot-base lets through"
     assert any(miss in case.play().misses for case in cases)
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        (JOINED, "messages pass between the sides robot and base outside the wire"),
+        (MOVED, "was removed or moved while the wire ran"),
+    ],
+)
+def test_a_wire_says_what_happens_to_it(what: str, words: str) -> None:
+    """Sides that are joined outside, and a journal that somebody moves."""
+    played = replace(PLAIN, starts=1, further=(what,)).play()
+    assert played.misses == ()
+    assert words in played.run.said
 
 
 @pytest.mark.parametrize("limit", LIMITS)

@@ -35,7 +35,20 @@ from evedrop.virtual.world import EPOCH
 from evedrop.wire.file import wire_of
 from tests.faults.wires import FILE
 from tests.virtual.small_limits import small_limits
-from tests.virtual.wire_commands import FURTHER, OPENED, SCENARIO, VIEW, readers, route, run_the_wire, type_words
+from tests.virtual.wire_commands import (
+    FURTHER,
+    JOINED,
+    MOVED,
+    OPENED,
+    SCENARIO,
+    VIEW,
+    join,
+    move_journal,
+    readers,
+    route,
+    run_the_wire,
+    type_words,
+)
 from tests.virtual.wire_draws import (
     BASE,
     ENDPOINTS,
@@ -267,6 +280,11 @@ class SimulatedWireCase:
             try:
                 if any("connect" in side for side in sides.values()):
                     begin("router", route)
+                if JOINED in self.further:
+                    joining = partial(join, [*sides.values()], self.seconds / 2.0)
+                    scheduler.at(self.seconds / 4.0, partial(begin, "joining", joining))
+                if MOVED in self.further:
+                    scheduler.at(self.seconds / 2.0, partial(begin, "mover", partial(move_journal, run.folder)))
                 for at, typed in self.operations:
                     scheduler.at(at, partial(begin, "operator", partial(type_words, run.folder, typed, course)))
                 for _ in range(self.starts):

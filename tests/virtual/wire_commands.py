@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,11 @@ from evedrop.system.lacks import report_refusal
 from evedrop.system.output import say
 from evedrop.system.world import world
 from evedrop.wire.file import load_wire
+from evedrop.wire.journal import JOURNAL_FOLDER
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.run import run_wire
 from tests.virtual.small_limits import LIMITS
-from tests.virtual.wire_draws import OUTSIDE, ROBOT
+from tests.virtual.wire_draws import BASE, ENDPOINTS, OUTSIDE, ROBOT
 from tests.virtual.wire_programs import Course
 from tests.wire.wire_recordings import shown
 
@@ -31,8 +33,26 @@ VIEW, REPLAY, OPENED, SCENARIO = "view", "replay", "opened from Python", "scenar
 
 Instead, a scenario is run whose links are those of the wire, if one of the drawn ones can have them.
 """
-FURTHER = {VIEW: 0.06, REPLAY: 0.06, OPENED: 0.1, SCENARIO: 0.12, **dict.fromkeys(LIMITS, 0.12)}
+JOINED, MOVED = "joined outside", "journal moved away"
+"""What happens meanwhile: a router outside joins the first two sides for some time; somebody moves the journal away."""
+FURTHER = {
+    VIEW: 0.06,
+    REPLAY: 0.06,
+    OPENED: 0.1,
+    SCENARIO: 0.12,
+    JOINED: 0.06,
+    MOVED: 0.03,
+    **dict.fromkeys(LIMITS, 0.12),
+}
 """How often each of it is drawn, and each of the limits."""
+_FITS: tuple[tuple[str, ...], ...] = (
+    (),
+    ("--gaps",),
+    ("--key", "*/data"),
+    ("--key", "0/**", "--gaps"),
+    ("--key", "//"),
+)
+"""Further words for `evedrop links fit`."""
 VIEW_FILE, REPLAY_FILE = "view.rrd", "replay.rrd"
 
 
@@ -52,6 +72,24 @@ def route() -> int:
             world().sleep(100.0)
 
 
+def join(sides: Sequence[Mapping[str, Any]], seconds: float) -> int:
+    """A router that connects to sides which listen, and joins them for some seconds."""
+    endpoints = [ENDPOINTS[ROBOT], ENDPOINTS[BASE]]
+    settings: dict[str, Any] = {"mode": "router", "connect": {"endpoints": endpoints}}
+    for user, password in next((side["users"] for side in sides if "users" in side), {}).items():
+        settings["transport"] = {"auth": {"usrpwd": {"user": user, "password": password}}}
+    with world().zenoh.open(zenoh.Config.from_json5(json.dumps(settings))):
+        world().sleep(seconds)
+    return 0
+
+
+def move_journal(folder: Path) -> int:
+    """Somebody moves the journal of a wire."""
+    with suppress(FileNotFoundError):
+        (folder / JOURNAL_FOLDER).rename(folder.parent / "moved")
+    return 0
+
+
 def type_words(folder: Path, words: str, course: Course) -> int:
     """Somebody types a command."""
     verb, *rest = words.split()
@@ -66,8 +104,12 @@ def readers(folder: Path, file: Path, plan: WirePlan, seed: int, further: tuple[
     keys = [f"{ROBOT}/data", "ask/robot", "**"]
     yield "wire", lambda: program(["wire", str(file), *keys, "--check"])
     yield "export", lambda: program(["export", str(folder), str(beside / "rows.csv")])
+    yield "links", lambda: program(["links", "fit", str(folder), *(["--gaps"] if seed % 8 else [])])
     for link in plan.links[seed % 3 : 1 + seed % 3]:
-        yield "links", lambda link=link: program(["links", "fit", str(folder), "--link", link.name])
+        yield (
+            "links",
+            lambda link=link: program(["links", "fit", str(folder), "--link", link.name, *_FITS[seed % len(_FITS)]]),
+        )
     if REPLAY in further:
         yield REPLAY, lambda: _status_of(lambda: _replay(folder, beside / REPLAY_FILE))
 

@@ -14,7 +14,7 @@ from typing import Any, Protocol, final
 
 import zenoh
 
-from evedrop.errors import Interrupted, UsageError
+from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.model.slot.link import NEVER, Fates, Link, LinkSchedule, streams_of
 from evedrop.model.streams import Batch, root_of_seed
 from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, WireSummary
@@ -39,7 +39,7 @@ from evedrop.wire.liveliness import joined
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import REASONS, WireFate
 from tests.faults.wires import wrong_numbers, wrong_summary
-from tests.virtual.wire_commands import REPLAY, REPLAY_FILE, VIEW, VIEW_FILE, wrong_recording
+from tests.virtual.wire_commands import JOINED, MOVED, OPENED, REPLAY, REPLAY_FILE, VIEW, VIEW_FILE, wrong_recording
 from tests.virtual.wire_programs import Course, Message, WireProgram, gid_of, ros_key, ros_token, service, stream_of
 
 Row = dict[str, Any]
@@ -95,6 +95,12 @@ class WireJudge:
         yield from (line for line in run.said.splitlines() if "Traceback" in line or "report this" in line)
         for process in course.processes:
             yield from self._of_status(process)
+        if MOVED not in self._case.further:  # or else it is elsewhere
+            yield from self._of_journal()
+
+    def _of_journal(self) -> Iterator[str]:
+        """What must hold of the journal, the summary, and those who read them."""
+        run, course = self._run, self._course
         try:
             starts = range(1, len(course.begun) + 1)
             rows = {
@@ -111,26 +117,31 @@ class WireJudge:
         yield from self._wrong_fates(flat)
         if not self._disk:
             yield from wrong_numbers(_numbered(rows))
-        yield from self._true_to_receivers(flat)
+        if JOINED not in self._case.further:
+            yield from self._true_to_receivers(flat)
         yield from self._wrong_senders(flat)
         if run.status in {0, 1} and not self._disk:
-            start = WireSummary.read(run.folder / WIRE_SUMMARY_FILE).start
-            if start != len(rows) and not any(
-                isinstance(fault, KillProcess | InterruptProcess) for fault in self._struck
-            ):
-                yield f"the summary is that of start {start} of {len(rows)}"
-            yield from wrong_summary(run.folder, rows[start], start)
-            yield from self._of_end()
-            if VIEW in self._case.further:
-                yield from wrong_recording(run.folder.parent / VIEW_FILE, rows[len(rows)])
+            yield from self._of_summary(rows)
         if not self._struck:
             yield from course.doubts
             yield from self._of_operators()
-            yield from self._of_tokens()
+            if JOINED not in self._case.further:
+                yield from self._of_tokens()
         if not self._killed:
             yield from self._of_readers(len(flat))
             if (REPLAY, 0) in [(name, status) for name, status, _ in course.read]:
                 yield from wrong_recording(run.folder.parent / REPLAY_FILE, rows[len(rows)])
+
+    def _of_summary(self, rows: Mapping[int, list[Row]]) -> Iterator[str]:
+        """The summary and the recording are those of the latest start."""
+        run = self._run
+        start = WireSummary.read(run.folder / WIRE_SUMMARY_FILE).start
+        if start != len(rows) and not any(isinstance(fault, KillProcess | InterruptProcess) for fault in self._struck):
+            yield f"the summary is that of start {start} of {len(rows)}"
+        yield from wrong_summary(run.folder, rows[start], start)
+        yield from self._of_end()
+        if VIEW in self._case.further and OPENED not in self._case.further:
+            yield from wrong_recording(run.folder.parent / VIEW_FILE, rows[len(rows)])
 
     def _of_status(self, process: VirtualProcess) -> Iterator[str]:
         status = process.task.status
@@ -141,7 +152,7 @@ class WireJudge:
         elif status == Interrupted.exit_status:
             if interrupts < ("interrupted again" in process.printed) + 1:
                 yield f"status 130 after {interrupts} signals: {process.printed.strip()[-300:]}"
-        elif status == 1 and self._plan.expectations and "FAILED" in process.printed:
+        elif any(status == wanted and words in process.printed for wanted, words in self._reasons()):
             return
         elif status != 0 and not self._disk:
             yield f"status {status}, although nothing of this may end a wire: {process.printed.strip()[-300:]}"
@@ -150,6 +161,16 @@ class WireJudge:
         ):
             yield f"status {status} names no disk: {process.printed.strip()[-300:]}"
 
+    def _reasons(self) -> Iterator[tuple[int, str]]:
+        """Statuses other than 0 with which a wire may end, and the words that say why."""
+        if self._plan.expectations:
+            yield 1, "FAILED"
+        if JOINED in self._case.further:
+            yield 1, "outside the wire"
+        if MOVED in self._case.further:
+            yield RunError.exit_status, "removed or moved"
+            yield UsageError.exit_status, "is not empty"
+
     def _of_end(self) -> Iterator[str]:
         """Nothing is left behind, the exit status tells whether expectations held, and wire.toml is the wire."""
         folder = self._run.folder
@@ -157,7 +178,7 @@ class WireJudge:
         if (folder / "control.json").exists():
             yield "control.json is left"
         summary = WireSummary.read(folder / WIRE_SUMMARY_FILE)
-        if bool(summary.failed_expectations) != (self._run.status == 1):
+        if bool(summary.failed_expectations or summary.bypasses) != (self._run.status == 1):
             yield f"status {self._run.status} with {summary.failed_expectations} failed expectations"
         if resolved_wire(load_wire(folder / WIRE_FILE)) != resolved_wire(self._plan):
             yield "wire.toml is another wire"
