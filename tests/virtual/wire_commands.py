@@ -104,6 +104,7 @@ def readers(folder: Path, file: Path, plan: WirePlan, seed: int, further: tuple[
     keys = [f"{ROBOT}/data", "ask/robot", "**"]
     yield "wire", lambda: program(["wire", str(file), *keys, "--check"])
     yield "export", lambda: program(["export", str(folder), str(beside / "rows.csv")])
+    yield "view", lambda: program(["view", str(folder), "--table"])
     yield "links", lambda: program(["links", "fit", str(folder), *(["--gaps"] if seed % 8 else [])])
     for link in plan.links[seed % 3 : 1 + seed % 3]:
         yield (

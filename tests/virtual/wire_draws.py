@@ -185,6 +185,7 @@ def _program(draw: random.Random, side: str, seconds: float, limited: bool) -> W
         (f"alive alive/{side}", 0.3),
         ("alive alive/all", 0.15),
         (f"blink alive/{side}/blinks", 0.1),
+        (f"odd {side}", 0.1),
         ("leave", 0.5),
     ):
         if draw.random() < chance:

@@ -77,8 +77,8 @@ class WireProgram:
     """A program at a side.
 
     What it does is told by words: `publish KEY`, `often KEY`, `many KEY`, `large KEY`, `delete KEY` and `ros TOPIC` in each turn;
-    `ask KEY` and `call TOPIC` in each turn; `answer KEY HOW` and `serve TOPIC HOW`; `alive TOKEN`, `blink TOKEN`, `watch TOKENS`,
-    `listen KEYS`; `leave` closes its session at its end.
+    `ask KEY` and `call TOPIC` in each turn; `answer KEY HOW` and `serve TOPIC HOW`; `alive TOKEN`, `odd SIDE` (tokens that few
+    understand), `blink TOKEN`, `watch TOKENS`, `listen KEYS`; `leave` closes its session at its end.
     """
 
     side: str
@@ -101,7 +101,7 @@ class WireProgram:
     def tokens(self) -> list[str]:
         """The liveliness tokens that it holds all the time."""
         ros = [ros_token(self.side, topic, _ROLES[verb]) for verb in _ROLES for topic in self.objects(verb)]
-        return [*self.objects("alive"), *ros]
+        return [*self.objects("alive"), *ros, *(token for side in self.objects("odd") for token in odd_tokens(side))]
 
     def answered(self) -> list[str]:
         """The keys at which it answers."""
@@ -111,6 +111,20 @@ class WireProgram:
 def ros_token(side: str, topic: str, kind: str) -> str:
     """The liveliness token of a publisher or a service of rmw_zenoh."""
     return f"@ros2_lv/0/{side}/0/1/{kind}/%/%/node/%{topic}/{_TYPE}/{_HASH}/::,:,:,:,,"
+
+
+def odd_tokens(side: str) -> list[str]:
+    """Tokens of a node, of an entity of an unknown kind, and malformed ones."""
+    endpoint = f"MP/%/%/node/%odd/{_TYPE}/{_HASH}"
+    ends = (
+        "NN/%/%/node",
+        "XX/%/%/node",
+        "MP/%/%/node/%odd",
+        f"{endpoint}/:",
+        f"{endpoint}/::x",
+        f"{endpoint}/9::,:,:,:,,",
+    )
+    return [f"@ros2_lv/0/{side}/0/{number}/{end}" for number, end in enumerate(ends, 7)]
 
 
 _TYPE, _HASH = "std_msgs::msg::dds_::String_", "RIHS01_5a"
@@ -216,6 +230,10 @@ class ProgramAtWork:
 
     def _alive(self, token: str) -> None:
         self._session.liveliness().declare_token(token)
+
+    def _odd(self, side: str) -> None:
+        for token in odd_tokens(side):
+            self._alive(token)
 
     def _blink(self, token: str) -> None:
         held: list[Any] = []

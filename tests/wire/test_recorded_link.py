@@ -200,6 +200,13 @@ def test_a_folder_without_a_journal_is_refused(tmp_path: Path) -> None:
         journal_recording(tmp_path)
 
 
+def test_messages_beyond_the_limit_of_keys_have_no_key(tmp_path: Path) -> None:
+    """They are of none that is asked for."""
+    carried(tmp_path, plan_of(SETTINGS), {"0/scan/a": 500, "": 1})
+    recording = journal_recording(tmp_path, "scan", "*/scan/a")
+    assert len(recording.series.outcomes) == 500
+
+
 def test_messages_that_were_heard_at_one_moment_have_no_distance(evedrop: Evedrop) -> None:
     """As by a wire that was suspended; a scenario's slot is not known then."""
     carried(evedrop.folder / "runs", plan_of(SETTINGS), {"0/scan/a": 500}, apart=0.0)

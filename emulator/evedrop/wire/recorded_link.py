@@ -170,7 +170,9 @@ class _LinkRows:
             ) from error
         taken = [
             text
-            for text in pc.unique(rows["key"].cast(pa.string())).to_pylist()
+            for text in pc.unique(
+                rows["key"].cast(pa.string()).drop_null()
+            ).to_pylist()  # keys beyond the limit have no text
             if expression.intersects(zenoh.KeyExpr(text))
         ]
         return pc.is_in(rows["key"].cast(pa.string()), pa.array(taken, pa.string()))
