@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import secrets
 import socket
+import ssl
 import tempfile
 import threading
 import time
@@ -76,6 +77,13 @@ class World(ABC):
     @abstractmethod
     def dial(self, address: Address, seconds: float) -> socket.socket:
         """Connect to the program that listens at an address, within this time. Raises OSError."""
+
+    @abstractmethod
+    def certificate(self, link: socket.socket, trust: ssl.SSLContext, host: str) -> bytes:
+        """The certificate, as DER, that a host shows on a connection, which is of no use afterwards.
+
+        Raises SSLCertVerificationError if it is not to be trusted, and any other OSError.
+        """
 
     @abstractmethod
     def expect_free(self, host: str, port: int) -> None:
@@ -160,6 +168,11 @@ class RealWorld(World):
             link.close()
             raise
         return link
+
+    def certificate(self, link: socket.socket, trust: ssl.SSLContext, host: str) -> bytes:
+        """The certificate that the host shows."""
+        with trust.wrap_socket(link, server_hostname=host) as shown:
+            return shown.getpeercert(binary_form=True) or b""
 
     def expect_free(self, host: str, port: int) -> None:
         """Raise OSError unless this machine can listen there."""

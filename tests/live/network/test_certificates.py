@@ -21,7 +21,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from evedrop.errors import BriefError, RunError, UsageError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
-from evedrop.live.network.certificates import Authority, check_identity
+from evedrop.live.network.certificates import Authority, check_identity, tls_section
 from evedrop.live.network.connecting import RouterAddress, connected
 from evedrop.live.network.control_file import Control, read_control
 from evedrop.live.network.session import client_config, router_address_of
@@ -183,6 +183,26 @@ def test_a_router_is_trusted_at_its_own_names_alone(stage: Bench) -> None:
     port = brief.router.rpartition(":")[2]
     with pytest.raises(BriefError, match=rf"does not name localhost; .* --connect tls/localhost:{port}, all of them"):
         connected(router_address_of(replace(brief, router=f"tls/localhost:{port}")), 20.0)
+
+
+def test_a_router_is_trusted_at_its_own_addresses_alone(stage: Bench) -> None:
+    """The same, of an address instead of a name, which is another error of OpenSSL."""
+    authority, port = Authority("r"), free_port()
+    tls = tls_section(authority.identity("router", ["localhost"]), listens=True)
+    config = {
+        "mode": "router",
+        "listen": {"endpoints": [f"tls/127.0.0.1:{port}"], "exit_on_failure": True},
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {"link": {"tls": tls}},
+    }
+    brief = replace(stage.briefs[EVE], router=f"tls/127.0.0.1:{port}", identity=authority.identity(EVE))
+    with (
+        zenoh.open(zenoh.Config.from_json5(json.dumps(config))),
+        pytest.raises(
+            BriefError, match=rf"does not name 127\.0\.0\.1; .* --connect tls/127\.0\.0\.1:{port}, all of them"
+        ),
+    ):
+        connected(router_address_of(brief), 20.0)
 
 
 def test_another_runs_router_is_told_apart(stage: Bench) -> None:

@@ -56,7 +56,7 @@ _QUICK_SECONDS = 2.0  # a refusal comes at once; a slower failure means that the
 _IDLE_SECONDS = 1.0  # a router keeps a connection at least so long on which nothing is said
 _AT_ONCE_SECONDS = 0.1
 
-_NOT_YET_VALID, _EXPIRED, _WRONG_PURPOSE, _WRONG_HOST = 9, 10, 26, 62  # of OpenSSL's X509_V_ERR
+_NOT_YET_VALID, _EXPIRED, _WRONG_PURPOSE, _WRONG_NAME, _WRONG_ADDRESS = 9, 10, 26, 62, 64  # of OpenSSL's X509_V_ERR
 
 
 class Credentials(Protocol):
@@ -271,7 +271,7 @@ def _knock(endpoint: AnyEndpoint, address: RouterAddress) -> None:
         with endpoint.dial(_ATTEMPT_SECONDS) as link:
             trust = ssl.create_default_context(cadata=address.identity.authority)
             # The router shows its certificate first; nothing more is needed here.
-            trust.wrap_socket(link, server_hostname=endpoint.host).close()
+            world().certificate(link, trust, endpoint.host)
     except ssl.SSLCertVerificationError as error:
         raise _mistrusted(endpoint, address, error) from error
 
@@ -284,7 +284,7 @@ def _mistrusted(endpoint: Endpoint, address: RouterAddress, error: ssl.SSLCertVe
             "clock, or write the briefs again with `evedrop brief`, all of them"
         )
     maker = _maker_at(endpoint)
-    if error.verify_code == _WRONG_HOST:
+    if error.verify_code in {_WRONG_NAME, _WRONG_ADDRESS}:
         return BriefError(
             f"{address.router}: the router's certificate does not name {endpoint.host}; write the briefs again with "
             f"--connect tls/{endpoint.host}:{endpoint.port}, all of them"
@@ -305,11 +305,8 @@ def _maker_at(endpoint: Endpoint) -> str:
     anybody = ssl.create_default_context()
     anybody.check_hostname, anybody.verify_mode = False, ssl.CERT_NONE
     try:
-        with (
-            endpoint.dial(_ATTEMPT_SECONDS) as link,
-            anybody.wrap_socket(link, server_hostname=endpoint.host) as shown,
-        ):
-            return maker_of(shown.getpeercert(binary_form=True) or b"")
+        with endpoint.dial(_ATTEMPT_SECONDS) as link:
+            return maker_of(world().certificate(link, anybody, endpoint.host))
     except (OSError, ValueError):
         return "an unknown authority"
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import ssl
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +18,7 @@ import zenoh
 from evedrop.system.world import Address
 from evedrop.virtual import notes
 from evedrop.virtual.scheduler import VirtualScheduler, VirtualTask
+from evedrop.virtual.zenoh import certificates
 from evedrop.virtual.zenoh.access import Peer, section
 from evedrop.virtual.zenoh.handlers import Callback, FifoChannel
 from evedrop.virtual.zenoh.session import VirtualSession
@@ -33,8 +35,9 @@ _SLOW = 300.0
 class _Link:
     """A connection on which nothing is said."""
 
-    def __init__(self, scheduler: VirtualScheduler) -> None:
-        self._scheduler, self._seconds = scheduler, 0.0
+    def __init__(self, scheduler: VirtualScheduler, certificate: bytes | None) -> None:
+        """certificate: that of the router at its other end, if it has one."""
+        self._scheduler, self._certificate, self._seconds = scheduler, certificate, 0.0
 
     def settimeout(self, seconds: float) -> None:
         """How long to wait for something."""
@@ -45,6 +48,13 @@ class _Link:
         del most
         self._scheduler.sleep(self._seconds)
         raise TimeoutError
+
+    def certificate(self, trust: ssl.SSLContext, host: str, now: float) -> bytes:
+        """What the router shows. Raises SSLCertVerificationError, or ConnectionResetError if it shows nothing."""
+        if self._certificate is None:
+            raise ConnectionResetError(errno.ECONNRESET, os.strerror(errno.ECONNRESET))
+        certificates.check(self._certificate, trust, host, now)
+        return self._certificate
 
     def close(self) -> None:
         """Close it."""
@@ -126,7 +136,7 @@ class VirtualZenoh:
         router = next((router for place, router in self._routers.items() if _address(place) == address), None)
         if router is None or self._is_cut(thread.task, router.task):
             raise ConnectionRefusedError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
-        return _Link(self.scheduler)
+        return _Link(self.scheduler, router.certificate)
 
     def expect_free(self, address: Address) -> None:
         """Raise OSError if something listens at an address."""

@@ -16,6 +16,7 @@ import zenoh
 from evedrop.virtual import notes
 from evedrop.virtual.scheduler import VirtualQueue, VirtualScheduler, VirtualTask
 from evedrop.virtual.zenoh.access import Access, intersects, section
+from evedrop.virtual.zenoh.certificates import shown_by
 from evedrop.virtual.zenoh.handlers import Callback, FifoChannel, Taker, VirtualDeclaration, items_of, taker_of
 from evedrop.virtual.zenoh.items import (
     MatchingStatus,
@@ -162,7 +163,7 @@ class VirtualSession:
         self.network, self.task = network, task
         self.scheduler: VirtualScheduler = network.scheduler
         self.router = section(config, "mode") == "router"
-        self.access = Access(config)
+        self.access, self.certificate = Access(config), shown_by(config)
         self.name = task.name
         self.zid = section(config, "id") or f"z{self.scheduler.number()}"
         self.user, self.password = (section(config, f"transport/auth/usrpwd/{name}") for name in ("user", "password"))
