@@ -58,6 +58,9 @@ def test_a_wrong_brief_ends_its_process_alone(seed: int) -> None:
         ("a run without a receiver", 3),
         ("a run that is interrupted", 130),
         ("a run with a wrong password", 3),
+        ("a run that is recorded for views", 0),
+        ("a run with certificates", 0),
+        ("a run with a brief of another run", 3),
     ],
 )
 def test_a_run_by_hand_ends_as_it_must(what: str, status: int) -> None:

@@ -5,11 +5,12 @@ Source: docs/hosts.md, processes started by hand.
 
 from __future__ import annotations
 
+import gc
 import json
 import random
 import signal
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from functools import partial
@@ -24,6 +25,7 @@ from evedrop.virtual.disturbance import KILLED, Disturbance
 from evedrop.virtual.notes import BY_HAND
 
 if TYPE_CHECKING:
+    from evedrop.virtual.processes import VirtualProcess
     from evedrop.virtual.run import SimulatedWorld
 
 _PORT = 20_000
@@ -53,8 +55,13 @@ _LACKS = ("No space left on device", "Input/output error", "not enough memory")
 _PATIENCE_SECONDS, _RUN_SECONDS = 10.0, 40.0
 _STARTED = 4
 """How many processes are started, one after the other."""
+_STOPS = 0.4
+"""How often a table itself is wrong, and not an entry of it."""
 _CLOCKS = (-90.0 * 86_400.0, 90.0 * 86_400.0)
 """By how many seconds a clock is wrong, so that no certificate is valid."""
+_RECORDED, _RECORDING = "a run that is recorded for views", b"RRF2"
+"""How Rerun's files begin."""
+_SECURE, _STRANGE = "a run with certificates", "a run with a brief of another run"
 _ENDED = frozenset({0, 1, UsageError.exit_status, RunError.exit_status, Interrupted.exit_status, KILLED})
 _WRONG: Sequence[Any] = (None, True, -1, 2**70, float("inf"), "", "x", "/nowhere", [], {}, [[1.0]], {"scheme": "x"})
 """What an entry of a brief is replaced with."""
@@ -176,7 +183,7 @@ class RunByHand(_ByHand):
 
     @classmethod
     def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """A whole run, one without a process, one whose recorder somebody ends, and one with a brief of another run."""
+        """Whole runs, and those in which a process or a brief is not the right one."""
         del scenario
         return [
             "a run",
@@ -184,13 +191,20 @@ class RunByHand(_ByHand):
             "a run without a receiver",
             "a run that is interrupted",
             "a run with a wrong password",
+            _RECORDED,
+            _SECURE,
+            _STRANGE,
         ]
 
     def _act(self, world: SimulatedWorld) -> int:
         scenario, folder = world.scenario, world.disk.root / f"by hand {self.after}"
         if scenario is None or folder.exists() or scenario.shards > 1 or scenario.slots > _MOST_SLOTS:
             return 0
-        briefs = self._briefs(world, scenario, folder)
+        recorded = self.target == _RECORDED
+        briefs = self._briefs(world, scenario, folder, recorded=recorded)
+        if self.target == _STRANGE:
+            others = {path.name: path for path in self._briefs(world, scenario, folder / "other", recorded=False)}
+            briefs = [others.get(path.name, path) if path.stem == LEGITIMATE else path for path in briefs]
         some = random.Random(here().token(8))  # noqa: S311 - to be repeated, not to be secret
         some.shuffle(briefs)
         if self.target == "a run without a receiver":
@@ -214,20 +228,33 @@ class RunByHand(_ByHand):
         for name, process in processes.items():
             if process.task.status not in _ENDED or "Traceback" in process.printed:
                 raise AssertionError(f"{name} ends with status {process.task.status}: {process.printed[-500:]}")
+        if recorded:
+            self._check_recording(folder / "results" / "recording.rrd", processes)
         return 0
 
     @staticmethod
-    def _briefs(world: SimulatedWorld, scenario: Scenario, folder: Path) -> list[Path]:
-        """Write the briefs; none if the disk does not take them."""
+    def _check_recording(path: Path, processes: Mapping[str, VirtualProcess]) -> None:
+        """A run that has ended well is recorded; Rerun's own threads, which are real ones, end."""
+        from rerun_bindings import flush_and_cleanup_orphaned_recordings  # noqa: PLC0415 - slow to import
+
+        gc.collect()
+        flush_and_cleanup_orphaned_recordings()
+        recorder = processes.get(RECORDER)
+        if recorder is not None and recorder.task.status == 0 and not path.read_bytes().startswith(_RECORDING):
+            raise AssertionError(f"{path.name} is no recording")
+
+    def _briefs(self, world: SimulatedWorld, scenario: Scenario, folder: Path, *, recorded: bool) -> list[Path]:
+        """Write the briefs; none if the disk does not take them. recorded: whether the run is recorded for views."""
         from evedrop.results.resolved_scenario import write_resolved  # noqa: PLC0415
 
         folder.mkdir(0o700)
         write_resolved(folder, scenario)
         written = folder / "written"
-        places = ["--listen", "tcp/127.0.0.1:17470", *(["--relay", "tcp/127.0.0.1:17471"] if scenario.relayed else [])]
+        at = f"{'tls' if self.target in {_SECURE, _STRANGE} else 'tcp'}/127.0.0.1"
+        places = ["--listen", f"{at}:17470", *(["--relay", f"{at}:17471"] if scenario.relayed else [])]
         words = ["brief", str(folder / "scenario.toml"), *places, "--results", str(folder / "results"), "--wait", "5"]
         status = world.machine.program([*words, "--out", str(written)])
-        if status == 0:  # views are not simulated: Rerun's threads are real ones
+        if status == 0 and not recorded:
             recorder = written / f"{RECORDER}.json"
             brief = json.loads(recorder.read_text())
             brief["part"]["recording"] = False
@@ -249,7 +276,7 @@ def _exchange(some: random.Random, brief: dict[str, Any], other: Mapping[str, An
 def _broken(some: random.Random, brief: Any) -> Any:
     """A brief in which an entry is wrong, lacks or is too many."""
     broken: Any = deepcopy(brief)
-    *path, last = some.choice([*_places(broken)])
+    *path, last = _place(some, broken)
     table = broken
     for name in path:
         table = table[name]
@@ -265,10 +292,12 @@ def _broken(some: random.Random, brief: Any) -> Any:
     return broken
 
 
-def _places(table: Any) -> Iterator[tuple[Any, ...]]:
-    """The keys that lead to each entry of a brief, also to tables and lists."""
-    entries = table.items() if isinstance(table, dict) else enumerate(table) if isinstance(table, list) else ()
-    for key, value in entries:
-        yield (key,)
-        for rest in _places(value):
-            yield (key, *rest)
+def _place(some: random.Random, table: Any) -> list[Any]:
+    """The keys that lead to an entry of a brief, which may be a table or a list: a large one is hit no more often."""
+    path = list[Any]()
+    while isinstance(table, dict | list) and table:
+        path.append(some.choice([*table]) if isinstance(table, dict) else some.randrange(len(table)))
+        table = table[path[-1]]
+        if some.random() < _STOPS:
+            break
+    return path

@@ -20,9 +20,12 @@ from evedrop.model.links import LOSS_MODELS
 from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.loading import Scenario
 from evedrop.virtual import own_classes
+from evedrop.virtual.broken_messages import BreakMessage
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import KINDS, faults_of
 from evedrop.virtual.drawn_hosts import DrawnHosts, drawn_hosts, kind_with
+from evedrop.virtual.drawn_plants import with_more
+from evedrop.virtual.faults import ShortenMessage
 from evedrop.virtual.programs import DrawnProgram, drawn_program, with_states
 from evedrop.virtual.rare_faults import RARE_KINDS, rare_faults
 
@@ -40,6 +43,8 @@ _PACES = (0.001, 0.01, 0.1, 0.3)
 """Seconds of a slot: a run of half a minute is written to the disk while it goes on, and outlasts the longest outage."""
 _OWN = 0.03
 """The fraction of classes that are not built in."""
+_RELAYED_SHARDS = 0.3
+"""The fraction of the runs in shards with two routers in each."""
 _UNSTABLE, _STABLE = 1.02, 0.9
 _LOOP: Mapping[str, Any] = {
     "plant": {"inputs": ["u"], "input_matrix": [[0.1], [0.0]], "noise": [[1e-4, 0.0], [0.0, 1e-4]]},
@@ -114,7 +119,11 @@ def case_of(seed: int) -> SimulatedCase:
     faults = (*faults_of(source, scenario, ahead), *of_hosts, *rare_faults(seed, scenario, ahead))
     program = drawn_program(seed, scenario) if hosts is None else None
     if program is not None:  # what such a run takes is known from its files alone
-        faults = tuple(fault for fault in faults if not (fault.lacking or fault.amends))
+        faults = tuple(
+            fault
+            for fault in faults
+            if not (fault.lacking or fault.amends or isinstance(fault, BreakMessage | ShortenMessage))
+        )
     return SimulatedCase(seed, scenario, faults, ahead, hosts, program)
 
 
@@ -122,7 +131,15 @@ def case_of(seed: int) -> SimulatedCase:
 def scenario_of(number: int) -> Scenario:
     """The scenario that some seeds play."""
     drawn = CaseDraw(random.Random(f"drawn {number}")).scenario()  # noqa: S311 - to be repeated, not to be secret
-    return with_states(number, drawn)
+    return with_states(number, with_two_routers(number, with_more(number, drawn)))
+
+
+def with_two_routers(number: int, scenario: Scenario) -> Scenario:
+    """A drawn scenario, which has two routers in each shard for some numbers."""
+    some = random.Random(f"routers {number}")  # noqa: S311 - to be repeated, not to be secret
+    if scenario.shards == 1 or some.random() >= _RELAYED_SHARDS:
+        return scenario
+    return Scenario({**scenario.as_tables(), "network": {"routers": 2}})
 
 
 def case_with(scenario: Scenario, seed: int) -> SimulatedCase:

@@ -23,7 +23,7 @@ from evedrop.virtual.outsiders import OperatorCommand
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld
 
-_ONE_IN = 6
+_ONE_IN = 5
 """How many runs there are for each with such a fault."""
 _ADDRESSES = {
     "127.0.0.1:0": "",

@@ -35,7 +35,7 @@ from evedrop.virtual.zenoh import VirtualZenoh
 MOST_SECONDS = 900.0
 """Virtual seconds, besides those of its slots, within which every run must end, whatever happens to it."""
 _ROUTER, _RELAY = "tcp/127.0.0.1:17460", "tcp/127.0.0.1:17461"
-"""Where two routers listen: encryption is not simulated."""
+"""Where two routers of a run listen; those of shards take free ports. Encryption is not simulated."""
 _LEAVE_SECONDS = 60.0
 """Virtual seconds for processes whose launcher has ended, or was killed, to write what they have and to end."""
 _LEAVE_HOSTS_SECONDS = SILENCE_SECONDS + 100.0
@@ -139,7 +139,8 @@ def run_in(
     """
     run = SimulatedRun(world.results)
     world.scenario, world.told = scenario, run.told
-    world.places = LISTENS if hosts_file is not None else {ROUTER: _ROUTER, RELAY: _RELAY} if scenario.relayed else {}
+    given = {ROUTER: _ROUTER, RELAY: _RELAY} if scenario.relayed and scenario.shards == 1 else {}
+    world.places = given if hosts_file is None else LISTENS
     scheduler = world.scheduler
 
     def watch(name: str, what: str, words: tuple[object, ...]) -> None:
@@ -156,9 +157,9 @@ def run_in(
             scenario,
             world.results,
             "off",
-            _ROUTER if scenario.relayed else None,
+            given.get(ROUTER),
             lambda event: run.told.append((scheduler.now, event)),
-            _RELAY if scenario.relayed else None,
+            given.get(RELAY),
             hosts=None if hosts_file is None else load_hosts(hosts_file, scenario),
             starters=world.machine.starter,
             ssh=None if world.hosts is None else world.hosts.ssh,
