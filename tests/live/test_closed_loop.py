@@ -238,6 +238,22 @@ def test_the_ratio_against_the_truth_counts_the_second_half_of_all_trials() -> N
 FACTORS = {"sensor": 0.5, "legitimate": 1.0, "smart": 3.0}
 
 
+@pytest.mark.parametrize("begun", [0, 1])
+def test_errors_of_a_shard_that_ended_before_its_first_slot_are_left_out(begun: int) -> None:
+    """Whether it is the first one or the last one, or none has begun."""
+    tallies = [FilterTally(9, 1), FilterTally(9, 1)]
+    tallies[begun].add_errors({name: np.full((4, 1), factor) for name, factor in FACTORS.items()})
+    merged, nothing = FilterTally.merged(tallies), FilterTally.merged([FilterTally(9, 1), FilterTally(9, 1)])
+    assert merged is not None
+    assert nothing is not None
+    assert (merged.slots, merged.count, merged.sums["smart"]) == (0, 4, 12.0)
+    assert {name: values.tolist() for name, values in merged.of_trials.items()} == {
+        name: [4.0 * factor] for name, factor in FACTORS.items()
+    }
+    assert math.isnan(merged.compared("smart").ratio)
+    assert nothing.of_trials == {}
+
+
 def test_errors_against_the_true_state_have_standard_errors(tmp_path: Path) -> None:
     """Those of runs of one trial each, which have none; z compares the filter's errors with its covariance."""
     filtered = in_memory(tmp_path / "run", **MEASURED).summary["filter"]

@@ -142,5 +142,6 @@ class FilterTally:
 
 
 def _concatenated(of_parts: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
-    """Values of trials by name, of parts that have the same names."""
-    return {name: np.concatenate([values[name] for values in of_parts]) for name in of_parts[0]}
+    """Values of trials by name, of parts that have the same names; those without a slot have none."""
+    some = [values for values in of_parts if values]
+    return {name: np.concatenate([values[name] for values in some]) for name in (some[0] if some else ())}
