@@ -20,6 +20,7 @@ from evedrop.model.metrics.standard_error import ratio_error, z_of
 from evedrop.results.comparison import read_comparison
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
+from evedrop.results.shard_score import packed, unpacked
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.progress_events import silent
 from evedrop.score.after_start import ratio_interval
@@ -236,6 +237,13 @@ def test_the_ratio_against_the_truth_counts_the_second_half_of_all_trials() -> N
 
 
 FACTORS = {"sensor": 0.5, "legitimate": 1.0, "smart": 3.0}
+
+
+def test_the_errors_of_a_shard_of_one_trial_are_read_from_its_file() -> None:
+    """By the example of a tally that has none yet."""
+    tally = FilterTally(9, 1)
+    tally.add_errors({name: np.full((9, 1), factor) for name, factor in FACTORS.items()})
+    assert unpacked(packed(tally), FilterTally(9, 1)).compared("smart") == tally.compared("smart")
 
 
 @pytest.mark.parametrize("begun", [0, 1])

@@ -48,7 +48,7 @@ class FilterTally:
         self._run, self._first = slots, int(window_bounds(slots)[WINDOWS // 2])
         self._alone = trials == 1
         self._later: dict[str, Floats] = {}
-        self._batches: dict[str, BatchMeans] = {}
+        self._batches = {SENSOR: BatchMeans()}  # also without a slot, as an example for those of a shard
         self.count = 0
         """Slots times trials so far."""
         self.slots = 0
