@@ -140,7 +140,7 @@ class WriteBriefs(_ByHand):
 
     def _refused(self, scenario: Scenario) -> bool:
         if self.target == _CONTAINERS:
-            return scenario.shards > 1 or scenario.modules is not None
+            return scenario.shards > 1 or scenario.modules is not None or scenario.process.source == "zenoh"
         return self.target in _WRONG_OPTIONS or scenario.shards > 1
 
     @staticmethod
