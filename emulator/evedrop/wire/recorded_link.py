@@ -168,14 +168,9 @@ class _LinkRows:
             raise UsageError(
                 f"--key {key}: Zenoh refuses this key expression; expected one such as */scan/**"
             ) from error
-        taken = [
-            text
-            for text in pc.unique(
-                rows["key"].cast(pa.string()).drop_null()
-            ).to_pylist()  # keys beyond the limit have no text
-            if expression.intersects(zenoh.KeyExpr(text))
-        ]
-        return pc.is_in(rows["key"].cast(pa.string()), pa.array(taken, pa.string()))
+        keys = rows["key"].cast(pa.string())  # those beyond the limit have no text
+        taken = [text for text in pc.unique(keys.drop_null()).to_pylist() if expression.intersects(zenoh.KeyExpr(text))]
+        return pc.is_in(keys, pa.array(taken, pa.string()))
 
     def _streams(self, rows: pa.Table, **columns_as: Callable[[str], str]) -> NDArray[np.int64]:
         """A number for each row, the same where the columns are. columns_as: column → the word for each of its words."""
