@@ -14,6 +14,7 @@ from evedrop.virtual.disturbance import EVERYBODY, Disturbance
 from evedrop.virtual.faults import (
     ConfuseKeys,
     CutConnection,
+    FillDisk,
     FreezeConnection,
     InterruptProcess,
     KillProcess,
@@ -72,6 +73,25 @@ def test_a_process_that_goes_on_without_a_connection_is_a_miss(ended: float, lat
     said = "evedrop: router stopped responding"
     broken = judged(tmp_path, struck, status=3, said=said, seconds=12.0, ends={"legitimate": (ended, 130)})
     assert broken == ([f"legitimate does not end, though it has had no connection for {ended - 0.5} s"] if late else [])
+
+
+@pytest.mark.parametrize(
+    ("fault", "most"), [(CutConnection("sensor", 50, 0.5), 12.5), (StopProcess("sensor", 50, 0.5), 6.5)], ids=str
+)
+def test_a_fault_that_loses_no_message_costs_what_it_lasts(fault: Disturbance, most: float, tmp_path: Path) -> None:
+    """1 s of slots, 5 of any run, 6 if messages must be sent again, and the half."""
+    assert judged(tmp_path / "in time", {fault: 0.5}, status=0, seconds=most) == ["there are no results"]
+    late = judged(tmp_path / "late", {fault: 0.5}, status=0, seconds=most + 1.0)
+    assert late == [f"the run took {most + 1.0} s, and not {most} s at most", "there are no results"]
+
+
+def test_a_full_disk_is_no_process_that_is_silent(tmp_path: Path) -> None:
+    """Who is cut off just then is not blamed."""
+    struck: dict[Disturbance, float] = {FillDisk("disk", 50): 0.5, CutConnection("sensor", 50, 0.5): 0.4}
+    said = "evedrop: sensor stopped responding: hung, suspended or cut off\nthe disk"
+    assert f"the disk fails, and a process is blamed: {said.splitlines()[0]}" in judged(
+        tmp_path, struck, status=3, said=said, seconds=2.0
+    )
 
 
 def test_a_fork_server_that_is_suspended_may_cost_two_minutes(tmp_path: Path) -> None:

@@ -40,6 +40,8 @@ _CONCERNED = 0.5
 """The fraction of these that hit a process which sends or reads the messages that are counted."""
 _NOTABLE = 0.4
 """The fraction of the other faults that strike at another moment than after some events."""
+_OF_DISK = 0.8
+"""The same of those that hit the disk."""
 _COUNTS: Mapping[str, Sequence[int]] = {
     COMMANDS: (1, 1, 2, 2, 3, 4, 5),
     BARRIERS: (1, 1, 2, 3),
@@ -119,10 +121,11 @@ def faults_of(source: random.Random, scenario: Scenario, ahead: int) -> tuple[Di
         if kind.lasts and (not kind.for_good or source.random() < 0.85):
             seconds = round(10.0 ** source.uniform(-2.0, log10(kind.most_seconds)), 3)
         before = next((fault for fault in reversed(drawn) if fault.moment == EVENTS), None)
-        if source.random() < _NOTABLE:
+        of_disk = issubclass(kind, faults.DiskDisturbance)
+        if source.random() < (_OF_DISK if of_disk else _NOTABLE):
             moment = source.choice(
                 [
-                    *([CHANGES] * 8 if issubclass(kind, faults.DiskDisturbance) else [COMMANDS, COMMANDS, CHANGES]),
+                    *([CHANGES] * 8 if of_disk else [COMMANDS, COMMANDS, CHANGES]),
                     *[BARRIERS, FINAL_BELIEFS][: len(_leaves(scenario)) + 1] * bool(scenario.timeline.holds),
                     *[LOSSES] * bool(drawn),
                 ]

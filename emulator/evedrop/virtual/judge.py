@@ -19,7 +19,7 @@ from evedrop.results.reading import Results
 from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance, processes_of
-from evedrop.virtual.faults import CutConnection
+from evedrop.virtual.faults import CutConnection, DelayThread, DiskDisturbance, HangProcess, StopProcess
 from evedrop.virtual.host_faults import LosePower
 from evedrop.virtual.host_parts import host_of
 from evedrop.virtual.processes import FORK_SERVERS
@@ -33,7 +33,7 @@ _HEEDED_SECONDS = 1.0
 _USUAL_SECONDS, _QUIET_SECONDS = 5.0, 1.5
 """That a run takes besides those of its slots, and that a run takes to which nothing happens."""
 _FAULT_SECONDS, _BRIEF_SECONDS = 15.0, 6.0
-"""That each fault may cost besides those that it lasts, and one of a second or less."""
+"""That each fault may cost besides those that it lasts, and one of a second or less; none if no message is lost."""
 _SUSPENDED_SECONDS = 3.0
 """That the end of a run takes if a receiver is suspended."""
 _NOTICED_SECONDS = 0.1
@@ -44,6 +44,8 @@ _PATIENCES = 2.0
 """How many times the longest outage a run may wait before it gives up."""
 _HOSTS_SECONDS = 180.0
 """For which a run also waits for other hosts, and processes there for others."""
+_SILENT = "stopped responding"
+"""What a failure says of a process that it blames without knowing why it is silent."""
 _GOES_ON = ("control.json", "unfinished")
 """What the folder of a run that goes on has, and that of a run that has ended has not."""
 
@@ -118,6 +120,8 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
         if case.hosts is not None:
             blamed += [name for fault in counted for name in case.hosts.processes_on(host_of(fault.target))]
         said = complaint if all(fault.named_first for fault in fatal) else run.said
+        if all(isinstance(fault, DiskDisturbance) for fault in fatal) and _SILENT in complaint:
+            yield f"the disk fails, and a process is blamed: {complaint}"
         if not any(word in said for word in blamed):
             yield f"the failure names none of {', '.join(blamed)}: {complaint or '(nothing was said)'}"
 
@@ -155,7 +159,11 @@ def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
         most += case.program.seconds(scenario)
     for fault in struck:
         brief = fault.seconds is not None and fault.seconds <= 1.0
-        most += (_BRIEF_SECONDS if brief else _FAULT_SECONDS) + (fault.seconds or 0.0)
+        if not brief:
+            most += _FAULT_SECONDS
+        elif not isinstance(fault, StopProcess | HangProcess | DelayThread):
+            most += _BRIEF_SECONDS
+        most += fault.seconds or 0.0
         if fault.target == EVERYBODY or scenario.timeline.holds:  # what was lost may have to be asked for twice
             most += _FAULT_SECONDS
     if any(not fault.survived(scenario.longest_outage) for fault in struck):
@@ -184,7 +192,8 @@ def _of_ends(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
             if (status := run.ends.get(name, (0.0, 0))[1]) != 0:
                 yield f"the run completes, and {name} ends with status {status}"
     if len(faults) == 1 and faults[0].cuts_off and faults[0].target == EVERYBODY and faults[0].seconds is None:
-        last = struck[faults[0]] + scenario.longest_outage + _LEASE_SECONDS + _GIVES_UP_SECONDS
+        lease = 0.0 if isinstance(faults[0], CutConnection) else _LEASE_SECONDS
+        last = struck[faults[0]] + scenario.longest_outage + lease + _GIVES_UP_SECONDS
         for name in {*processes_of(scenario)} - {*ROUTERS, RECORDER}:
             if name in run.ends and run.ends[name][0] > last:
                 yield f"{name} does not end, though it has had no connection for {run.ends[name][0] - struck[faults[0]]:.1f} s"

@@ -23,6 +23,8 @@ def wrong_tables(results: Results, reference: RunReference, done: bool) -> Itera
     summary, tables = results.summary, dict(tables_of(results))
     for name, table in tables.items():
         yield from reference.wrong_rows(name, table, int(summary["slots"]))
+    if tables["slots"].num_rows:
+        yield from (f"there is no table {name}" for name in sorted(reference.tables.keys() - tables.keys()))
     yield from missing_rows(tables, summary, reference, done)
     yield from unlike_digests(summary, tables["digests"])
     yield from unlike_rows(summary, tables, reference.shards)
