@@ -169,7 +169,10 @@ UNUSABLE: dict[str, list[tuple[Callable[[dict[str, Any]], None], str]]] = {
         (one_state, "part.noise_covariance cannot be used (ValueError: it does not have 2 states"),
         (no_covariance, "part.noise_covariance cannot be used (ValueError: not positive definite)"),
     ],
-    "eavesdroppers/sensor": [(without_parameter, "part.scheme.state_probability is missing")],
+    "eavesdroppers/sensor": [
+        (without_parameter, "part.scheme.state_probability is missing"),
+        (set_in("part.scheme.state_probability", None), "part.scheme.state_probability is None; expected a number"),
+    ],
     "acknowledged/router": [
         (set_in("part.acknowledgements.spans", [[-1, 3]]), "-1 is not a slot, expected a number from 0 to"),
         (set_in("part.acknowledgements.attack", "smile"), "part.acknowledgements.attack is smile"),
