@@ -29,6 +29,8 @@ _CHECKED: Mapping[str, frozenset[str]] = {
     "journal": frozenset({"delivered", "lost", "unsent", "late"}),
 }
 """Kind of message → fields whose numbers the recorder holds against others, if it records all trials."""
+CONTRADICTIONS = ("but the journal says", "and what it reported of these slots", "contradicts")
+"""Of which one is in what a run says that has noticed a wrong number."""
 
 
 @final
@@ -52,7 +54,7 @@ class BreakMessage(Disturbance):
     @property
     def blamed(self) -> tuple[str, ...]:
         """The sender, which depends on the message, or the two that contradict each other."""
-        return ("broke the protocol", "but the journal says", "and what it reported of these slots", "contradicts")
+        return ("broke the protocol", *CONTRADICTIONS)
 
 
 def broken(some: random.Random, message: bytes, *, checked: bool = False) -> bytes:

@@ -65,12 +65,12 @@ def record(brief: Brief[RecorderPart], report: EndPrinter, serve: str | None = N
             pass
     viewer = None if web_address is None else _serve(web_address, run.folder.now)
     with end.noted(), run.folder.open():
-        try:
-            _conduct(run, brief, stop, confirmations, end, by_hand=by_hand)
-        except EvedropError as error:
-            end.take(error)
-        finally:
-            emit(SaveStarted())
+        with end.noted():  # whatever ended the run, the digests that have come get their rows
+            try:
+                _conduct(run, brief, stop, confirmations, end, by_hand=by_hand)
+            except EvedropError as error:
+                end.take(error)
+        emit(SaveStarted())
         run.folder.settle(end)
     run.view.conclude(run.folder.verdict)
     usual_end = run.view.close()
