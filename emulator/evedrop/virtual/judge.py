@@ -107,24 +107,30 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
     elif not any(status in fault.statuses for fault in fatal):
         yield f"status {status}, by which none of this ends a run: {complaint}"
     elif status == RunError.exit_status:
-        first = min(struck[fault] for fault in fatal)  # what comes later, or lasts until then, hits a run that fails
-        counted = [
-            fault
-            for fault in struck
-            if fault in fatal
-            or struck[fault] + (fault.seconds or 0.0) >= first
-            or any(map(_is_worse_for_others, fatal))
-        ]
-        blamed = [word for fault in counted for word in fault.blamed]
-        if program is not None:
-            blamed.append(SENSOR)
-        if case.hosts is not None:
-            blamed += [name for fault in counted for name in case.hosts.processes_on(host_of(fault.target))]
-        said = complaint if all(fault.named_first for fault in fatal) else run.said
-        if all(isinstance(fault, DiskDisturbance) for fault in fatal) and _SILENT in complaint:
-            yield f"the disk fails, and a process is blamed: {complaint}"
-        if not any(word in said for word in blamed):
-            yield f"the failure names none of {', '.join(blamed)}: {complaint or '(nothing was said)'}"
+        yield from _of_blame(case, run, struck, complaint)
+
+
+def _of_blame(
+    case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float], complaint: str
+) -> Iterator[str]:
+    """Whether a run that failed names what has made it fail; complaint: the first line of what it said."""
+    fatal = [fault for fault in struck if not fault.survived(case.scenario.longest_outage)]
+    first = min(struck[fault] for fault in fatal)  # what comes later, or lasts until then, hits a run that fails
+    counted = [
+        fault
+        for fault in struck
+        if fault in fatal or struck[fault] + (fault.seconds or 0.0) >= first or any(map(_is_worse_for_others, fatal))
+    ]
+    blamed = [word for fault in counted for word in fault.blamed]
+    if _wrong_program(case) is not None:
+        blamed.append(SENSOR)
+    if case.hosts is not None:
+        blamed += [name for fault in counted for name in case.hosts.processes_on(host_of(fault.target))]
+    said = complaint if all(fault.named_first for fault in fatal) else run.said
+    if all(isinstance(fault, DiskDisturbance) for fault in fatal) and _SILENT in complaint:
+        yield f"the disk fails, and a process is blamed: {complaint}"
+    if not any(word in said for word in blamed):
+        yield f"the failure names none of {', '.join(blamed)}: {complaint or '(nothing was said)'}"
 
 
 def _wrong_program(case: SimulatedCase) -> str | None:
