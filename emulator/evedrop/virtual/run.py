@@ -175,8 +175,11 @@ def run_in(
             leave = _LEAVE_SECONDS if world.hosts is None else _LEAVE_HOSTS_SECONDS
             with contextlib.suppress(Stuck):
                 scheduler.run(ended + leave, lambda: not _alive(world))
-                if world.hosts is not None:
+            if world.hosts is not None:
+                with contextlib.suppress(Stuck):
                     scheduler.run(scheduler.now + _CLEAN_SECONDS, lambda: False)
+                with contextlib.suppress(Stuck):  # what somebody has started meanwhile
+                    scheduler.run(ended + leave, lambda: not _alive(world))
         except Stuck as why:
             ended = scheduler.now
             run.suspended = process.task.stopped  # the processes of a run that has failed wait for it to end them

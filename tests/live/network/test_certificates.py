@@ -24,7 +24,7 @@ from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network.certificates import Authority, check_identity, tls_section
 from evedrop.live.network.connecting import RouterAddress, connected
 from evedrop.live.network.control_file import Control, read_control
-from evedrop.live.network.session import client_config, router_address_of
+from evedrop.live.network.session import Session, client_config, router_address_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol.brief import AnyBrief, Identity, RecorderPart, read_brief
 from evedrop.system.ports import free_port
@@ -349,8 +349,10 @@ def test_a_router_that_is_not_there_is_waited_for() -> None:
     assert len(calls) > 1
 
 
-def test_briefs_that_fit_no_endpoint_are_refused() -> None:
+def test_briefs_that_fit_no_endpoint_are_refused(stage: Bench) -> None:
     """Certificates for a router without TLS, none for a router that requires them, and malformed endpoints."""
+    with pytest.raises(BriefError, match="7447 is not an endpoint"):
+        Session(replace(stage.briefs[EVE], router="7447"))
     for address, message in (
         (RouterAddress("tls/127.0.0.1:7447", "r01", {}), "there is no identity"),
         (RouterAddress("tcp/127.0.0.1:7447", "r01", {}, EVES), "takes no identity"),

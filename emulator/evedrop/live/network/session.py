@@ -192,8 +192,8 @@ class Session:
         self._wait = WaitReporter(brief.process, brief.router, clock)
         if config is None or listen is None:
             address = _once(router_address_of(brief))
-            once = zenoh.Config.from_json5(json.dumps(address.config))
             first = connected(address, self.patience, meanwhile, clock, opened)
+            once = zenoh.Config.from_json5(json.dumps(address.config))
             self.connection = Connection(first, lambda: self._wait.attempt(lambda: opened(once)), self._changed)
         else:
             self.connection = Connection(listening(listen, brief.identity, config), None)
