@@ -34,6 +34,9 @@ from evedrop.system.signals import (
 )
 from evedrop.system.threads import ThreadEvent
 
+_SWITCH_SECONDS = 5e-4
+"""How long a thread may keep the interpreter while another one waits for it."""
+
 
 class ThisProcess(ABC):
     """What a program can do to its own process, and ask about it."""
@@ -82,6 +85,10 @@ class ThisProcess(ABC):
     @abstractmethod
     def removed_with_it(self, folder: Path) -> AbstractContextManager[None]:
         """Have a folder, which is made in the block, removed should this process die, however it dies. Raises OSError."""
+
+    @abstractmethod
+    def switch_threads_soon(self) -> None:
+        """Let a thread that computes for long give way to others much sooner than by Python's default."""
 
     @abstractmethod
     def prepare_for_messages(self, largest: int) -> None:
@@ -187,6 +194,10 @@ class RealProcess(ThisProcess):
             yield
         finally:
             dismiss(guard)
+
+    def switch_threads_soon(self) -> None:
+        """By Python's default a message waits for 5 ms for such a thread."""
+        sys.setswitchinterval(_SWITCH_SECONDS)
 
     def prepare_for_messages(self, largest: int) -> None:
         """Keep memory, and modules: a collection that looks at them holds up packets."""

@@ -182,6 +182,9 @@ class VirtualProcess(ThisProcess):
             if self.task.alive:
                 self.task.held.remove(remove)
 
+    def switch_threads_soon(self) -> None:
+        """Its threads take turns by the seed."""
+
     def prepare_for_messages(self, largest: int) -> None:
         """Its memory is the interpreter's."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, final
@@ -14,17 +13,11 @@ from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
 from evedrop.score.verdict import Verdict
 from evedrop.show.view.scene_slots import AckFates, loop_values_of, open_recording, shown
+from evedrop.system.world import world
 
 if TYPE_CHECKING:
     from evedrop.show.view.recording import ViewRecording
     from evedrop.show.view.scene_slots import LoopValues
-
-
-_SWITCH_SECONDS = 5e-4
-"""How long a thread may keep the interpreter while another one waits for it.
-
-The view's thread computes for tens of milliseconds at a time. By Python's default each message would wait for it for 5 ms.
-"""
 
 
 @final
@@ -40,7 +33,7 @@ class RunView:
 
     def open(self, scenario: Scenario, run: str, path: Path) -> None:
         """Begin the recording of the run with this name."""
-        sys.setswitchinterval(_SWITCH_SECONDS)
+        world().process.switch_threads_soon()  # the view's thread computes for tens of milliseconds at a time
         self._around, self._loop_values = scenario.process.around, loop_values_of(scenario)
         self._ack_fates = AckFates(scenario, scenario.first_trial)
         self._recording = open_recording(scenario, run, path, lambda text: emit(ViewOpened(None, text)), live=True)
