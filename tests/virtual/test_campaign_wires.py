@@ -25,7 +25,7 @@ from evedrop.wire.time_steps import StepCounter
 from tests.virtual import simulated, wire_scenarios
 from tests.virtual.small_limits import LIMITS
 from tests.virtual.wire_cases import EVERY, WIRE, SimulatedWireCase
-from tests.virtual.wire_commands import JOINED, MOVED, OPENED, REPLAY, REPLAY_FILE, SCENARIO, VIEW, VIEW_FILE
+from tests.virtual.wire_commands import FURTHER, JOINED, MOVED, OPENED, REPLAY, REPLAY_FILE, SCENARIO, VIEW, VIEW_FILE
 from tests.virtual.wire_draws import BASE, ROBOT, file_of
 from tests.virtual.wire_judge import DISK
 from tests.virtual.wire_mistakes import MISTAKES, TRIALS
@@ -49,6 +49,14 @@ def test_a_seed_decides_a_wire_again() -> None:
     first, again, other = case.play(), case.play(), replace(case, seed=4).play()
     assert first.run.digest == again.run.digest != other.run.digest
     assert first.misses == again.misses == ()
+
+
+@pytest.mark.parametrize("what", [what for what in FURTHER if what not in LIMITS])
+def test_what_is_done_besides_is_the_same_again(what: str) -> None:
+    """No random name of a file gets into the events."""
+    case = replace(PLAIN, further=(what,))
+    first, again = case.play(), case.play()
+    assert first.run.digest == again.run.digest
 
 
 def test_other_seeds_are_runs_as_before() -> None:

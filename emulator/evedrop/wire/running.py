@@ -10,7 +10,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -138,8 +137,11 @@ class RunningWire:
 
     def __enter__(self) -> Self:
         """Start the wire, and wait until programs can connect. Raises UsageError or RunError if it cannot begin."""
-        with tempfile.TemporaryDirectory() as given:  # the results folder must be empty, or that of an earlier start
-            file = Path(given) / "wire.toml"
+        # Not in the results folder, which must be empty, or that of an earlier start.
+        given = world().temporary_folder() / f"evedrop-wire-{world().token(8).hex()}"
+        world().disk.make_folder(given, 0o700)
+        try:
+            file = given / "wire.toml"
             write_private(file, resolved_wire(self.plan))
             self._process = self._start(
                 "wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds:g} s", "--quiet"
@@ -147,6 +149,8 @@ class RunningWire:
             self._listener = world().thread(self._hear_errors, self._process, name="wire")
             self._listener.start()
             self._wait()
+        finally:
+            world().disk.remove_tree(given, ignore_errors=True)
         return self
 
     def _wait(self) -> None:
