@@ -21,6 +21,7 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.loading import Scenario
 from evedrop.virtual import own_classes
 from evedrop.virtual.broken_messages import BreakMessage
+from evedrop.virtual.by_hand import RunByHand, WriteBriefs
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import KINDS, faults_of
 from evedrop.virtual.drawn_hosts import DrawnHosts, drawn_hosts, kind_with
@@ -119,11 +120,10 @@ def case_of(seed: int) -> SimulatedCase:
     faults = (*faults_of(source, scenario, ahead), *of_hosts, *rare_faults(seed, scenario, ahead))
     program = drawn_program(seed, scenario) if hosts is None else None
     if program is not None:  # what such a run takes is known from its files alone
-        faults = tuple(
-            fault
-            for fault in faults
-            if not (fault.lacking or fault.amends or isinstance(fault, BreakMessage | ShortenMessage))
-        )
+        wrong: tuple[type[Disturbance], ...] = BreakMessage, ShortenMessage
+        if not program.listens:  # two sensors cannot listen at one place
+            wrong += WriteBriefs, RunByHand
+        faults = tuple(fault for fault in faults if not (fault.lacking or fault.amends or isinstance(fault, wrong)))
     return SimulatedCase(seed, scenario, faults, ahead, hosts, program)
 
 
