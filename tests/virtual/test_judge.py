@@ -12,6 +12,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, Disturbance
 from evedrop.virtual.faults import (
+    BreakWrite,
     ConfuseKeys,
     CutConnection,
     FillDisk,
@@ -43,7 +44,7 @@ TOLD = InterruptProcess("launcher", 60)
 
 def judged(folder: Path, struck: Mapping[Disturbance, float], ahead: int = 8, **run: object) -> list[str]:
     """The misses of a run without results; ahead: how far the sensor may be ahead."""
-    (folder / "temporary").mkdir(parents=True)
+    (folder / "temporary").mkdir(parents=True, exist_ok=True)
     faults = tuple(struck)
     ended = SimulatedRun(folder / "results", **run)  # type: ignore[arg-type]
     return misses(SimulatedCase(1, SCENARIO, faults, ahead), ended, struck, REFERENCE, {"": folder / "temporary"})
@@ -64,6 +65,22 @@ def test_a_process_that_its_launcher_ends_is_a_miss(seconds: float, kept: bool, 
     struck: dict[Disturbance, float] = {CutConnection("sensor", 50, seconds): 0.5}
     broken = judged(tmp_path, struck, status=0, seconds=2.0, ends={"sensor": (2.0, 130), "router": (2.0, 0)})
     assert ("the run completes, and sensor ends with status 130" in broken) is not kept
+
+
+def test_who_misses_one_message_need_not_end(tmp_path: Path) -> None:
+    """It still has its connection."""
+    struck: dict[Disturbance, float] = {ConfuseKeys(EVERYBODY, 50): 0.5}
+    assert not any(
+        "does not end" in miss for miss in judged(tmp_path, struck, status=3, ends={"legitimate": (30.0, 130)})
+    )
+
+
+@pytest.mark.parametrize("fault", [BreakWrite("disk", 50), FillDisk("disk", 50)])
+def test_what_cannot_be_removed_stays(fault: Disturbance, tmp_path: Path) -> None:
+    """After an input/output error; a full disk lets everything be removed."""
+    (tmp_path / "temporary" / "evedrop-1").mkdir(parents=True)
+    broken = judged(tmp_path, {fault: 0.5}, status=3)
+    assert ("evedrop-1 is left" in broken) is isinstance(fault, FillDisk)
 
 
 @pytest.mark.parametrize(("ended", "late"), [(8.9, False), (9.1, True)])

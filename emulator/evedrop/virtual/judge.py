@@ -20,7 +20,15 @@ from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
 from evedrop.virtual.broken_messages import CONTRADICTIONS
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance, processes_of
-from evedrop.virtual.faults import CutConnection, DelayThread, DiskDisturbance, HangProcess, StopProcess
+from evedrop.virtual.faults import (
+    BreakWrite,
+    CutConnection,
+    DelayThread,
+    DiskDisturbance,
+    FreezeConnection,
+    HangProcess,
+    StopProcess,
+)
 from evedrop.virtual.host_faults import LosePower
 from evedrop.virtual.host_parts import host_of
 from evedrop.virtual.processes import FORK_SERVERS
@@ -73,7 +81,9 @@ def misses(
     broken += _of_status(case, run, struck, reference.status)
     broken += _of_time(case, run, struck)
     broken += _of_ends(case, run, struck)
-    if not any(fault.ends_at_once(LAUNCHER) for fault in struck) and not run.suspended:
+    # Where the disk refuses to remove something, it stays.
+    removes = not any(fault.ends_at_once(LAUNCHER) or isinstance(fault, BreakWrite) for fault in struck)
+    if removes and not run.suspended:
         broken += [f"{path.name} is left" for path in sorted(temporaries[""].iterdir())]
     for host in temporaries.keys() - {"", *(host_of(fault.target) for fault in struck if isinstance(fault, LosePower))}:
         broken += [f"{path.name} is left on {host}" for path in sorted(temporaries[host].iterdir())]
@@ -199,7 +209,10 @@ def _of_ends(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
         for name in sorted({*processes_of(scenario)} - struck_routers):
             if (status := run.ends.get(name, (0.0, 0))[1]) != 0:
                 yield f"the run completes, and {name} ends with status {status}"
-    if len(faults) == 1 and faults[0].cuts_off and faults[0].target == EVERYBODY and faults[0].seconds is None:
+    for_good = [
+        fault for fault in faults if isinstance(fault, CutConnection | FreezeConnection) and fault.seconds is None
+    ]
+    if len(faults) == 1 and for_good and faults[0].target == EVERYBODY and _wrong_program(case) is None:
         lease = 0.0 if isinstance(faults[0], CutConnection) else _LEASE_SECONDS
         last = struck[faults[0]] + scenario.longest_outage + lease + _GIVES_UP_SECONDS
         for name in {*processes_of(scenario)} - {*ROUTERS, RECORDER}:
