@@ -97,7 +97,7 @@ class DrawnProgram:
     def seconds(self, scenario: Scenario) -> float:
         """For how much longer a run may take because of it."""
         patience = 30.0 + max(5.0, scenario.longest_outage) if self.mistake else 0.0
-        return 3.0 * _PAUSE_SECONDS * scenario.slots + 2.0 + patience
+        return 2.0 * _LATER_SECONDS * scenario.slots + 2.0 + patience
 
     def scenario(self, scenario: Scenario) -> Scenario:
         """A scenario with given states, so that a live run takes them from this program."""

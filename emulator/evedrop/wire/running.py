@@ -11,8 +11,8 @@ import signal
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Protocol, Self
@@ -137,21 +137,30 @@ class RunningWire:
 
     def __enter__(self) -> Self:
         """Start the wire, and wait until programs can connect. Raises UsageError or RunError if it cannot begin."""
-        # Not in the results folder, which must be empty, or that of an earlier start.
-        given = world().temporary_folder() / f"evedrop-wire-{world().token(8).hex()}"
-        world().disk.make_folder(given, 0o700)
-        try:
-            file = given / "wire.toml"
-            write_private(file, resolved_wire(self.plan))
+        with self._file() as file:
             self._process = self._start(
                 "wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds:g} s", "--quiet"
             )
             self._listener = world().thread(self._hear_errors, self._process, name="wire")
             self._listener.start()
             self._wait()
-        finally:
-            world().disk.remove_tree(given, ignore_errors=True)
         return self
+
+    @contextmanager
+    def _file(self) -> Iterator[Path]:
+        """The file of the wire; not in the results folder, which must be empty, or that of an earlier start."""
+        folder = world().temporary_folder() / f"evedrop-wire-{world().token(8).hex()}"
+        try:
+            try:
+                world().disk.make_folder(folder, 0o700)
+                write_private(folder / "wire.toml", resolved_wire(self.plan))
+            except OSError as error:
+                raise UsageError(
+                    f"cannot write the wire's file ({error.strerror}); set TMPDIR to a folder that can be written"
+                ) from error
+            yield folder / "wire.toml"
+        finally:
+            world().disk.remove_tree(folder, ignore_errors=True)
 
     def _wait(self) -> None:
         """Wait until the wire answers."""
