@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,9 @@ from typing import Any
 import zenoh
 
 from evedrop.cli.simulated import program
-from evedrop.errors import EvedropError
-from evedrop.system.lacks import report_refusal
 from evedrop.system.output import say
 from evedrop.system.world import world
+from evedrop.virtual.endings import status_of
 from evedrop.wire.file import load_wire
 from evedrop.wire.journal import JOURNAL_FOLDER
 from evedrop.wire.plan import WirePlan
@@ -59,7 +58,7 @@ VIEW_FILE, REPLAY_FILE = "view.rrd", "replay.rrd"
 def run_the_wire(file: Path, folder: Path, seconds: float, *, view: bool) -> int:
     """The wire, as the command runs it, without its report: pictures take longer than all the rest."""
     shown = str(folder.parent / VIEW_FILE) if view else "off"
-    return _status_of(
+    return status_of(
         lambda: run_wire(load_wire(file), folder, seconds=seconds, say=lambda _: None, complain=say, view=shown)
     )
 
@@ -112,7 +111,7 @@ def readers(folder: Path, file: Path, plan: WirePlan, seed: int, further: tuple[
             lambda link=link: program(["links", "fit", str(folder), "--link", link.name, *_FITS[seed % len(_FITS)]]),
         )
     if REPLAY in further:
-        yield REPLAY, lambda: _status_of(lambda: _replay(folder, beside / REPLAY_FILE))
+        yield REPLAY, lambda: status_of(lambda: _replay(folder, beside / REPLAY_FILE))
 
 
 def wrong_recording(path: Path, rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
@@ -131,14 +130,3 @@ def _replay(folder: Path, path: Path) -> int:
     wire_seconds(folder)
     replay_wire(folder, path)
     return 0
-
-
-def _status_of(work: Callable[[], int]) -> int:
-    """What a command makes of an error."""
-    try:
-        return work()
-    except EvedropError as error:
-        say(error.illustrated)
-        return error.exit_status
-    except OSError as error:
-        return report_refusal(error)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 import secrets
 import socket
-import ssl
 import tempfile
 import threading
 import time
@@ -20,11 +19,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
-from typing import IO, Any, TypeVar, final
+from typing import IO, TYPE_CHECKING, Any, TypeVar, final
 
 from evedrop.system.disk import REAL_DISK, Disk
 from evedrop.system.this_process import REAL_PROCESS, ThisProcess
 from evedrop.system.threads import Condition, Lock, Queue, Thread, ThreadEvent
+
+if TYPE_CHECKING:
+    import ssl
 
 T = TypeVar("T")
 Address = tuple[str, int] | Path

@@ -54,7 +54,7 @@ _PATIENCES = 2.0
 _HOSTS_SECONDS = 180.0
 """For which a run also waits for other hosts, and processes there for others."""
 _SILENT = "stopped responding"
-"""What a failure says of a process that it blames without knowing why it is silent."""
+"""What a run that fails says of a process that fell silent for a reason it does not know."""
 _GOES_ON = ("control.json", "unfinished")
 """What the folder of a run that goes on has, and that of a run that has ended has not."""
 

@@ -28,7 +28,7 @@ from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
 from evedrop.scenario.words import listed
 from evedrop.show.report.wire import expectation_failures, wire_faults
 from evedrop.system.native_log import MARK
-from evedrop.system.processes import kill, wait_for
+from evedrop.system.processes import KillableProcess, kill, wait_for
 from evedrop.system.world import world
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.journal import journal_tables
@@ -91,7 +91,7 @@ def described_wire(
     return plan, folder
 
 
-class ProcessOfWire(Protocol):
+class ProcessOfWire(KillableProcess, Protocol):
     """The part of `subprocess.Popen` that is used here."""
 
     @property
@@ -105,14 +105,8 @@ class ProcessOfWire(Protocol):
     def poll(self) -> int | None:
         """Its exit status; None while it runs."""
 
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end. Raises subprocess.TimeoutExpired."""
-
     def send_signal(self, sig: int) -> None:
         """Send a signal to it."""
-
-    def kill(self) -> None:
-        """End it."""
 
 
 Start = Callable[..., ProcessOfWire]

@@ -45,7 +45,7 @@ FORK_SERVER_LOST = 1001
 _STACKS_SECONDS = 0.3  # for a process that does not leave to write the stacks of its threads into its log
 
 
-class StartedProcess(Protocol):
+class StartedProcess(KillableProcess, Protocol):
     """The part of `subprocess.Popen` that the launcher uses."""
 
     @property
@@ -63,17 +63,11 @@ class StartedProcess(Protocol):
     def poll(self) -> int | None:
         """Its exit status; None while it runs."""
 
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end; returns its exit status. Raises subprocess.TimeoutExpired."""
-
     def send_signal(self, sig: int) -> None:
         """Send a signal to it."""
 
     def terminate(self) -> None:
         """Ask it to end."""
-
-    def kill(self) -> None:
-        """End it."""
 
 
 class ReportedProcess(ABC):

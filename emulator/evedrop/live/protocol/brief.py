@@ -398,7 +398,8 @@ def _scheme(brief: AnyBrief, spec: Mapping[str, Any]) -> Scheme:
         problem = "missing" if parameter in kind.parameters else "not a parameter of the scheme"
         raise BriefError(f"part.scheme.{parameter} is {problem}; {WRITE_AGAIN}")
     with _using("part.scheme"):
-        for parameter, problem in kind.mistakes(spec):
+        if mistakes := [*kind.mistakes(spec)]:
+            parameter, problem = mistakes[0]
             raise BriefError(f"part.scheme.{parameter} {problem}; {WRITE_AGAIN}")
         return scheme_of(brief.model.process, spec)
 

@@ -186,8 +186,8 @@ class Conductor:
     def end(self, patience: float) -> None:
         """Tell all processes that the run is over, repeatedly until they have left; the routers after all others.
 
-        patience: how many seconds to wait for the others: some may be cut off just now. They are told once more, and not waited
-        for, if this process is told to end: its launcher may kill it before the results are written.
+        patience: seconds to wait for the others, some of which may be cut off. If this process is told to end, it tells them
+        once more and does not wait: its launcher might kill it before it has written the results.
         """
         others = [name for name in self._present if name not in {ROUTER, RELAY} and name not in self.absent]
         told: set[str] = set()
