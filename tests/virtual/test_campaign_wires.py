@@ -59,6 +59,13 @@ def test_what_is_done_besides_is_the_same_again(what: str) -> None:
     assert first.run.digest == again.run.digest
 
 
+def test_no_messages_that_go_round_are_duplicated() -> None:
+    """A wire whose sides are joined outside would have millions of them."""
+    joined = [case for case in map(SimulatedWireCase.of, range(600)) if JOINED in case.further]
+    assert joined
+    assert not any("duplicate" in f"{case.file} {case.operations}" for case in joined)
+
+
 def test_other_seeds_are_runs_as_before() -> None:
     """The wires take none of the draws of runs."""
     assert simulated.any_case(EVERY + 1) == case_of(EVERY + 1)

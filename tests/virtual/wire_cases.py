@@ -156,7 +156,10 @@ class SimulatedWireCase:
         programs = drawn_programs(draw, tables, seconds)
         operations = drawn_operations(draw, tables, seconds)
         faults = _faults(draw, starts * seconds)
-        further = tuple(what for what, chance in FURTHER.items() if draw.random() < chance)
+        drawn = [what for what, chance in FURTHER.items() if draw.random() < chance]
+        # Messages go round between sides that are joined outside: if links duplicate them, there are millions.
+        duplicates = "duplicate" in file or any("duplicate" in words for _, words in operations)
+        further = tuple(what for what in drawn if not (duplicates and what == JOINED))
         return cls(seed, faults, starts, seconds, file, programs, operations, (), further)
 
     @classmethod
