@@ -159,6 +159,8 @@ class WireJudge:
         elif status != 0 and not any(
             word in process.printed for word in ("cannot be", "could not be", "disk", "space")
         ):
+            if OPENED in self._case.further and not process.printed:  # its opener was killed before it read the errors
+                return
             yield f"status {status} names no disk: {process.printed.strip()[-300:]}"
 
     def _reasons(self) -> Iterator[tuple[int, str]]:

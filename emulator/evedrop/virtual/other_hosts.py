@@ -183,7 +183,8 @@ class OtherHost:
             process.print("sh: 1: exec: evedrop: not found\n")
             return 127
         if self.oddity == "another version":
-            process.send_event(line_of(Greeting(OTHER_VERSION)))
+            with suppress(BrokenPipeError):  # the launcher may be gone
+                process.send_event(line_of(Greeting(OTHER_VERSION)))
             Alarm(lambda: process.signal(signal.SIGKILL)).set(SILENCE_SECONDS)
             while process.read_input(_MOST_BYTES):
                 pass
