@@ -35,8 +35,8 @@ _OFFSETS = (4, 12)
 _PAUSE_SECONDS, _LATER_SECONDS = 0.02, 0.5
 """The mean time between two states, and that once there were many more than there are slots."""
 _PLENTY = 3
-_FLOOD = 100_001
-"""More states than a sensor keeps."""
+_FLOOD = 101_000
+"""More states than a sensor keeps and takes meanwhile."""
 _NO_FLOOD = 0.9
 """The fraction of programs with a mistake whose mistake is no flood: one takes as long to play as forty runs."""
 _NO_STATE = "no state came"
