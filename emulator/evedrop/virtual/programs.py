@@ -132,7 +132,7 @@ class DrawnProgram:
                 for key, payload in self._messages(scenario, sent, wrong):
                     session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
                 session.delete(_KEY)  # is no state
-                sent += 1
+                sent += _FLOOD if wrong == "a flood" and sent == self.right else 1
                 mean = _PAUSE_SECONDS if sent < _PLENTY * scenario.slots else _LATER_SECONDS
                 here().sleep(2.0 * mean * here().token(1)[0] / 256.0)
         return 0
@@ -141,7 +141,7 @@ class DrawnProgram:
         """The keys and messages of one state; wrong: the mistake in them."""
         x, v = state(scenario, number)
         if wrong == "a flood" and number == self.right:
-            yield from [(_KEY, self._message([x, v]))] * _FLOOD
+            yield from ((_KEY, self._message(state(scenario, later))) for later in range(number, number + _FLOOD))
         elif wrong == "no number":
             yield _KEY, self._message([x, float("nan")])
         elif wrong == "a large number":
