@@ -83,12 +83,14 @@ def test_what_cannot_be_removed_stays(fault: Disturbance, tmp_path: Path) -> Non
     assert ("evedrop-1 is left" in broken) is isinstance(fault, FillDisk)
 
 
-@pytest.mark.parametrize(("ended", "late"), [(8.9, False), (9.1, True)])
-def test_a_process_that_goes_on_without_a_connection_is_a_miss(ended: float, late: bool, tmp_path: Path) -> None:
-    """It ends after the longest outage, 4 s until a connection counts as lost, and 1.5 s."""
+@pytest.mark.parametrize(("ended", "began", "late"), [(8.9, 0.4, False), (9.1, 0.4, True), (9.1, 0.6, False)])
+def test_a_process_that_goes_on_without_a_connection_is_a_miss(
+    ended: float, began: float, late: bool, tmp_path: Path
+) -> None:
+    """It ends after the longest outage, 4 s until a connection counts as lost, and 1.5 s; later if the run had not begun."""
     struck: dict[Disturbance, float] = {FreezeConnection(EVERYBODY, 50): 0.5}
-    said = "evedrop: router stopped responding"
-    broken = judged(tmp_path, struck, status=3, said=said, seconds=12.0, ends={"legitimate": (ended, 130)})
+    said, put = "evedrop: router stopped responding", [PutMessage(began, "uplink", "0")]
+    broken = judged(tmp_path, struck, status=3, said=said, seconds=12.0, ends={"legitimate": (ended, 130)}, put=put)
     assert broken == ([f"legitimate does not end, though it has had no connection for {ended - 0.5} s"] if late else [])
 
 

@@ -197,7 +197,8 @@ def _of_ends(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
     """Whether processes end by themselves, rather than because their launcher ends them.
 
     They do if the run completes, but for a receiver that is away to the end, and the routers, which wait for it; and for a
-    router that is started again when all others have left. And they do if all of them are cut off for good.
+    router that is started again when all others have left. And they do if all of them are cut off for good once every shard
+    has begun: a process that is not connected yet waits for its router for longer.
     """
     scenario, faults = case.scenario, list(struck)
     if case.hosts is not None:
@@ -212,7 +213,10 @@ def _of_ends(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
     for_good = [
         fault for fault in faults if isinstance(fault, CutConnection | FreezeConnection) and fault.seconds is None
     ]
-    if len(faults) == 1 and for_good and faults[0].target == EVERYBODY and _wrong_program(case) is None:
+    if len(faults) != 1 or not for_good or faults[0].target != EVERYBODY or _wrong_program(case) is not None:
+        return
+    first = [message.at for message in run.put if message.key == "uplink" and 0 in message.slots]
+    if sum(at < struck[faults[0]] for at in first) >= max(1, scenario.shards):
         lease = 0.0 if isinstance(faults[0], CutConnection) else _LEASE_SECONDS
         last = struck[faults[0]] + scenario.longest_outage + lease + _GIVES_UP_SECONDS
         for name in {*processes_of(scenario)} - {*ROUTERS, RECORDER}:
