@@ -150,21 +150,27 @@ class ModulatedCovariance:
         """E(s) after a slot, from E(s) before it, when the slot is `lag` slots ago."""
         A, chain = self._process.A, slot.segment.chain
         quality = slot.quality * slot.segment.arrived[lag]
-        whole = self._whole if self._slots_at is None else SlotOdds.of(self._slots_at(slot.k))
-        odds = {name: values[:, None, None] for name, values in whole.at(quality).items()}
+        odds = self._whole if self._slots_at is None else SlotOdds.of(self._slots_at(slot.k))
         weights = chain.stationary[:, None, None]
         if states is None or slot.before is None:
-            first: Floats = odds["initial"] * weights * self._process.initial_covariance
+            first: Floats = odds.of_part("initial", quality) * weights * self._process.initial_covariance
             return first
-        mixed = states.sum(axis=0)[None] * weights if slot.fresh else np.tensordot(chain.transitions.T, states, axes=1)
-        # Without the mask, 0 · inf would spoil a bounded expectation once Σ_k exceeds double precision.
-        grown = 2.0 * (A @ slot.before @ A.T)
-        misled = np.where(odds["misled"] > 0.0, odds["misled"] * grown, 0.0)
-        source = odds["predicted"] * self._process.Q + misled
+        mixed = states.sum(axis=0)[None] * weights if slot.fresh else _mixed(chain, states)
+        source = odds.of_part("predicted", quality) * self._process.Q
+        if odds.misleads:
+            misled = odds.of_part("misled", quality)
+            # Without the mask, 0 · inf would spoil a bounded expectation once Σ_k exceeds double precision.
+            source = source + np.where(misled > 0.0, misled * (2.0 * (A @ slot.before @ A.T)), 0.0)
         if slot.remaining is not None:
-            source = source + odds["leaked"] * slot.remaining
-        kept: Floats = odds["propagated"] * (A @ mixed @ A.T) + weights * source
+            source = source + odds.of_part("leaked", quality) * slot.remaining
+        kept: Floats = odds.of_part("propagated", quality) * (A @ mixed @ A.T) + weights * source
         return kept
+
+
+def _mixed(chain: Chain, states: Floats) -> Floats:
+    """Σ_s' Π(s', s) E(s'), (states, n, n), from E(s')."""
+    mixed: Floats = chain.transitions.T.dot(states.reshape(len(states), -1)).reshape(states.shape)
+    return mixed
 
 
 _LARGEST = 160  # numbers that a block carries along: beyond it the operator costs more than it saves
@@ -189,6 +195,16 @@ class SlotOdds:
     def leaks(self) -> bool:
         """Whether a packet may leak what it does not contain."""
         return bool(self.slope["leaked"] or self.base["leaked"])
+
+    @property
+    def misleads(self) -> bool:
+        """Whether a packet may mislead the receiver."""
+        return bool(self.slope["misled"] or self.base["misled"])
+
+    def of_part(self, name: str, quality: Floats) -> Floats:
+        """The probability of an outcome in every state, (states, 1, 1), for the qualities of the states."""
+        odds: Floats = (self.base[name] + self.slope[name] * quality)[:, None, None]
+        return odds
 
     def at(self, quality: Floats) -> dict[str, Floats]:
         """The probabilities in every state, (states,) each, for the qualities of the states."""
@@ -266,7 +282,7 @@ def _limit_sources(process: Process, chain: Chain, outcomes: list[Outcomes]) -> 
 
 def _limit_step(process: Process, chain: Chain, outcomes_at: OutcomesAt, states: Floats) -> Floats:
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
-    mixed = np.tensordot(chain.transitions.T, states, axes=1)
+    mixed = _mixed(chain, states)
     kept = np.array([outcome.propagated for outcome in outcomes])[:, None, None]
     stepped: Floats = kept * (process.A @ mixed @ process.A.T) + _limit_sources(process, chain, outcomes)
     return stepped
