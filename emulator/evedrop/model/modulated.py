@@ -10,6 +10,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -196,7 +197,7 @@ class SlotOdds:
         """Whether a packet may leak what it does not contain."""
         return bool(self.slope["leaked"] or self.base["leaked"])
 
-    @property
+    @cached_property
     def misleads(self) -> bool:
         """Whether a packet may mislead the receiver."""
         return bool(self.slope["misled"] or self.base["misled"])

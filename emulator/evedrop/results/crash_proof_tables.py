@@ -276,11 +276,13 @@ def metrics_path(folder: Path) -> Path:
     return folder / UNFINISHED / _SUMMARY
 
 
-def keep(folder: Path) -> None:
-    """Let a power cut leave all rows that count. Raises OSError."""
-    for file in (*(file for file, _ in last_round(folder).tables.values()), _ROUNDS):
+def keep(folder: Path) -> TableRound:
+    """Let a power cut leave all rows that count; returns their round. Raises OSError."""
+    latest = last_round(folder)
+    for file in (*(file for file, _ in latest.tables.values()), _ROUNDS):
         with contextlib.suppress(FileNotFoundError):  # of a table that is a Parquet file already
             world().disk.sync(folder / UNFINISHED / file)
+    return latest
 
 
 def batches_of(folder: Path, name: str) -> Iterator[pa.RecordBatch]:
@@ -288,11 +290,20 @@ def batches_of(folder: Path, name: str) -> Iterator[pa.RecordBatch]:
     file, rows = last_round(folder).tables.get(name, ("", 0))
     if not file:
         return
-    with (
-        contextlib.suppress(OSError, pa.ArrowException, StopIteration),
-        pa.OSFile(str(folder / UNFINISHED / file)) as source,
-        pa.ipc.open_stream(source) as reader,
-    ):
+    with contextlib.suppress(OSError, pa.ArrowException), _stream_in(folder, file) as reader:
+        yield from _batches_in(reader, rows)
+
+
+@contextlib.contextmanager
+def _stream_in(folder: Path, file: str) -> Iterator[pa.RecordBatchStreamReader]:
+    """The stream in a file of the folder `unfinished`. Raises OSError or an error of Arrow."""
+    with pa.OSFile(str(folder / UNFINISHED / file)) as source, pa.ipc.open_stream(source) as reader:
+        yield reader
+
+
+def _batches_in(reader: pa.RecordBatchStreamReader, rows: int) -> Iterator[pa.RecordBatch]:
+    """The first rows of a stream, batch by batch; fewer if it is damaged."""
+    with contextlib.suppress(OSError, pa.ArrowException, StopIteration):
         while rows > 0:
             batch = reader.read_next_batch()
             yield batch.slice(0, rows)
@@ -305,7 +316,7 @@ def schema_of(folder: Path, name: str) -> pa.Schema | None:
     if not file:
         return None
     try:
-        with pa.OSFile(str(folder / UNFINISHED / file)) as source, pa.ipc.open_stream(source) as reader:
+        with _stream_in(folder, file) as reader:
             return reader.schema
     except (OSError, pa.ArrowException):
         return None
@@ -340,22 +351,29 @@ def finish(folder: Path) -> None:
 
     Raises OSError if a file cannot be written: its table and all later ones stay streams, which can be read as well.
     """
-    keep(folder)  # or a power cut would leave some tables whole, and of the others what had reached the disk by itself
-    for name, (file, _) in last_round(folder).tables.items():
-        schema = schema_of(folder, name)
-        if schema is None:
-            continue
-        unfinished = folder / UNFINISHED / f"{name}.parquet"
-        try:
-            with parquet_writer(unfinished, schema) as writer:
-                for group in _groups(batches_of(folder, name)):
-                    writer.write_table(pa.Table.from_batches(group, schema).combine_chunks())
-        except (OSError, pa.ArrowException):
-            world().disk.remove(unfinished, missing_ok=True)
-            raise
-        world().disk.sync(unfinished)
-        world().disk.replace(unfinished, folder / f"{name}.parquet")
+    # Without `keep`, a power cut would leave some tables whole, and of the others what had reached the disk by itself.
+    for name, (file, rows) in keep(folder).tables.items():
+        with contextlib.ExitStack() as opened:
+            try:
+                reader = opened.enter_context(_stream_in(folder, file))
+            except (OSError, pa.ArrowException):
+                continue
+            _write_parquet(folder, name, reader, rows)
         world().disk.remove(folder / UNFINISHED / file)
+
+
+def _write_parquet(folder: Path, name: str, reader: pa.RecordBatchStreamReader, rows: int) -> None:
+    """Turn the first rows of a stream into the Parquet file of a table. Raises OSError or an error of Arrow."""
+    unfinished = folder / UNFINISHED / f"{name}.parquet"
+    try:
+        with parquet_writer(unfinished, reader.schema) as writer:
+            for group in _groups(_batches_in(reader, rows)):
+                writer.write_table(pa.Table.from_batches(group, reader.schema).combine_chunks())
+    except (OSError, pa.ArrowException):
+        world().disk.remove(unfinished, missing_ok=True)
+        raise
+    world().disk.sync(unfinished)
+    world().disk.replace(unfinished, folder / f"{name}.parquet")
 
 
 @contextlib.contextmanager
