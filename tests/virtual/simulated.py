@@ -121,7 +121,7 @@ def campaign(seeds: range, workers: int, explained: int, view: Path | None) -> b
     failed: list[tuple[int, tuple[str, ...]]] = []
     with ProcessPoolExecutor(workers, initializer=collect_seldom) as pool:
         for seed, case, digest, happened, seconds, misses, status in pool.map(
-            played, seeds, chunksize=4 * SEEDS_OF_A_SCENARIO
+            played, seeds, chunksize=SEEDS_OF_A_SCENARIO
         ):
             events += happened
             total.update(digest.encode())
