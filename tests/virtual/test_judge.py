@@ -154,3 +154,22 @@ def test_a_fault_that_everybody_has_may_cost_two(target: str, most: float, tmp_p
 def test_a_quiet_run_ends_soon(tmp_path: Path) -> None:
     """A second and a half after its slots."""
     assert "the run took 2.6 s, and not 2.5 s at most" in judged(tmp_path, {}, seconds=2.6)
+
+
+def test_what_one_lost_connection_costs_is_sent_again_once(tmp_path: Path) -> None:
+    """A second round means that the first one was in vain."""
+    rounds = [PutMessage(at, "control/router", "again 2") for at in (0.5, 1.0)]
+    cut = CutConnection("legitimate", 60, 0.01)
+    miss = f"messages are asked for 2 times after {cut}"
+    assert miss in judged(tmp_path, {cut: 0.4}, put=rounds)
+    assert miss not in judged(tmp_path / "once", {cut: 0.4}, put=rounds[:1])
+    both = judged(tmp_path / "both", {cut: 0.4, StopProcess("sensor", 60, 1.0): 0.4}, put=rounds)
+    assert not any("are asked for" in miss for miss in both)
+
+
+@pytest.mark.parametrize(("sent", "missed"), [("4-5", False), ("5", False), ("hold 5", False), ("6-7", True)])
+def test_the_sensor_sends_again_what_it_announces(sent: str, missed: bool, tmp_path: Path) -> None:
+    """A router waits for the slot that is announced."""
+    put = [PutMessage(0.5, "uplink", said) for said in ("again 5", sent, "8")]
+    miss = "slot 5 is announced to be sent again, and slot 6 is sent"
+    assert (miss in judged(tmp_path, {KILLED: 0.4}, put=put)) is missed

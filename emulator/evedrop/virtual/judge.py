@@ -14,7 +14,7 @@ from typing import Any
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.briefs import LAUNCHED_PATIENCE
-from evedrop.names import RECORDER, SENSOR
+from evedrop.names import RECORDER, ROUTER, SENSOR
 from evedrop.results.reading import Results
 from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
 from evedrop.virtual.broken_messages import CONTRADICTIONS
@@ -27,6 +27,8 @@ from evedrop.virtual.faults import (
     DiskDisturbance,
     FreezeConnection,
     HangProcess,
+    KillProcess,
+    ShortenMessage,
     StopProcess,
 )
 from evedrop.virtual.host_faults import LosePower
@@ -35,7 +37,7 @@ from evedrop.virtual.processes import FORK_SERVERS
 from evedrop.virtual.reference import RunReference, tables_of
 from evedrop.virtual.results import wrong_outages, wrong_summary, wrong_tables
 from evedrop.virtual.run import SimulatedRun
-from evedrop.virtual.traffic import wrong_messages
+from evedrop.virtual.traffic import is_late, wrong_messages
 
 _HEEDED_SECONDS = 1.0
 """After a signal to the launcher, a run that has slots to come does not complete."""
@@ -88,6 +90,7 @@ def misses(
     for host in temporaries.keys() - {"", *(host_of(fault.target) for fault in struck if isinstance(fault, LosePower))}:
         broken += [f"{path.name} is left on {host}" for path in sorted(temporaries[host].iterdir())]
     broken += _of_logs(run)
+    broken += _of_rounds(case, run, struck)
     broken += wrong_messages(case, run.put, disturbed=bool(struck) or _wrong_program(case) is not None)
     if not any(fault.destroys for fault in struck):
         broken += _of_files(run, struck)
@@ -139,6 +142,9 @@ def _of_blame(
     said = complaint if all(fault.named_first for fault in fatal) else run.said
     if all(isinstance(fault, DiskDisturbance) for fault in fatal) and _SILENT in complaint:
         yield f"the disk fails, and a process is blamed: {complaint}"
+    for fault in fatal if len(struck) == 1 else ():
+        if isinstance(fault, ShortenMessage) and f"{fault.target} broke the protocol" in complaint:
+            yield f"{fault.target} is blamed for a message that it got: {complaint}"
     if not any(word in said for word in blamed):
         yield f"the failure names none of {', '.join(blamed)}: {complaint or '(nothing was said)'}"
 
@@ -222,6 +228,21 @@ def _of_ends(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
         for name in {*processes_of(scenario)} - {*ROUTERS, RECORDER}:
             if name in run.ends and run.ends[name][0] > last:
                 yield f"{name} does not end, though it has had no connection for {run.ends[name][0] - struck[faults[0]]:.1f} s"
+
+
+def _of_rounds(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
+    """Whether all that was lost with one connection, or with a router, was sent again in one round."""
+    scenario, fault = case.scenario, next(iter(struck), None)
+    brief = isinstance(fault, CutConnection) and fault.target != EVERYBODY and 0.0 < (fault.seconds or 0.0) <= 1.0
+    if not brief and not (isinstance(fault, KillProcess) and fault.target in ROUTERS):
+        return
+    if len(struck) > 1 or scenario.shards > 1 or case.hosts is not None or case.program is not None:
+        return
+    if is_late(scenario):
+        return
+    rounds = sum(message.key == f"control/{ROUTER}" and message.said.startswith("again") for message in run.put)
+    if rounds > 1:
+        yield f"messages are asked for {rounds} times after {fault}"
 
 
 def _progress(run: SimulatedRun) -> Iterator[tuple[float, int]]:

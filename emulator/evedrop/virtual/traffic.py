@@ -20,10 +20,15 @@ def wrong_messages(case: SimulatedCase, put: list[PutMessage], *, disturbed: boo
     scenario = case.scenario
     if scenario.shards == 1:
         yield from _too_far_ahead(scenario, flow_of(scenario, case.ahead).window, put)
+        yield from _forgotten(scenario, put)
     yield from _to_the_absent(scenario, put)
-    late = scenario.pace > 0 and any(scenario.link(name).delay for name in scenario.receivers)
-    if not disturbed and not late:  # a packet may be under way for so long that it is asked for again
+    if not disturbed and not is_late(scenario):
         yield from _sent_again(put, scenario.shards)
+
+
+def is_late(scenario: Scenario) -> bool:
+    """Whether a packet may be under way for so long that it is asked for again."""
+    return scenario.pace > 0 and any(scenario.link(name).delay for name in scenario.receivers)
 
 
 def _too_far_ahead(scenario: Scenario, window: int, put: list[PutMessage]) -> Iterator[str]:
@@ -41,6 +46,23 @@ def _too_far_ahead(scenario: Scenario, window: int, put: list[PutMessage]) -> It
             if last >= behind + window:
                 yield f"slot {last} is sent while slot {behind} is not done, in a window of {window}"
                 return
+
+
+def _forgotten(scenario: Scenario, put: list[PutMessage]) -> Iterator[str]:
+    """The first slot that the sensor says it sends again, and does not send: a router would wait for it."""
+    announced: int | None = None
+    for message in put:
+        if message.key != "uplink" or message.said == f"hold {scenario.slots}":  # with which a router wakes itself up
+            continue
+        *words, slots = message.said.split() or [""]
+        if words == ["again"]:
+            announced = int(slots)
+        elif announced is not None:
+            first = int(slots.partition("-")[0] or announced)
+            if first > announced:
+                yield f"slot {announced} is announced to be sent again, and slot {first} is sent"
+                return
+            announced = None
 
 
 def _to_the_absent(scenario: Scenario, put: list[PutMessage]) -> Iterator[str]:
