@@ -11,6 +11,7 @@ import pytest
 
 from evedrop.errors import ScenarioError
 from evedrop.results.resolved_scenario import write_resolved
+from evedrop.scenario.dry_run import has_foreign
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
@@ -322,3 +323,8 @@ def test_a_file_that_is_not_there_is_told() -> None:
     assert mistakes_of(checked, changed(LOOP, plant__disturbance_file="none.csv"), "file") == [
         "plant.disturbance_file: is given together with disturbance_values; expected one of them"
     ]
+
+
+def test_a_controller_is_a_class_that_is_built_in() -> None:
+    """Results of a closed loop whose metrics are lost can be looked at: theory needs no class that is not built in."""
+    assert not has_foreign(Scenario(LOOP))

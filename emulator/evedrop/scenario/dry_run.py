@@ -12,6 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from evedrop.errors import NoAnswer
+from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.links import LOSS_MODELS, POOLED, loss_of, single_specs
@@ -36,7 +37,7 @@ _TRIALS = 3
 
 def foreign(tables: Any) -> bool:
     """Whether tables name any class that is not built in."""
-    built_in = {POOLED}.union(SCHEMES, STRATEGIES, LOSS_MODELS, DELAY_MODELS)
+    built_in = {POOLED}.union(SCHEMES, STRATEGIES, LOSS_MODELS, DELAY_MODELS, CONTROLLERS)
     return any(name not in built_in for name in names_in(tables))
 
 
