@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -15,10 +16,13 @@ from evedrop.virtual.faults import (
     BreakWrite,
     ConfuseKeys,
     CutConnection,
+    CutPower,
     FillDisk,
     FreezeConnection,
+    HangProcess,
     InterruptProcess,
     KillProcess,
+    ShortenMessage,
     StopProcess,
 )
 from evedrop.virtual.judge import misses
@@ -173,3 +177,30 @@ def test_the_sensor_sends_again_what_it_announces(sent: str, missed: bool, tmp_p
     put = [PutMessage(0.5, "uplink", said) for said in ("again 5", sent, "8")]
     miss = "slot 5 is announced to be sent again, and slot 6 is sent"
     assert (miss in judged(tmp_path, {KILLED: 0.4}, put=put)) is missed
+
+
+def test_a_run_that_is_held_gives_up_in_time(tmp_path: Path) -> None:
+    """After thirty seconds; one that was told to go on is not held."""
+    put = [PutMessage(0.5, "uplink", "hold 5")]
+    hangs: dict[Disturbance, float] = {HangProcess("legitimate", 60): 0.5}
+    miss = "the run is held for 35.5 s, and goes on to wait"
+    assert miss in judged(tmp_path, hangs, put=put, ended=36.0)
+    assert miss not in judged(tmp_path / "go", hangs, put=[*put, PutMessage(0.6, "control/sensor", "go 5")], ended=36.0)
+
+
+def test_who_gets_a_broken_message_is_not_to_blame(tmp_path: Path) -> None:
+    """Whoever sent it is."""
+    said = "evedrop: legitimate broke the protocol: refuses = 'input'"
+    broken = judged(tmp_path, {ShortenMessage("legitimate", 60): 0.5}, status=3, said=said)
+    assert f"legitimate is blamed for a message that it got: {said}" in broken
+
+
+@pytest.mark.parametrize(("metrics", "rows", "missed"), [(20, 10, True), (20, 20, False), (10, 0, False)])
+def test_metrics_are_of_rows_that_are_there(metrics: int, rows: int, missed: bool, tmp_path: Path) -> None:
+    """But for the first ones, which are written before their rows count."""
+    unfinished = tmp_path / "results" / "unfinished"
+    unfinished.mkdir(parents=True)
+    (unfinished / "summary.json").write_text(json.dumps({"slots": metrics}))
+    (unfinished / "rounds").write_bytes(json.dumps({"at": "slot 9", "slots": rows, "tables": {}}).encode() + b"\n")
+    broken = judged(tmp_path, {CutPower("disk", 60): 0.5}, status=-9)
+    assert (f"there are metrics of {metrics} slots, and rows of {rows}" in broken) is missed

@@ -14,8 +14,11 @@ from typing import Any
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.briefs import LAUNCHED_PATIENCE
+from evedrop.live.network.session import READY_SECONDS
 from evedrop.names import RECORDER, ROUTER, SENSOR
+from evedrop.results.crash_proof_tables import last_round
 from evedrop.results.reading import Results
+from evedrop.scenario.plugins import named_in
 from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
 from evedrop.virtual.broken_messages import CONTRADICTIONS
 from evedrop.virtual.cases import SimulatedCase
@@ -35,7 +38,7 @@ from evedrop.virtual.host_faults import LosePower
 from evedrop.virtual.host_parts import host_of
 from evedrop.virtual.processes import FORK_SERVERS
 from evedrop.virtual.reference import RunReference, tables_of
-from evedrop.virtual.results import wrong_outages, wrong_summary, wrong_tables
+from evedrop.virtual.results import lost_rows, wrong_outages, wrong_summary, wrong_tables
 from evedrop.virtual.run import SimulatedRun
 from evedrop.virtual.traffic import is_late, wrong_messages
 
@@ -197,6 +200,25 @@ def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
         most += _HOSTS_SECONDS
     if took > most and not run.suspended:
         yield f"the run took {took:.1f} s, and not {most:.1f} s at most"
+    yield from _of_hold(case, run, struck)
+
+
+def _of_hold(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
+    """Whether a run that is held in vain, because a process hangs other than the sensor, has given up in time."""
+    fault, held = next(iter(struck), None), None
+    if not isinstance(fault, HangProcess) or len(struck) > 1 or fault.target == SENSOR or case.scenario.shards > 1:
+        return
+    for message in run.put:
+        if (
+            message.key == "uplink"
+            and message.said.startswith("hold ")
+            and message.said != f"hold {case.scenario.slots}"
+        ):
+            held = message.at if held is None else held
+        elif message.key == f"control/{SENSOR}" and message.said.startswith("go"):
+            held = None
+    if held is not None and run.ended > held + READY_SECONDS + _GIVES_UP_SECONDS:
+        yield f"the run is held for {run.ended - held:.1f} s, and goes on to wait"
 
 
 def _of_ends(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
@@ -283,11 +305,13 @@ def _of_results(
         yield "there are no results"
     for folder, expected in references.items():
         whole = expected is reference
+        yield from lost_rows(folder)
         try:
             results = Results.read(folder)
             dict(tables_of(results))
         except UsageError as error:
-            if done or (whole and not lacking and any(slots for _, slots in _progress(run))):
+            has_rows = last_round(folder).slots > 0 and not any(named_in(case.scenario.as_tables()))
+            if done or has_rows or (whole and not lacking and any(slots for _, slots in _progress(run))):
                 yield f"the results cannot be read: {error}"
             continue
         if falsified:  # rows may have a number that was noticed later, when its block was complete

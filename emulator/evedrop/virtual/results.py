@@ -5,10 +5,13 @@ Source: docs/results.md.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+from evedrop.results.crash_proof_tables import last_round, metrics_path
 from evedrop.results.reading import Results
 from evedrop.virtual.metrics import unlike_digests, unlike_memory, unlike_rows
 from evedrop.virtual.reference import RunReference, tables_of
@@ -66,3 +69,17 @@ def wrong_outages(
             yield f"an outage of {entry['process']} at slot {entry['slot']} until {entry['until']}, in a run that is complete"
         if entry["seconds"] < 0.0:
             yield f"an outage of {entry['seconds']} s"
+
+
+def lost_rows(folder: Path) -> Iterator[str]:
+    """Rows of a run that was cut short which are not there, although metrics of them are.
+
+    The first metrics are written when their rows are, and before these count.
+    """
+    try:
+        slots = json.loads(metrics_path(folder).read_text("utf-8"))["slots"]
+    except (OSError, ValueError):
+        return
+    rows = last_round(folder)
+    if slots and not (folder / "summary.json").exists() and (not rows.at or 0 < rows.slots < slots):
+        yield f"there are metrics of {slots} slots, and rows of {rows.slots}"
