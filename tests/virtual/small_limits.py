@@ -10,10 +10,12 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest.mock import patch
 
+from evedrop.virtual.zenoh import transport
 from evedrop.wire import departures, journal, publications, queries, ros2, tallies
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.send_queue import SendQueue
 
+FULL = "short queues"
 _CONSTANTS: dict[str, tuple[tuple[Any, str, int], ...]] = {
     "few keys": (
         (journal, "MOST_KEYS", 6),
@@ -27,13 +29,14 @@ _CONSTANTS: dict[str, tuple[tuple[Any, str, int], ...]] = {
         (publications, "OFTEN", 5),
     ),
     "few departures": ((departures, "MOST", 1), (departures, "MANY", 2), (departures, "MOST_GONE", 1)),
+    FULL: ((transport, "_ROOM", 3000),),
     "short counts": ((tallies, "_SAMPLE", 16), (tallies, "_MOST_RANGES", 2)),
 }
 _ARGUMENTS: dict[str, tuple[Any, dict[str, Any]]] = {
     "short parts": (WireJournal, {"part_rows": 32}),
-    "short queues": (SendQueue, {"most": 3, "most_bytes": 6000, "patience": 0.5}),
+    FULL: (SendQueue, {"most": 3, "most_bytes": 6000, "patience": 0.5}),
 }
-LIMITS = (*_CONSTANTS, *_ARGUMENTS)
+LIMITS = tuple(dict.fromkeys((*_CONSTANTS, *_ARGUMENTS)))
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from evedrop.scenario.words import toml_text
 from evedrop.virtual.cases import case_of
 from evedrop.virtual.faults import CutConnection, CutPower, FillDisk, KillProcess, StopProcess
 from evedrop.wire.file import wire_of
+from evedrop.wire.liveliness import LivelinessRelay
 from evedrop.wire.publications import _Way
 from evedrop.wire.running import RunningWire
 from evedrop.wire.running_link import RunningLink
@@ -26,9 +27,10 @@ from tests.virtual import simulated, wire_scenarios
 from tests.virtual.small_limits import LIMITS
 from tests.virtual.wire_cases import EVERY, WIRE, SimulatedWireCase
 from tests.virtual.wire_commands import FURTHER, JOINED, MOVED, OPENED, REPLAY, REPLAY_FILE, SCENARIO, VIEW, VIEW_FILE
-from tests.virtual.wire_draws import BASE, ROBOT, file_of
+from tests.virtual.wire_draws import BASE, ENDPOINTS, FIELD, ROBOT, SIDES, file_of
 from tests.virtual.wire_judge import DISK
 from tests.virtual.wire_mistakes import MISTAKES, TRIALS
+from tests.virtual.wire_programs import WireProgram
 
 PLAIN = SimulatedWireCase(1, (), starts=2, seconds=10.0)
 NUMBERED, TALLIED, MESSAGE, COUNTED = RunningLink._counted, LinkTally.add, _Way.message, StepCounter.add
@@ -196,6 +198,24 @@ def test_small_limits_break_no_promise(limit: str) -> None:
     case = replace(SimulatedWireCase.of(8 * EVERY), further=())
     limited = replace(case, further=(limit,))
     assert limited.play().misses == case.play().misses == ()
+
+
+def test_a_token_that_is_mirrored_hides_another_one_of_its_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh does not tell of the second one, so a side that shares no link with the holder of the first need not see it."""
+    sides = {side: {"listen": ENDPOINTS[side]} for side in SIDES}
+    links = [{"from": FIELD, "to": ROBOT}, {"from": ROBOT, "to": BASE}]
+    programs = (
+        WireProgram(FIELD, ("alive alive/all",)),
+        WireProgram(ROBOT, ("alive alive/all",), after=1.5),
+        WireProgram(BASE, ("watch alive/**",)),
+    )
+    case = SimulatedWireCase(1, (), seconds=12.0, file=toml_text({"side": sides, "link": links}), programs=programs)
+    assert case.play().misses == ()
+    earlier = replace(case, programs=(replace(programs[0], after=3.0), replace(programs[1], after=0.0), programs[2]))
+    assert earlier.play().misses == ()
+    monkeypatch.setattr(LivelinessRelay, "mirror", lambda _: None)
+    alone = replace(case, programs=programs[1:])
+    assert "the token alive/all of robot is not seen at base" in alone.play().misses
 
 
 def test_a_failing_wire_is_shrunk_and_shown(

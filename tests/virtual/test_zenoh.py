@@ -795,6 +795,19 @@ def test_a_router_sees_tokens(net: Network) -> None:
 
 
 @behaviour
+def test_a_router_that_holds_a_token_does_not_see_another_one_of_its_key(net: Network) -> None:
+    """A question finds one token, whoever holds it: the router cannot know."""
+    router = net.router()
+    client = net.client("client")
+    seen = watched(router, "alive/*")
+    net.kept.append(router.liveliness().declare_token("alive/a"))
+    net.kept += [client.liveliness().declare_token(key) for key in ("alive/a", "alive/end")]
+    net.until(lambda: ("alive/end", True) in seen)
+    assert seen.count(("alive/a", True)) == 1
+    assert present(router, "alive/a") == ["alive/a"]
+
+
+@behaviour
 def test_two_watchers_of_a_session_both_see_a_token(net: Network) -> None:
     """Each once."""
     shower, watcher = pair(net)

@@ -17,7 +17,7 @@ from tests.conftest import LIMIT
 
 PUT, DELETE, BLOCK = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE, zenoh.CongestionControl.BLOCK
 REMOTE = zenoh.Locality.REMOTE
-Body = Callable[[Any, Callable[[], Any]], object]
+Body = Callable[[Any, Callable[..., Any]], object]
 """Gets the session of a router, and what opens a client of it."""
 
 
@@ -32,8 +32,8 @@ def carry_out(body: Body) -> int:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     sessions = [opened("router", listen={"endpoints": [endpoint]})]
 
-    def client() -> Any:
-        sessions.append(opened("client", connect={"endpoints": [endpoint]}))
+    def client(mode: str = "client") -> Any:
+        sessions.append(opened(mode, connect={"endpoints": [endpoint]}))
         return sessions[-1]
 
     try:
@@ -73,7 +73,7 @@ def in_world(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[Body],
 def test_messages_keep_what_they_carry(in_world: Callable[[Body], None]) -> None:
     """On the way from a client to the router, with a publisher and without; and a delete is none of them."""
 
-    def body(router: Any, client: Callable[[], Any]) -> None:
+    def body(router: Any, client: Callable[..., Any]) -> None:
         got: list[Any] = []
         router.declare_subscriber("**", got.append, allowed_origin=REMOTE)
         session, how = client(), {"priority": zenoh.Priority.DATA_HIGH, "congestion_control": BLOCK, "express": True}
@@ -105,7 +105,7 @@ def test_messages_keep_what_they_carry(in_world: Callable[[Body], None]) -> None
 def test_a_session_can_speak_to_others_only_and_hear_others_only(in_world: Callable[[Body], None]) -> None:
     """So a wire does not hear what it says itself."""
 
-    def body(router: Any, client: Callable[[], Any]) -> None:
+    def body(router: Any, client: Callable[..., Any]) -> None:
         of_others: list[bytes] = []
         of_all: list[bytes] = []
         router.declare_subscriber(
@@ -132,7 +132,7 @@ def test_a_session_can_speak_to_others_only_and_hear_others_only(in_world: Calla
 def test_a_querier_asks_others_only_until_they_answer_no_more(in_world: Callable[[Body], None]) -> None:
     """Its handler gets their answers, and is told of the end."""
 
-    def body(router: Any, client: Callable[[], Any]) -> None:
+    def body(router: Any, client: Callable[..., Any]) -> None:
         asked: list[str] = []
         router.declare_queryable("**", lambda query: asked.append(str(query.key_expr)), allowed_origin=REMOTE)
         querier = router.declare_querier(
@@ -169,7 +169,7 @@ def test_a_querier_asks_others_only_until_they_answer_no_more(in_world: Callable
 def test_a_router_knows_its_connections(in_world: Callable[[Body], None]) -> None:
     """Those that are there, and those that come and go; with their ids, and that they are clients."""
 
-    def body(router: Any, client: Callable[[], Any]) -> None:
+    def body(router: Any, client: Callable[..., Any]) -> None:
         first = client()
         until(router.info.transports, "the first client is connected")
         events: list[tuple[Any, str]] = []
@@ -200,7 +200,7 @@ def test_a_router_knows_its_connections(in_world: Callable[[Body], None]) -> Non
 def test_liveliness_is_told_until_it_is_asked_no_more(in_world: Callable[[Body], None]) -> None:
     """Tokens that come and go; and whether one is there, by a handler that is told of the end."""
 
-    def body(router: Any, client: Callable[[], Any]) -> None:
+    def body(router: Any, client: Callable[..., Any]) -> None:
         seen: list[tuple[str, Any]] = []
 
         def note(sample: Any) -> None:
@@ -231,5 +231,19 @@ def test_liveliness_is_told_until_it_is_asked_no_more(in_world: Callable[[Body],
         token.undeclare()
         until(lambda: not there("here"), "it is gone again")
         assert len(seen) == 2
+
+    in_world(body)
+
+
+def test_a_router_knows_a_peer_from_a_client(in_world: Callable[[Body], None]) -> None:
+    """By its connection."""
+
+    def body(router: Any, client: Callable[..., Any]) -> None:
+        client(), client("peer")
+
+        def modes() -> list[Any]:
+            return [one.whatami for one in router.info.transports()]
+
+        until(lambda: all(mode in modes() for mode in (zenoh.WhatAmI.CLIENT, zenoh.WhatAmI.PEER)), "both")
 
     in_world(body)

@@ -28,13 +28,13 @@ from evedrop.scenario.words import toml_text
 from evedrop.virtual import notes
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import KINDS
-from evedrop.virtual.faults import DiskDisturbance
+from evedrop.virtual.faults import DiskDisturbance, FreezeConnection, StopProcess
 from evedrop.virtual.run import SimulatedRun, SimulatedWorld
 from evedrop.virtual.scheduler import Stuck
 from evedrop.virtual.world import EPOCH
 from evedrop.wire.file import wire_of
 from tests.faults.wires import FILE
-from tests.virtual.small_limits import small_limits
+from tests.virtual.small_limits import FULL, small_limits
 from tests.virtual.wire_commands import (
     FURTHER,
     JOINED,
@@ -160,6 +160,9 @@ class SimulatedWireCase:
         # Messages go round between sides that are joined outside: if links duplicate them, there are millions.
         duplicates = "duplicate" in file or any("duplicate" in words for _, words in operations)
         further = tuple(what for what in drawn if not (duplicates and what == JOINED))
+        if FULL in further:  # so that something waits
+            stops = draw.choice((FreezeConnection, StopProcess))
+            faults += (stops(BASE, round(draw.uniform(_FIRST, _PER_SECOND)), round(draw.uniform(1.0, 12.0), 2)),)
         return cls(seed, faults, starts, seconds, file, programs, operations, (), further)
 
     @classmethod

@@ -82,7 +82,9 @@ def _side(draw: random.Random, name: str) -> Tables:
     if draw.random() < 0.1:
         made["users"] = dict(USER)
     if draw.random() < 0.1:
-        made["keys"] = [*_PUBLISHED, "ask/**", "alive/**"]
+        made["keys"] = [*_PUBLISHED, "ask/**", "alive/**", *(["*/data"] if draw.random() < 0.5 else [])]
+    if draw.random() < 0.1:
+        made["peers"] = True
     return made
 
 
@@ -186,6 +188,12 @@ def _program(draw: random.Random, side: str, seconds: float, limited: bool) -> W
         ("alive alive/all", 0.15),
         (f"blink alive/{side}/blinks", 0.1),
         (f"odd {side}", 0.1),
+        (f"many {side}/data/@adv", 0.08),
+        (f"named {side}/named", 0.08),
+        (f"ros {side}2", 0.1),
+        (f"vary {side}/vary", 0.1),
+        ("peer quiet", 0.04),
+        ("peer heard", 0.04),
         ("leave", 0.5),
     ):
         if draw.random() < chance:

@@ -35,12 +35,12 @@ from evedrop.virtual.world import EPOCH
 from evedrop.virtual.zenoh.access import intersects
 from evedrop.wire.file import load_wire, resolved_wire
 from evedrop.wire.journal import journal_tables
-from evedrop.wire.liveliness import joined
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import REASONS, WireFate
 from tests.faults.wires import wrong_numbers, wrong_summary
 from tests.virtual.wire_commands import JOINED, MOVED, OPENED, REPLAY, REPLAY_FILE, VIEW, VIEW_FILE, wrong_recording
 from tests.virtual.wire_programs import Course, Message, WireProgram, gid_of, ros_key, ros_token, service, stream_of
+from tests.virtual.wire_tokens import wrong_tokens
 
 Row = dict[str, Any]
 DISK = "disk"
@@ -49,8 +49,6 @@ _DOUBT = 7.0
 """For how long after a further start, or after a connection may be made again, a reader may still be away."""
 _ARRIVING, _LEAVING = 1.0, 1.0
 """Seconds after a program has begun, and before its end, in which messages may miss it."""
-_STEADY_SECONDS = 3.0
-"""For which programs and wire must be there together, so that all tokens are known."""
 _TIMEOUT_BYTES = 7
 """Of the answer with which Zenoh says that a time limit is over."""
 _CUT = {"cut", "overflow", "too_large", "looped"}
@@ -126,7 +124,7 @@ class WireJudge:
             yield from course.doubts
             yield from self._of_operators()
             if JOINED not in self._case.further:
-                yield from self._of_tokens()
+                yield from wrong_tokens(self._plan, course, course.begun[0] + self._case.seconds)
         if not self._killed:
             yield from self._of_readers(len(flat))
             if (REPLAY, 0) in [(name, status) for name, status, _ in course.read]:
@@ -169,6 +167,8 @@ class WireJudge:
             yield 1, "FAILED"
         if JOINED in self._case.further:
             yield 1, "outside the wire"
+        if any(program.objects("peer") for program, *_ in self._course.here):
+            yield 1, "past the wire"
         if MOVED in self._case.further:
             yield RunError.exit_status, "removed or moved"
             yield UsageError.exit_status, "is not empty"
@@ -307,38 +307,6 @@ class WireJudge:
             if status not in {0, UsageError.exit_status}:
                 yield f"{words!r} ends with status {status}"
 
-    def _of_tokens(self) -> Iterator[str]:
-        """A token is seen at the sides at which it must be, and nowhere else."""
-        to = joined(self._plan)
-        held = [(program, token) for program, *_ in self._course.here for token in program.tokens()]
-        blinks = [(program, token) for program, *_ in self._course.here for token in program.objects("blink")]
-        shown = {(side, token) for program, token in [*held, *blinks] for side in (program.side, *to[program.side])}
-        if strange := sorted(self._course.alive - shown):
-            yield f"{len(strange)} tokens are seen where they must not be, such as {strange[0]}"
-        end = self._course.begun[0] + self._case.seconds
-        steady = {
-            program.side: program
-            for program, since, until in self._course.here
-            if since + _STEADY_SECONDS < end and (not until or until[0] > since + _STEADY_SECONDS)
-        }
-        together = max((since for _, since, _ in self._course.here), default=0.0) + _STEADY_SECONDS
-        if together > min((until[0] for *_, until in self._course.here if until), default=end) or together > end:
-            return
-        for holder in steady.values():
-            for token in holder.tokens():
-                for side in to[holder.side]:
-                    lets = side in steady and _watches(steady[side], token) and self._lets(side, holder.side, token)
-                    if lets and (side, token) not in self._course.alive:
-                        yield f"the token {token} of {holder.side} is not seen at {side}"
-
-    def _lets(self, side: str, other: str, token: str) -> bool:
-        """Whether both sides allow a token."""
-        return all(
-            any(zenoh.KeyExpr(key).intersects(zenoh.KeyExpr(token)) for key in self._plan.sides[name].keys)
-            or self._plan.sides[name].keys == ("**",)
-            for name in (side, other)
-        )
-
     def _of_readers(self, rows: int) -> Iterator[str]:
         """Check the output of commands that read the folder afterwards."""
         for words, status, said in self._course.read:
@@ -359,9 +327,13 @@ def _copies(rows: Iterable[Row]) -> int:
 
 
 def _numbered(rows: Mapping[int, list[Row]]) -> dict[int, list[Row]]:
-    """The rows with numbers; deletions are numbered as publications."""
+    """The rows with numbers; deletions are numbered as publications, and all keys `KEY/@adv/…` as one."""
     return {
-        start: [{**row, "kind": stream_of(row["kind"])} for row in some if row["n"] is not None]
+        start: [
+            {**row, "kind": stream_of(row["kind"]), "key": numbered_as(row["key"])}
+            for row in some
+            if row["n"] is not None
+        ]
         for start, some in rows.items()
     }
 
@@ -375,10 +347,6 @@ def _hears(program: WireProgram, kind: str, key: str) -> bool:
     else:
         keys = [*program.objects("ask"), *map(service, program.objects("call"))]
     return any(intersects(pattern, key) for pattern in keys)
-
-
-def _watches(program: WireProgram, token: str) -> bool:
-    return any(intersects(tokens, token) for tokens in program.objects("watch"))
 
 
 def fates_by_model(link: WireLink, seed: int, kind: str, key: str, count: int) -> Fates:

@@ -5,6 +5,7 @@ Source: docs/maintainers/simulated-world.md.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ def open_from_python(
         return child
 
     plan, _ = described_wire(file, folder, {})
+    _describe_again(plan, file, folder, course)
     running = RunningWire(plan, folder, seconds + _LONGER, start)
     try:
         with running:
@@ -50,6 +52,17 @@ def open_from_python(
     if heard > rows or (folder / "summary.json").exists() != (running.typed_summary().state == "ended"):
         course.doubts.append(f"the summary heard {heard} messages, and the journal has {rows}")
     return 0
+
+
+def _describe_again(plan: WirePlan, file: Path, folder: Path, course: Course) -> None:
+    """The same wire is described by its plan, and by its tables; entries beside a plan are refused."""
+    tables = tomllib.loads(file.read_text("utf-8"))
+    names = [*tables["side"]]
+    for source, entries in ((plan, {}), (None, {**tables}), (None, {**tables, "side": names})):
+        same, _ = described_wire(source, folder, entries)
+        if [*same.sides] != names or same.links != plan.links:
+            course.doubts.append(f"{same} is another wire")
+    _refused(lambda: described_wire(plan, folder, {"seed": 1}), "expected no entries", course)
 
 
 def _use(running: RunningWire, plan: WirePlan, seconds: float, course: Course) -> None:

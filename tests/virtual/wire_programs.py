@@ -76,9 +76,11 @@ class Course:
 class WireProgram:
     """A program at a side.
 
-    What it does is told by words: `publish KEY`, `often KEY`, `many KEY`, `large KEY`, `delete KEY` and `ros TOPIC` in each turn;
+    What it does is told by words: `publish KEY`, `often KEY`, `many KEY`, `large KEY`, `delete KEY`, `ros TOPIC`, `named KEY`
+    (the publisher and its number as rmw_zenoh once wrote them) and `vary KEY` (now and then express) in each turn;
     `ask KEY` and `call TOPIC` in each turn; `answer KEY HOW` and `serve TOPIC HOW`; `alive TOKEN`, `odd SIDE` (tokens that few
-    understand), `blink TOKEN`, `watch TOKENS`, `listen KEYS`; `leave` closes its session at its end.
+    understand), `blink TOKEN`, `watch TOKENS`, `listen KEYS`; `leave` closes its session at its end;
+    `peer quiet` is in mode peer, and `peer heard` also answers multicast scouting.
     """
 
     side: str
@@ -145,9 +147,11 @@ def gid_of(token: str) -> str:
     return entity.gid
 
 
-def connected(endpoint: str, users: Mapping[str, str] | None = None) -> Any:
-    """A session at an endpoint, once somebody listens there."""
+def connected(endpoint: str, users: Mapping[str, str] | None = None, peer: str | None = None) -> Any:
+    """A session at an endpoint, once somebody listens there; peer: `quiet` or `heard`, as in the words of a program."""
     settings: dict[str, Any] = {"mode": "client", "connect": {"endpoints": [endpoint]}}
+    if peer is not None:
+        settings |= {"mode": "peer", "scouting": {"multicast": {"enabled": peer == "heard"}}}
     for user, password in (users or {}).items():
         settings["transport"] = {"auth": {"usrpwd": {"user": user, "password": password}}}
     config = zenoh.Config.from_json5(json.dumps(settings))
@@ -169,16 +173,19 @@ class ProgramAtWork:
         self._turns: list[Callable[[], object]] = []
         self._late: deque[tuple[int, Callable[[], object]]] = deque()
         self._turn = 0
-        self._own = {*program.objects("publish", "often", "large", "delete"), *map(ros_key, program.objects("ros"))}
+        self._own = {
+            *program.objects("publish", "often", "large", "delete", "named", "vary"),
+            *map(ros_key, program.objects("ros")),
+        }
 
     def run(self, endpoint: str, users: Mapping[str, str] | None, epoch: float) -> int:
         """Work until its end; epoch: when the world began, in seconds since 1970."""
         program = self._program
         world().sleep(program.after)
-        self._session = session = connected(endpoint, users)
+        self._session = session = connected(endpoint, users, next(iter(program.objects("peer")), None))
         for words in program.does:
             verb, *objects = words.split(" ")
-            if verb != "leave":
+            if verb not in {"leave", "peer"}:
                 getattr(self, f"_{verb}")(*objects)
         begun, end = world().monotonic(), list[float]()
         self._course.here.append((program, world().time() - epoch, end))
@@ -194,9 +201,11 @@ class ProgramAtWork:
             session.close()
         return 0
 
-    def _say(self, key: str, extra: int = 0, attachment: bytes = b"", *, delete: bool = False) -> None:
+    def _say(
+        self, key: str, extra: int = 0, attachment: bytes = b"", *, delete: bool = False, express: bool = False
+    ) -> None:
         size = next(self._numbers) + extra
-        how: dict[str, Any] = {"congestion_control": zenoh.CongestionControl.BLOCK}
+        how: dict[str, Any] = {"congestion_control": zenoh.CongestionControl.BLOCK, "express": express}
         if delete:
             attachment = bytes(size)
         self._course.sent.add(("put", key, size if delete else size + len(attachment)))
@@ -227,6 +236,19 @@ class ProgramAtWork:
         gid = bytes.fromhex(gid_of(token))
         self._alive(token)
         self._turns.append(lambda: self._say(ros_key(topic), attachment=_GID.pack(self._turn, 0, len(gid), gid)))
+
+    def _named(self, key: str) -> None:
+        gid = self._side.encode().ljust(16, b"\0")
+        before, time, after = b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid"
+
+        def say() -> None:
+            number = struct.pack("<q", self._turn)
+            self._say(key, attachment=before + number + time + bytes(8) + after + bytes([len(gid)]) + gid)
+
+        self._turns.append(say)
+
+    def _vary(self, key: str) -> None:
+        self._turns += [lambda: self._say(key, express=self._turn % _OFTEN == 0)] * 2
 
     def _alive(self, token: str) -> None:
         self._session.liveliness().declare_token(token)

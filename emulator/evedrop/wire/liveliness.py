@@ -1,8 +1,9 @@
-"""Liveliness that crosses: a token of a program at one side is mirrored at the other sides, and is never lost.
+"""Liveliness that crosses: a token of a program at one side is mirrored at the other sides.
 
 A token lives at a side as long as a program there, or at a side joined to it, holds it. Zenoh reports the first token with a key
 and the end of the last, among them those of the wire, and does not say who holds one. So the wire mirrors no token at a side
-whose programs hold it already; and when it gives up a mirrored token, it looks whether a program there holds the same one.
+whose programs hold it already; and when it gives up a mirrored token, it looks whether a program there holds the same one. Until
+then, it cannot know of a program that declares a token which is mirrored there.
 
 Source: docs/wire/semantics.md, liveliness.
 """

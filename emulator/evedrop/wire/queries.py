@@ -212,21 +212,18 @@ class QueryRelay:
 
     def _reply(self, asked: _Asked, source: str, reply: zenoh.Reply) -> None:
         """Bring a reply back over the link from the side that it comes from."""
-        sample, query = reply.ok, asked.query
-        if sample is None:
-            error = reply.err
-            if error is not None:
-                refusal = error
-                self._cross(
-                    Kind.REPLY,
-                    asked,
-                    (source, asked.side),
-                    asked.key,
-                    query.key_expr,
-                    _Message(lambda: query.reply_err(refusal.payload, encoding=refusal.encoding), error.payload),
-                )
+        answer, error, query = reply.ok, reply.err, asked.query
+        if error is not None:
+            self._cross(
+                Kind.REPLY,
+                asked,
+                (source, asked.side),
+                asked.key,
+                query.key_expr,
+                _Message(lambda: query.reply_err(error.payload, encoding=error.encoding), error.payload),
+            )
             return
-        answer = sample
+        assert answer is not None  # noqa: S101 - a reply without an error
 
         def send() -> None:
             if answer.kind == zenoh.SampleKind.PUT:

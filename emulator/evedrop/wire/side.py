@@ -81,16 +81,17 @@ class SideSession:
 
 def _opened(side: Side, largest: int, users: str | None) -> tuple[zenoh.Session, tuple[str, ...]]:
     """The session of a side, and its endpoints. Raises UsageError."""
-    for attempt in range(_ATTEMPTS):
+    attempts = _ATTEMPTS
+    while True:
+        attempts -= 1
         endpoints = tuple(_with_port(endpoint) for endpoint in side.listen)
         config = side_config(replace(side, listen=endpoints), largest, users)
         try:
             return open_session(zenoh.Config.from_json5(json.dumps(config))), endpoints
         except zenoh.ZError as error:
             fixed = endpoints == side.listen or "in use" not in str(error)
-            if fixed or attempt == _ATTEMPTS - 1:
+            if fixed or not attempts:
                 raise UsageError(_refusal(side, str(error))) from error
-    raise AssertionError
 
 
 def _with_port(endpoint: str) -> str:

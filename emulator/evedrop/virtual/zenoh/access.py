@@ -20,6 +20,8 @@ class Peer(NamedTuple):
 
     zid: str
     user: str | None
+    is_peer: bool = False
+    """Whether it is in mode peer, and no client."""
 
 
 @lru_cache(maxsize=1 << 16)

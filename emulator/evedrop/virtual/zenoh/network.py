@@ -11,7 +11,7 @@ import ssl
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Self, final
+from typing import Any, Self, final
 
 import zenoh
 
@@ -64,6 +64,18 @@ class _Link:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+@final
+class VirtualScout:
+    """Looks for peers until it is stopped."""
+
+    def __init__(self) -> None:
+        self.is_stopped = False
+
+    def stop(self) -> None:
+        """Look no more."""
+        self.is_stopped = True
 
 
 @final
@@ -128,6 +140,21 @@ class VirtualZenoh:
             raise
         return session
 
+    def scout(self, heard: Callable[[Any], object], what: str, config: zenoh.Config) -> VirtualScout:
+        """Call a function with each peer that answers multicast scouting, until it is stopped; what: "peer"."""
+        del what, config
+        scheduler, scout = self.scheduler, VirtualScout()
+        assert scheduler.current is not None  # noqa: S101 - only programs scout
+
+        def ask() -> None:
+            for session in [*self._sessions]:
+                scheduler.sleep(scheduler.random.expovariate(1.0 / _OPEN_SECONDS))
+                if session.answers_scouts and not scout.is_stopped:
+                    heard(SimpleNamespace(zid=session.zid))
+
+        scheduler.thread("scouts", ask, scheduler.current.task).start()
+        return scout
+
     def dial(self, address: Address) -> _Link:
         """Connect to whatever listens at an address. Raises OSError if nothing does."""
         thread = self.scheduler.current
@@ -172,7 +199,7 @@ class VirtualZenoh:
         if any(end.peer.zid == session.zid for end in router.ends):  # it has not noticed a lost connection yet
             return False
         mine = End(session, Peer(router.zid, None), to_router=True)
-        theirs = End(router, Peer(session.zid, session.user), to_router=session.router)
+        theirs = End(router, Peer(session.zid, session.user, session.peer), to_router=session.router)
         VirtualConnection(self.scheduler, mine, theirs)
         self.scheduler.note(notes.CONNECTS, session.name, router.name)
         session.ends.append(mine)

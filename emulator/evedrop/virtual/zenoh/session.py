@@ -133,7 +133,8 @@ class Info:
 
 def transport_of(end: End) -> VirtualTransport:
     """A connection, as one of its ends sees it."""
-    what = zenoh.WhatAmI.ROUTER if end.to_router else zenoh.WhatAmI.CLIENT
+    other = zenoh.WhatAmI.PEER if end.peer.is_peer else zenoh.WhatAmI.CLIENT
+    what = zenoh.WhatAmI.ROUTER if end.to_router else other
     return VirtualTransport(end.peer.zid, what, end.peer.user, f"tcp/{end.peer.zid}")
 
 
@@ -162,7 +163,8 @@ class VirtualSession:
     def __init__(self, network: Network, task: VirtualTask, config: zenoh.Config) -> None:
         self.network, self.task = network, task
         self.scheduler: VirtualScheduler = network.scheduler
-        self.router = section(config, "mode") == "router"
+        self.router, self.peer = (section(config, "mode") == mode for mode in ("router", "peer"))
+        self.answers_scouts = self.peer and section(config, "scouting/multicast/enabled") is not False
         self.access, self.certificate = Access(config), shown_by(config)
         self.name = task.name
         self.zid = section(config, "id") or f"z{self.scheduler.number()}"
