@@ -15,7 +15,7 @@ demo: $(READY)
 
 # What needs more than processors and a disk has a target of its own, below: packages to install, a driver that draws, root.
 test: $(READY)
-	$(BIN)/python -m pytest -n 6 --dist loadfile --no-loadscope-reorder -m "not (long or hosts or containers or fresh or notebooks or wheel or pictures)"
+	$(BIN)/python -m pytest -n 6 --dist loadfile --no-loadscope-reorder -m "not (long or campaign or hosts or containers or fresh or notebooks or wheel or pictures)"
 
 # The wheel, built and installed into environments of its own.
 test-wheel: $(READY)
@@ -86,9 +86,11 @@ test-mutants: $(READY)
 
 # Runs whose programs all live in one interpreter, in virtual time: COUNT seeds from SEED on. EXPLAIN=17 shrinks and shows the case of
 # that seed alone; VIEW=run.rrd also writes it as a recording for Rerun, and VIEW=window opens a viewer (docs/maintainers/simulated-world.md).
+# The tests of the campaign itself come first, except where one case is played.
 EXPLAIN ?=
 VIEW ?=
 test-simulated: $(READY)
+	$(if $(EXPLAIN)$(filter 1,$(COUNT)),,$(BIN)/python -m pytest -n 2 -m campaign tests/virtual)
 	$(BIN)/python -m tests.virtual.simulated --seed $(or $(SEED),1) --count $(COUNT) $(if $(EXPLAIN),--explain $(EXPLAIN)) \
 		$(if $(VIEW),--view $(VIEW:window=))
 

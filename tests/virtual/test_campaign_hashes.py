@@ -7,9 +7,12 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from tests.virtual.simulated import played
 
-SEEDS, HASH = range(1, 31), "10d1336fbce679d2"
+HASH = "10d1336fbce679d2"
+"""Of the seeds 1 to 30."""
 _PLAY = """
 from evedrop.results.reading import Results
 from evedrop.virtual import campaign
@@ -19,14 +22,18 @@ print(campaign.play(1002, program).misses, played(1104)[2])
 """
 
 
-def test_seeds_give_the_same_events_on_every_machine() -> None:
-    """To the byte, with every version of Python. A change of the programs may change the hash: then it is written here again."""
+@pytest.mark.parametrize(
+    ("seeds", "expected"), [(3, "cb7fa6a4c3a7e235"), pytest.param(30, HASH, marks=pytest.mark.campaign)]
+)
+def test_seeds_give_the_same_events_on_every_machine(seeds: int, expected: str) -> None:
+    """To the byte, with every version of Python. A change of the programs may change a hash: then it is written here again."""
     total = hashlib.blake2b(digest_size=8)
-    for seed in SEEDS:
+    for seed in range(1, seeds + 1):
         total.update(played(seed)[2].encode())
-    assert total.hexdigest() == HASH
+    assert total.hexdigest() == expected
 
 
+@pytest.mark.campaign
 def test_the_order_of_texts_in_sets_decides_nothing() -> None:
     """The router of a run ends while others watch it: who heard first of whose end was in the order of a set.
 

@@ -15,7 +15,13 @@ from evedrop.virtual.cases import case_from
 REGRESSIONS = tomllib.loads(Path(__file__).with_name("regressions.toml").read_text("utf-8"))["regression"]
 
 
-@pytest.mark.parametrize("regression", REGRESSIONS, ids=[one["why"] for one in REGRESSIONS])
+@pytest.mark.parametrize(
+    "regression",
+    [
+        pytest.param(one, id=one["why"], marks=pytest.mark.campaign if number else ())
+        for number, one in enumerate(REGRESSIONS)
+    ],
+)
 def test_a_case_that_broke_a_promise_keeps_it(regression: dict[str, Any]) -> None:
     """Every entry of regressions.toml."""
     assert play_case(case_from(str(regression["case"])), program).misses == ()

@@ -36,7 +36,9 @@ PLAIN = SimulatedWireCase(1, (), starts=2, seconds=10.0)
 NUMBERED, TALLIED, MESSAGE, COUNTED = RunningLink._counted, LinkTally.add, _Way.message, StepCounter.add
 
 
-@pytest.mark.parametrize("seed", range(EVERY, 9 * EVERY, EVERY))
+@pytest.mark.parametrize(
+    "seed", [EVERY, *(pytest.param(seed, marks=pytest.mark.campaign) for seed in range(2 * EVERY, 9 * EVERY, EVERY))]
+)
 def test_a_wire_of_a_seed_keeps_its_promises(seed: int) -> None:
     """It is the same case each time, and can be written down."""
     case = simulated.any_case(seed)
@@ -45,6 +47,7 @@ def test_a_wire_of_a_seed_keeps_its_promises(seed: int) -> None:
     assert simulated.play(case).misses == ()
 
 
+@pytest.mark.campaign
 def test_a_seed_decides_a_wire_again() -> None:
     """To the last event; another seed is another wire."""
     case = SimulatedWireCase(3, (KillProcess(WIRE, 300), CutConnection(BASE, 700, 2.0)), starts=2, seconds=10.0)
@@ -53,6 +56,7 @@ def test_a_seed_decides_a_wire_again() -> None:
     assert first.misses == again.misses == ()
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("what", [what for what in FURTHER if what not in LIMITS])
 def test_what_is_done_besides_is_the_same_again(what: str) -> None:
     """No random name of a file gets into the events."""
@@ -61,6 +65,7 @@ def test_what_is_done_besides_is_the_same_again(what: str) -> None:
     assert first.run.digest == again.run.digest
 
 
+@pytest.mark.campaign
 def test_no_messages_that_go_round_are_duplicated() -> None:
     """A wire whose sides are joined outside would have millions of them."""
     joined = [case for case in map(SimulatedWireCase.of, range(600)) if JOINED in case.further]
@@ -73,6 +78,7 @@ def test_other_seeds_are_runs_as_before() -> None:
     assert simulated.any_case(EVERY + 1) == case_of(EVERY + 1)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     "fault",
     [
@@ -109,6 +115,7 @@ def test_a_mistake_that_is_not_named_is_seen() -> None:
         assert any("status 0 for a file with a negative seed" in miss for miss in case.play().misses)
 
 
+@pytest.mark.campaign
 def test_a_link_is_fitted_whose_messages_were_heard_at_once() -> None:
     """A wire that was suspended for most of its time: there is no time between its messages, and so no rate."""
     case = replace(PLAIN, faults=(StopProcess(WIRE, 30, 15.0),))
@@ -121,6 +128,7 @@ def swallowing() -> Callable[..., Any]:
     return lambda *arguments: (lambda: None) if next(numbers) % 20 == 0 else MESSAGE(*arguments)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("place", "name", "mistake", "miss"),
     [
@@ -144,6 +152,7 @@ def test_a_mistake_of_the_wire_is_seen(
     assert any(miss in found for found in PLAIN.play().misses)
 
 
+@pytest.mark.campaign
 def test_recordings_count_what_the_journal_has(monkeypatch: pytest.MonkeyPatch) -> None:
     """The view that the wire records, and the one that is made of its journal; one that forgets a message is seen."""
     case = replace(PLAIN, starts=1, further=(VIEW, REPLAY))
@@ -153,6 +162,7 @@ def test_recordings_count_what_the_journal_has(monkeypatch: pytest.MonkeyPatch) 
     assert sorted(miss.partition(" counts ")[0] for miss in case.play().misses) == [REPLAY_FILE, VIEW_FILE]
 
 
+@pytest.mark.campaign
 def test_a_program_opens_the_wire_and_uses_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """It steers the wire and reads its journal; a summary that counts a message too many is seen."""
     case = replace(PLAIN, further=(OPENED,))
@@ -162,6 +172,7 @@ def test_a_program_opens_the_wire_and_uses_it(monkeypatch: pytest.MonkeyPatch) -
     assert any("the summary heard" in miss for miss in case.play().misses)
 
 
+@pytest.mark.campaign
 def test_a_scenario_has_the_links_of_a_wire(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its packets have the fates of the wire's messages; those of a wire with another seed are seen."""
     radio = {"from": ROBOT, "to": BASE, "quality": 0.5}
@@ -178,6 +189,7 @@ def test_a_scenario_has_the_links_of_a_wire(monkeypatch: pytest.MonkeyPatch) -> 
     assert any(miss in case.play().misses for case in cases)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("what", "words"),
     [
@@ -192,6 +204,7 @@ def test_a_wire_says_what_happens_to_it(what: str, words: str) -> None:
     assert words in played.run.said
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("limit", LIMITS)
 def test_small_limits_break_no_promise(limit: str) -> None:
     """What they drop is in the journal, with the reason."""
@@ -200,6 +213,7 @@ def test_small_limits_break_no_promise(limit: str) -> None:
     assert limited.play().misses == case.play().misses == ()
 
 
+@pytest.mark.campaign
 def test_a_token_that_is_mirrored_hides_another_one_of_its_key(monkeypatch: pytest.MonkeyPatch) -> None:
     """Zenoh does not tell of the second one, so a side that shares no link with the holder of the first need not see it."""
     sides = {side: {"listen": ENDPOINTS[side]} for side in SIDES}
@@ -218,6 +232,7 @@ def test_a_token_that_is_mirrored_hides_another_one_of_its_key(monkeypatch: pyte
     assert "the token alive/all of robot is not seen at base" in alone.play().misses
 
 
+@pytest.mark.campaign
 def test_a_failing_wire_is_shrunk_and_shown(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
