@@ -11,7 +11,7 @@ import pytest
 
 from tests.virtual.simulated import played
 
-HASH = "10d1336fbce679d2"
+HASH = "61a5b711a95b08bd"
 """Of the seeds 1 to 30."""
 _PLAY = """
 from evedrop.results.reading import Results
