@@ -11,6 +11,7 @@ import pytest
 
 from evedrop import design
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 from tests.golden.pages import Golden
 
 LOW = 0.534206
@@ -312,7 +313,7 @@ def test_the_suggestion_is_the_cheapest_with_nearly_the_largest_ratio() -> None:
     assert design("numerical", changes={"eavesdroppers": {}}).suggestion is None
 
 
-@pytest.mark.parametrize("suffix", ["pdf", "png", "svg"])
+@pytest.mark.parametrize("suffix", mostly_long(["pdf", "png", "svg"], ["svg"]))
 def test_a_design_has_a_plot(evedrop: Evedrop, suffix: str) -> None:
     """As the kind of file that its name says."""
     path = evedrop.folder / f"plot.{suffix}"

@@ -153,6 +153,7 @@ def test_a_study_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: st
         assert getattr(ours, table).equals(getattr(theirs, table)), table
 
 
+@pytest.mark.long
 def test_a_sweep_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str) -> None:
     """The same table, bit by bit."""
     base = (

@@ -119,9 +119,7 @@ def task_files(folder: Path) -> list[Path]:
 MODES = {"exact": (), "cov": ("--covariance-only",), "err": ("--error-coordinates",)}
 
 
-@pytest.mark.parametrize(
-    ("name", "workers"), mostly_long(itertools.product(MODES, "12"), [("exact", "2"), ("cov", "1")])
-)
+@pytest.mark.parametrize(("name", "workers"), mostly_long(itertools.product(MODES, "12"), [("exact", "2")]))
 def test_an_interrupted_study_ends_like_a_whole_one(
     name: str, workers: str, evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch, whole: Whole
 ) -> None:

@@ -61,13 +61,13 @@ def own(folder: Path, text: str, taken: str = REPEATABLE) -> str:
 
 
 def test_a_scenario_with_its_own_classes_and_a_nemesis_passes(evedrop: Evedrop) -> None:
-    """Ten seeds; the results kept are those of the same trials in memory."""
+    """Four seeds; the results kept are those of the same trials in memory."""
     place = own(evedrop.folder, HOLDS)
-    done = evedrop("test", place, "--simulated", "--seeds", "10", "--out", "kept")
+    done = evedrop("test", place, "--simulated", "--seeds", "4", "--out", "kept")
     assert (done.status, done.err) == (0, "")
     outcome, told, *_ = done.out.splitlines()
     assert re.fullmatch(r"passed +\d+\.\d s  own.toml", outcome)
-    assert re.fullmatch(r" +10 runs from seed 1 on, 0 of which broke a promise; \d+\.\d runs/s", told)
+    assert re.fullmatch(r" +4 runs from seed 1 on, 0 of which broke a promise; \d+\.\d runs/s", told)
     assert Results.read(evedrop.folder / "kept" / "own").summary["slots"] == 40
 
 
@@ -99,7 +99,7 @@ def test_a_failed_expectation_fails_the_test(evedrop: Evedrop) -> None:
 
 def test_a_class_that_cannot_be_repeated_breaks_a_promise(evedrop: Evedrop) -> None:
     """The first failing seed is told with its faults, the command that repeats it, and a shrunk run, in JUnit too."""
-    place = own(evedrop.folder, BEGINNING.replace("slots = 40", "slots = 12"), UNREPEATABLE)
+    place = own(evedrop.folder, BEGINNING.replace("slots = 40", "slots = 6"), UNREPEATABLE)
     scenario = load(str(evedrop.folder / place))
     seed = next(seed for seed in count(1) if not case_with(scenario, seed).faults)  # or a fault might end it early
     options = ("--simulated", "--trials", "2", "--out", "kept")
@@ -112,7 +112,7 @@ def test_a_class_that_cannot_be_repeated_breaks_a_promise(evedrop: Evedrop) -> N
     assert found is not None
     [smallest] = [line for line in others if "the smallest run found" in line]
     assert smallest.endswith("no fault")
-    assert int(re.findall(r"(\d+) slots", smallest)[0]) < 12
+    assert int(re.findall(r"(\d+) slots", smallest)[0]) < 6
     assert any(re.search(r"launcher +router +sensor +legitimate +mine +recorder", line) for line in others)
     again = evedrop(*shlex.split(found[3]), "--out", "again")
     assert again.status == 3

@@ -27,6 +27,7 @@ from evedrop.show.view.palette import DROPPED, paper_inks
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from tests.builders import GOOD
+from tests.examples import mostly_long
 from tests.pages import Checked, checked
 from tests.scenario.conformance.own_classes import BLOCK, TEXT
 
@@ -130,7 +131,7 @@ def test_the_plane_shows_the_truth_and_who_follows_it(results: RunResults) -> No
     assert axes.get_xlabel() == "slot"
 
 
-@pytest.mark.parametrize("receivers", [1, 4, 9])
+@pytest.mark.parametrize("receivers", mostly_long([1, 4, 9], [9]))
 def test_receivers_are_named_beside_their_errors(receivers: int) -> None:
     """No name covers another, and none is in a legend; the axis has the unit of what it shows."""
     link = {"quality": 0.9}
@@ -255,7 +256,7 @@ def test_results_write_their_page(results: RunResults) -> None:
     assert SCENARIO.title in checked(results.folder).headings
 
 
-@pytest.mark.parametrize("receivers", [1, 4, 9])
+@pytest.mark.parametrize("receivers", mostly_long([1, 4, 9], [9]))
 def test_a_figure_for_a_column_of_a_journal(receivers: int, tmp_path: Path) -> None:
     """89 mm wide, letters of at least 7 points in embedded fonts, names beside the curves, without title and legend."""
     link = {"quality": 0.9}

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 
 SMALL = ("--slots", "20", "--trials", "2", "--out", "study")
 STUDIES = {
@@ -18,7 +19,7 @@ STUDIES = {
 }
 
 
-@pytest.mark.parametrize("study", STUDIES)
+@pytest.mark.parametrize("study", mostly_long(STUDIES, ["run", "sweep"]))
 def test_the_picture_and_the_tables_of_any_study(study: str, evedrop: Evedrop) -> None:
     """As PDF, PNG and SVG, as CSV and LaTeX; the command says which files it wrote."""
     assert evedrop(*STUDIES[study]).status in {0, 1}

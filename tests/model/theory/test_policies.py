@@ -169,7 +169,7 @@ def test_a_point_of_the_front_is_what_the_scheme_does() -> None:
 
 def test_the_front_is_a_front() -> None:
     """Along the weights the legitimate error falls; no point dominates another; weights with the same policy are one point."""
-    weights = [i / 20 for i in range(21)]
+    weights = [i / 10 for i in range(11)]
     result = front(MICROGRID, links_of(MU, MU_E), weights, (0.0, 1e-6), 6)
     for price in (0.0, 1e-6):
         ours = [point for point in result.points if point.price == price]

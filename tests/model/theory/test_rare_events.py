@@ -13,6 +13,7 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.theory import rare_events
 from evedrop.model.theory.covariances import NOBODY, Outcomes, theoretical_traces
 from evedrop.model.theory.rare_events import RARE, Streaks, rare_in_slots, streaks
+from tests.examples import mostly_long
 
 PLANE = Process(
     np.array([[1.1, 0.3], [0.0, 0.7]]), np.array([[0.5, 0.1], [0.1, 0.3]]), np.array([[9.0, 1.0], [1.0, 4.0]])
@@ -81,7 +82,7 @@ def test_streaks_are_those_of_all_courses_of_a_run(process: Process, outcomes: O
 
 
 @pytest.mark.parametrize("process", [PLANE, STABLE], ids=["plane", "stable"])
-@pytest.mark.parametrize("trials", [10, 40, 200, 3000, 10**5])
+@pytest.mark.parametrize("trials", mostly_long([10, 40, 200, 3000, 10**5], [40, 3000]))
 @pytest.mark.parametrize(
     "outcomes", [LEGITIMATE, MISLED, SMART, NOBODY], ids=["legitimate", "misled", "smart", "nobody"]
 )

@@ -23,6 +23,7 @@ from evedrop.scenario.recordings.mcap_recording import mcap_recording
 from evedrop.wire.file import wire_of
 from evedrop.wire.running_link import KeyFates
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 from tests.scenario.recordings.recorded_messages import BURSTS, Recorded, heard, lossy, trimmed, write
 
 
@@ -200,7 +201,7 @@ def test_a_damaged_byte_raises_no_other_error(tmp_path_factory: pytest.TempPathF
         mcap_recording(path)
 
 
-@pytest.mark.parametrize("spec", [{"model": "bernoulli", "quality": 0.8}, BURSTS])
+@pytest.mark.parametrize("spec", mostly_long([{"model": "bernoulli", "quality": 0.8}, BURSTS], [BURSTS]))
 def test_the_fitted_link_loses_as_the_recorded_one_did(spec: dict[str, Any], tmp_path: Path) -> None:
     """Rate and length of bursts of 200 000 messages through the fitted model, within 4 % of the link that was recorded."""
     outcomes = lossy(spec, 8000)

@@ -35,10 +35,12 @@ def rows_of(rrd: Path) -> Rows:
     rows: Rows = {}
     for chunk in RrdReader(rrd).stream().filter(is_static=False):
         columns = chunk.to_record_batch().to_pydict()
-        for i, slot in enumerate(columns[TIMELINE]):
-            place = str(chunk.entity_path), slot
-            assert place not in rows or place[0].startswith(("/events", "/knows/")), place
-            rows[place] = [values[i] for name, values in columns.items() if ":" in name]
+        entity = str(chunk.entity_path)
+        repeated = entity.startswith(("/events", "/knows/"))
+        parts = [values for name, values in columns.items() if ":" in name]
+        for slot, *row in zip(columns[TIMELINE], *parts, strict=True):
+            assert repeated or (entity, slot) not in rows, (entity, slot)
+            rows[entity, slot] = row
     return rows
 
 

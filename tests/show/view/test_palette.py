@@ -100,8 +100,14 @@ NINE = {
     "eight of three strategies": _eavesdroppers(*["smart", "naive", "suspicious"] * 2, "smart", "naive"),
     "eight strategies": _eavesdroppers(*_EIGHT),
 }
-TOGETHER: Mapping[str, Mapping[str, str]] = {**{name: _of_scenario(name) for name in shipped()}, **NINE}
-"""Receivers that appear together, with their strategies."""
+TOGETHER = [*shipped(), *NINE]
+"""Scenarios, and others, whose receivers appear together."""
+
+
+@cache
+def _together(name: str) -> Mapping[str, str]:
+    """Receivers that appear together, with their strategies."""
+    return NINE[name] if name in NINE else _of_scenario(name)
 
 
 def _check(pairs: Iterable[Sequence[Colour]], least: float) -> None:
@@ -123,16 +129,16 @@ def _firsts(strategies: Mapping[str, str]) -> list[Colour]:
     return list(first.values())
 
 
-@pytest.mark.parametrize("name", [*shipped(), *NINE][:-1])
+@pytest.mark.parametrize("name", TOGETHER[:-1])
 def test_receivers_that_appear_together_differ(name: str) -> None:
     """Full colours, dim ones, one of each, and those on paper; also further receivers with a strategy, which have its shades."""
-    colours = _firsts(TOGETHER[name])
+    colours = _firsts(_together(name))
     pairs = list(combinations(colours, 2))
     _check(pairs, DIFFERENT)
     _check([(dim(colour), dim(other)) for colour, other in pairs], DIM)
     _check([(dim(colour), other) for colour, other in permutations(colours, 2)], DIM_TO_BRIGHT)
     _check([(on_paper(colour), on_paper(other)) for colour, other in pairs], ON_PAPER)
-    _check(combinations(identities(TOGETHER[name]).values(), 2), SAME)
+    _check(combinations(identities(_together(name)).values(), 2), SAME)
 
 
 def test_any_two_strategies_differ() -> None:
@@ -157,7 +163,7 @@ def test_every_strategy_has_a_colour() -> None:
 def test_green_is_the_legitimate_estimator_s_and_vermilion_nobody_s(name: str) -> None:
     """Also of variants, on paper, and dim."""
     shades: tuple[Callable[[Colour], Colour], ...] = (lambda colour: colour, dim, on_paper, letters)
-    for (receiver, colour), shade in product(identities(TOGETHER[name]).items(), shades):
+    for (receiver, colour), shade in product(identities(_together(name)).items(), shades):
         assert _green(shade(colour)) == (receiver == LEGITIMATE)
         assert not _vermilion(shade(colour))
 
@@ -193,7 +199,7 @@ def test_a_strategy_has_the_same_colour_in_every_scenario() -> None:
 @pytest.mark.parametrize("name", TOGETHER)
 def test_receivers_can_be_seen(name: str) -> None:
     """Curves have a contrast of 3 on the dark ground and, on paper, with both grounds of a page; letters are tested below."""
-    for colour in identities(TOGETHER[name]).values():
+    for colour in identities(_together(name)).values():
         assert _contrast(colour, GROUND) >= _LARGE
         assert min(_contrast(on_paper(colour), ground) for ground in (GROUND, _WHITE)) >= _LARGE
 
