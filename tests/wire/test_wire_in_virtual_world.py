@@ -143,6 +143,7 @@ def test_a_wire_accounts_for_every_message(tmp_path: Path, seed: int) -> None:
     assert first.rows() == second.rows()
 
 
+@pytest.mark.long
 def test_an_hour_of_a_wire_with_a_cut(tmp_path: Path) -> None:
     """From minute 10 to minute 20, on one of its links."""
     outcome = run(1, tmp_path, plan_with(events=(WireEvent(600.0, 1200.0, cut="robot-base"),)), seconds=HOUR)

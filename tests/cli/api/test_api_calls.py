@@ -41,6 +41,7 @@ from evedrop.simulate.simulation import Mode
 from evedrop.studies.sweep import grid_of
 from tests.builders import GOOD, digests_of
 from tests.conftest import LIMIT
+from tests.examples import mostly_long
 from tests.pages import checked
 
 SMALL = Scenario(GOOD).replace(slots=12)
@@ -302,7 +303,7 @@ def test_a_notebook_shows_progress_and_takes_it_away(cells: list[str]) -> None:
     assert cells[-2] == '<progress max="1" value="0.5000"></progress> 50% · 1,000 slots/s'
 
 
-@pytest.mark.parametrize("mode", ["auto", "web", "notebook"])
+@pytest.mark.parametrize("mode", mostly_long(["auto", "web", "notebook"], ["auto"]))
 def test_a_live_run_is_shown_in_the_cell(mode: str, cells: list[str]) -> None:
     """While it goes on; its page stays when it has ended."""
     kept = run(SMALL, view=mode)

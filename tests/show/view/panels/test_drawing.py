@@ -82,8 +82,12 @@ def test_the_house_and_the_room_have_their_parts() -> None:
     assert room.levels[0].low < 17.0  # where it starts
 
 
+SMALL, LARGE = (391.0, 455.0), (854.0, 620.0)
+BETWEEN = [(569.0, 330.0), (569.0, 424.0)]
+
+
 @pytest.mark.parametrize("name", ["microgrid", "heated-room"])
-@pytest.mark.parametrize("size", [(391.0, 455.0), (569.0, 330.0), (569.0, 424.0), (854.0, 620.0)])
+@pytest.mark.parametrize("size", [SMALL, LARGE, *(pytest.param(size, marks=pytest.mark.long) for size in BETWEEN)])
 def test_words_do_not_cover_each_other(name: str, size: tuple[float, float]) -> None:
     """Nor are they cut: in a picture of 880 × 660, in windows of 1280 × 720, with a high strip as well, and of 1920 × 1080."""
     drawing = drawing_of(name)
