@@ -28,6 +28,7 @@ from evedrop.virtual.faults import (
     CutConnection,
     DelayThread,
     DiskDisturbance,
+    FlapConnection,
     FreezeConnection,
     HangProcess,
     KillProcess,
@@ -357,16 +358,19 @@ def _of_cuts(
 ) -> Iterator[str]:
     """Whether a process that was cut off while the run went on is said to have been; so is it with a router, or the recorder.
 
-    Not if something else happens, too: who is cut off already cannot be cut off.
+    Not if something else happens, too, but that a thread is late: who is cut off already cannot be cut off.
     """
     scenario = reference.scenario
-    fault, at = next(iter(struck.items()), (None, 0.0))
-    if not isinstance(fault, CutConnection) or len(struck) > 1 or run.status != reference.status or scenario.shards > 1:
+    cuts = [(fault, at) for fault, at in struck.items() if isinstance(fault, CutConnection | FlapConnection)]
+    delays = [fault.seconds or 0.0 for fault in struck if isinstance(fault, DelayThread)]
+    if len(cuts) != 1 or len(struck) > 1 + len(delays) or run.status != reference.status or scenario.shards > 1:
         return
+    [(fault, at)] = cuts
+    flaps = 0.0 if isinstance(fault, CutConnection) else fault.seconds or 0.0
     begun = any(message.said == "start" and message.at < at for message in run.put)
     goes_on = any(
         message.key == f"progress/{RECORDER}"
-        and message.at > at + _NOTICED_SECONDS
+        and message.at > at + flaps + _NOTICED_SECONDS + sum(delays)
         and scenario.slots not in message.slots
         for message in run.put
     )
