@@ -39,6 +39,8 @@ from evedrop.virtual.zenoh.transport import Details, End, TransportFrame
 _LEASE_MS = 10_000
 _PATIENCE_US = 5_000_000
 _USUAL_CHANNEL = FifoChannel(256)
+_TOKENS_FIRST = 0.5
+"""How often a router tells another one who is there before it tells what they read."""
 
 
 @final
@@ -322,8 +324,14 @@ class VirtualSession:
             end.send(TransportFrame(kind, key))
 
     def greet(self, end: End) -> None:
-        """Tell a new end everything that is declared here, and, from a router, what others have declared."""
+        """Tell a new end everything that is declared here, and, from a router, what others have declared.
+
+        Another router may learn who is there before it learns what they read.
+        """
         others = [other for other in self.ends if other is not end and self.router]
+        tokens_first = self.router and end.to_router and self.scheduler.random.random() < _TOKENS_FIRST
+        if tokens_first:
+            self._liveliness.greet(end, others)
         for subscriber in self._subscribers:
             self._tell(end, "declare_subscriber", subscriber.key)
         for queryable in self.questions.answering:
@@ -333,7 +341,8 @@ class VirtualSession:
                 for key, times in getattr(other, name).items():
                     for _ in range(times):  # an old connection's, too, whose end is passed on
                         self._tell(end, kind, key)
-        self._liveliness.greet(end, others)
+        if not tokens_first:
+            self._liveliness.greet(end, others)
         if self.info.listeners:
             self.inbox.put((end, TransportFrame("connected", ""), 0))
 
