@@ -10,13 +10,26 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 from unittest.mock import patch
 
+from evedrop.system.world import world
 from evedrop.virtual.zenoh import transport
 from evedrop.wire import departures, journal, publications, queries, ros2, tallies
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.send_queue import SendQueue
+from evedrop.wire.side import SideSession
+from evedrop.wire.watchdog import Watchdog
 
-FULL = "short queues"
-_CONSTANTS: dict[str, tuple[tuple[Any, str, int], ...]] = {
+FULL, HUNG = "short queues", "Zenoh hangs"
+"""Connections are full soon; a question that the wire puts to Zenoh may have no end."""
+
+
+def _perhaps_hang(side: SideSession) -> None:
+    """What a side does when it is asked whether it answers."""
+    del side
+    if world().token(1)[0] < 64:
+        world().event().wait()
+
+
+_CONSTANTS: dict[str, tuple[tuple[Any, str, Any], ...]] = {
     "few keys": (
         (journal, "MOST_KEYS", 6),
         (publications, "MOST_PUBLISHERS", 1),
@@ -30,6 +43,7 @@ _CONSTANTS: dict[str, tuple[tuple[Any, str, int], ...]] = {
     ),
     "few departures": ((departures, "MOST", 1), (departures, "MANY", 2), (departures, "MOST_GONE", 1)),
     FULL: ((transport, "_ROOM", 3000),),
+    HUNG: ((SideSession, "answer", _perhaps_hang), (Watchdog.ask, "__defaults__", (3.0,))),
     "short counts": ((tallies, "_SAMPLE", 16), (tallies, "_MOST_RANGES", 2)),
 }
 _ARGUMENTS: dict[str, tuple[Any, dict[str, Any]]] = {

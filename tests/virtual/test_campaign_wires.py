@@ -23,10 +23,22 @@ from evedrop.wire.running_link import RunningLink
 from evedrop.wire.scenario_network import over_wire
 from evedrop.wire.tallies import LinkTally
 from evedrop.wire.time_steps import StepCounter
-from tests.virtual import simulated, wire_scenarios
-from tests.virtual.small_limits import LIMITS
-from tests.virtual.wire_cases import EVERY, WIRE, SimulatedWireCase
-from tests.virtual.wire_commands import FURTHER, JOINED, MOVED, OPENED, REPLAY, REPLAY_FILE, SCENARIO, VIEW, VIEW_FILE
+from tests.virtual import simulated, wire_damage, wire_scenarios
+from tests.virtual.small_limits import HUNG, LIMITS
+from tests.virtual.wire_cases import EVERY, USUAL_PROGRAMS, WIRE, SimulatedWireCase
+from tests.virtual.wire_commands import (
+    DAMAGED,
+    FURTHER,
+    JOINED,
+    MOVED,
+    OPENED,
+    REPLAY,
+    REPLAY_FILE,
+    SCENARIO,
+    VIEW,
+    VIEW_FILE,
+)
+from tests.virtual.wire_damage import DAMAGES, Damage
 from tests.virtual.wire_draws import BASE, ENDPOINTS, FIELD, ROBOT, SIDES, file_of
 from tests.virtual.wire_judge import DISK
 from tests.virtual.wire_mistakes import MISTAKES, TRIALS
@@ -202,6 +214,53 @@ def test_a_wire_says_what_happens_to_it(what: str, words: str) -> None:
     played = replace(PLAIN, starts=1, further=(what,)).play()
     assert played.misses == ()
     assert words in played.run.said
+
+
+@pytest.mark.campaign
+def test_the_history_of_a_lossless_topic_is_lossless() -> None:
+    """Its keys share their numbers, and it is not delayed either."""
+    tables = PLAIN.tables
+    tables["link"] = [{"from": ROBOT, "to": BASE, "delay": {"model": "constant", "value": 0.03}}]
+    file = toml_text({"side": tables["side"], "link": tables["link"], "lossless": f"{ROBOT}/data"})
+    case = replace(PLAIN, file=file, programs=(WireProgram(ROBOT, (f"many {ROBOT}/data/@adv",)),))
+    assert case.play().misses == ()
+
+
+@pytest.mark.campaign
+def test_a_wire_whose_zenoh_hangs_ends_by_itself() -> None:
+    """And says where it hangs."""
+    played = replace(PLAIN, starts=1, further=(HUNG,)).play()
+    assert played.misses == ()
+    assert "nothing has moved at the side" in played.run.said
+    assert played.run.status == 3
+
+
+@pytest.mark.campaign
+def test_programs_in_mode_peer_are_named() -> None:
+    """Where a side lets them be there, only those that answer multicast scouting."""
+    robot, base = USUAL_PROGRAMS[1], USUAL_PROGRAMS[0]
+    tables = PLAIN.tables
+    tables["side"][ROBOT]["peers"] = True
+    for file in (PLAIN.file, toml_text(tables)):
+        for how in ("quiet", "heard"):
+            peer = replace(robot, does=(*robot.does, f"peer {how}"))
+            played = replace(PLAIN, starts=1, file=file, programs=(base, peer)).play()
+            assert played.misses == ()
+            assert ("the wire has no verdict" in played.run.said) == (file == PLAIN.file or how == "heard")
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_folder_is_refused_by_name_or_used(damage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is recovered from what cannot be right; a refusal in other words, or none, is seen."""
+    monkeypatch.setattr(wire_damage, "_EACH", 1)
+    monkeypatch.setattr(wire_damage, "DAMAGES", {damage: DAMAGES[damage]})
+    case = replace(PLAIN, starts=1, seconds=2.0, further=(DAMAGED,))
+    assert case.play().misses == ()
+    change, named = DAMAGES[damage]
+    other = Damage(change, "other words" if named is None else None)
+    monkeypatch.setattr(wire_damage, "DAMAGES", {damage: other})
+    assert [miss.partition(":")[0] for miss in case.play().misses] == [damage]
 
 
 @pytest.mark.campaign

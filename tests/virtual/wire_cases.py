@@ -36,6 +36,7 @@ from evedrop.wire.file import wire_of
 from tests.faults.wires import FILE
 from tests.virtual.small_limits import FULL, small_limits
 from tests.virtual.wire_commands import (
+    DAMAGED,
     FURTHER,
     JOINED,
     MOVED,
@@ -49,6 +50,7 @@ from tests.virtual.wire_commands import (
     run_the_wire,
     type_words,
 )
+from tests.virtual.wire_damage import tried_damages
 from tests.virtual.wire_draws import (
     BASE,
     ENDPOINTS,
@@ -242,7 +244,7 @@ class SimulatedWireCase:
         """Play it, and judge it; keep: whether to keep all events."""
         misses: tuple[str, ...] = ()
         if SCENARIO in self.further:
-            played, misses = play_over_wire(wire_of(self.tables), self.seed, keep)
+            played, misses = play_over_wire(self.tables, self.seed, keep)
             if played is not None:
                 return PlayedWire(self, played.run, misses)
         memory = Path("/dev/shm")  # noqa: S108 - folders in it are private
@@ -315,6 +317,8 @@ class SimulatedWireCase:
                     scheduler.at(moment, lambda: None)
                     scheduler.run(moment + 1.0, lambda moment=moment: scheduler.now >= moment)  # type: ignore[misc]
                 self._read(simulated, course, run.folder)
+                if DAMAGED in self.further and not any(isinstance(fault, DiskDisturbance) for fault in self.faults):
+                    course.damaged += tried_damages(simulated, run.folder, self.tables, self.seed)
             except Stuck as why:
                 run.stuck = str(why)
             run.status = course.processes[-1].task.status if course.processes else None

@@ -22,7 +22,7 @@ from evedrop.wire.file import load_wire
 from evedrop.wire.journal import JOURNAL_FOLDER
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.run import run_wire
-from tests.virtual.small_limits import LIMITS
+from tests.virtual.small_limits import HUNG, LIMITS
 from tests.virtual.wire_draws import BASE, ENDPOINTS, OUTSIDE, ROBOT
 from tests.virtual.wire_programs import Course
 from tests.wire.wire_recordings import shown
@@ -32,8 +32,11 @@ VIEW, REPLAY, OPENED, SCENARIO = "view", "replay", "opened from Python", "scenar
 
 Instead, a scenario is run whose links are those of the wire, if one of the drawn ones can have them.
 """
-JOINED, MOVED = "joined outside", "journal moved away"
-"""What happens meanwhile: a router outside joins the first two sides for some time; somebody moves the journal away."""
+JOINED, MOVED, DAMAGED = "joined outside", "journal moved away", "damaged"
+"""What happens meanwhile: a router outside joins the first two sides for some time; somebody moves the journal away.
+
+Afterwards copies of its folder are damaged, as `wire_damage.py` says.
+"""
 FURTHER = {
     VIEW: 0.06,
     REPLAY: 0.06,
@@ -41,7 +44,9 @@ FURTHER = {
     SCENARIO: 0.12,
     JOINED: 0.06,
     MOVED: 0.03,
+    DAMAGED: 0.1,
     **dict.fromkeys(LIMITS, 0.12),
+    HUNG: 0.04,
 }
 """How often each of it is drawn, and each of the limits."""
 _FITS: tuple[tuple[str, ...], ...] = (

@@ -38,6 +38,7 @@ from evedrop.wire.journal import journal_tables
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import REASONS, WireFate
 from tests.faults.wires import wrong_numbers, wrong_summary
+from tests.virtual.small_limits import HUNG
 from tests.virtual.wire_commands import JOINED, MOVED, OPENED, REPLAY, REPLAY_FILE, VIEW, VIEW_FILE, wrong_recording
 from tests.virtual.wire_programs import Course, Message, WireProgram, gid_of, ros_key, ros_token, service, stream_of
 from tests.virtual.wire_tokens import wrong_tokens
@@ -81,6 +82,8 @@ class WireJudge:
         self._case, self._plan, self._course, self._run, self._struck = case, plan, course, run, struck
         self._disk = any(isinstance(fault, DiskDisturbance) for fault in struck)
         self._killed = any(isinstance(fault, KillProcess) for fault in struck) or self._disk
+        self._hung = HUNG in case.further and "the wire no longer answers" in run.said
+        self._killed |= self._hung
         self._targets = {link.name: link.target for link in plan.links}
 
     def misses(self) -> Iterator[str]:
@@ -91,6 +94,7 @@ class WireJudge:
             return
         yield from (f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors)
         yield from (line for line in run.said.splitlines() if "Traceback" in line or "report this" in line)
+        yield from course.damaged
         for process in course.processes:
             yield from self._of_status(process)
         if MOVED not in self._case.further:  # or else it is elsewhere
@@ -118,9 +122,9 @@ class WireJudge:
         if JOINED not in self._case.further:
             yield from self._true_to_receivers(flat)
         yield from self._wrong_senders(flat)
-        if run.status in {0, 1} and not self._disk:
+        if run.status in {0, 1} and not self._disk and not self._hung:
             yield from self._of_summary(rows)
-        if not self._struck:
+        if not (self._struck or self._hung):
             yield from course.doubts
             yield from self._of_operators()
             if JOINED not in self._case.further:
@@ -167,6 +171,8 @@ class WireJudge:
             yield 1, "FAILED"
         if JOINED in self._case.further:
             yield 1, "outside the wire"
+        if HUNG in self._case.further:
+            yield RunError.exit_status, "the wire no longer answers: nothing has moved at the side"
         if any(program.objects("peer") for program, *_ in self._course.here):
             yield 1, "past the wire"
         if MOVED in self._case.further:
@@ -195,7 +201,7 @@ class WireJudge:
                 streams[row["link"], stream_of(row["kind"]), numbered_as(row["key"])][row["n"]] = row
         for (name, kind, key), of_stream in sorted(streams.items()):
             link = self._plan.named(name)
-            if self._plan.is_lossless(zenoh.KeyExpr(key)):
+            if self._plan.is_lossless(zenoh.KeyExpr(next(iter(of_stream.values()))["key"])):
                 lost = [n for n, row in of_stream.items() if row["reason"] in {"loss", "corrupted", "cut", "overflow"}]
                 if lost:
                     yield f"{len(lost)} messages of {key} are lost, which must never be"
@@ -287,6 +293,8 @@ class WireJudge:
         """When messages that the wire handed over may have been lost on their way to their reader."""
         for begun in self._course.begun[1:]:
             yield begun, begun + _DOUBT
+        if self._hung:
+            yield 0.0, float("inf")
         for fault, at in self._struck.items():
             if isinstance(fault, SlowConnection):
                 continue

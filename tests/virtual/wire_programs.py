@@ -13,6 +13,7 @@ import struct
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any, NamedTuple, final
 
 import zenoh
@@ -67,6 +68,8 @@ class Course:
     """Commands of operators, and how they ended."""
     doubts: list[str] = field(default_factory=list)
     """What a program that opened the wire expected in vain."""
+    damaged: list[str] = field(default_factory=list)
+    """What is wrong with what starts in damaged copies of the folder said."""
     read: list[tuple[str, int, str]] = field(default_factory=list)
     """Commands that read the folder afterwards, how they ended, and what they printed."""
 
@@ -77,9 +80,9 @@ class WireProgram:
     """A program at a side.
 
     What it does is told by words: `publish KEY`, `often KEY`, `many KEY`, `large KEY`, `delete KEY`, `ros TOPIC`, `named KEY`
-    (the publisher and its number as rmw_zenoh once wrote them) and `vary KEY` (now and then express) in each turn;
-    `ask KEY` and `call TOPIC` in each turn; `answer KEY HOW` and `serve TOPIC HOW`; `alive TOKEN`, `odd SIDE` (tokens that few
-    understand), `blink TOKEN`, `watch TOKENS`, `listen KEYS`; `leave` closes its session at its end;
+    (the publisher and its number as rmw_zenoh once wrote them) and `vary KEY` (with source information, now and then express)
+    in each turn; `ask KEY` and `call TOPIC` in each turn; `answer KEY HOW` and `serve TOPIC HOW`; `alive TOKEN`, `odd SIDE`
+    (tokens that few understand), `blink TOKEN`, `watch TOKENS`, `listen KEYS`; `leave` closes its session at its end;
     `peer quiet` is in mode peer, and `peer heard` also answers multicast scouting.
     """
 
@@ -201,11 +204,9 @@ class ProgramAtWork:
             session.close()
         return 0
 
-    def _say(
-        self, key: str, extra: int = 0, attachment: bytes = b"", *, delete: bool = False, express: bool = False
-    ) -> None:
+    def _say(self, key: str, extra: int = 0, attachment: bytes = b"", *, delete: bool = False, **details: Any) -> None:
         size = next(self._numbers) + extra
-        how: dict[str, Any] = {"congestion_control": zenoh.CongestionControl.BLOCK, "express": express}
+        how: dict[str, Any] = {"congestion_control": zenoh.CongestionControl.BLOCK, **details}
         if delete:
             attachment = bytes(size)
         self._course.sent.add(("put", key, size if delete else size + len(attachment)))
@@ -248,7 +249,13 @@ class ProgramAtWork:
         self._turns.append(say)
 
     def _vary(self, key: str) -> None:
-        self._turns += [lambda: self._say(key, express=self._turn % _OFTEN == 0)] * 2
+        source_id = SimpleNamespace(zid=self._session.info.zid(), eid=1)
+
+        def say() -> None:
+            source = SimpleNamespace(source_id=source_id, source_sn=self._turn)
+            self._say(key, express=self._turn % _OFTEN == 0, source_info=source)
+
+        self._turns += [say] * 2
 
     def _alive(self, token: str) -> None:
         self._session.liveliness().declare_token(token)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import random
 import tempfile
 from collections.abc import Iterator
+from copy import deepcopy
 from pathlib import Path
 
 import zenoh
@@ -21,43 +22,60 @@ from evedrop.scenario.tables import Scenario
 from evedrop.virtual.campaign import PlayedCase, play_case
 from evedrop.virtual.cases import CaseDraw, case_with
 from evedrop.virtual.reference import in_memory
+from evedrop.wire.file import wire_of
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.scenario_network import over_wire
-from tests.virtual.wire_draws import BASE, ROBOT
+from tests.virtual.wire_draws import BASE, ROBOT, Tables
 from tests.virtual.wire_judge import fates_by_model
 
-_DRAWS = 6
+_DRAWS = 16
 _KEYS = (f"{ROBOT}/data", f"{ROBOT}/data", f"{ROBOT}/data", "other", f"{ROBOT}/**", "//", None)
 _MOST_SLOTS = 60
 _SPARING = {"withholding", "scheduled"}
 """Schemes whose sensor does not send in every slot."""
 
 
-def play_over_wire(plan: WirePlan, seed: int, keep: bool) -> tuple[PlayedCase | None, tuple[str, ...]]:
+def play_over_wire(tables: Tables, seed: int, keep: bool) -> tuple[PlayedCase | None, tuple[str, ...]]:
     """Play the first drawn scenario that can have the links of a wire, if there is one; returns the misses as well.
 
-    keep: whether to keep all events.
+    Others are only drawn: they can have them, too, or the reasons why not are told. tables: of the wire; keep: whether to keep
+    all events.
     """
     draw = random.Random(f"over a wire {seed}")  # noqa: S311 - to be repeated, not to be secret
     misses: list[str] = []
-    listeners = [name for name in plan.sides if name != ROBOT]
+    played: PlayedCase | None = None
     for _ in range(_DRAWS):
+        plan = wire_of(_eased(tables) if draw.random() < 0.7 else tables)
+        listeners = [name for name in plan.sides if name != ROBOT]
         scenario, key = _drawn(draw), draw.choice(_KEYS)
         sides = {SENSOR: ROBOT, LEGITIMATE: BASE, **{name: draw.choice(listeners) for name in scenario.eavesdroppers}}
         if draw.random() < 0.1:
             sides["nobody"] = ROBOT
+        if draw.random() < 0.1:
+            del sides[SENSOR]
         try:
             over = checked(scenario.as_tables(), "wire", over_wire(scenario, plan, key, sides))
         except UsageError as error:
             if not isinstance(error, ScenarioError):
                 misses += [line for line in str(error).splitlines() if not line.startswith("--wire: ")]
             continue
+        if played is not None:
+            continue
         with tempfile.TemporaryDirectory() as folder:
             reference = in_memory(over, Path(folder))
             misses += _wrong_packets(plan, over, str(key), Results.read(folder))
             played = play_case(case_with(over, seed), program, keep, reference)
-        return played, (*misses, *played.misses)
-    return None, tuple(misses)
+    return played, (*misses, *(() if played is None else played.misses))
+
+
+def _eased(tables: Tables) -> Tables:
+    """The wire without what no scenario can have."""
+    eased = deepcopy(tables)
+    for link in eased["link"]:
+        for entry in ("rate", "queue", "ordered"):
+            link.pop(entry, None)
+    eased["event"] = [event for event in eased.get("event", ()) if "rate" not in event.get("set", {})]
+    return eased
 
 
 def _drawn(draw: random.Random) -> Scenario:
