@@ -18,6 +18,8 @@ from evedrop.wire.send_queue import SendQueue
 from evedrop.wire.side import SideSession
 from evedrop.wire.watchdog import Watchdog
 
+FEW_KEYS = "few keys"
+"""And few senders."""
 FULL, HUNG = "short queues", "Zenoh hangs"
 """Connections are full soon; a question that the wire puts to Zenoh may have no end."""
 
@@ -30,11 +32,11 @@ def _perhaps_hang(side: SideSession) -> None:
 
 
 _CONSTANTS: dict[str, tuple[tuple[Any, str, Any], ...]] = {
-    "few keys": (
+    FEW_KEYS: (
         (journal, "MOST_KEYS", 6),
         (publications, "MOST_PUBLISHERS", 1),
         (publications, "OFTEN", 5),
-        (ros2, "MOST_SENDERS", 2),
+        (ros2, "MOST_SENDERS", 1),
     ),
     "few keys at a time": (
         (publications, "READY_KEYS", 3),

@@ -6,6 +6,8 @@ import random
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,6 +17,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import toml_text
 from evedrop.virtual.cases import case_of
 from evedrop.virtual.faults import CutConnection, CutPower, FillDisk, KillProcess, StopProcess
+from evedrop.virtual.run import SimulatedRun
 from evedrop.wire.file import wire_of
 from evedrop.wire.liveliness import LivelinessRelay
 from evedrop.wire.publications import _Way
@@ -40,9 +43,9 @@ from tests.virtual.wire_commands import (
 )
 from tests.virtual.wire_damage import DAMAGES, Damage
 from tests.virtual.wire_draws import BASE, ENDPOINTS, FIELD, ROBOT, SIDES, file_of
-from tests.virtual.wire_judge import DISK
+from tests.virtual.wire_judge import DISK, WireJudge
 from tests.virtual.wire_mistakes import MISTAKES, TRIALS
-from tests.virtual.wire_programs import WireProgram
+from tests.virtual.wire_programs import Course, WireProgram
 
 PLAIN = SimulatedWireCase(1, (), starts=2, seconds=10.0)
 NUMBERED, TALLIED, MESSAGE, COUNTED = RunningLink._counted, LinkTally.add, _Way.message, StepCounter.add
@@ -187,7 +190,7 @@ def test_a_program_opens_the_wire_and_uses_it(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.campaign
 def test_a_scenario_has_the_links_of_a_wire(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its packets have the fates of the wire's messages; those of a wire with another seed are seen."""
-    radio = {"from": ROBOT, "to": BASE, "quality": 0.5}
+    radio = {"name": "radio", "from": ROBOT, "to": BASE, "quality": 0.5}
     file = toml_text({"seed": 7, "side": {ROBOT: {}, BASE: {}}, "link": [radio]})
     cases = [SimulatedWireCase(seed, (), file=file, further=(SCENARIO,)) for seed in range(1, 7)]
     assert not any(case.play().misses for case in cases)
@@ -197,7 +200,7 @@ def test_a_scenario_has_the_links_of_a_wire(monkeypatch: pytest.MonkeyPatch) -> 
         return {**made, "wire": {**made["wire"], "seed": 1}}
 
     monkeypatch.setattr(wire_scenarios, "over_wire", other_seed)
-    miss = "legitimate does not get the packets that the link robot-base lets through"
+    miss = "legitimate does not get the packets that the link radio lets through"
     assert any(miss in case.play().misses for case in cases)
 
 
@@ -214,6 +217,16 @@ def test_a_wire_says_what_happens_to_it(what: str, words: str) -> None:
     played = replace(PLAIN, starts=1, further=(what,)).play()
     assert played.misses == ()
     assert words in played.run.said
+
+
+@pytest.mark.campaign
+def test_an_opener_without_power_has_not_read_all_errors() -> None:
+    """The wire ended before, and said why; what a wire itself prints is complete."""
+    process: Any = SimpleNamespace(task=SimpleNamespace(status=1), printed="evedrop: warning: no link leads back")
+    for further, misses in (((OPENED,), 0), ((), 1)):
+        case, run = replace(PLAIN, further=further), SimulatedRun(Path())
+        judge = WireJudge(case, wire_of(case.tables), Course(), run, {CutPower(DISK, 0): 1.0})
+        assert len([*judge._of_status(process)]) == misses
 
 
 @pytest.mark.campaign

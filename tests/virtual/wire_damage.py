@@ -16,21 +16,24 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import zenoh
 
 from evedrop.cli.simulated import program
 from evedrop.errors import UsageError
 from evedrop.scenario.words import toml_text
+from evedrop.system.world import world
 from evedrop.virtual.run import SimulatedWorld
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import JOURNAL_FOLDER, UNFINISHED, locked
 from evedrop.wire.records import RECORD, STORED
-from tests.virtual.wire_draws import ENDPOINTS, Tables
+from tests.virtual.wire_draws import BASE, ENDPOINTS, Tables
 
 Entry = dict[str, Any]
 _EACH = 4
 """How many damages are tried of a wire."""
 _SECONDS = 60.0
 """In which a command ends."""
+_ELSEWHERE = {side: endpoint.replace(":175", ":177") for side, endpoint in ENDPOINTS.items()}
 _HISTORY = "history.jsonl"
 
 
@@ -83,6 +86,13 @@ def _wrong_record(journal: Path) -> None:
     (journal / UNFINISHED / f"{start:03d}-9999.rows").write_bytes(records.tobytes())
 
 
+def _occupied(journal: Path) -> object:
+    """A damage: another program listens where a side is to listen."""
+    del journal
+    settings = {"mode": "router", "listen": {"endpoints": [_ELSEWHERE[BASE]]}}
+    return world().zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+
+
 class Damage(NamedTuple):
     """A damage, and what a start of the wire says of it: nothing if it goes on."""
 
@@ -109,8 +119,9 @@ DAMAGES: dict[str, Damage] = {
     "files without links": Damage(_without("link"), None),
     "a wrong record": Damage(_wrong_record, "is not one of this wire"),
     "a folder in use": Damage(locked, "another wire writes to"),
+    "an endpoint in use": Damage(_occupied, "end the program that listens there already"),
 }
-"""What may happen to the folder `journal`."""
+"""What may happen to the folder `journal`, or to what else a start needs."""
 
 
 def tried_damages(simulated: SimulatedWorld, folder: Path, tables: Tables, seed: int) -> Iterator[str]:
@@ -121,7 +132,7 @@ def tried_damages(simulated: SimulatedWorld, folder: Path, tables: Tables, seed:
     if not (folder / JOURNAL_FOLDER / _HISTORY).is_file():
         return
     copy, file, scheduler = folder.parent / "damaged", folder.parent / "damaged.toml", simulated.scheduler
-    sides = {name: {"listen": ENDPOINTS[name].replace(":175", ":177")} for name in tables["side"]}
+    sides = {name: {"listen": _ELSEWHERE[name]} for name in tables["side"]}
     file.write_text(toml_text({**tables, "side": sides}), "utf-8")
     start = WireHistory.read(folder / JOURNAL_FOLDER).start
     parts = [pq.read_table(path)["n"] for path in folder.rglob(f"{start:03d}-*.parquet")]

@@ -82,7 +82,7 @@ def _side(draw: random.Random, name: str) -> Tables:
     if draw.random() < 0.1:
         made["users"] = dict(USER)
     if draw.random() < 0.1:
-        made["keys"] = [*_PUBLISHED, "ask/**", "alive/**", *(["*/data"] if draw.random() < 0.5 else [])]
+        made["keys"] = [*(["*/data"] if draw.random() < 0.5 else []), *_PUBLISHED, "ask/**", "alive/**"]
     if draw.random() < 0.1:
         made["peers"] = True
     return made
@@ -211,6 +211,7 @@ def drawn_operations(draw: random.Random, tables: Tables, seconds: float) -> tup
         "status",
         f"link {link} cut",
         f"link {link} heal",
+        "link nothing heal",
         f"link {link} duplicate=0.5",
         f"link {link} qualty=0.5",
         f"partition {first} {second}",

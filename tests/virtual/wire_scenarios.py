@@ -69,12 +69,17 @@ def play_over_wire(tables: Tables, seed: int, keep: bool) -> tuple[PlayedCase | 
 
 
 def _eased(tables: Tables) -> Tables:
-    """The wire without what no scenario can have."""
+    """The wire without what no scenario can have, and with more events."""
     eased = deepcopy(tables)
     for link in eased["link"]:
         for entry in ("rate", "queue", "ordered"):
             link.pop(entry, None)
     eased["event"] = [event for event in eased.get("event", ()) if "rate" not in event.get("set", {})]
+    link, other = eased["link"][0], eased["link"][-1]
+    eased["event"] += [
+        *({"at": at, "link": link["name"], "set": {"corrupt": corrupt}} for at, corrupt in ((0.3, 0.2), (0.6, 0.4))),
+        {"from": 0.7, "to": 0.8, "cut": other["name"]},
+    ]
     return eased
 
 
