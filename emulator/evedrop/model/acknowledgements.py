@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from evedrop.model.checks import expect_slots
 from evedrop.model.receiver import Codes, Flags
 from evedrop.model.streams import Ahead, Batch, BlockReader
+from evedrop.system.fields import Probability
 
 Attack = Callable[[Flags, Flags, Flags], Flags]
 """(γ of the legitimate estimator, γᵉ of the jammer, whether the attacker flips) → the acknowledgements on the air, all (R,)."""
@@ -139,14 +140,14 @@ def heed_rule_of(attack: str, quality: float, overheard: float) -> HeedRule | No
 class AckChannelSpec:
     """The acknowledgement channel as the router needs to know it."""
 
-    quality: float
+    quality: Probability
     attack: str
     jammer: str | None
     spans: Sequence[tuple[int, int]] | None
     """Slots [from, to) in which the attack is on; None: in all slots."""
-    flip: float = 0.0
+    flip: Probability = 0.0
     """The probability of a flip, for the attack `flip`."""
-    overheard: float = 1.0
+    overheard: Probability = 1.0
     """The probability that the jammer hears a packet, for the attack `hijack`."""
 
     def __post_init__(self) -> None:

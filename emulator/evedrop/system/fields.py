@@ -12,3 +12,4 @@ Finite = Annotated[float, Meta(ge=-1e308, le=1e308)]
 """A finite number: NaN is in no range."""
 NotNegative = Annotated[float, Meta(ge=0.0, le=1e308)]
 """The same, 0 or more."""
+Probability = Annotated[float, Meta(ge=0.0, le=1.0)]

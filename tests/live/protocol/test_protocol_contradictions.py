@@ -166,6 +166,7 @@ def no_covariance(brief: dict[str, Any]) -> None:
 
 UNUSABLE: dict[str, list[tuple[Callable[[dict[str, Any]], None], str]]] = {
     "noise-before/bayesian": [
+        (set_in("first", 1), "first is 1, where no outage of bayesian ends"),
         (one_state, "part.noise_covariance cannot be used (ValueError: it does not have 2 states"),
         (no_covariance, "part.noise_covariance cannot be used (ValueError: not positive definite)"),
     ],
@@ -175,9 +176,15 @@ UNUSABLE: dict[str, list[tuple[Callable[[dict[str, Any]], None], str]]] = {
     ],
     "acknowledged/router": [
         (set_in("part.acknowledgements.spans", [[-1, 3]]), "-1 is not a slot, expected a number from 0 to"),
+        *(
+            (set_in(f"part.acknowledgements.{name}", -1), "Expected `float` >= 0.0")
+            for name in ("quality", "flip", "overheard")
+        ),
         (set_in("part.acknowledgements.attack", "smile"), "part.acknowledgements.attack is smile"),
         (set_in("part.links.legitimate.window", 10**9), "its window is above 100000000 slots"),
         (set_in("part.links.legitimate.settings", {}), "or its settings have no loss"),
+        (set_in("part.links.legitimate.settings.loss.quality", "x"), 'quality is "x"'),
+        (set_in("part.links.legitimate.settings.delay", {"model": "constant", "value": -1.0}), "value is -1.0"),
         *(
             (set_in(f"part.links.legitimate.settings.{name}", "x"), f"{name} is 'x', expected a number of at least 0")
             for name in ("reorder", "duplicate", "corrupt", "rate", "queue")

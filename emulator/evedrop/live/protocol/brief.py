@@ -41,7 +41,7 @@ from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import Link, LinkSchedule, streams_of
 from evedrop.model.streams import KEY_BYTES, MOST_SLOTS, Batch
 from evedrop.names import ACKNOWLEDGEMENTS
-from evedrop.system.fields import Finite, NotNegative, Slot
+from evedrop.system.fields import Finite, NotNegative, Probability, Slot
 from evedrop.system.files import Unreadable, opened, why_of
 from evedrop.system.world import world
 
@@ -282,7 +282,8 @@ class LegitimatePart:
     """The file in which it keeps its state."""
 
     def expect_usable(self, brief: AnyBrief) -> None:
-        """Make the scheme, and look for the keys of its streams."""
+        """Make the scheme, and look for the keys of its streams, and the absence before a restart."""
+        _expect_return(brief, self.outages)
         brief.expect_keys(_scheme(brief, self.scheme).estimator_streams)
         if self.controller is not None and self.controller.plant is not None:
             _expect_plant(brief, "part.controller.plant", self.controller.plant)
@@ -312,7 +313,8 @@ class EavesdropperPart:
         return None if self.noise_covariance is None else NoiseDistribution(self.noise_covariance)
 
     def expect_usable(self, brief: AnyBrief) -> None:
-        """Look for the class, its parameters and the keys of its streams, and make the distribution of noise."""
+        """Look for the class, its parameters, the keys of its streams and the absence before a restart; make the noise."""
+        _expect_return(brief, self.outages)
         kind, n, noise = STRATEGIES[self.strategy], brief.model.process.n, self.noise_distribution
         lacking = sorted(set(kind.parameters) - set(self.parameters))
         if lacking:
@@ -387,6 +389,12 @@ PARTS: Mapping[str, type[Part]] = {
     for kind in (RouterPart, RelayPart, SensorPart, LegitimatePart, EavesdropperPart, ControllerPart, RecorderPart)
 }
 """Role → its part."""
+
+
+def _expect_return(brief: AnyBrief, outages: Sequence[Outage]) -> None:
+    """Raise BriefError unless a receiver begins with the run, or with the slot after an outage."""
+    if brief.first and all(stop != brief.first for _, stop, _ in outages):
+        raise BriefError(f"first is {brief.first}, where no outage of {brief.process} ends; {WRITE_AGAIN}")
 
 
 def _scheme(brief: AnyBrief, spec: Mapping[str, Any]) -> Scheme:
@@ -470,13 +478,13 @@ class Model:
     A: list[list[Finite]]
     Q: list[list[Finite]]
     initial_covariance: list[list[Finite]]
-    state_probability: Annotated[float, Meta(ge=0.0, le=1.0)]
+    state_probability: Probability
     """μ_d; its mean over the slots if it differs from slot to slot."""
     header: Annotated[int, Meta(ge=0, le=64)] = 0
     """How many unencrypted numbers a packet has in addition to its payload."""
     singular_noise: bool = False
     """Whether Q may be singular."""
-    state_probabilities: tuple[Annotated[float, Meta(ge=0.0, le=1.0)], ...] | None = None
+    state_probabilities: tuple[Probability, ...] | None = None
     """μ_d(k) for every slot; None if it is the same in all slots."""
 
     def __post_init__(self) -> None:

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.checks import LAST_SLOT, expect_slots
-from evedrop.model.delays import delay_of
+from evedrop.model.delays import DELAY_MODELS, DelayModel, delay_of
 from evedrop.model.kernels.current import kernels
-from evedrop.model.links import loss_of
+from evedrop.model.links import LOSS_MODELS, loss_of, single_specs
 from evedrop.model.links.loss_model import REASONS, Fate, LossModel
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
@@ -111,6 +111,8 @@ class LinkSchedule:
         expect_slots(self.window, *(change.at for change in self.changes), *outages)
         if self.window > MOST_SLOTS or not isinstance(self.settings.get("loss"), Mapping):
             raise ValueError(f"its window is above {MOST_SLOTS} slots, or its settings have no loss")
+        for spec in single_specs(self.settings["loss"]):
+            _expect_right(LOSS_MODELS[spec["model"]], spec)
         for name in _NUMBERS & self.settings.keys():
             value = self.settings[name]
             if not isinstance(value, (int, float)) or not 0.0 <= value < math.inf:
@@ -118,7 +120,15 @@ class LinkSchedule:
         if self.settings.get("rate") and "queue" not in self.settings:
             raise ValueError("it has a rate, and no queue")
         if (delay := self.settings.get("delay")) is not None:
-            delay_of(delay)
+            _expect_right(DELAY_MODELS[delay["model"]], delay)
+
+
+def _expect_right(kind: type[LossModel | DelayModel], spec: Mapping[str, Any]) -> None:
+    """Raise ValueError for a mistake in the parameters of a model, which must be all that it has."""
+    given = {name: value for name, value in spec.items() if name != "model"}
+    for entry, problem in kind.mistakes(given):
+        raise ValueError(f"{entry} {problem}")
+    kind(**given)
 
 
 def streams_of(receiver: str, schedule: LinkSchedule) -> tuple[str, ...]:
