@@ -213,7 +213,7 @@ def test_a_recorder_that_never_asks_again_is_shown_by_one_cut(monkeypatch: pytes
     )
     monkeypatch.setattr(Recovery, "_round", lambda *_: None)
     failing, misses = next((cut, found) for cut in cuts if (found := misses_of(cut)))
-    shrunk = shrink(failing, misses, misses_of, most=12)
+    shrunk = shrink(failing, misses, misses_of, most=20)
     assert [fault.kind for fault in shrunk.case.faults] == ["cut"]
     assert list(shrunk.case.scenario.eavesdroppers) == ["eve1"]
     monkeypatch.undo()

@@ -194,6 +194,8 @@ def _without_tables(case: SimulatedCase) -> Iterator[SimulatedCase]:
         ("expect",),
         ("nemesis",),
         ("event",),
+        ("integrity", "event"),
+        ("comfort",),
         ("shards",),
         ("network",),
         ("controller", "plant"),
@@ -331,7 +333,8 @@ def _fit(tables: Tables) -> None:
     events = [
         event | ({"to": min(event["to"], tables["slots"])} if "to" in event else {})
         for event in tables.pop("event", [])
-        if event.get("from", event.get("at")) < tables["slots"] and not names.isdisjoint(map(str, event.values()))
+        if event.get("from", event.get("at")) < tables["slots"]
+        and ("spoof" in event or not names.isdisjoint(map(str, event.values())))
     ]
     if events:
         tables["event"] = events
@@ -342,5 +345,9 @@ def _fit(tables: Tables) -> None:
         tables["process"]["state_values"] = tables["process"]["state_values"][: tables["slots"]]
     if "controller" not in tables:
         tables[LEGITIMATE].pop("knows_input", None)
+        for name in ("integrity", "comfort"):
+            tables.pop(name, None)
+    if not any("spoof" in event for event in events):
+        tables.get("integrity", {}).pop("attack", None)
     if tables.get("shards", 1) > tables["trials"]:
         del tables["shards"]
