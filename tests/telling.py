@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, NoReturn
 from evedrop import __main__ as command
 from evedrop.cli.console import ProgressLine
 from evedrop.fork_server import serve
-from evedrop.live.launch import starter
 from evedrop.scenario.progress_events import Held
+from evedrop.system import fork_channels
 
 if TYPE_CHECKING:
     from evedrop.scenario.progress_events import ProgressEvent
@@ -112,5 +112,5 @@ program = command.program
 if __name__ == "__main__":
     limited_program()
 else:
-    starter.start_servers = forked_servers
+    fork_channels.start_servers = forked_servers
     command.program = program_with_path

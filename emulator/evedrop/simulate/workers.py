@@ -27,9 +27,10 @@ from evedrop.model.registry import place_of
 from evedrop.scenario.dry_run import foreign
 from evedrop.simulate.tasks import OnProgress, R, Result, Stopped, Task
 from evedrop.system.environment import SINGLE_THREADED, own_environment
+from evedrop.system.killable import KILLED_SECONDS
 from evedrop.system.lacks import lack_of
 from evedrop.system.parents import continue_when_parent_dies
-from evedrop.system.processes import KILLED_SECONDS, SUSPENDED_SECONDS, SuspensionWatch, kill
+from evedrop.system.processes import SUSPENDED_SECONDS, SuspensionWatch, kill
 from evedrop.system.signals import SIGNALS
 
 _POLL_SECONDS = 0.1

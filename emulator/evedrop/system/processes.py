@@ -4,25 +4,14 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Collection
-from typing import Protocol, TypeVar, final
+from typing import TypeVar, final
 
+from evedrop.system.killable import KILLED_SECONDS, KillableProcess
 from evedrop.system.world import world
 
-KILLED_SECONDS = 10.0
-"""How long to wait for a killed process: the next turn of a busy processor ends it, unless it hangs in the system itself."""
 SUSPENDED_SECONDS = 60.0
 """How long a process that others wait for may be suspended."""
 _POLL_SECONDS = 1.0
-
-
-class KillableProcess(Protocol):
-    """The part of `subprocess.Popen` that is used here."""
-
-    def kill(self) -> None:
-        """End it."""
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end; returns its exit status. Raises subprocess.TimeoutExpired."""
 
 
 P = TypeVar("P", bound=KillableProcess)

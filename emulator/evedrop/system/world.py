@@ -15,8 +15,8 @@ import tempfile
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, TYPE_CHECKING, Any, TypeVar, final
@@ -27,6 +27,9 @@ from evedrop.system.threads import Condition, Lock, Queue, Thread, ThreadEvent
 
 if TYPE_CHECKING:
     import ssl
+
+    from evedrop.system.fork_channels import ForkChannel
+    from evedrop.system.ssh_client import SshClient
 
 T = TypeVar("T")
 Address = tuple[str, int] | Path
@@ -94,6 +97,19 @@ class World(ABC):
     @abstractmethod
     def pipe(self) -> tuple[IO[bytes], IO[bytes]]:
         """The two ends of a pipe, which other processes can inherit: to read from, and to write to. Raises OSError."""
+
+    @property
+    @abstractmethod
+    def forks(self) -> bool:
+        """Whether there can be fork servers: not outside Linux, or where a sandbox forbids them."""
+
+    @abstractmethod
+    def fork_channels(self, modules: Sequence[Sequence[str]]) -> AbstractContextManager[Sequence[ForkChannel]]:
+        """Channels with fork servers, each of which imports these modules and those of the servers before it. Raises OSError."""
+
+    @abstractmethod
+    def ssh(self, command: Sequence[str]) -> SshClient:
+        """Start ssh with a command. Raises OSError."""
 
     @abstractmethod
     def temporary_folder(self) -> Path:
@@ -188,6 +204,27 @@ class RealWorld(World):
         """A pipe of the system."""
         read, write = os.pipe()
         return os.fdopen(read, "rb", buffering=0), os.fdopen(write, "wb")
+
+    @property
+    def forks(self) -> bool:
+        """Whether the system can refer to processes."""
+        try:
+            os.close(os.pidfd_open(os.getpid()))
+        except (AttributeError, OSError):
+            return False
+        return True
+
+    def fork_channels(self, modules: Sequence[Sequence[str]]) -> AbstractContextManager[Sequence[ForkChannel]]:
+        """Channels with processes of the system."""
+        from evedrop.system.fork_channels import fork_channels  # noqa: PLC0415 - most commands start no process
+
+        return fork_channels(modules)
+
+    def ssh(self, command: Sequence[str]) -> SshClient:
+        """The system's ssh."""
+        from evedrop.system.ssh_client import SystemSsh  # noqa: PLC0415 - not needed on one machine
+
+        return SystemSsh(command)
 
     def temporary_folder(self) -> Path:
         """That of the environment."""

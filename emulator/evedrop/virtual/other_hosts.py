@@ -9,18 +9,17 @@ import re
 import signal
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from pathlib import Path
 from queue import Empty
 from typing import IO, cast, final
 
 from evedrop.live.launch.other_hosts import SILENCE_SECONDS, Greeting, line_of, serve_launcher
-from evedrop.live.launch.ssh_client import SshClient
-from evedrop.live.launch.starter import Starter
+from evedrop.system.ssh_client import SshClient
 from evedrop.system.waiting import Alarm
 from evedrop.virtual.disk import VirtualDisk
 from evedrop.virtual.endings import status_of
-from evedrop.virtual.host_parts import HOST_FORK_SERVER, PROGRAM, SESSION, SSH, part_on
+from evedrop.virtual.host_parts import PROGRAM, SESSION, SSH, part_on
 from evedrop.virtual.pipes import Pipe, PipeFile
 from evedrop.virtual.processes import VirtualMachine, VirtualProcess
 from evedrop.virtual.scheduler import VirtualQueue, VirtualScheduler
@@ -194,13 +193,10 @@ class OtherHost:
                 process.send_event(b"Welcome %d\n" % number)
 
         def serve() -> int:
-            serve_launcher(self._starter)
+            serve_launcher()
             return 0
 
         return status_of(serve)
-
-    def _starter(self) -> AbstractContextManager[Starter]:
-        return self._machine.starter(names=[part_on(HOST_FORK_SERVER, self.name)])
 
 
 NOISE: Mapping[str, int] = {"a chatty shell": 5, "a shell that only talks": 300}

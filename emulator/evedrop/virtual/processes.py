@@ -13,12 +13,12 @@ import signal
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from queue import Empty
 from typing import IO, BinaryIO, NoReturn, cast, final
 
-from evedrop.live.launch.starter import ForkServer, PreloadedStarter, ProcessHandle, StandardFiles, Starter
+from evedrop.system.fork_channels import ProcessHandle, StandardFiles
 from evedrop.system.signals import AGAIN_SECONDS, INTERRUPTED
 from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import ThreadEvent
@@ -410,17 +410,6 @@ class VirtualMachine:
 
         scheduler.thread("main", run, process.task).start()
         return process
-
-    @contextmanager
-    def starter(self, stop: ThreadEvent | None = None, names: Sequence[str] = FORK_SERVERS) -> Iterator[Starter]:
-        """Starts processes by fork servers, as on a real machine: the last one starts recorders, the first one all others."""
-        with ExitStack() as stack:
-            servers = []
-            for name in names:
-                server = ForkServer(VirtualForkServer(self, name))
-                stack.callback(server.close)
-                servers.append(server)
-            yield PreloadedStarter(servers, stop)
 
 
 @final

@@ -118,6 +118,7 @@ class SimulatedWorld:
     def add_hosts(self, root: Path, oddities: Mapping[str, str]) -> OtherHosts:
         """Add other hosts; root, oddities: as for `OtherHosts`."""
         self.hosts = OtherHosts(self.machine, self.zenoh, self.world.disks, root, oddities)
+        self.world.client = self.hosts.ssh
         return self.hosts
 
     def process(self, name: str) -> VirtualProcess | None:
@@ -161,8 +162,6 @@ def run_in(
             lambda event: run.told.append((scheduler.now, event)),
             given.get(RELAY),
             hosts=None if hosts_file is None else load_hosts(hosts_file, scenario),
-            starters=world.machine.starter,
-            ssh=None if world.hosts is None else world.hosts.ssh,
             ahead=ahead,
         ).status
 

@@ -8,17 +8,21 @@ from __future__ import annotations
 import socket
 import ssl
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import IO, Any, cast, final
 
 from evedrop.system.disk import Disk
+from evedrop.system.fork_channels import ForkChannel
+from evedrop.system.ssh_client import SshClient
 from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import Condition, Lock, Queue, Thread, ThreadEvent
 from evedrop.system.world import Address, World
 from evedrop.virtual.disk import VirtualDisk
+from evedrop.virtual.host_parts import HOST_FORK_SERVER, part_on
 from evedrop.virtual.pipes import Pipe, PipeFile
-from evedrop.virtual.processes import VirtualMachine
+from evedrop.virtual.processes import FORK_SERVERS, VirtualForkServer, VirtualMachine
 from evedrop.virtual.scheduler import (
     VirtualCondition,
     VirtualEvent,
@@ -40,6 +44,8 @@ class VirtualWorld(World):
     def __init__(self, scheduler: VirtualScheduler, machine: VirtualMachine, zenoh: Any, disk: Disk) -> None:
         self.scheduler, self.machine, self._disk = scheduler, machine, disk
         self._zenoh = zenoh
+        self.client: Callable[[Sequence[str]], SshClient] | None = None
+        """Starts ssh, if there are other hosts."""
         self.disks: dict[str, VirtualDisk] = {}
         """Other host → its disk."""
 
@@ -107,6 +113,22 @@ class VirtualWorld(World):
         """A pipe between simulated processes."""
         pipe = Pipe(self.scheduler)
         return cast("IO[bytes]", PipeFile(pipe)), cast("IO[bytes]", pipe.end())
+
+    @property
+    def forks(self) -> bool:
+        """There always can."""
+        return True
+
+    def fork_channels(self, modules: Sequence[Sequence[str]]) -> AbstractContextManager[Sequence[ForkChannel]]:
+        """Channels with simulated fork servers on the machine of the current process."""
+        host = self.machine.current.task.host
+        names = [part_on(HOST_FORK_SERVER, host)] if host else FORK_SERVERS
+        return nullcontext([VirtualForkServer(self.machine, name) for name in names[: len(modules)]])
+
+    def ssh(self, command: Sequence[str]) -> SshClient:
+        """A simulated ssh, which the other hosts have."""
+        assert self.client is not None  # noqa: S101 - only a run with other hosts asks
+        return self.client(command)
 
     def temporary_folder(self) -> Path:
         """That of the machine of the current process."""

@@ -27,8 +27,9 @@ from evedrop.results.folder import claimed, default_folder, write_private
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
 from evedrop.scenario.words import listed
 from evedrop.show.report.wire import expectation_failures, wire_faults
+from evedrop.system.killable import KillableProcess
 from evedrop.system.native_log import MARK
-from evedrop.system.processes import KillableProcess, kill, wait_for
+from evedrop.system.processes import kill, wait_for
 from evedrop.system.world import world
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.journal import journal_tables

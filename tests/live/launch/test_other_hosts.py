@@ -30,11 +30,11 @@ from evedrop.live.launch.other_hosts import (
     order_in,
     own_version,
 )
-from evedrop.live.launch.ssh_client import SystemSsh
 from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST
 from evedrop.live.protocol.brief import brief_from
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 from evedrop.system.environment import own_environment
+from evedrop.system.ssh_client import SystemSsh
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import brief_of_eve
 

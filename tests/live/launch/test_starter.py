@@ -9,7 +9,8 @@ from io import BytesIO
 import pytest
 
 from evedrop.live.launch.starter import GRACE_SECONDS, ReportedProcess, end_all
-from evedrop.system.processes import KILLED_SECONDS, kill, wait_for
+from evedrop.system.killable import KILLED_SECONDS
+from evedrop.system.processes import kill, wait_for
 from evedrop.system.signals import SHOW_STACKS
 
 

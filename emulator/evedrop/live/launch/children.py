@@ -71,8 +71,6 @@ class ProcessExit:
             return "was interrupted by a signal"
         if self.status == CONNECTION_LOST:
             return "was lost with its host"
-        if self.status == FORK_SERVER_LOST:
-            return "was ended with its fork server"
         return f"ended with status {self.status}" if self.status else "left before the run ended"
 
 
@@ -215,10 +213,10 @@ class Children:
 
     def _confirm(self, request: ProcessRequest) -> None:
         recorder = self._processes[RECORDER].stdin
-        if recorder is not None:
-            with contextlib.suppress(OSError):
-                recorder.write(b"%d\n" % request.number)
-                recorder.flush()
+        assert recorder is not None  # noqa: S101 - it is never on another host
+        with contextlib.suppress(OSError):
+            recorder.write(b"%d\n" % request.number)
+            recorder.flush()
 
     def next_event(self, seconds: float) -> ProgressEvent | ProcessExit | None:
         """The next event or exit that concerns the caller, or None; waits for `seconds` at most.
@@ -254,7 +252,11 @@ class Children:
 
         Once it has begun to write the results, it may take `_FINISH_SECONDS`, as long as it sends heartbeats.
         """
-        self.terminate(RECORDER, patience)
+        recorder = self._processes[RECORDER]
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            recorder.wait(patience)
+        if recorder.poll() is None:
+            recorder.terminate()
         begun = world().monotonic()
         ending: RunEnded | None = None
         while self.silent_seconds < SILENCE_SECONDS and (
@@ -268,16 +270,6 @@ class Children:
                 on_event(event)
                 ending = event if isinstance(event, RunEnded) else ending
         return ending
-
-    def terminate(self, name: str, after: float = 0.0) -> None:
-        """Ask a child to end, unless it ends by itself within `after` seconds."""
-        process = self._processes.get(name)
-        if process is None:
-            return
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(after)
-        if process.poll() is None:
-            process.terminate()
 
     def wait_all(self) -> None:
         """Wait for all processes to leave by themselves, for `GRACE_SECONDS` at most."""

@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain, count
+from itertools import chain
 from pathlib import Path
 from typing import Any, final
 
@@ -245,11 +245,11 @@ class Gathered(ABC):
             private_replacement(table) as unfinished,
             parquet_writer(unfinished, schema) as writer,
         ):
-            for first in count(0, self.slots_at_once):
-                parts = [reader.below(first + self.slots_at_once) for reader in rows]
-                if not any(part.num_rows for part in parts):
-                    break
+            first, parts = 0, [reader.below(self.slots_at_once) for reader in rows]
+            while any(part.num_rows for part in parts):
                 writer.write_table(self._one(first, parts, schema))
+                first += self.slots_at_once
+                parts = [reader.below(first + self.slots_at_once) for reader in rows]
 
     def codes(self, table: pa.Table) -> NDArray[np.int64]:
         """The index of the receiver of every row; 0 for a table without receivers."""

@@ -6,8 +6,6 @@ It imports neither zenoh nor rerun. It alone decides how the run ended.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +23,6 @@ from evedrop.system.world import world
 
 if TYPE_CHECKING:
     from evedrop.live.launch.hosts_file import HostsPlan
-    from evedrop.live.launch.ssh_client import SshClient
     from evedrop.live.launch.starter import Starter
 
 _HOSTS_PATIENCE = 120  # seconds; some hosts take long to start Python
@@ -41,17 +38,14 @@ def launch(
     *,
     paused: bool = False,
     hosts: HostsPlan | None = None,
-    starters: Callable[[ThreadEvent], AbstractContextManager[Starter]] = process_starter,
-    ssh: Callable[[Sequence[str]], SshClient] | None = None,
     ahead: int = MOST_SLOTS_AHEAD,
 ) -> FinishedRun:
     """Run a scenario live into a results folder; `on_event` gets the recorder's events as they come.
 
     view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; by default no
     port, or free ports for two routers; paused: whether the run is held before slot 0, until the operator lets it continue;
-    hosts: the hosts of processes that are not on this machine, and the endpoints of the routers then; starters: gives what starts
-    processes; ssh: starts a client for a host, by default the system's; ahead: how many slots at most the
-    sensor may be ahead of the process that has done the fewest.
+    hosts: the hosts of processes that are not on this machine, and the endpoints of the routers then; ahead: how many
+    slots at most the sensor may be ahead of the process that has done the fewest.
 
     Raises UsageError before any process is started, RunError if the run failed, Interrupted on Ctrl-C or SIGTERM; in the
     last two cases the results so far are in the folder and no process is left.
@@ -63,9 +57,9 @@ def launch(
         say(f"the processes of the run go on, and only this command stops{pausing}; `fg` continues the command")
 
     this = world().process
-    with this.stop_on_signals() as stop, this.told_when_suspended(suspended), starters(stop) as start:
+    with this.stop_on_signals() as stop, this.told_when_suspended(suspended), process_starter(stop) as start:
         if hosts is not None:
-            return _on_hosts(scenario, folder, view, on_event, stop, start, hosts, paused, ssh, ahead)
+            return _on_hosts(scenario, folder, view, on_event, stop, start, hosts, paused, ahead)
         if scenario.shards == 1:
             endpoints = None
             if listen is not None or relay is not None or scenario.relayed:
@@ -95,19 +89,17 @@ def _on_hosts(
     here: Starter,
     hosts: HostsPlan,
     paused: bool,
-    ssh: Callable[[Sequence[str]], SshClient] | None,
     ahead: int,
 ) -> FinishedRun:
     """Run a scenario as `launch` does, with processes on other hosts."""
     # Not needed on one machine.
     from evedrop.live.launch.other_hosts import ssh_starter  # noqa: PLC0415
-    from evedrop.live.launch.ssh_client import SystemSsh  # noqa: PLC0415
 
     if scenario.shards > 1:
         raise UsageError(
             f"--hosts: the scenario has {scenario.shards} shards, and hosts carry one run; give --set shards=1"
         )
-    with ssh_starter(hosts, here, stop, scenario.longest_outage, ssh or SystemSsh) as start:
+    with ssh_starter(hosts, here, stop, scenario.longest_outage) as start:
         return launch_one(
             scenario,
             folder,

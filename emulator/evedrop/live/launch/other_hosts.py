@@ -17,8 +17,8 @@ import importlib.metadata
 import itertools
 import json
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Annotated, Any, final
@@ -28,7 +28,6 @@ from msgspec import Meta, Struct, convert, to_builtins
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.hosts_file import HostsPlan, HostTable
 from evedrop.live.launch.private_folder import private_folder
-from evedrop.live.launch.ssh_client import SshClient, SystemSsh
 from evedrop.live.launch.starter import (
     CONNECTION_LOST,
     FORK_SERVER_LOST,
@@ -222,12 +221,10 @@ class SshHost:
         config: Path | None,
         longest_outage: float,
         beat_seconds: float = _BEAT_SECONDS,
-        ssh: Callable[[Sequence[str]], SshClient] = SystemSsh,
     ) -> None:
         """Begin to connect. Raises UsageError if there is no ssh.
 
-        longest_outage: seconds for which a process of the run may be cut off. beat_seconds: between two heartbeats. ssh: starts
-        a client with a command.
+        longest_outage: seconds for which a process of the run may be cut off. beat_seconds: between two heartbeats.
         """
         self.name, self._table, self._beat_seconds = name, table, beat_seconds
         self._sending, self._guard = world().lock(), world().lock()
@@ -236,7 +233,7 @@ class SshHost:
         self._lack: str | None = None
         self._answered, self._lost = world().event(), world().event()
         try:
-            self._ssh = ssh(ssh_command(table, config, longest_outage))
+            self._ssh = world().ssh(ssh_command(table, config, longest_outage))
         except OSError as error:
             raise UsageError(f"ssh cannot be started ({error.strerror}); install OpenSSH's client") from error
         self._reader = world().thread(self._follow, name=f"host {name}")
@@ -412,11 +409,10 @@ def ssh_starter(
     here: Starter,
     stop: ThreadEvent,
     longest_outage: float,
-    ssh: Callable[[Sequence[str]], SshClient] = SystemSsh,
 ) -> Iterator[Starter]:
     """A starter that is connected to all of these hosts; ends all processes on them at the end of the block.
 
-    longest_outage, ssh: as for `SshHost`. Raises UsageError if a host cannot be used, Interrupted if stopped meanwhile.
+    longest_outage: as for `SshHost`. Raises UsageError if a host cannot be used, Interrupted if stopped meanwhile.
     """
     with ExitStack() as stack:
         hosts: dict[str, SshHost] = {}
@@ -430,7 +426,7 @@ def ssh_starter(
 
         stack.callback(close)
         for name, table in plan.hosts.items():
-            hosts[name] = SshHost(name, table, plan.ssh_config, longest_outage, ssh=ssh)
+            hosts[name] = SshHost(name, table, plan.ssh_config, longest_outage)
         deadline = world().monotonic() + ANSWER_SECONDS
         for host in hosts.values():
             host.wait_until_ready(deadline, stop)
@@ -440,8 +436,8 @@ def ssh_starter(
 _LAST_LINES_SECONDS = 1.0  # for the last lines of a process that has ended, whose own children may hold its log open
 
 
-def serve_launcher(starter: Callable[[], AbstractContextManager[Starter]] = preloaded_without_recorder) -> None:
-    """Carry out the launcher's orders until it closes standard input; starter: gives what starts processes.
+def serve_launcher() -> None:
+    """Carry out the launcher's orders until it closes standard input.
 
     Raises RunError for an order that is malformed; all processes are then ended.
     """
@@ -449,7 +445,7 @@ def serve_launcher(starter: Callable[[], AbstractContextManager[Starter]] = prel
     this.continue_when_parent_dies()  # if suspended, once the connection, whose process on this host is the parent, is closed
     this.keep_files_private()
     this.keep_events_apart(launched=True)
-    with this.raise_on_signals(), private_folder() as private, starter() as start:
+    with this.raise_on_signals(), private_folder() as private, preloaded_without_recorder() as start:
         host, silence = HostProcesses(private, start, this.send_event), _Silence()
         try:
             host.answer(Greeting(own_version()))
@@ -548,8 +544,7 @@ class HostProcesses:
 
     def _with_local_files(self, brief: AnyBrief) -> AnyBrief:
         """The same brief with the files of the process in the private folder of this host."""
-        if brief.last_word is not None:
-            brief = replace(brief, last_word=str(last_word_file(self._private, brief.process)))
+        brief = replace(brief, last_word=str(last_word_file(self._private, brief.process)))
         if not isinstance(brief.part, ReceiverPart) or brief.part.state_file is None:
             return brief
         state_file = str((self._private / f"{brief.process}.state").absolute())

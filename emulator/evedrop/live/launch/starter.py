@@ -14,9 +14,7 @@ import contextlib
 import errno
 import json
 import os
-import select
 import signal
-import socket
 import subprocess
 import sys
 from abc import ABC, abstractmethod
@@ -29,9 +27,12 @@ from typing import IO, Protocol, final
 
 from evedrop.errors import Interrupted
 from evedrop.names import RECORDER, RELAY, ROUTER
-from evedrop.system.environment import SINGLE_THREADED, own_environment
-from evedrop.system.processes import KILLED_SECONDS, KillableProcess, kill, wait_for
+from evedrop.system.environment import own_environment
+from evedrop.system.fork_channels import POLL_SECONDS, ForkChannel, ProcessHandle
+from evedrop.system.killable import KILLED_SECONDS, KillableProcess
+from evedrop.system.processes import kill, wait_for
 from evedrop.system.signals import SHOW_STACKS, held_back
+from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import Queue, ThreadEvent
 from evedrop.system.world import world
 
@@ -157,8 +158,6 @@ def end_all(processes: Collection[StartedProcess]) -> None:
             process.stdin.close()
 
 
-_MOST_BYTES = 4096
-_POLL_SECONDS = 0.25
 _REPORT_SECONDS = 5.0
 """For a fork server to report the end of a process: a suspended one never does. Only the launcher's own time counts."""
 _START_SECONDS = 120.0
@@ -181,169 +180,28 @@ OF_SUMMARIES = ("scipy.special",)
 """What it imports once it makes a summary, which takes an eighth of a second."""
 
 
-class ProcessHandle(Protocol):
-    """Refers to a process: once it has ended, its id may be another process's."""
-
-    @property
-    def over(self) -> bool:
-        """Whether the process has ended."""
-
-    def send_signal(self, sig: int) -> None:
-        """Send a signal to it. Raises ProcessLookupError if it has ended."""
-
-    def close(self) -> None:
-        """Refer to it no longer."""
-
-
-class StandardFiles(Protocol):
-    """The standard files of a process that is forked."""
-
-    descriptors: tuple[int, int, int]
-    """Of standard input, standard output and standard error."""
-    stdin: IO[bytes]
-    """The launcher's end of standard input."""
-    stdout: IO[bytes] | None
-    """The launcher's end of standard output, if the launcher reads it."""
-
-    def close_theirs(self) -> None:
-        """Close the ends of the process, which has its own."""
-
-
-class ForkChannel(Protocol):
-    """The launcher's end of its channel with a fork server."""
-
-    def files(self, log: IO[bytes], tells: bool) -> StandardFiles:
-        """Files for a process; tells: whether the launcher reads its standard output."""
-
-    def send(self, request: bytes, descriptors: tuple[int, int, int]) -> None:
-        """Send a request, with the standard files of the process. Raises OSError."""
-
-    def receive(self) -> tuple[bytes, list[ProcessHandle]]:
-        """The next report, with a process that it is about; empty at the end. Raises TimeoutError after a moment, OSError."""
-
-    def shut(self) -> None:
-        """End it for both sides. Raises OSError if it is closed."""
-
-    def close(self) -> None:
-        """Close this end."""
-
-
-@final
-class _Descriptor:
-    """A file descriptor that refers to a process."""
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-
-    @property
-    def over(self) -> bool:
-        """Whether the process has ended: the system says so."""
-        system = select.poll()
-        system.register(self._descriptor, select.POLLIN)
-        return bool(system.poll(0))
-
-    def send_signal(self, sig: int) -> None:
-        """Send a signal to it."""
-        signal.pidfd_send_signal(self._descriptor, sig)
-
-    def close(self) -> None:
-        """Close the descriptor."""
-        os.close(self._descriptor)
-
-
-@final
-class _Pipes:
-    """A pipe to a process, its log, and perhaps a pipe from it."""
-
-    def __init__(self, log: IO[bytes], tells: bool) -> None:
-        read_stdin, write_stdin = os.pipe()
-        self._write_stdout: int | None
-        read_stdout, self._write_stdout = os.pipe() if tells else (None, None)
-        self._read_stdin = read_stdin
-        self.stdin: IO[bytes] = os.fdopen(write_stdin, "wb")
-        self.stdout: IO[bytes] | None = None if read_stdout is None else os.fdopen(read_stdout, "rb")
-        stdout = log.fileno() if self._write_stdout is None else self._write_stdout
-        self.descriptors = (read_stdin, stdout, log.fileno())
-
-    def close_theirs(self) -> None:
-        """Close the ends of the process."""
-        os.close(self._read_stdin)
-        if self._write_stdout is not None:
-            os.close(self._write_stdout)
-
-
-@final
-class _Socket:
-    """A channel over a socket that passes file descriptors on."""
-
-    def __init__(self, ours: socket.socket) -> None:
-        ours.settimeout(_POLL_SECONDS)
-        self._ours = ours
-
-    def files(self, log: IO[bytes], tells: bool) -> StandardFiles:
-        """Pipes of the system."""
-        return _Pipes(log, tells)
-
-    def send(self, request: bytes, descriptors: tuple[int, int, int]) -> None:
-        """Send a request, with descriptors."""
-        socket.send_fds(self._ours, [request], descriptors)
-
-    def receive(self) -> tuple[bytes, list[ProcessHandle]]:
-        """The next report."""
-        report, handles, _, _ = socket.recv_fds(self._ours, _MOST_BYTES, 1)
-        return report, [_Descriptor(handle) for handle in handles]
-
-    def shut(self) -> None:
-        """End it for both sides."""
-        self._ours.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        """Close this end."""
-        self._ours.close()
-
-
 @final
 class Fork(ReportedProcess):
     """A process that a fork server has started, and whose end it reports."""
 
     def __init__(self, pid: int, handle: ProcessHandle) -> None:
         super().__init__(pid)
-        self._handle: ProcessHandle | None = handle
+        self._handle = handle
 
     def _close(self) -> None:
-        if self._handle is not None:
-            self._handle.close()
-        self._handle = None
+        self._handle.close()
 
     @property
     def over(self) -> bool:
         """Whether it has ended, reported or not: the system says so."""
         with self._lock:
-            return self._handle is None or self._handle.over
+            return self.poll() is not None or self._handle.over
 
     def send_signal(self, sig: int) -> None:
         """Send a signal to it, if it still runs."""
         with self._lock, suppress(ProcessLookupError):
-            if self._handle is not None:
+            if self.poll() is None:
                 self._handle.send_signal(sig)
-
-
-def start_servers(channels: Sequence[socket.socket], modules: Sequence[Sequence[str]]) -> KillableProcess:
-    """Start the first of some fork servers, each of which takes requests from its end of a channel. Raises OSError.
-
-    modules: what each imports in addition to those before it. Each server after the first is forked from the one before.
-    """
-    words = [[str(channel.fileno()), *names] for channel, names in zip(channels, modules, strict=True)]
-    with held_back():
-        return subprocess.Popen(
-            [sys.executable, "-P", "-m", "evedrop.fork_server", json.dumps(words)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-            env={**own_environment(), **SINGLE_THREADED},
-            pass_fds=[channel.fileno() for channel in channels],
-        )
 
 
 @final
@@ -431,7 +289,7 @@ class ForkServer:
         deadline = world().monotonic() + _START_SECONDS
         while world().monotonic() < deadline:
             with suppress(Empty):
-                return self._begun.get(timeout=_POLL_SECONDS)
+                return self._begun.get(timeout=POLL_SECONDS)
             if stop is not None and stop.is_set():
                 self._give_up()
                 raise Interrupted
@@ -457,7 +315,7 @@ class ForkServer:
                 report, handles = self._channel.receive()
             except TimeoutError:
                 # Not by the clock: this process may have been suspended, too.
-                unreported = unreported + _POLL_SECONDS if any(fork.over for fork in self._forks.values()) else 0.0
+                unreported = unreported + POLL_SECONDS if any(fork.over for fork in self._forks.values()) else 0.0
             except OSError:
                 return None
             else:
@@ -478,15 +336,8 @@ class ForkServer:
 def fork_servers(*modules: Sequence[str]) -> Iterator[tuple[ForkServer, ...]]:
     """Fork servers, each of which imports these modules and those of the servers before it. Raises OSError."""
     with ExitStack() as stack:
-        pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in modules]
-        for ours, _ in pairs:  # also if no process, or no thread, can be started
-            stack.callback(ours.close)
-        with ExitStack() as theirs:
-            for _, end in pairs:
-                theirs.enter_context(end)
-            process = start_servers([end for _, end in pairs], modules)
-        stack.callback(kill, process)  # it may be in the middle of its imports, or suspended
-        servers = tuple(ForkServer(_Socket(ours)) for ours, _ in pairs)
+        channels = stack.enter_context(world().fork_channels(modules))
+        servers = tuple(ForkServer(channel) for channel in channels)
         for server in servers:
             stack.callback(server.close)
         yield servers
@@ -515,16 +366,18 @@ class PreloadedStarter:
 @final
 @dataclass(frozen=True)
 class _Preloaded:
-    """The fork servers of a `preloaded` block, and the environment in which their interpreters were started."""
+    """The fork servers of a `preloaded` block, the environment in which their interpreters were started, and by which process."""
 
     servers: tuple[ForkServer, ...]
     starter: Starter
     environment: Mapping[str, str]
+    process: ThisProcess
 
     @property
     def usable(self) -> bool:
         """Whether the servers live, and interpreters that were started now would be no different."""
-        return all(server.alive for server in self.servers) and self.environment == _inherited()
+        same = self.process is world().process and self.environment == _inherited()
+        return same and all(server.alive for server in self.servers)
 
 
 _preloaded: list[_Preloaded] = []
@@ -569,14 +422,12 @@ def preloaded_without_recorder() -> Iterator[Starter]:
 @contextmanager
 def _waiting_servers(*modules: Sequence[str]) -> Iterator[Starter]:
     """Fork servers that import these modules, for all runs in the block. Raises OSError."""
-    try:
-        os.close(os.pidfd_open(world().process.pid))
-    except (AttributeError, OSError):  # not Linux, or a sandbox that forbids it
+    if not world().forks:
         yield start_process
         return
     with fork_servers(*modules) as servers:
         starter = PreloadedStarter(servers)
-        waiting = _Preloaded(servers, starter, _inherited())
+        waiting = _Preloaded(servers, starter, _inherited(), world().process)
         _preloaded.append(waiting)
         try:
             yield starter

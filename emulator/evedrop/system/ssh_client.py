@@ -15,8 +15,8 @@ import tempfile
 from collections.abc import Sequence
 from typing import IO, Protocol, final
 
+from evedrop.system.killable import KillableProcess
 from evedrop.system.parents import signalled_when_parent_dies
-from evedrop.system.processes import KillableProcess
 
 _MOST_SAID = 2**20
 
