@@ -32,7 +32,6 @@ EXCEPTIONS = {
     "emulator/evedrop/live/launch/compose.py write_text": "a command of its own, which starts no run",
     "emulator/evedrop/live/network/connection.py touch": "a heartbeat, which has no contents",
     "emulator/evedrop/results/folder.py rmdir": "a command removes the folder that it made if nothing is in it",
-    "emulator/evedrop/live/network/operator.py zenoh.init_log_from_env_or": "not converted yet",
     "emulator/evedrop/live/protocol/codec.py threading": "a packer for each thread; simulated ones can share it",
 }
 """File and name → why it may be used there."""

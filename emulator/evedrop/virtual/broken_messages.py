@@ -6,12 +6,13 @@ Source: docs/protocol.md, messages and envelope.
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping, Sequence
+import struct
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, final
 
 import msgpack
 
-from evedrop.names import RECORDER
+from evedrop.names import CONTROLLER, RECORDER, SENSOR
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.disturbance import ROUTERS, Disturbance, processes_of
 from evedrop.virtual.notes import key_within
@@ -21,14 +22,26 @@ if TYPE_CHECKING:
 
 _UNREAD = frozenset({"digests", "header"})
 """Fields of which no reader can say that they are wrong: it knows only how long they are."""
-_WRONG: Sequence[Any] = (None, True, -1, "x", b"", [], {}, [{}, 1], 2**63)
-_BEYOND = b"\xff\xff"
-"""The last bytes of a number that is none, and of flags of trials that are not there."""
+_SUMS = frozenset({"seconds", "trace", "trace_sums"})
+"""Fields with numbers that are never below 0."""
+_WRONG: Sequence[Any] = (None, True, -1, "x", b"", [], {}, [{}, 1], [{}] * 70_000, 2**63)
+"""What stands in place of any value; the longest list has more maps than any message."""
+_MANY = 100
+_BEYOND, _BELOW, _LARGE = b"\xff\xff", struct.pack("<d", -1.0), struct.pack("<d", 1e9)
+"""The last bytes of a number that is none, and of flags of trials that are not there; a number below 0, and a large one."""
 _CHECKED: Mapping[str, frozenset[str]] = {
-    "telemetry": frozenset({"x_hat", "P", "action", "late", "trace", "digests", "trace_sums"}),
+    "telemetry": frozenset({"x_hat", "P", "action", "late", "late_used", "digests"}),
     "journal": frozenset({"delivered", "lost", "unsent", "late"}),
 }
 """Kind of message → fields whose numbers the recorder holds against others, if it records all trials."""
+_OF_SENSOR = frozenset({"sent"})
+"""The same, of the sensor's telemetry."""
+_WANTED = ("journal", "telemetry", "telemetry")
+"""The messages to the recorder of which one is wrong, by how their keys begin."""
+_COMMON = frozenset({"k", "c", "n", "do"})
+"""What nearly all messages have: it is wrong less often than what few have."""
+_Place = tuple[Any, ...]
+"""The names, and the numbers in lists, that lead to a value in a message."""
 CONTRADICTIONS = ("but the journal says", "and what it reported of these slots", "contradicts")
 """Of which one is in what a run says that has noticed a wrong number."""
 
@@ -37,24 +50,29 @@ CONTRADICTIONS = ("but the journal says", "and what it reported of these slots",
 class BreakMessage(Disturbance):
     """A field of the next message to a process is wrong."""
 
-    kind, share = "break a message to", 9
+    kind, share = "break a message to", 14
 
     @classmethod
     def targets(cls, scenario: Scenario) -> Sequence[str]:
         """All that read messages, and rather who reads most kinds."""
-        return [*processes_of(scenario), *ROUTERS[:1], *[RECORDER] * 3]
+        return [*processes_of(scenario), *ROUTERS[:1], *[RECORDER] * 6]
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Let it be wrong."""
-        some = random.Random(self.after)  # noqa: S311 - to be repeated, not to be secret
+        some = random.Random(world.scheduler.random.getrandbits(64))  # noqa: S311 - to be repeated, not to be secret
         scenario = world.scenario
         checked = self.target == RECORDER and scenario is not None and scenario.record_trials == scenario.trials
-        return world.zenoh.change(self.target, lambda message: broken(some, message, checked=checked))
+        wanted = some.choice(_WANTED) if self.target == RECORDER else ""
+
+        def change(message: bytes) -> bytes | None:
+            return broken(some, message, checked=checked) if _unpacked(message)[0].startswith(wanted) else None
+
+        return world.zenoh.change(self.target, change)
 
     @property
     def blamed(self) -> tuple[str, ...]:
-        """The sender, which depends on the message, or the two that contradict each other."""
-        return ("broke the protocol", *CONTRADICTIONS)
+        """The sender, which depends on the message, the two that contradict each other, or who was told to leave."""
+        return ("broke the protocol", *CONTRADICTIONS, *super().blamed)
 
 
 def broken(some: random.Random, message: bytes, *, checked: bool = False) -> bytes:
@@ -62,56 +80,85 @@ def broken(some: random.Random, message: bytes, *, checked: bool = False) -> byt
 
     checked: whether its reader holds the numbers in it against others, so that they may be wrong, too.
     """
-    unpacker = msgpack.Unpacker(strict_map_key=False)
-    unpacker.feed(message)
-    key = unpacker.unpack()
-    head = bytes(message[: unpacker.tell()])
-    fields = unpacker.unpack()
-    kind, _, name = key_within(key).partition("/")
-    numbers = _CHECKED.get(kind, frozenset()) if checked and name not in {"sensor", "controller"} else frozenset()
-    if not any(value for name, value in fields.items() if name not in _UNREAD) or some.random() < 0.05:
+    key, head, fields = _unpacked(message)
+    kind, _, name = key.partition("/")
+    numbers = _CHECKED.get(kind, frozenset()) if checked and name != CONTROLLER else frozenset()
+    if name == SENSOR:
+        numbers &= _OF_SENSOR
+    places = [*_places(fields)]
+    rarer = [place for place in places if place[-1] not in _COMMON]
+    if rarer and some.random() < 0.8:
+        places = rarer
+    if not places or some.random() < 0.05:
         return head + bytes(msgpack.packb([1]))
     wrong = fields
     while wrong == fields:
-        wrong = _broken_map(some, fields, numbers)
+        wrong = _changed(some, fields, some.choice(places), numbers)
     return head + bytes(msgpack.packb(wrong))
 
 
-def _broken_map(some: random.Random, fields: Mapping[Any, Any], numbers: frozenset[str]) -> dict[Any, Any]:
-    """A map in which an entry is wrong, lacks, or is too many; numbers: the fields in which numbers may be wrong."""
-    name = some.choice([name for name, value in fields.items() if name not in _UNREAD or isinstance(value, dict)])
-    value, chance = fields[name], some.random()
-    if isinstance(value, dict) and value and chance < 0.8:
-        within = numbers | frozenset(value) if name in numbers else numbers
-        return {**fields, name: _wrong_entries(some, value, within)}
-    if isinstance(value, list) and value and chance < 0.8 and isinstance(value[0], dict):
-        return {**fields, name: [_wrong_entries(some, value[0], numbers), *value[1:]]}
-    return {**fields, name: _wrong_value(some, value, name in numbers)}
+def _unpacked(message: bytes) -> tuple[str, bytes, Any]:
+    """The key of a message within its run, its envelope, and its fields."""
+    unpacker = msgpack.Unpacker(strict_map_key=False)
+    unpacker.feed(message)
+    key, at = unpacker.unpack(), unpacker.tell()
+    return key_within(key), bytes(message[:at]), unpacker.unpack()
 
 
-def _wrong_entries(some: random.Random, value: Mapping[Any, Any], numbers: frozenset[Any]) -> dict[Any, Any]:
-    """A map within a message in which something is wrong."""
-    chance, name = some.random(), some.choice([*value])
-    if chance < 0.15:
-        return {other: entry for other, entry in value.items() if other != name}
-    if chance < 0.25:
-        return {**value, 2**40: b""}
-    if isinstance(value[name], dict) and value[name] and chance < 0.85:
-        return {**value, name: _wrong_entries(some, value[name], numbers)}
-    return {**value, name: _wrong_value(some, value[name], name in numbers)}
+def _places(value: Any) -> Iterator[_Place]:
+    """All places in a message at which something can be wrong; of a list, the first map stands for all."""
+    entries = value.items() if isinstance(value, dict) else [(0, value[0])] if _has_maps(value) else ()
+    for name, entry in entries:
+        if name not in _UNREAD or isinstance(entry, dict):
+            yield (name,)
+        for rest in _places(entry):
+            yield (name, *rest)
+    if isinstance(value, dict) and "gamma" in value:  # if nobody has received anything, there is no state
+        yield ("z",)
 
 
-def _wrong_value(some: random.Random, value: Any, numbers: bool) -> Any:
-    """Another value; numbers: whether it may be one that its type allows."""
-    if isinstance(value, bytes) and value and some.random() < 0.8:
-        if numbers and some.random() < 0.7:
-            at = some.randrange(len(value))
-            return value[:at] + bytes([value[at] ^ 1 << some.randrange(8)]) + value[at + 1 :]
-        return some.choice(
-            (value[:-1], value + b"\0", value[:-2] + _BEYOND if len(value) > 1 else b"", b"\xff" * len(value))
-        )
-    if isinstance(value, int) and not isinstance(value, bool) and some.random() < 0.5:
-        return some.choice((value + 1, value - 1, value + 1000))
-    if isinstance(value, str) and some.random() < 0.5:
-        return "x"
-    return some.choice(_WRONG)
+def _has_maps(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
+
+
+def _changed(some: random.Random, value: Any, place: _Place, numbers: frozenset[str], within: _Place = ()) -> Any:
+    """The same map or list with something wrong at a place; numbers: the fields in which numbers may be wrong."""
+    (name, *rest), copy = place, value.copy()
+    if rest:
+        copy[name] = _changed(some, value[name], tuple(rest), numbers, (*within, name))
+    elif isinstance(value, dict) and some.random() < 0.15:
+        copy.pop(name, None)
+    else:
+        before = value.get(name) if isinstance(value, dict) else value[name]
+        copy[name] = _wrong_value(some, before, {*within, name}, numbers)
+    return copy
+
+
+def _wrong_value(some: random.Random, value: Any, names: Collection[str], numbers: frozenset[str]) -> Any:
+    """Another value of the fields with these names, within each other."""
+    others = [*_WRONG]
+    if some.random() < 0.8:
+        if isinstance(value, bytes) and value:
+            others = _wrong_bytes(some, value, names, numbers)
+        elif isinstance(value, list):
+            others = [value * _MANY, [*value, "x"]]
+        elif isinstance(value, dict) and not any(isinstance(name, str) for name in value):
+            others = [{**value, 2**40: b""}]
+        elif isinstance(value, int) and not isinstance(value, bool):
+            others = [value + 1, value - 1, value + 1000, -1]
+        elif isinstance(value, str):
+            others = ["x", "end"]  # as a command, it is not due
+    return some.choice(others)
+
+
+def _wrong_bytes(some: random.Random, value: bytes, names: Collection[str], numbers: frozenset[str]) -> list[bytes]:
+    """Other bytes for those of an array."""
+    at = some.randrange(len(value))
+    if not numbers.isdisjoint(names) and some.random() < 0.7:
+        if "P" in names:  # below the diagonal, a reader notices only what is no rounding
+            return [value[: at // 8 * 8] + _LARGE + value[at // 8 * 8 + 8 :]]
+        return [value[:at] + bytes([value[at] ^ 1 << some.randrange(8)]) + value[at + 1 :]]
+    if not _SUMS.isdisjoint(names) and some.random() < 0.5:
+        return [value[:-8] + _BELOW]
+    beyond = [value[:-2] + _BEYOND if len(value) > 1 else b"", b"\xff" * len(value)]
+    return [value[:-1], value + b"\0", *(beyond if _UNREAD.isdisjoint(names) else [])]

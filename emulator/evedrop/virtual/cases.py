@@ -21,7 +21,7 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.loading import Scenario
 from evedrop.virtual import own_classes
 from evedrop.virtual.broken_messages import BreakMessage
-from evedrop.virtual.by_hand import RunByHand, WriteBriefs
+from evedrop.virtual.by_hand import WriteBriefs
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import KINDS, faults_of
 from evedrop.virtual.drawn_hosts import DrawnHosts, drawn_hosts, kind_with
@@ -29,6 +29,7 @@ from evedrop.virtual.drawn_plants import with_more
 from evedrop.virtual.faults import ShortenMessage
 from evedrop.virtual.programs import DrawnProgram, drawn_program, with_states
 from evedrop.virtual.rare_faults import RARE_KINDS, rare_faults
+from evedrop.virtual.runs_by_hand import RunByHand
 
 SEEDS_OF_A_SCENARIO = 6
 """How many seeds after each other play the same scenario: the same trials in memory are computed once for all of them."""

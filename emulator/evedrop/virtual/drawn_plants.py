@@ -1,4 +1,4 @@
-"""What a drawn scenario may have besides: an eavesdropper that learns a state, and more in a closed loop.
+"""What a drawn scenario may have besides: an eavesdropper that learns a state, an expectation, and more in a closed loop.
 
 Source: docs/integrity.md.
 """
@@ -13,6 +13,8 @@ from evedrop.errors import ScenarioError
 from evedrop.scenario.loading import Scenario
 
 _BETRAYED, _MEASURED, _DISTURBED, _COMFORTABLE = 0.05, 0.6, 0.4, 0.3
+_EXPECTED = 0.1
+"""The fraction of scenarios with an expectation."""
 _UNWATCHED = 0.2
 """The fraction of sensors that measure without a detector."""
 
@@ -22,7 +24,8 @@ def with_more(number: int, scenario: Scenario) -> Scenario:
     some = random.Random(f"plant {number}")  # noqa: S311 - to be repeated, not to be secret
     tables = deepcopy(scenario.as_tables())
     of_loop = ((_MEASURED, _measure), (_DISTURBED, _disturb), (_COMFORTABLE, _comfort))
-    for fraction, add in ((_BETRAYED, _betray), *(of_loop if scenario.controller is not None else ())):
+    added = (_BETRAYED, _betray), *(of_loop if scenario.controller is not None else ()), (_EXPECTED, _expect)
+    for fraction, add in added:
         if some.random() < fraction:
             more = deepcopy(tables)
             add(some, more)
@@ -39,6 +42,10 @@ def _betray(some: random.Random, tables: dict[str, Any]) -> None:
         kept = {entry: value for entry, value in eavesdropper.items() if entry in {"link", "window"}}
         tables["eavesdroppers"][name] = {"strategy": "replay-informed", **learns, **kept}
         return
+
+
+def _expect(some: random.Random, tables: dict[str, Any]) -> None:
+    tables["expect"] = [{"metric": "legitimate.mean_squared_error", "below": some.choice([1e-9, 1e9])}]
 
 
 def _measure(some: random.Random, tables: dict[str, Any]) -> None:

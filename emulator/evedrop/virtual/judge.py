@@ -20,7 +20,7 @@ from evedrop.results.crash_proof_tables import last_round
 from evedrop.results.reading import Results
 from evedrop.scenario.plugins import named_in
 from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
-from evedrop.virtual.broken_messages import CONTRADICTIONS
+from evedrop.virtual.broken_messages import CONTRADICTIONS, BreakMessage
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance, processes_of
 from evedrop.virtual.faults import (
@@ -95,7 +95,9 @@ def misses(
         broken += [f"{path.name} is left on {host}" for path in sorted(temporaries[host].iterdir())]
     broken += _of_logs(run)
     broken += _of_rounds(case, run, struck)
-    broken += wrong_messages(case, run.put, disturbed=bool(struck) or _wrong_program(case) is not None)
+    misled = any(isinstance(fault, BreakMessage) and fault.target == SENSOR for fault in struck)  # by a wrong number
+    if not misled:
+        broken += wrong_messages(case, run.put, disturbed=bool(struck) or _wrong_program(case) is not None)
     if not any(fault.destroys for fault in struck):
         broken += _of_files(run, struck)
         broken += _of_results(case, run, struck, reference)

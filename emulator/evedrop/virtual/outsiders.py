@@ -17,7 +17,9 @@ import zenoh
 
 from evedrop.errors import UsageError
 from evedrop.live.network.control_file import Control, read_controls
+from evedrop.live.network.operator import read_answer
 from evedrop.live.network.session import client_config
+from evedrop.live.protocol.codec import enclosed, pack, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import RECORDER
 from evedrop.scenario.tables import Scenario
@@ -167,10 +169,16 @@ class LetStrangerIn(_Outsider):
                 for key in (keys.uplink, keys.journal, keys.input, *of_processes):
                     session.put(key, here().token(1 + here().token(1)[0]))
                 session.put(keys.uplink, bytes(_LARGEST_GARBAGE))
-                answers = list(session.get(keys.control(RECORDER), payload=here().token(20)))
+                asked = keys.control(RECORDER)
+                answers = list(session.get(asked, payload=here().token(20)))
+                refusals = list(session.get(asked, payload=enclosed(asked, pack({"do": "dance"}))))
                 here().sleep(_LISTENS_SECONDS)
                 read = everything.try_recv()
         except zenoh.ZError:  # the run is over
             return
         if read is not None or any(answer.ok is None for answer in answers):
             raise AssertionError(f"the operator reads {read or answers}")
+        for refusal in refusals:
+            payload = refusal.ok and payload_of(asked, refusal.ok.payload.to_bytes())
+            if payload and not read_answer(asked, payload).refused:
+                raise AssertionError("a recorder does what nobody understands")

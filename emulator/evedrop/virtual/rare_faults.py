@@ -11,19 +11,22 @@ from typing import TYPE_CHECKING, final
 
 from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.metrics_server import MetricsAddress, RunMetrics
-from evedrop.names import RELAY, ROUTER
+from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.scenario.tables import Scenario
 from evedrop.system.world import world as here
 from evedrop.virtual.broken_messages import BreakMessage
-from evedrop.virtual.by_hand import RunByHand, WriteBriefs
+from evedrop.virtual.by_hand import WriteBriefs
 from evedrop.virtual.disturbance import LAUNCHER, Disturbance
 from evedrop.virtual.drawn_faults import events_of
-from evedrop.virtual.outsiders import OperatorCommand
+from evedrop.virtual.faults import CutConnection, RenameResults
+from evedrop.virtual.moments import COMMANDS, DECISIONS, FINAL_BELIEFS, PROGRESS_OF_RECEIVERS
+from evedrop.virtual.outsiders import ChangeLink, OperatorCommand, PauseRun
+from evedrop.virtual.runs_by_hand import RunByHand, RunWrongly
 
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld
 
-_ONE_IN = 5
+_ONE_IN = 3
 """How many runs there are for each with such a fault."""
 _ADDRESSES = {
     "127.0.0.1:0": "",
@@ -39,6 +42,10 @@ _ADDRESSES = {
 _STEERING = (("pause",), ("step", "1"), ("step", "3"), ("resume",))
 _COMMANDS, _RESUME_SECONDS = 4, 0.5
 _READINGS, _BETWEEN_SECONDS = 5, 0.1
+_NOTABLE = 0.5
+"""The fraction of wrong messages that are commands, or other rarer ones."""
+_ACCOMPANIED = 0.4
+"""The fraction of faults with another one before them, which makes what they hit less usual."""
 
 
 @final
@@ -133,8 +140,13 @@ class SteerRun(OperatorCommand):
 
 
 RARE_KINDS: Mapping[str, type[Disturbance]] = {
-    kind.kind: kind for kind in (BreakMessage, ReadMetrics, RunByHand, SteerRun, TakePort, WriteBriefs)
+    kind.kind: kind for kind in (BreakMessage, ReadMetrics, RunByHand, RunWrongly, SteerRun, TakePort, WriteBriefs)
 }
+_WITH: Mapping[type[Disturbance], Sequence[tuple[type[Disturbance], float | None]]] = {
+    BreakMessage: ((PauseRun, 0.5), (ChangeLink, None), (CutConnection, 0.3)),
+    ReadMetrics: ((PauseRun, 1.0), (RenameResults, None)),
+}
+"""Kind → those of which one may come before it, and for how long that lasts."""
 
 
 def rare_faults(seed: int, scenario: Scenario, ahead: int) -> tuple[Disturbance, ...]:
@@ -147,4 +159,19 @@ def rare_faults(seed: int, scenario: Scenario, ahead: int) -> tuple[Disturbance,
     last = events_of(scenario, ahead)
     after = int(some.uniform(1, last) if some.random() < 0.5 else max(2.0, last) ** some.random())
     seconds = round(10.0 ** some.uniform(-2.0, 1.0), 3) if kind.lasts and some.random() < 0.6 else None
-    return (kind(target, after, seconds),)
+    fault = kind(target, after, seconds)
+    if kind is BreakMessage and some.random() < _NOTABLE:
+        moment = some.choice(_notable(target, scenario))
+        fault = kind(target, some.choice((1, 1, 1, 2, 2, 3)), None, moment)
+    if kind in _WITH and some.random() < _ACCOMPANIED:
+        other, lasting = some.choice(_WITH[kind])
+        return other(some.choice(other.targets(scenario)), int(after * some.random()) + 1, lasting), fault
+    return (fault,)
+
+
+def _notable(target: str, scenario: Scenario) -> list[str]:
+    """The moments at which a message to a process is of a rarer kind."""
+    if target != RECORDER:
+        return [COMMANDS]
+    leaves = any(scenario.timeline.outages.values())
+    return [PROGRESS_OF_RECEIVERS, *[FINAL_BELIEFS] * leaves, *[DECISIONS] * (scenario.controller is not None)]

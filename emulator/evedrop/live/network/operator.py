@@ -26,6 +26,7 @@ from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import OperatorRequest, RunStatus, WireStatus, read_request
 from evedrop.names import OPERATOR, RECORDER
 from evedrop.system.fields import Slot
+from evedrop.system.world import world
 
 
 class Answer(Struct, frozen=True, omit_defaults=True):
@@ -91,7 +92,7 @@ def ask(control: Control, request: OperatorRequest, patience: float) -> Answer |
 
     Raises zenoh.ZError if the router is not there or refuses the operator.
     """
-    zenoh.init_log_from_env_or("off")
+    world().zenoh.init_log_from_env_or("off")
     key = RunKeys(control.run).control(RECORDER)
     # A run in progress has a router: one attempt is enough.
     with open_session(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
@@ -111,7 +112,7 @@ def is_there(brief: AnyBrief) -> bool:
 
     Asks with the credentials of the process itself, which may ask for no other process.
     """
-    zenoh.init_log_from_env_or("off")
+    world().zenoh.init_log_from_env_or("off")
     config = client_config(brief)
     config["connect"]["timeout_ms"] = int(_CONNECT_SECONDS * 1000)
     if isinstance(brief.part, RoutingPart):

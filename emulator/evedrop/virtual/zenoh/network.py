@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import socket
 import ssl
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -29,15 +30,20 @@ _OPEN_SECONDS = 2e-3
 _OPEN_MS, _POLL_SECONDS = 10_000, 0.05
 _SLOW = 300.0
 """By which a slow connection takes longer."""
+_UNKNOWN = "unknown"
+"""The name of a host that no host knows."""
 
 
 @final
 class _Link:
-    """A connection on which nothing is said."""
+    """A connection with a router, on which nothing is said, or with another program."""
 
-    def __init__(self, scheduler: VirtualScheduler, certificate: bytes | None) -> None:
-        """certificate: that of the router at its other end, if it has one."""
-        self._scheduler, self._certificate, self._seconds = scheduler, certificate, 0.0
+    def __init__(self, scheduler: VirtualScheduler, certificate: bytes | None, says: bytes | None = None) -> None:
+        """certificate: that of the router at its other end, if it has one.
+
+        says: what another program says there, nothing if it hangs up.
+        """
+        self._scheduler, self._certificate, self._says, self._seconds = scheduler, certificate, says, 0.0
 
     def settimeout(self, seconds: float) -> None:
         """How long to wait for something."""
@@ -45,7 +51,8 @@ class _Link:
 
     def recv(self, most: int) -> bytes:
         """A router says nothing to who says nothing."""
-        del most
+        if self._says is not None:
+            return self._says[:most]
         self._scheduler.sleep(self._seconds)
         raise TimeoutError
 
@@ -96,10 +103,10 @@ class VirtualZenoh:
         self._unplugged: dict[str, float] = {}
         """Host that is cut off from all others → until when."""
         self._confused: set[str] = set()
-        self._changes: dict[str, Callable[[bytes], bytes]] = {}
+        self._changes: dict[str, Callable[[bytes], bytes | None]] = {}
         """Process → what becomes of the next message to it."""
-        self._occupied: set[Address] = set()
-        """Addresses at which other programs listen."""
+        self._occupied: dict[Address, bytes] = {}
+        """Address at which another program listens → what that says."""
         scheduler.on_stop = self._stopped
 
     # What programs call
@@ -160,13 +167,17 @@ class VirtualZenoh:
         thread = self.scheduler.current
         assert thread is not None  # noqa: S101 - only programs dial
         self.scheduler.sleep(self.scheduler.random.expovariate(1.0 / _OPEN_SECONDS))
+        _expect_known(address)
+        if address in self._occupied:
+            return _Link(self.scheduler, None, self._occupied[address])
         router = next((router for place, router in self._routers.items() if _address(place) == address), None)
         if router is None or self._is_cut(thread.task, router.task):
             raise ConnectionRefusedError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
         return _Link(self.scheduler, router.certificate)
 
     def expect_free(self, address: Address) -> None:
-        """Raise OSError if something listens at an address."""
+        """Raise OSError if something listens at an address, or if nobody knows it."""
+        _expect_known(address)
         if address in self._occupied or any(_address(place) == address for place in self._routers):
             raise OSError(errno.EADDRINUSE, os.strerror(errno.EADDRINUSE))
 
@@ -295,8 +306,8 @@ class VirtualZenoh:
         """Whether the message that a session gets now is to arrive at the wrong subscriber."""
         return self._unmark(session, self._confused)
 
-    def change(self, process: str, change: Callable[[bytes], bytes]) -> bool:
-        """Let the next message to a process be another one when it arrives."""
+    def change(self, process: str, change: Callable[[bytes], bytes | None]) -> bool:
+        """Let the next message to a process for which `change` has another one be that one when it arrives."""
         hit = any(session.name == process for session in self._sessions)
         if hit:
             self._changes[process] = change
@@ -304,12 +315,16 @@ class VirtualZenoh:
 
     def changed(self, session: VirtualSession, message: bytes) -> bytes:
         """What arrives at a session of a message."""
-        change = self._changes.pop(session.name, None)
-        return message if change is None else change(message)
+        change = self._changes.get(session.name)
+        other = None if change is None else change(message)
+        if other is None:
+            return message
+        del self._changes[session.name]
+        return other
 
-    def occupy(self, place: str) -> None:
-        """Let another program listen at an endpoint, so that no router can."""
-        self._occupied.add(_address(place))
+    def occupy(self, place: str, says: bytes = b"") -> None:
+        """Let another program listen at an endpoint, so that no router can; it hangs up unless it says something."""
+        self._occupied[_address(place)] = says
 
     def _mark(self, process: str, marked: set[str]) -> bool:
         """Mark a process, if it has a session."""
@@ -335,3 +350,8 @@ def _address(place: str) -> Address:
         return Path(where)
     host, _, port = where.rpartition(":")
     return host, int(port)
+
+
+def _expect_known(address: Address) -> None:
+    if isinstance(address, tuple) and address[0] == _UNKNOWN:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")

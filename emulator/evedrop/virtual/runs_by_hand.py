@@ -1,0 +1,211 @@
+"""Somebody who runs the same scenario beside a run: each process by hand, or all with options that are wrong.
+
+Source: docs/hosts.md, processes started by hand.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import random
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, final
+
+from evedrop.errors import Interrupted, RunError, UsageError
+from evedrop.live.launch.launcher import launch
+from evedrop.live.network.connection import VARIABLE
+from evedrop.names import LEGITIMATE, RECORDER, ROUTER, SENSOR
+from evedrop.scenario.tables import Scenario
+from evedrop.system.world import world as here
+from evedrop.virtual.by_hand import CLOCKS, LACKS, Brief, ByHand
+from evedrop.virtual.disturbance import KILLED
+from evedrop.virtual.endings import status_of
+from evedrop.virtual.notes import BY_HAND
+
+if TYPE_CHECKING:
+    from evedrop.virtual.processes import VirtualProcess
+    from evedrop.virtual.run import SimulatedWorld
+
+_MOST_SLOTS = 20
+_POLL_SECONDS, _RUN_SECONDS = 0.2, 40.0
+_WATCHED, _RECORDED, _RECORDING = "a run with a health file", "a run that is recorded for views", b"RRF2"
+"""How Rerun's files begin."""
+_INTERRUPTED, _STRANGE, _WRONG_CLOCK, _TAKEN = (
+    *("a run that is interrupted", "a run with a brief of another run"),
+    *("a run with a wrong clock", "a run where another program listens"),
+)
+_ENDED = frozenset({0, 1, UsageError.exit_status, RunError.exit_status, Interrupted.exit_status, KILLED})
+Briefs = dict[str, Brief]
+"""Process → its brief."""
+
+
+def _without_receiver(briefs: Briefs) -> None:
+    del briefs[LEGITIMATE]
+
+
+def _wrong_password(briefs: Briefs) -> None:
+    briefs[LEGITIMATE]["password"] = "0" * 32
+
+
+def _other_certificate(briefs: Briefs) -> None:
+    briefs[ROUTER]["identity"] = briefs[SENSOR]["identity"]
+
+
+def _other_name(briefs: Briefs) -> None:
+    for brief in briefs.values():
+        brief["router"] = brief["router"].replace("127.0.0.1", "localhost")
+
+
+def _unchanged(briefs: Briefs) -> None:
+    del briefs
+
+
+_RUNS: Mapping[str, tuple[str, Callable[[Briefs], None]]] = {
+    "a run": ("tcp", _unchanged),
+    _WATCHED: ("tcp", _unchanged),
+    _TAKEN: ("tcp", _unchanged),
+    "a run without a receiver": ("tcp", _without_receiver),
+    _INTERRUPTED: ("tcp", _unchanged),
+    "a run with a wrong password": ("tcp", _wrong_password),
+    _RECORDED: ("tcp", _unchanged),
+    "a run with certificates": ("tls", _unchanged),
+    _STRANGE: ("tls", _unchanged),
+    _WRONG_CLOCK: ("tls", _unchanged),
+    "a run with the certificate of another process": ("tls", _other_certificate),
+    "a run at another name": ("tls", _other_name),
+}
+"""What is run → the protocol of its routers, and what is changed in its briefs."""
+
+
+@final
+class RunByHand(ByHand):
+    """The same scenario is run beside the run, all of whose processes somebody starts by hand, in any order."""
+
+    kind, share = "start by hand", 2
+    awaited_seconds = 60.0
+    """Its processes wait for one that is missing, or that an event has ended: no launcher starts it again."""
+
+    @classmethod
+    def targets(cls, scenario: Scenario) -> Sequence[str]:
+        """Whole runs, and those in which a process or a brief is not the right one."""
+        del scenario
+        return [*_RUNS]
+
+    def _act(self, world: SimulatedWorld) -> int:
+        scenario, folder = world.scenario, world.disk.root / f"by hand {self.after}"
+        if scenario is None or folder.exists() or scenario.shards > 1 or scenario.slots > _MOST_SLOTS:
+            return 0
+        briefs = self._briefs(world, scenario, folder)
+        if self.target == _STRANGE and briefs:
+            briefs |= {LEGITIMATE: self._briefs(world, scenario, folder / "other").get(LEGITIMATE, briefs[LEGITIMATE])}
+        if briefs:
+            _RUNS[self.target][1](briefs)
+        file = folder / "health"
+        if self.target == _WATCHED:
+            os.environ[VARIABLE] = str(file)
+        try:
+            processes = self._run(world, folder, briefs)
+        finally:
+            os.environ.pop(VARIABLE, None)
+        for name, process in processes.items():
+            if process.task.status not in _ENDED or "Traceback" in process.printed:
+                raise AssertionError(f"{name} ends with status {process.task.status}: {process.printed[-500:]}")
+        done = RECORDER in processes and processes[RECORDER].task.status == 0
+        if self.target == _RECORDED:
+            self._check_recording(folder / "results" / "recording.rrd", done)
+        if self.target == _WATCHED and done and not file.exists():
+            raise AssertionError("no process has touched the health file")
+        return 0
+
+    def _run(self, world: SimulatedWorld, folder: Path, briefs: Briefs) -> Mapping[str, VirtualProcess]:
+        """Start a process with each brief, and ask for its health; returns the processes, which have ended."""
+        some = random.Random(here().token(8))  # noqa: S311 - to be repeated, not to be secret
+        processes = {}
+        if self.target == _TAKEN and briefs:
+            world.zenoh.occupy(briefs[ROUTER]["router"], some.choice([b"", b"hello"]))
+        paths = {name: folder / f"{name}.json" for name in some.sample([*briefs], len(briefs))}
+        for name, path in paths.items():
+            path.write_text(json.dumps(briefs[name]))
+            path.chmod(0o600)
+            words = [briefs[name]["role"], str(path)]
+            processes[name] = world.machine.begin(f"{name} {BY_HAND}", partial(world.machine.program, words))
+        if self.target == _WRONG_CLOCK and processes:
+            processes[LEGITIMATE].task.clock = some.choice(CLOCKS)
+        here().sleep(some.uniform(0.0, 1.0))
+        if self.target == _INTERRUPTED and processes:
+            processes[RECORDER].interrupt()
+        elif paths and (status := world.machine.program(["health", str(some.choice([*paths.values()]))])) not in _ENDED:
+            raise AssertionError(f"who asks for the health of a process is told status {status}")
+        deadline = here().monotonic() + _RUN_SECONDS
+        while any(process.task.alive for process in processes.values()) and here().monotonic() < deadline:
+            here().sleep(_POLL_SECONDS)
+        for process in processes.values():
+            process.signal(signal.SIGKILL)  # something cut them off from each other
+        return processes
+
+    @staticmethod
+    def _check_recording(path: Path, done: bool) -> None:
+        """A run that has ended well is recorded; Rerun's own threads, which are real ones, end."""
+        from rerun_bindings import flush_and_cleanup_orphaned_recordings  # noqa: PLC0415 - slow to import
+
+        gc.collect()
+        flush_and_cleanup_orphaned_recordings()
+        if done and not path.read_bytes().startswith(_RECORDING):
+            raise AssertionError(f"{path.name} is no recording")
+
+    def _briefs(self, world: SimulatedWorld, scenario: Scenario, folder: Path) -> Briefs:
+        """Write the briefs, and read them; none if the disk does not take them."""
+        from evedrop.results.resolved_scenario import write_resolved  # noqa: PLC0415
+
+        folder.mkdir(0o700)
+        write_resolved(folder, scenario)
+        written, at = folder / "written", f"{_RUNS[self.target][0]}/127.0.0.1"
+        places = ["--listen", f"{at}:17470", *(["--relay", f"{at}:17471"] if scenario.relayed else [])]
+        words = ["brief", str(folder / "scenario.toml"), *places, "--results", str(folder / "results"), "--wait", "5"]
+        if world.machine.program([*words, "--out", str(written)]) != 0:
+            return {}
+        briefs = {path.stem: json.loads(path.read_text()) for path in sorted(written.glob("*.json"))}
+        briefs[RECORDER]["part"]["recording"] = self.target == _RECORDED
+        return briefs
+
+
+_AT = "tls/127.0.0.1:17480"
+_OPTIONS: Mapping[str, tuple[str, str | None]] = {
+    "a port that others reach": ("tls/0.0.0.0:17480", None),
+    "no endpoint": ("nowhere", None),
+    "two routers at one place": (_AT, _AT),
+    "two routers of two kinds": (_AT, "tcp/127.0.0.1:17481"),
+}
+"""What is wrong → where the router and the relay are to listen."""
+
+
+@final
+class RunWrongly(ByHand):
+    """The same scenario is to be run beside the run, with options that no run may have."""
+
+    kind, share = "run beside it with", 1
+
+    @classmethod
+    def targets(cls, scenario: Scenario) -> Sequence[str]:
+        """Each of them."""
+        del scenario
+        return [*_OPTIONS]
+
+    def _act(self, world: SimulatedWorld) -> int:
+        scenario = world.scenario
+        if scenario is None:
+            return 0
+        listen, relay = _OPTIONS[self.target]
+        folder = world.disk.root / f"by hand {self.after}"
+
+        def run() -> int:
+            return launch(scenario, folder, "off", listen, lambda _: None, relay).status
+
+        status = status_of(run)
+        if status != UsageError.exit_status and not any(lack in world.machine.current.printed for lack in LACKS):
+            raise AssertionError(f"to run with {self.target} ends with status {status}")
+        return 0
