@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import pytest
 
@@ -24,20 +25,22 @@ def where(condition: Callable[[SimulatedCase], bool]) -> SimulatedCase:
     return next(case for case in map(case_of, range(1, 5000)) if condition(case))
 
 
-LARGE = replace(
-    where(
-        lambda case: (
-            len(case.scenario.eavesdroppers) > 1
-            and case.scenario.slots > 20
-            and case.scenario.trials > 2
-            and case.scenario.controller is not None
-            # It learns in slot 40, so that such a run cannot be shorter.
-            and all(table.strategy != "replay-informed" for table in case.scenario.eavesdroppers.values())
-        )
-    ),
-    faults=(StopProcess("eve0", 123, 1.234), KillProcess(SENSOR, 2045), CutConnection("legitimate", 60, 0.5)),
-)
-"""A case in which much can be left out."""
+@cache
+def large() -> SimulatedCase:
+    """A case in which much can be left out."""
+    return replace(
+        where(
+            lambda case: (
+                len(case.scenario.eavesdroppers) > 1
+                and case.scenario.slots > 20
+                and case.scenario.trials > 2
+                and case.scenario.controller is not None
+                # It learns in slot 40, so that such a run cannot be shorter.
+                and all(table.strategy != "replay-informed" for table in case.scenario.eavesdroppers.values())
+            )
+        ),
+        faults=(StopProcess("eve0", 123, 1.234), KillProcess(SENSOR, 2045), CutConnection("legitimate", 60, 0.5)),
+    )
 
 
 def killed_after_five(case: SimulatedCase) -> tuple[str, ...]:
@@ -48,7 +51,7 @@ def killed_after_five(case: SimulatedCase) -> tuple[str, ...]:
 
 def test_only_what_breaks_the_promise_is_left() -> None:
     """The fault, the slots, and nothing else."""
-    shrunk = shrink(LARGE, [MISS], killed_after_five)
+    shrunk = shrink(large(), [MISS], killed_after_five)
     scenario = shrunk.case.scenario
     assert [fault.kind for fault in shrunk.case.faults] == ["kill"]
     assert scenario.slots == 5
@@ -62,29 +65,29 @@ def test_only_what_breaks_the_promise_is_left() -> None:
 
 def test_what_breaks_the_promise_stays() -> None:
     """Everything that the promise is about."""
-    scheme, names = LARGE.scenario.encoding.scheme, set(LARGE.scenario.eavesdroppers)
-    strategies = {table.strategy for table in LARGE.scenario.eavesdroppers.values()}
+    scheme, names = large().scenario.encoding.scheme, set(large().scenario.eavesdroppers)
+    strategies = {table.strategy for table in large().scenario.eavesdroppers.values()}
 
     def play(case: SimulatedCase) -> Sequence[str]:
         tables = case.scenario.eavesdroppers
         same = set(tables) == names and {table.strategy for table in tables.values()} == strategies
-        return [MISS] if same and case.scenario.encoding.scheme == scheme and case.faults == LARGE.faults else []
+        return [MISS] if same and case.scenario.encoding.scheme == scheme and case.faults == large().faults else []
 
-    case = shrink(LARGE, [MISS], play).case
-    assert case.faults == LARGE.faults
+    case = shrink(large(), [MISS], play).case
+    assert case.faults == large().faults
     assert set(case.scenario.eavesdroppers) == names
     assert case.scenario.slots == 1
 
 
 def test_the_same_case_shrinks_to_the_same_case() -> None:
     """Whenever it is shrunk."""
-    assert shrink(LARGE, [MISS], killed_after_five) == shrink(LARGE, [MISS], killed_after_five)
+    assert shrink(large(), [MISS], killed_after_five) == shrink(large(), [MISS], killed_after_five)
 
 
 def test_another_broken_promise_does_not_count() -> None:
     """A smaller case that fails in another way explains nothing."""
-    shrunk = shrink(LARGE, [MISS], lambda case: [MISS] if case.faults == LARGE.faults else ["sensor is left"])
-    assert shrunk.case.faults == LARGE.faults
+    shrunk = shrink(large(), [MISS], lambda case: [MISS] if case.faults == large().faults else ["sensor is left"])
+    assert shrunk.case.faults == large().faults
 
 
 def test_no_more_cases_are_played_than_allowed() -> None:
@@ -95,7 +98,7 @@ def test_no_more_cases_are_played_than_allowed() -> None:
         played.append(case)
         return killed_after_five(case)
 
-    shrunk = shrink(LARGE, [MISS], play, most=7)
+    shrunk = shrink(large(), [MISS], play, most=7)
     assert shrunk.plays == len(played) == 7
     assert killed_after_five(shrunk.case)
 
@@ -108,13 +111,13 @@ def test_no_case_is_played_twice() -> None:
         texts.append(case.to_text())
         return killed_after_five(case)
 
-    shrink(LARGE, [MISS], play)
+    shrink(large(), [MISS], play)
     assert len(texts) == len(set(texts))
 
 
 def test_a_smaller_case_that_is_lucky_is_tried_in_other_worlds() -> None:
     """Its interleavings are not those of the case."""
-    shrunk = shrink(LARGE, [MISS], lambda case: [MISS] if case.seed == 2 or case == LARGE else [])
+    shrunk = shrink(large(), [MISS], lambda case: [MISS] if case.seed == 2 or case == large() else [])
     assert shrunk.case.seed == 2
     assert shrunk.case.scenario.slots == 1
 
@@ -122,7 +125,7 @@ def test_a_smaller_case_that_is_lucky_is_tried_in_other_worlds() -> None:
 def test_a_fault_comes_earlier_in_a_shorter_run() -> None:
     """Otherwise it would come after the end."""
     fault = KillProcess("router", 2040)
-    case = SimulatedCase(1, LARGE.scenario, (fault,))
+    case = SimulatedCase(1, large().scenario, (fault,))
     per_slot = fault.after / case.scenario.slots
 
     def play(smaller: SimulatedCase) -> Sequence[str]:

@@ -14,10 +14,9 @@ from typing import NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.checks import expect_slots
+from evedrop.model.checks import expect_slots, is_probability
 from evedrop.model.receiver import Codes, Flags
 from evedrop.model.streams import Ahead, Batch, BlockReader
-from evedrop.system.fields import Probability
 
 Attack = Callable[[Flags, Flags, Flags], Flags]
 """(γ of the legitimate estimator, γᵉ of the jammer, whether the attacker flips) → the acknowledgements on the air, all (R,)."""
@@ -140,18 +139,21 @@ def heed_rule_of(attack: str, quality: float, overheard: float) -> HeedRule | No
 class AckChannelSpec:
     """The acknowledgement channel as the router needs to know it."""
 
-    quality: Probability
+    quality: float
     attack: str
     jammer: str | None
     spans: Sequence[tuple[int, int]] | None
     """Slots [from, to) in which the attack is on; None: in all slots."""
-    flip: Probability = 0.0
+    flip: float = 0.0
     """The probability of a flip, for the attack `flip`."""
-    overheard: Probability = 1.0
+    overheard: float = 1.0
     """The probability that the jammer hears a packet, for the attack `hijack`."""
 
     def __post_init__(self) -> None:
         expect_slots(*(slot for span in self.spans or () for slot in span))
+        for name in ("quality", "flip", "overheard"):
+            if not is_probability(getattr(self, name)):
+                raise ValueError(f"{name} is {getattr(self, name)}, expected a number from 0 to 1")
 
     @property
     def memory(self) -> int:

@@ -177,7 +177,7 @@ UNUSABLE: dict[str, list[tuple[Callable[[dict[str, Any]], None], str]]] = {
     "acknowledged/router": [
         (set_in("part.acknowledgements.spans", [[-1, 3]]), "-1 is not a slot, expected a number from 0 to"),
         *(
-            (set_in(f"part.acknowledgements.{name}", -1), "Expected `float` >= 0.0")
+            (set_in(f"part.acknowledgements.{name}", -1), f"{name} is -1.0, expected a number from 0 to 1")
             for name in ("quality", "flip", "overheard")
         ),
         (set_in("part.acknowledgements.attack", "smile"), "part.acknowledgements.attack is smile"),
