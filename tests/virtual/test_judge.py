@@ -98,6 +98,19 @@ def test_a_process_that_goes_on_without_a_connection_is_a_miss(
     assert broken == ([f"legitimate does not end, though it has had no connection for {ended - 0.5} s"] if late else [])
 
 
+@pytest.mark.parametrize("away", [True, False])
+def test_who_is_away_to_the_end_waits_for_its_launcher(away: bool, tmp_path: Path) -> None:
+    """It has done all that it had to do, and watches no connection."""
+    (tmp_path / "temporary").mkdir()
+    tables = {**SCENARIO.as_tables(), "event": [{"from": 5, "to": 10 if away else 9, "pause": "legitimate"}]}
+    struck: dict[Disturbance, float] = {FreezeConnection(EVERYBODY, 50): 0.5}
+    ends, put = {"legitimate": (9.1, 130)}, [PutMessage(0.4, "uplink", "0")]
+    run = SimulatedRun(tmp_path / "results", status=3, ends=ends, put=put)
+    case = SimulatedCase(1, Scenario(tables), tuple(struck), 8)
+    broken = misses(case, run, struck, REFERENCE, {"": tmp_path / "temporary"})
+    assert any("does not end" in miss for miss in broken) is not away
+
+
 @pytest.mark.parametrize(
     ("fault", "most"), [(CutConnection("sensor", 50, 0.5), 12.5), (StopProcess("sensor", 50, 0.5), 6.5)], ids=str
 )

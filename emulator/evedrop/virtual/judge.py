@@ -234,7 +234,11 @@ def _of_ends(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
     scenario, faults = case.scenario, list(struck)
     if case.hosts is not None:
         return
-    away = any(away.stop >= scenario.slots for outages in scenario.timeline.outages.values() for away in outages)
+    away = {
+        name
+        for name, outages in scenario.timeline.outages.items()
+        if any(outage.stop >= scenario.slots for outage in outages)
+    }
     brief = all(fault.survived(scenario.longest_outage) and (fault.seconds or 0.0) <= 1.0 for fault in faults)
     if run.status == 0 and brief and not away:
         struck_routers = {fault.target for fault in faults} & {*ROUTERS}
@@ -250,7 +254,7 @@ def _of_ends(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
     if sum(at < struck[faults[0]] for at in first) >= max(1, scenario.shards):
         lease = 0.0 if isinstance(faults[0], CutConnection) else _LEASE_SECONDS
         last = struck[faults[0]] + scenario.longest_outage + lease + _GIVES_UP_SECONDS
-        for name in {*processes_of(scenario)} - {*ROUTERS, RECORDER}:
+        for name in {*processes_of(scenario)} - {*ROUTERS, RECORDER} - away:  # who is away waits for its launcher
             if name in run.ends and run.ends[name][0] > last:
                 yield f"{name} does not end, though it has had no connection for {run.ends[name][0] - struck[faults[0]]:.1f} s"
 
