@@ -76,6 +76,11 @@ class TakePort(Disturbance):
         """What cannot be done there."""
         return ("listen", self.target)
 
+    @property
+    def named_first(self) -> bool:
+        """Whether it is in the first line: no, if a process on another host meets the other program before the router tries."""
+        return False
+
 
 @final
 class ReadMetrics(Disturbance):
