@@ -46,12 +46,19 @@ KILLED = KillProcess("legitimate", 50)
 TOLD = InterruptProcess("launcher", 60)
 
 
-def judged(folder: Path, struck: Mapping[Disturbance, float], ahead: int = 8, **run: object) -> list[str]:
+def judged(
+    folder: Path, struck: Mapping[Disturbance, float], ahead: int = 8, scenario: Scenario = SCENARIO, **run: object
+) -> list[str]:
     """The misses of a run without results; ahead: how far the sensor may be ahead."""
     (folder / "temporary").mkdir(parents=True, exist_ok=True)
     faults = tuple(struck)
     ended = SimulatedRun(folder / "results", **run)  # type: ignore[arg-type]
-    return misses(SimulatedCase(1, SCENARIO, faults, ahead), ended, struck, REFERENCE, {"": folder / "temporary"})
+    return misses(SimulatedCase(1, scenario, faults, ahead), ended, struck, REFERENCE, {"": folder / "temporary"})
+
+
+def with_outage(first: int, end: int) -> Scenario:
+    """The scenario, whose legitimate estimator is away in these slots."""
+    return Scenario({**SCENARIO.as_tables(), "event": [{"from": first, "to": end, "pause": "legitimate"}]})
 
 
 @pytest.mark.parametrize(("seconds", "late"), [(56.0, False), (58.0, True)])
@@ -101,13 +108,10 @@ def test_a_process_that_goes_on_without_a_connection_is_a_miss(
 @pytest.mark.parametrize("away", [True, False])
 def test_who_is_away_to_the_end_waits_for_its_launcher(away: bool, tmp_path: Path) -> None:
     """It has done all that it had to do, and watches no connection."""
-    (tmp_path / "temporary").mkdir()
-    tables = {**SCENARIO.as_tables(), "event": [{"from": 5, "to": 10 if away else 9, "pause": "legitimate"}]}
     struck: dict[Disturbance, float] = {FreezeConnection(EVERYBODY, 50): 0.5}
     ends, put = {"legitimate": (9.1, 130)}, [PutMessage(0.4, "uplink", "0")]
-    run = SimulatedRun(tmp_path / "results", status=3, ends=ends, put=put)
-    case = SimulatedCase(1, Scenario(tables), tuple(struck), 8)
-    broken = misses(case, run, struck, REFERENCE, {"": tmp_path / "temporary"})
+    scenario = with_outage(5, 10 if away else 9)
+    broken = judged(tmp_path, struck, scenario=scenario, status=3, ends=ends, put=put)
     assert any("does not end" in miss for miss in broken) is not away
 
 
@@ -182,6 +186,8 @@ def test_what_one_lost_connection_costs_is_sent_again_once(tmp_path: Path) -> No
     assert miss not in judged(tmp_path / "once", {cut: 0.4}, put=rounds[:1])
     both = judged(tmp_path / "both", {cut: 0.4, StopProcess("sensor", 60, 1.0): 0.4}, put=rounds)
     assert not any("are asked for" in miss for miss in both)
+    away = judged(tmp_path / "away", {cut: 0.4}, scenario=with_outage(5, 8), put=rounds)
+    assert not any("are asked for" in miss for miss in away), "a receiver that comes back has a round of its own"
 
 
 @pytest.mark.parametrize(("sent", "missed"), [("4-5", False), ("5", False), ("hold 5", False), ("6-7", True)])

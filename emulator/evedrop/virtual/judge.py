@@ -267,7 +267,9 @@ def _of_rounds(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
         return
     if len(struck) > 1 or scenario.shards > 1 or case.hosts is not None or case.program is not None:
         return
-    if is_late(scenario):
+    if is_late(scenario) or any(
+        scenario.timeline.outages.values()
+    ):  # a receiver that comes back has a round of its own
         return
     rounds = sum(message.key == f"control/{ROUTER}" and message.said.startswith("again") for message in run.put)
     if rounds > 1:
