@@ -6,7 +6,7 @@ from evedrop.cli.simulated import program
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.campaign import play_case
 from evedrop.virtual.cases import SimulatedCase, case_of
-from evedrop.virtual.own_classes import LOSS_MODEL, SCHEME, STRATEGY
+from evedrop.virtual.own_classes import LOSS_MODEL, SCHEME, STRATEGY, EverySecond
 
 SCENARIO = Scenario(
     {
@@ -32,3 +32,9 @@ def test_own_classes_are_drawn() -> None:
     texts = [case_of(seed).to_text() for seed in range(1, 150)]
     for name in (SCHEME, LOSS_MODEL, STRATEGY):
         assert any(name in text for text in texts), name
+
+
+def test_a_loss_model_refuses_what_is_no_probability() -> None:
+    """A router that is given one by a wrong brief says so, before the run."""
+    assert [entry for entry, _ in EverySecond.mistakes({"good": "half"})] == ["good"]
+    assert EverySecond.mistakes({"good": 0.9}) == []

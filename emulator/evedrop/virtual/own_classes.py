@@ -8,11 +8,12 @@ Source: docs/your-own/rules.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import ClassVar, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 
 from evedrop.model import update
+from evedrop.model.checks import probability_mistakes
 from evedrop.model.eavesdroppers.eavesdropper import PacketReader
 from evedrop.model.links.loss_model import LossModel, fates_of
 from evedrop.model.process import Floats, Process
@@ -76,6 +77,11 @@ class EverySecond(LossModel):
 
     def __init__(self, good: float) -> None:
         self._good = good
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """It is a probability."""
+        return probability_mistakes(given, "good")
 
     @property
     def quality(self) -> float:
