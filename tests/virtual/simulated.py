@@ -48,7 +48,11 @@ def play(case: AnyCase, keep: bool = False) -> PlayedCase | PlayedWire:
 
 def played(seed: int) -> tuple[int, str, str, int, float, tuple[str, ...], int | None]:
     """A case, as it is told: seed, case, digest, events, virtual seconds, misses, status."""
-    result = play_seed(seed, program) if seed % EVERY else play(any_case(seed))
+    try:
+        result = play_seed(seed, program) if seed % EVERY else play(any_case(seed))
+    except Exception as error:
+        error.add_note(f"while seed {seed} was played")
+        raise
     run = result.run
     return seed, str(result.case), run.digest, run.events, run.seconds, result.misses, run.status
 

@@ -148,6 +148,7 @@ class WireJudge:
     def _of_status(self, process: VirtualProcess) -> Iterator[str]:
         status = process.task.status
         interrupts = sum(isinstance(fault, InterruptProcess) for fault in self._struck)
+        interrupts += OPENED in self._case.further  # its opener asks it to end
         if status == -signal.SIGKILL:
             if not any(isinstance(fault, KillProcess | CutPower) for fault in self._struck):
                 yield "the wire was killed by something else"

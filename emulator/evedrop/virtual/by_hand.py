@@ -65,7 +65,7 @@ _TOO_LARGE = 2**30 + 1
 _WAIT_SECONDS, _POLL_SECONDS = "1", 0.2
 LACKS = ("No space left on device", "Input/output error", "not enough memory", "no further process or thread")
 _PATIENCE_SECONDS = 10.0
-_STARTED = 12
+_STARTED, _STARTING_SECONDS = 12, 40.0
 """How many processes are started, one after the other."""
 CLOCKS = (-90.0 * 86_400.0, 90.0 * 86_400.0)
 """By how many seconds a clock is wrong, so that no certificate is valid."""
@@ -171,7 +171,10 @@ class WriteBriefs(ByHand):
         for path, brief in briefs.items():
             for place in _places(brief):
                 of_kind.setdefault(str(next(name for name in reversed(place) if name != 0)), []).append((path, place))
+        deadline = here().monotonic() + _STARTING_SECONDS
         for _ in range(_STARTED):
+            if here().monotonic() > deadline:
+                return
             path, place = some.choice(of_kind[some.choice([*of_kind])])
             brief, role, clock, chance = deepcopy(briefs[path]), briefs[path]["role"], 0.0, some.random()
             if chance < 0.03:
@@ -217,10 +220,13 @@ def _exchange(some: random.Random, brief: Brief, other: Brief) -> None:
 
 
 def _places(table: Any) -> Iterator[list[Any]]:
-    """The names that lead to each entry of a brief; the first one of a list stands for all, and a scenario for its entries."""
+    """The names that lead to each entry of a brief; the first one of a list stands for all, and a scenario for its entries.
+
+    So do the answers of classes: simulated processes share what they have learned of them.
+    """
     for name in [*table] if isinstance(table, dict) else [0] if isinstance(table, list) and table else []:
         yield [name]
-        if name != "scenario":
+        if name not in {"scenario", "classes"}:
             for rest in _places(table[name]):
                 yield [name, *rest]
 

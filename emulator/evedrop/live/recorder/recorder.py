@@ -122,6 +122,9 @@ def _conduct(
         emit(SlotsDone())
         try:
             conductor.end(brief.flow.longest_outage)
+        except EvedropError as error:  # a message that breaks the protocol, although all slots are there
+            end.blame([], error)
+            raise
         finally:
             course.misdelivered = conductor.dropped
 
