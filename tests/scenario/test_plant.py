@@ -11,7 +11,7 @@ import pytest
 
 from evedrop.errors import ScenarioError
 from evedrop.results.resolved_scenario import write_resolved
-from evedrop.scenario.dry_run import has_foreign
+from evedrop.scenario.dry_run import foreign
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
@@ -325,6 +325,7 @@ def test_a_file_that_is_not_there_is_told() -> None:
     ]
 
 
-def test_a_controller_is_a_class_that_is_built_in() -> None:
-    """Results of a closed loop whose metrics are lost can be looked at: theory needs no class that is not built in."""
-    assert not has_foreign(Scenario(LOOP))
+@pytest.mark.parametrize("own", [{}, {"integrity": {"attack": {"model": "replay", "recorded": 2}}}], ids=str)
+def test_every_class_of_a_closed_loop_is_built_in(own: dict[str, Any]) -> None:
+    """Results whose metrics are lost can be looked at: theory needs no class that is not built in."""
+    assert not foreign({**LOOP, **own})

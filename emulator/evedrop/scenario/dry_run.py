@@ -15,6 +15,7 @@ from evedrop.errors import NoAnswer
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
+from evedrop.model.integrity import SENSOR_ATTACKS
 from evedrop.model.links import LOSS_MODELS, POOLED, loss_of, single_specs
 from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
@@ -37,7 +38,7 @@ _TRIALS = 3
 
 def foreign(tables: Any) -> bool:
     """Whether tables name any class that is not built in."""
-    built_in = {POOLED}.union(SCHEMES, STRATEGIES, LOSS_MODELS, DELAY_MODELS, CONTROLLERS)
+    built_in = {POOLED}.union(SCHEMES, STRATEGIES, LOSS_MODELS, DELAY_MODELS, CONTROLLERS, SENSOR_ATTACKS)
     return any(name not in built_in for name in names_in(tables))
 
 

@@ -320,6 +320,7 @@ class EavesdropperPart:
         if lacking:
             raise BriefError(f"part.parameters.{lacking[0]} is missing, which the strategy needs; {WRITE_AGAIN}")
         with _using("part.parameters"):
+            _expect_right("part.parameters", kind.mistakes(self.parameters))
             streams = kind.streams(self.parameters)
         brief.expect_keys(streams)
         with _using("part.noise_covariance"):
@@ -406,10 +407,14 @@ def _scheme(brief: AnyBrief, spec: Mapping[str, Any]) -> Scheme:
         problem = "missing" if parameter in kind.parameters else "not a parameter of the scheme"
         raise BriefError(f"part.scheme.{parameter} is {problem}; {WRITE_AGAIN}")
     with _using("part.scheme"):
-        if mistakes := [*kind.mistakes(spec)]:
-            parameter, problem = mistakes[0]
-            raise BriefError(f"part.scheme.{parameter} {problem}; {WRITE_AGAIN}")
+        _expect_right("part.scheme", kind.mistakes(spec))
         return scheme_of(brief.model.process, spec)
+
+
+def _expect_right(path: str, mistakes: Iterable[tuple[str, str]]) -> None:
+    """Raise BriefError for the first mistake that a class has found in its parameters."""
+    for parameter, problem in mistakes:
+        raise BriefError(f"{path}.{parameter} {problem}; {WRITE_AGAIN}")
 
 
 def _expect_plant(brief: AnyBrief, path: str, plant: Plant, disturbances: str | None = None) -> None:
