@@ -166,11 +166,14 @@ def test_any_sums_are_judged(first: float, second: float) -> None:
     assert abs(first) <= np.sqrt(TRIALS * second) * (1.0 + 1e-6)
 
 
+@pytest.mark.parametrize("first", [True, False], ids=["before the report", "after it"])
 @pytest.mark.parametrize(
     ("column", "place", "message"),
     [("x_hat", (1, 3), "its x_hat of trial 13 is"), ("P", (0, 0, 1), "its P of trial 11 is"), ("P", (0, 0, 3), None)],
 )
-def test_a_receiver_leaves_with_what_it_reported(column: str, place: tuple[int, ...], message: str | None) -> None:
+def test_a_receiver_leaves_with_what_it_reported(
+    column: str, place: tuple[int, ...], message: str | None, first: bool
+) -> None:
     """Its last word before an outage, from which it is carried on, is what its report of the slot before says.
 
     The covariance of a trial that is not recorded is not in the report.
@@ -178,15 +181,21 @@ def test_a_receiver_leaves_with_what_it_reported(column: str, place: tuple[int, 
     verifier, followed = Verifier({"eve": Blocks(SLOTS, CUTS)}, RECORDED, 10), beliefs()
     last = followed[299]
     other = at(place, lambda x: x + 1.0)(getattr(last, column))
-    verifier.left("eve", 300, last._replace(x_hat=other) if column == "x_hat" else last._replace(P=other))
+    left = last._replace(x_hat=other) if column == "x_hat" else last._replace(P=other)
     *before, of_last = [report for report in reports(100) if report.slots.first < 300]
     for report in before:
         verifier.report("eve", report)
+    two: list[Callable[[], None]] = [
+        lambda: verifier.left("eve", 300, left),
+        lambda: verifier.report("eve", of_last),
+    ]
+    earlier, later = two if first else two[::-1]
+    earlier()
     if message is None:
-        verifier.report("eve", of_last)
+        later()
         return
     with pytest.raises(Contradiction, match=f"before slot 300, with which it goes away, {message}"):
-        verifier.report("eve", of_last)
+        later()
 
 
 def slots_of(**changes: Any) -> Slots:

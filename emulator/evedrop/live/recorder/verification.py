@@ -39,17 +39,26 @@ class Verifier:
         self._blocks, self._recorded, self._first_trial = blocks, recorded, first_trial
         self._digests: dict[str, PartialDigests] = {}
         self._leaving: dict[tuple[str, int], Belief] = {}
+        """Receiver and first slot of its absence → its final belief, until its report of the slot before is there."""
+        self._reported: dict[str, ReceiverSlots] = {}
+        """Receiver → its latest report."""
 
     def left(self, name: str, k: int, belief: Belief) -> None:
-        """Take a receiver's final belief before slot k, the first slot of its absence."""
-        self._leaving[name, k] = belief
+        """Take a receiver's final belief before slot k, the first slot of its absence. Raises Contradiction as `report` does."""
+        latest = self._reported.get(name)
+        if latest is not None and latest.slots.stop == k:
+            self._check_leaving(name, latest, belief)
+        else:
+            self._leaving[name, k] = belief
 
     def report(self, name: str, report: Report) -> None:
         """Check a receiver's next report. Raises Contradiction if the report contradicts itself."""
         slots = report.slots
         self._check_traces(name, slots)
         end = slots.slots.stop
-        self._check_leaving(name, slots, end)
+        if (left := self._leaving.pop((name, end), None)) is not None:
+            self._check_leaving(name, slots, left)
+        self._reported[name] = slots
         first, blocks = slots.first, self._blocks[name]
         some = slice(0, self._recorded)
         while first < end:
@@ -126,11 +135,9 @@ class Verifier:
                 f"recorded trials, {traces.shape[1]} of {trials}, are {sums[2]} and {sums[3]}",
             )
 
-    def _check_leaving(self, name: str, slots: ReceiverSlots, end: int) -> None:
+    def _check_leaving(self, name: str, slots: ReceiverSlots, left: Belief) -> None:
         """Check that a receiver's final belief is the one in its report of its last slot."""
-        left = self._leaving.pop((name, end), None)
-        if left is None:
-            return
+        end = slots.slots.stop
         for quantity, on_leaving, reported in (
             ("x_hat", left.x_hat, slots.x_hat[-1]),
             ("P", left.P[..., : self._recorded], slots.P[-1]),
