@@ -334,6 +334,28 @@ def test_no_rows_are_on_disk_before_the_first_metrics(tmp_path: Path) -> None:
         assert Results.read(tmp_path).summary["ended"] == "the run goes on, at slot 10"
 
 
+def test_rows_whose_first_metrics_cannot_be_written_count_at_the_end(tmp_path: Path) -> None:
+    """They are whole; a shard's score, which was saved before, is of them."""
+    scenario = microgrid()
+    nothing = summary_of(scenario, RunTally.nothing(scenario, 1), dict.fromkeys(scenario.digested), RunOutcome(0.0, ""))
+
+    def full() -> None:
+        if sizes(tmp_path)["slots-0.arrows"] > before:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def checkpoints() -> bool:
+        writer.checkpoint("slot 10", lambda: nothing)
+        return False
+
+    write_resolved(tmp_path, scenario)
+    with suppress(OSError), ResultsWriter.of(tmp_path, scenario, full) as writer:
+        before = sizes(tmp_path)["slots-0.arrows"]
+        for receiver in scenario.receivers:
+            writer.slot_rows(0, receiver, sums(10), np.zeros(10))
+        wait_until(checkpoints, "no room")
+    assert pq.read_table(tmp_path / "slots.parquet").num_rows == 10 * len(scenario.receivers)
+
+
 @pytest.mark.long
 def test_a_score_is_saved_only_with_rows(tmp_path: Path) -> None:
     """What a shard saves together with its metrics: if it is killed before, it has neither score nor rows."""

@@ -191,13 +191,19 @@ class ResultsWriter:
         self._streams["slots"] = self._stream("slots", self._restarts)
 
     def _round(self, before: Callable[[], None] = lambda: None) -> None:
-        """Write all rows; before: called when they are written, and do not count yet."""
+        """Write all rows; before: called when they are written, and do not count yet: they do in the next round if it fails."""
         if self._broken:  # rows after an incomplete batch could not be read
             raise OSError(errno.EIO, "an earlier part could not be written")
         self._broken = True  # until the round succeeds
         if self._taken is not None:
             self._taken.write()
-        self._unfinished.round(self._at, self._slots, self._streams, before)
+
+        def whole() -> None:
+            self._broken = False  # all batches are whole, even if what comes before they count fails
+            before()
+            self._broken = True
+
+        self._unfinished.round(self._at, self._slots, self._streams, whole)
         self._broken = False
         self._on_disk, self._bytes = self._on_disk + self._bytes, 0
         for stream in self._outdated:
