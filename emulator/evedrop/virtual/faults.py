@@ -17,7 +17,7 @@ from evedrop.names import RECORDER, ROUTER, SENSOR
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.disk import DiskFault
 from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance, processes_of
-from evedrop.virtual.host_parts import host_of
+from evedrop.virtual.host_parts import host_of, part_of
 from evedrop.virtual.processes import FORK_SERVERS
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class StopProcess(_OfProcess):
         """A fork server has some seconds to tell of the end of a process; for a recorder, the time stands still."""
         if self.target == RECORDER:
             return self.seconds is not None
-        tells = self.target not in FORK_SERVERS or (self.seconds is not None and self.seconds < _TELLS_SECONDS)
+        tells = part_of(self.target) not in FORK_SERVERS or (self.seconds is not None and self.seconds < _TELLS_SECONDS)
         return tells and super().survived(longest_outage)
 
     @property
