@@ -183,6 +183,37 @@ def read_until(net: Network, subscriber: Any) -> list[bytes]:
 
 
 @behaviour
+def test_a_ring_that_nobody_reads_forgets_the_oldest_messages_and_holds_nobody_up(net: Network) -> None:
+    """The messages of other keys arrive meanwhile."""
+    writer, reader = pair(net)
+    ring = reader.declare_subscriber("a/b", net.zenoh.handlers.RingChannel(3))
+    others = payloads(reader, "a/c")
+    put, other = publisher(net, writer, "a/b"), publisher(net, writer, "a/c")
+    for number in range(10):
+        put.put(bytes([number]))
+    other.put(b"one")
+    wait_for_length(net, others, 1)
+    assert read(net, ring, 3) == [b"\x07", b"\x08", b"\x09"]
+    assert ring.try_recv() is None
+
+
+@behaviour
+def test_what_a_ring_has_kept_is_gone_with_its_session(net: Network) -> None:
+    """Unlike what waits in a channel that holds up its session."""
+    writer, reader = pair(net)
+    ring, fifo = reader.declare_subscriber("a/b", net.zenoh.handlers.RingChannel(3)), channel(net, reader, "a/c")
+    end = payloads(reader, "a/d")
+    for key in ("a/b", "a/c", "a/d"):
+        publisher(net, writer, key).put(b"one")
+    wait_for_length(net, end, 1)
+    reader.close()
+    assert fifo.try_recv().payload.to_bytes() == b"one"
+    for subscriber in (ring, fifo):
+        with pytest.raises(zenoh.ZError):
+            subscriber.try_recv()
+
+
+@behaviour
 def test_messages_of_two_writers_arrive_each_in_order(net: Network) -> None:
     """Whichever is first."""
     writer, reader = pair(net)

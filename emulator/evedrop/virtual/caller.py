@@ -78,7 +78,7 @@ class CallerWorld:
             stack.callback(gc.unfreeze)  # the command of a wire keeps what there is
             stack.enter_context(inside(self.world))
             stack.enter_context(self._instead(zenoh, "open", self._open))
-            for name in ("FifoChannel", "Callback"):
+            for name in ("FifoChannel", "RingChannel", "Callback"):
                 stack.enter_context(self._instead(zenoh.handlers, name, getattr(self.zenoh.handlers, name)))
             for place, name, what in _REAL:
                 stack.enter_context(self._instead(place, name, _refused(what)))

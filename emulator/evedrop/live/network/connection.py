@@ -49,7 +49,11 @@ class Subscription:
     """A subscription to one exact key, read in order with `recv`."""
 
     def __init__(self, key: str, dropped: Dropped, status: StatusReporter, room: int) -> None:
-        """status: of the process, which records there that it waits; room: how many messages it holds."""
+        """status: of the process, which records there that it waits; room: how many messages it holds, the latest ones.
+
+        It forgets older ones rather than keep Zenoh's thread, which brings the messages of all keys, from going on: a process
+        that waits for another key, or that has ended its work, does not read it.
+        """
         self._room = room
         self._key, self._head, self._dropped, self._status = key, head_of(key), dropped, status
         self._waits = (key,)
@@ -57,8 +61,8 @@ class Subscription:
         self._subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
 
     def declare(self, session: zenoh.Session) -> None:
-        """Subscribe; messages that arrived on earlier sessions are read first."""
-        self._subscribers.put(session.declare_subscriber(self._key, world().zenoh.handlers.FifoChannel(self._room)))
+        """Subscribe. What has arrived on the previous session, and is not read, is lost with it."""
+        self._subscribers.put(session.declare_subscriber(self._key, world().zenoh.handlers.RingChannel(self._room)))
 
     def close(self) -> None:
         """End the subscription: there will be no other session."""
@@ -97,7 +101,7 @@ class Subscription:
                     raise SubscriptionClosedError(self._key)
             try:
                 message = self._subscriber.recv().payload.to_bytes()
-            except zenoh.ZError:  # its session is closed, and all messages that had arrived are read
+            except zenoh.ZError:  # its session is closed
                 self._subscriber = None
                 continue
             payload = self._dropped.contents(self._key, self._head, message)

@@ -1,7 +1,8 @@
 """A process's session on the network: how it connects, what it declares, when it is ready, how it ends.
 
-Nothing here assumes that the transport loses no messages. The transport blocks when full; messages lost with a connection
-show as a gap in the slot numbers that every message carries, and are sent again. A process whose connection is lost opens
+Nothing here assumes that the transport loses no messages. The transport blocks when full; a subscription that is not read
+forgets its oldest messages. Messages lost in either way, or with a connection, show as a gap in the slot numbers that every
+message carries, and are sent again. A process whose connection is lost opens
 another session and declares everything there. Each message names its key; messages that arrive under another key are
 dropped.
 """
@@ -72,7 +73,9 @@ _NEVER_MS = 86_400_000
 # Of what Zenoh sends at once. A message that waits to be read keeps the whole batch in memory that it came in.
 _BATCH_PACKETS, _LEAST_BATCH_BYTES, _LARGEST_BATCH_BYTES = 64, 1 << 14, (1 << 16) - 1
 _ANSWER_BYTES = 64 * 2**20  # for the operator
-_WINDOWS = 8  # how many windows a subscription holds: messages that were sent again in some rounds wait there, too
+_WINDOWS = (
+    8  # how many windows a subscription holds: messages that were sent again in the latest rounds wait there, too
+)
 ATTEMPT: ZenohConfig = {"open_timeout": int(_LEASE_SECONDS * 1000)}
 """Zenoh's limit of one attempt to connect again: one that a cut connection has swallowed holds up the next for so long."""
 _LOGGED = f"{LOGGED},zenoh_transport::unicast::establishment::open=off"  # the program reports a refusal itself

@@ -36,6 +36,14 @@ class FifoChannel:
 
 
 @final
+class RingChannel:
+    """A handler that keeps the last `capacity` messages, and forgets the oldest ones; nobody waits. With its end all are gone."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+
+
+@final
 class Callback:
     """A handler that calls a function with each item, and another one when no more will come."""
 
@@ -82,10 +90,11 @@ class Taker(Protocol):
 
 @final
 class Channel:
-    """Keeps up to `capacity` items; a thread that has another one waits."""
+    """Keeps up to `capacity` items; a thread that has another one waits, or the oldest one is forgotten."""
 
-    def __init__(self, session: HandlingSession, capacity: int) -> None:
+    def __init__(self, session: HandlingSession, capacity: int, *, forgets: bool = False) -> None:
         self._scheduler, self._task, self._capacity = session.scheduler, session.task, capacity
+        self._forgets = forgets
         self._kept: deque[Any] = deque()
         self._readers: deque[Waiter] = deque()
         self._full: deque[Waiter] = deque()
@@ -93,6 +102,8 @@ class Channel:
 
     def put(self, item: Any) -> None:
         """Add an item, unless the channel has ended."""
+        if self._forgets and len(self._kept) >= self._capacity:
+            self._kept.popleft()
         can_wait = self._scheduler.current is not None  # the world itself, which ends a question in time, cannot
         while can_wait and len(self._kept) >= self._capacity and not self._over:
             self._scheduler.wait(self._full)
@@ -120,6 +131,8 @@ class Channel:
     def end(self) -> None:
         """Nothing comes any more."""
         self._over = True
+        if self._forgets:
+            self._kept.clear()
         self._scheduler.wake(self._readers)
         self._scheduler.wake(self._full)
 
@@ -151,10 +164,10 @@ class DirectCalls:
             attempt(self._session, function)
 
 
-def taker_of(session: HandlingSession, handler: FifoChannel | Callable[[Any], object]) -> Taker:
+def taker_of(session: HandlingSession, handler: FifoChannel | RingChannel | Callable[[Any], object]) -> Taker:
     """What takes the items of a handler; for a function, a thread of its own calls it for one item after the other."""
-    if isinstance(handler, FifoChannel):
-        return Channel(session, handler.capacity)
+    if isinstance(handler, FifoChannel | RingChannel):
+        return Channel(session, handler.capacity, forgets=isinstance(handler, RingChannel))
     function = handler if isinstance(handler, Callback) else Callback(handler)
     if not function.indirect:
         return DirectCalls(session, function)

@@ -21,7 +21,7 @@ from evedrop.virtual import notes
 from evedrop.virtual.scheduler import VirtualScheduler, VirtualTask
 from evedrop.virtual.zenoh import certificates
 from evedrop.virtual.zenoh.access import Peer, section
-from evedrop.virtual.zenoh.handlers import Callback, FifoChannel
+from evedrop.virtual.zenoh.handlers import Callback, FifoChannel, RingChannel
 from evedrop.virtual.zenoh.session import VirtualSession
 from evedrop.virtual.zenoh.transport import End, VirtualConnection
 
@@ -91,7 +91,7 @@ class VirtualZenoh:
 
     Config, ZError, ZBytes, KeyExpr = zenoh.Config, zenoh.ZError, zenoh.ZBytes, zenoh.KeyExpr
     SampleKind, CongestionControl, Reliability = zenoh.SampleKind, zenoh.CongestionControl, zenoh.Reliability
-    handlers = SimpleNamespace(FifoChannel=FifoChannel, Callback=Callback)
+    handlers = SimpleNamespace(FifoChannel=FifoChannel, RingChannel=RingChannel, Callback=Callback)
 
     def __init__(self, scheduler: VirtualScheduler) -> None:
         self.scheduler = scheduler

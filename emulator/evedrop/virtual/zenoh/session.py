@@ -17,7 +17,15 @@ from evedrop.virtual import notes
 from evedrop.virtual.scheduler import VirtualQueue, VirtualScheduler, VirtualTask
 from evedrop.virtual.zenoh.access import Access, intersects, section
 from evedrop.virtual.zenoh.certificates import shown_by
-from evedrop.virtual.zenoh.handlers import Callback, FifoChannel, Taker, VirtualDeclaration, items_of, taker_of
+from evedrop.virtual.zenoh.handlers import (
+    Callback,
+    FifoChannel,
+    RingChannel,
+    Taker,
+    VirtualDeclaration,
+    items_of,
+    taker_of,
+)
 from evedrop.virtual.zenoh.items import (
     MatchingStatus,
     TransportEvent,
@@ -224,14 +232,14 @@ class VirtualSession:
     def declare_subscriber(
         self,
         key: str | zenoh.KeyExpr,
-        handler: FifoChannel | Callable[[VirtualSample], object] = _USUAL_CHANNEL,
+        handler: FifoChannel | RingChannel | Callable[[VirtualSample], object] = _USUAL_CHANNEL,
         *,
         allowed_origin: zenoh.Locality = zenoh.Locality.ANY,
     ) -> VirtualSubscriber:
         """Read a key expression. Raises ZError if the session is closed, and TypeError for a handler of another kind."""
         self.expect_open()
-        if not (isinstance(handler, FifoChannel) or callable(handler)):
-            raise TypeError(f"{handler!r} is not simulated; expected a function or zenoh.handlers.FifoChannel")
+        if not (isinstance(handler, FifoChannel | RingChannel) or callable(handler)):
+            raise TypeError(f"{handler!r} is not simulated; expected a function, or a FifoChannel or RingChannel")
         remote = allowed_origin == zenoh.Locality.REMOTE
         subscriber = VirtualSubscriber(self, str(key), taker_of(self, handler), remote)
         self._subscribers.append(subscriber)
