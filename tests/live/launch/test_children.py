@@ -17,6 +17,7 @@ from evedrop.errors import Interrupted, MalformedMessage, MissingProcesses
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.children import Children, ProcessExit
 from evedrop.live.launch.process_set import follow_to_end
+from evedrop.live.launch.starter import FORK_SERVER_LOST
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, protocol_breaker, read_last_word
 from evedrop.live.protocol.launcher_events import ProcessRequest, RouterListens, read_event
@@ -158,6 +159,11 @@ def test_a_process_that_gets_no_memory_is_named_as_such(bench: Bench, log: str, 
     (bench.results / "logs" / "eve.log").write_text(log)
     report = bench.children.failure_report(ProcessExit("eve", -6), None)
     assert report.splitlines()[0] == f"eve was ended by signal 6{end}"
+
+
+def test_a_fork_server_that_ends_meanwhile_is_named() -> None:
+    """Its processes count as lost a moment after the first of them has ended."""
+    assert ProcessExit("eve", FORK_SERVER_LOST).manner == "was lost with its fork server"
 
 
 @pytest.mark.parametrize("first", [ProcessExit("eve", 3), ProcessExit("recorder", 3)])

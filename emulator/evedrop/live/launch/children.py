@@ -71,6 +71,8 @@ class ProcessExit:
             return "was interrupted by a signal"
         if self.status == CONNECTION_LOST:
             return "was lost with its host"
+        if self.status == FORK_SERVER_LOST:
+            return "was lost with its fork server"
         return f"ended with status {self.status}" if self.status else "left before the run ended"
 
 
