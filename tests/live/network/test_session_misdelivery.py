@@ -224,7 +224,7 @@ def test_a_lost_connection_is_replaced(stage: Stage) -> None:
             ids.add(str(session.connection.session.zid()))
         stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), Progress(2).pack())])
         stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), Progress(3).pack())])
-        assert [subscription.recv(), subscription.recv()] == [Progress(1).pack(), Progress(2).pack()]
+        assert subscription.recv() == Progress(2).pack()  # what was not read on the first session is lost with it
         assert handed_on.get(timeout=LIMIT) == Progress(3).pack()
         wait_until(lambda: session.reaches(keys.progress("eve")), "the reader of its progress")
         put(GOOD)
