@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import random
+import signal
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
 import pytest
 import zenoh
 
+from evedrop.live.launch.starter import StartedProcess
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.codec import enclosed
@@ -96,6 +99,7 @@ def disturbed(seed: int, evedrop: Evedrop, how: str) -> None:
         everybody = ("sensor", *scenario.receivers, "recorder")
         run.write(**(dict.fromkeys(everybody, wire.endpoint) if how == "proxy" else {}))
         run.start()
+        stack.enter_context(unless_zenoh_crashes(run.processes["router"]))
         for waits in flaps(seed):
             with stepping(evedrop, run.results, 500):
                 for wait in waits:
@@ -108,6 +112,17 @@ def disturbed(seed: int, evedrop: Evedrop, how: str) -> None:
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, folder / "memory")
         assert run.summary["outages"]
+
+
+@contextmanager
+def unless_zenoh_crashes(router: StartedProcess) -> Iterator[None]:
+    """Whatever fails because the router has crashed is a fault of Zenoh that is known."""
+    try:
+        yield
+    except Exception:
+        if router.poll() == -signal.SIGSEGV:
+            pytest.xfail("use after free in Zenoh: docs/maintainers/tests.md")
+        raise
 
 
 def may_reset() -> bool:
