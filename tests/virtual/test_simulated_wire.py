@@ -377,9 +377,9 @@ def test_the_real_zenoh_does_not_find_a_simulated_wire(evedrop_simulated_wire: O
         radio.start(REAL_OPEN, radio.config("robot")).result()
     with (
         zenoh.open(radio.config("robot")) as robot,
-        pytest.raises(TypeError, match=r"RingChannel.* not simulated"),
+        pytest.raises(TypeError, match=r"DefaultHandler.* not simulated"),
     ):
-        robot.declare_subscriber("place", zenoh.handlers.RingChannel(3))
+        robot.declare_subscriber("place", zenoh.handlers.DefaultHandler())
 
 
 def test_ctrl_c_in_a_program_is_for_the_test(tmp_path: Path) -> None:
