@@ -25,6 +25,7 @@ from evedrop.virtual.faults import (
     ShortenMessage,
     StopProcess,
 )
+from evedrop.virtual.host_faults import CutSsh
 from evedrop.virtual.judge import misses
 from evedrop.virtual.notes import PutMessage
 from evedrop.virtual.reference import RunReference
@@ -196,6 +197,20 @@ def test_the_sensor_sends_again_what_it_announces(sent: str, missed: bool, tmp_p
     put = [PutMessage(0.5, "uplink", said) for said in ("again 5", sent, "8")]
     miss = "slot 5 is announced to be sent again, and slot 6 is sent"
     assert (miss in judged(tmp_path, {KILLED: 0.4}, put=put)) is missed
+
+
+@pytest.mark.parametrize(("cut", "missed"), [(0.4, False), (0.6, True)])
+def test_a_program_that_is_suspended_when_its_launcher_is_cut_off_stays(
+    cut: float, missed: bool, tmp_path: Path
+) -> None:
+    """Nobody lets it go on; before, its launcher does."""
+    struck: dict[Disturbance, float] = {
+        CutSsh("connection of host alpha", 50): cut,
+        StopProcess("evedrop host of host alpha", 60): 0.5,
+    }
+    left = [f"{name} of host alpha" for name in ("evedrop host", "fork server")]
+    broken = judged(tmp_path, struck, status=3, left=left)
+    assert ({f"{name} is left" for name in left} <= {*broken}) is missed
 
 
 def test_a_run_that_is_held_gives_up_in_time(tmp_path: Path) -> None:

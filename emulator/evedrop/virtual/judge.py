@@ -35,7 +35,7 @@ from evedrop.virtual.faults import (
     ShortenMessage,
     StopProcess,
 )
-from evedrop.virtual.host_faults import LosePower
+from evedrop.virtual.host_faults import CutSsh, LosePower
 from evedrop.virtual.host_parts import host_of
 from evedrop.virtual.processes import FORK_SERVERS
 from evedrop.virtual.reference import RunReference, tables_of
@@ -79,10 +79,15 @@ def misses(
     if run.stuck is not None:
         return [f"stuck: {run.stuck}"]
     killed = min((at for fault, at in struck.items() if fault.ends_at_once(LAUNCHER)), default=math.inf)
+    cut = {host_of(fault.target): at for fault, at in struck.items() if isinstance(fault, CutSsh)}
     unheard = {  # suspended when nobody was left to let them go on
-        fault.target for fault, at in struck.items() if fault.kind == "stop" and fault.seconds is None and at >= killed
+        fault.target
+        for fault, at in struck.items()
+        if isinstance(fault, StopProcess) and fault.seconds is None
+        if at >= min(killed, cut.get(host_of(fault.target), math.inf))
     }
-    broken = [f"{name} is left" for name in run.left if name not in unheard]
+    deaf = {host_of(name) for name in unheard} - {""}
+    broken = [f"{name} is left" for name in run.left if name not in unheard and host_of(name) not in deaf]
     broken += [f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors]
     broken += _of_status(case, run, struck, reference.status)
     broken += _of_time(case, run, struck)
@@ -91,7 +96,8 @@ def misses(
     removes = not any(fault.ends_at_once(LAUNCHER) or isinstance(fault, BreakWrite) for fault in struck)
     if removes and not run.suspended:
         broken += [f"{path.name} is left" for path in sorted(temporaries[""].iterdir())]
-    for host in temporaries.keys() - {"", *(host_of(fault.target) for fault in struck if isinstance(fault, LosePower))}:
+    dark = {host_of(fault.target) for fault in struck if isinstance(fault, LosePower)}
+    for host in temporaries.keys() - {""} - dark - deaf:
         broken += [f"{path.name} is left on {host}" for path in sorted(temporaries[host].iterdir())]
     broken += _of_logs(run)
     broken += _of_rounds(case, run, struck)
