@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 
 from evedrop.scenario.progress_events import RunProgress
@@ -211,6 +212,17 @@ def test_a_program_that_is_suspended_when_its_launcher_is_cut_off_stays(
     left = [f"{name} of host alpha" for name in ("evedrop host", "fork server")]
     broken = judged(tmp_path, struck, status=3, left=left)
     assert ({f"{name} is left" for name in left} <= {*broken}) is missed
+
+
+@pytest.mark.parametrize(("error", "wrong"), [(1e-16, False), (1e-6, True)])
+def test_the_standard_error_of_equal_trials_is_what_rounding_leaves(error: float, wrong: bool) -> None:
+    """Shards add up other sums than the run in memory."""
+    row = {"slot": 0, "peer": "legitimate", "mean_squared_error": 1.0, "standard_error": 1e-8}
+    reference = RunReference(SCENARIO, {}, {"slots": {(0, "legitimate"): row}})
+    table = pa.Table.from_pylist([{**row, "standard_error": error}])
+    assert [*reference.wrong_rows("slots", table)] == (
+        [f"slots (0, 'legitimate'): standard_error is {error}, not 1e-08"] if wrong else []
+    )
 
 
 def test_a_run_that_is_held_gives_up_in_time(tmp_path: Path) -> None:

@@ -31,7 +31,9 @@ KEYS: Mapping[str, tuple[str, ...]] = {
 """Table → what names a row of it."""
 _COUNTS = {"slots": "trials", "journal": "offered"}  # of how many trials a row is
 _ROUNDED = 1e-9  # of metrics that a live run adds up in another order
-_CANCELLED = 1e-7  # of a standard error, which is a difference of sums
+_CANCELLED = (
+    1e-7  # of a standard error, which is a difference of sums: of itself, or of the mean if all trials are equal
+)
 _SHOWN = 3  # rows that are wrong, of a table
 
 Row = Mapping[str, Any]
@@ -153,7 +155,9 @@ def _difference(name: str, row: Row, wanted: Row, fewer: bool) -> str | None:
         if name == "slots":
             if "quantile" in column:  # in memory alone
                 continue
-            same = _near(value, expected, _CANCELLED if column == "standard_error" else _ROUNDED)
+            same = _near(value, expected, _ROUNDED)
+            if column == "standard_error" and not same:
+                same = _near(value, expected, _CANCELLED, _CANCELLED * (wanted["mean_squared_error"] or 0.0))
         else:
             same = repr(value) == repr(expected)  # to the last bit, NaN and −0 included
         if not same:
@@ -161,12 +165,15 @@ def _difference(name: str, row: Row, wanted: Row, fewer: bool) -> str | None:
     return None
 
 
-def _near(value: Any, expected: Any, rounded: float) -> bool:
-    """Whether two numbers are the same but for rounding; where there is nothing it is None or NaN."""
+def _near(value: Any, expected: Any, rounded: float, least: float = 1e-300) -> bool:
+    """Whether two numbers are the same but for rounding; where there is nothing it is None or NaN.
+
+    rounded: the relative difference that there may be; least: the absolute one.
+    """
     if _nothing(value) or _nothing(expected):
         return _nothing(value) and _nothing(expected)
     if isinstance(value, float) and isinstance(expected, float):
-        return value == expected or math.isclose(value, expected, rel_tol=rounded, abs_tol=1e-300)
+        return value == expected or math.isclose(value, expected, rel_tol=rounded, abs_tol=least)
     return bool(value == expected)
 
 
