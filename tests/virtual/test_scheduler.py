@@ -279,6 +279,15 @@ def test_who_takes_too_long_is_stuck() -> None:
     scheduler.take_down()
 
 
+def test_who_has_taken_too_long_may_be_given_more_time() -> None:
+    """It still goes on when what it waits for has come."""
+    scheduler = VirtualScheduler(1)
+    task = started(scheduler, "a", lambda: scheduler.sleep(20.0))
+    with pytest.raises(Stuck, match="10 virtual seconds"):
+        finish(scheduler, task, until=10.0)
+    finish(scheduler, task, until=30.0)
+
+
 def test_an_exception_ends_its_thread_only() -> None:
     """It is told."""
     scheduler = VirtualScheduler(1)

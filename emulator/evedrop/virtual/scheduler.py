@@ -375,13 +375,14 @@ class VirtualScheduler:
                 ready[index], ready[-1] = ready[-1], ready[index]
                 self._go_on(ready.pop())
             elif self._timers:
-                moment, _, what = heapq.heappop(self._timers)
-                if isinstance(what, Waiter):
-                    if what.gone:
-                        continue
-                    what.gone = True
+                moment, number, what = heapq.heappop(self._timers)
+                if isinstance(what, Waiter) and what.gone:
+                    continue
                 if moment > until:
+                    heapq.heappush(self._timers, (moment, number, what))
                     raise Stuck(f"not done after {until:.0f} virtual seconds")
+                if isinstance(what, Waiter):
+                    what.gone = True
                 self.now = max(self.now, moment)
                 if isinstance(what, Waiter):
                     self._go_on(what)
