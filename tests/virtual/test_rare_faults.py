@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import random
 import struct
+from typing import Any
 
 import msgpack
 import pytest
 
 from evedrop.live.protocol.codec import enclosed, pack
 from evedrop.scenario.tables import Scenario
-from evedrop.virtual import notes
+from evedrop.virtual import by_hand, notes
 from evedrop.virtual.broken_messages import BreakMessage, broken
 from evedrop.virtual.by_hand import WriteBriefs
 from evedrop.virtual.cases import case_from, case_of
@@ -120,3 +121,11 @@ def test_all_are_drawn_and_written_down() -> None:
     assert {type(fault) for case in rare for fault in case.faults} >= {*RARE_KINDS.values()}
     for case in rare:
         assert case_from(case.to_text()) == case
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_a_wrong_brief_names_no_other_path(seed: int) -> None:
+    """It would be outside the simulated disk: in the folder in which the tests run, or anywhere."""
+    brief: dict[str, Any] = {"part": {"results": "/home/somebody/results"}}
+    by_hand._break(random.Random(seed), brief, ["part", "results"])  # noqa: S311 - to be repeated, not to be secret
+    assert not isinstance(brief["part"].get("results"), str)

@@ -69,6 +69,8 @@ _STARTED, _STARTING_SECONDS = 12, 40.0
 """How many processes are started, one after the other."""
 CLOCKS = (-90.0 * 86_400.0, 90.0 * 86_400.0)
 """By how many seconds a clock is wrong, so that no certificate is valid."""
+_PATHS = frozenset({"last_word", "modules", "results", "state_file"})
+"""Entries with a path: another one would be outside the simulated disk."""
 _WRONG: Sequence[Any] = (None, True, -1, 2**70, float("inf"), "", "x", "/nowhere", [], {}, [[1.0]], {"scheme": "x"})
 """What an entry of a brief is replaced with."""
 _IS_ENDPOINT, _ENDPOINTS = (
@@ -239,6 +241,8 @@ def _break(some: random.Random, brief: Brief, place: Sequence[Any]) -> None:
         table = table[name]
     if some.random() < 0.15:
         del table[last]
+    elif last in _PATHS:
+        table[last] = some.choice([value for value in _WRONG if not isinstance(value, str)])
     else:
         table[last] = some.choice(_others(table[last]) if some.random() < 0.8 else _WRONG)
 
