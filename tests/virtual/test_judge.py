@@ -26,7 +26,6 @@ from evedrop.virtual.faults import (
     ShortenMessage,
     StopProcess,
 )
-from evedrop.virtual.host_faults import CutSsh
 from evedrop.virtual.judge import misses
 from evedrop.virtual.notes import PutMessage
 from evedrop.virtual.reference import RunReference
@@ -108,11 +107,11 @@ def test_a_process_that_goes_on_without_a_connection_is_a_miss(
 
 
 @pytest.mark.parametrize("away", [True, False])
-def test_who_is_away_to_the_end_waits_for_its_launcher(away: bool, tmp_path: Path) -> None:
-    """It has done all that it had to do, and watches no connection."""
+def test_who_is_away_at_times_may_wait_for_its_launcher(away: bool, tmp_path: Path) -> None:
+    """While it is away, it watches no connection."""
     struck: dict[Disturbance, float] = {FreezeConnection(EVERYBODY, 50): 0.5}
     ends, put = {"legitimate": (9.1, 130)}, [PutMessage(0.4, "uplink", "0")]
-    scenario = with_outage(5, 10 if away else 9)
+    scenario = with_outage(5, 9) if away else SCENARIO
     broken = judged(tmp_path, struck, scenario=scenario, status=3, ends=ends, put=put)
     assert any("does not end" in miss for miss in broken) is not away
 
@@ -200,17 +199,14 @@ def test_the_sensor_sends_again_what_it_announces(sent: str, missed: bool, tmp_p
     assert (miss in judged(tmp_path, {KILLED: 0.4}, put=put)) is missed
 
 
-@pytest.mark.parametrize(("cut", "missed"), [(0.4, False), (0.6, True)])
-def test_a_program_that_is_suspended_when_its_launcher_is_cut_off_stays(
-    cut: float, missed: bool, tmp_path: Path
+@pytest.mark.parametrize(("ended", "missed"), [(0.4, False), (0.6, True)])
+def test_a_program_that_is_suspended_once_its_session_has_ended_stays(
+    ended: float, missed: bool, tmp_path: Path
 ) -> None:
-    """Nobody lets it go on; before, its launcher does."""
-    struck: dict[Disturbance, float] = {
-        CutSsh("connection of host alpha", 50): cut,
-        StopProcess("evedrop host of host alpha", 60): 0.5,
-    }
+    """Nobody lets it go on; before, the server does."""
+    struck: dict[Disturbance, float] = {StopProcess("evedrop host of host alpha", 60): 0.5}
     left = [f"{name} of host alpha" for name in ("evedrop host", "fork server")]
-    broken = judged(tmp_path, struck, status=3, left=left)
+    broken = judged(tmp_path, struck, status=3, left=left, ends={"sshd of host alpha": (ended, -9)})
     assert ({f"{name} is left" for name in left} <= {*broken}) is missed
 
 

@@ -10,6 +10,7 @@ import msgpack
 import pytest
 
 from evedrop.live.protocol.codec import enclosed, pack
+from evedrop.model.receiver import Action
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual import by_hand, notes
 from evedrop.virtual.broken_messages import BreakMessage, broken
@@ -112,6 +113,22 @@ def test_what_no_reader_can_check_is_wrong_in_its_length_alone() -> None:
         assert not isinstance(action, bytes) or len(action) != 1 or action in {b"\1", b"\xff"}
         below += wrong.get("trace") == sums[:8] + struct.pack("<d", -1.0)
     assert below > 0
+
+
+def test_a_wrong_action_says_of_a_packet_that_it_was_lost_or_was_not() -> None:
+    """What a receiver did with one that arrived, the recorder cannot know."""
+    fields, key = {"k": 0, "c": 3, "action": b"\0\2\3"}, "evedrop/r/telemetry/eve"
+    some = random.Random(1)  # noqa: S311 - to be repeated, not to be secret
+    wrong = set()
+    for _ in range(500):
+        other = msgpack.unpackb(broken(some, enclosed(key, pack(fields)), checked=True)[len(enclosed(key, b"")) :])
+        action = other.get("action") if isinstance(other, dict) else None
+        wrong |= {action} if isinstance(action, bytes) and len(action) == 3 else set()
+    assert {action for action in wrong if max(action) <= max(Action)} - {fields["action"]} == {
+        b"\1\2\3",
+        b"\0\0\3",
+        b"\0\2\0",
+    }
 
 
 def test_all_are_drawn_and_written_down() -> None:

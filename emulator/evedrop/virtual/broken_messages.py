@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import msgpack
 
+from evedrop.model.receiver import Action
 from evedrop.names import CONTROLLER, RECORDER, SENSOR
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.disturbance import ROUTERS, Disturbance, processes_of
@@ -159,6 +160,8 @@ def _wrong_bytes(some: random.Random, value: bytes, names: Collection[str], numb
     if not numbers.isdisjoint(names) and some.random() < 0.7:
         if "P" in names:  # below the diagonal, a reader notices only what is no rounding
             return [value[: at // 8 * 8] + _LARGE + value[at // 8 * 8 + 8 :]]
+        if "action" in names:  # what was done with a packet that arrived is the receiver's own affair
+            return [value[:at] + bytes([Action.STATE if value[at] == Action.LOST else Action.LOST]) + value[at + 1 :]]
         return [value[:at] + bytes([value[at] ^ 1 << some.randrange(8)]) + value[at + 1 :]]
     if not _SUMS.isdisjoint(names) and some.random() < 0.5:
         return [value[:-8] + _BELOW]

@@ -35,8 +35,8 @@ from evedrop.virtual.faults import (
     ShortenMessage,
     StopProcess,
 )
-from evedrop.virtual.host_faults import CutSsh, LosePower
-from evedrop.virtual.host_parts import host_of
+from evedrop.virtual.host_faults import LosePower
+from evedrop.virtual.host_parts import SESSION, host_of, part_of
 from evedrop.virtual.processes import FORK_SERVERS
 from evedrop.virtual.reference import RunReference, tables_of
 from evedrop.virtual.results import lost_rows, wrong_outages, wrong_summary, wrong_tables
@@ -79,7 +79,7 @@ def misses(
     if run.stuck is not None:
         return [f"stuck: {run.stuck}"]
     killed = min((at for fault, at in struck.items() if fault.ends_at_once(LAUNCHER)), default=math.inf)
-    cut = {host_of(fault.target): at for fault, at in struck.items() if isinstance(fault, CutSsh)}
+    cut = {host_of(name): at for name, (at, _) in run.ends.items() if part_of(name) == SESSION}
     unheard = {  # suspended when nobody was left to let them go on
         fault.target
         for fault, at in struck.items()
@@ -103,7 +103,7 @@ def misses(
     broken += _of_rounds(case, run, struck)
     misled = any(isinstance(fault, BreakMessage) and fault.target == SENSOR for fault in struck)  # by a wrong number
     if not misled:
-        broken += wrong_messages(case, run.put, disturbed=bool(struck) or _wrong_program(case) is not None)
+        broken += wrong_messages(case, run.put, disturbed=bool(struck) or case.program is not None)
     if not any(fault.destroys for fault in struck):
         broken += _of_files(run, struck)
         broken += _of_results(case, run, struck, reference)
@@ -240,13 +240,10 @@ def _of_ends(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
     scenario, faults = case.scenario, list(struck)
     if case.hosts is not None:
         return
-    away = {
-        name
-        for name, outages in scenario.timeline.outages.items()
-        if any(outage.stop >= scenario.slots for outage in outages)
-    }
+    away = {name: outages for name, outages in scenario.timeline.outages.items() if outages}
+    to_the_end = any(outage.stop >= scenario.slots for outages in away.values() for outage in outages)
     brief = all(fault.survived(scenario.longest_outage) and (fault.seconds or 0.0) <= 1.0 for fault in faults)
-    if run.status == 0 and brief and not away:
+    if run.status == 0 and brief and not to_the_end:
         struck_routers = {fault.target for fault in faults} & {*ROUTERS}
         for name in sorted({*processes_of(scenario)} - struck_routers):
             if (status := run.ends.get(name, (0.0, 0))[1]) != 0:
@@ -260,7 +257,7 @@ def _of_ends(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
     if sum(at < struck[faults[0]] for at in first) >= max(1, scenario.shards):
         lease = 0.0 if isinstance(faults[0], CutConnection) else _LEASE_SECONDS
         last = struck[faults[0]] + scenario.longest_outage + lease + _GIVES_UP_SECONDS
-        for name in {*processes_of(scenario)} - {*ROUTERS, RECORDER} - away:  # who is away waits for its launcher
+        for name in {*processes_of(scenario)} - {*ROUTERS, RECORDER, *away}:  # who is away waits for its launcher
             if name in run.ends and run.ends[name][0] > last:
                 yield f"{name} does not end, though it has had no connection for {run.ends[name][0] - struck[faults[0]]:.1f} s"
 
@@ -314,7 +311,7 @@ def _of_results(
     """Whether the tables can be read, and have the right rows, and no others, and the summary is of them."""
     done = run.status == reference.status
     lacking = any(fault.lacking for fault in struck)
-    falsified = not done and any(text in run.said for text in CONTRADICTIONS)
+    falsified = not done and _falsified(run, struck)
     references = reference.of_folders(run.folder)
     if done and not references:
         yield "there are no results"
@@ -344,6 +341,12 @@ def _of_results(
             yield f"all slots were done, and the summary has {summary['slots']}"
         if not any(fault.ends_at_once(RECORDER) for fault in struck):
             yield from _of_course(case, run, struck, summary, expected, whole)
+
+
+def _falsified(run: SimulatedRun, struck: Iterable[Disturbance]) -> bool:
+    """Whether a run that has failed may have rows with a wrong number: it says so, unless a signal came first."""
+    wrong = any(isinstance(fault, BreakMessage) and fault.target == RECORDER for fault in struck)
+    return any(text in run.said for text in CONTRADICTIONS) or (wrong and run.status == Interrupted.exit_status)
 
 
 def _of_course(

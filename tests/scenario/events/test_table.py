@@ -294,3 +294,13 @@ def test_who_is_told_a_state_must_be_there(event: dict[str, Any], away: str | No
     else:
         (line,) = mistakes_of(right, event, eavesdroppers={"spy": spy})
         assert line == f"eavesdroppers.spy.learns_at: is 15, when spy is {away}; expected a slot in which it is present"
+
+
+def test_changes_of_a_link_are_told_in_the_order_of_a_toml_file() -> None:
+    """Which has tables behind other entries: a run that is repeated from its files tells the same as that of an operator."""
+    loss = {"model": "bernoulli", "quality": 0.5}
+    one, other = (
+        [act.text for act in right({"at": 1, "link": "eve", "set": changes}).event[0].acts()]
+        for changes in ({"loss": loss, "corrupt": 0.2}, {"corrupt": 0.2, "loss": loss})
+    )
+    assert one == other

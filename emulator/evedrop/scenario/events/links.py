@@ -42,7 +42,8 @@ class Set(EventKind):
     def acts(self) -> Iterator[Act]:
         """The changes, and their end."""
         link = f"link {spoken(self.names)}"
-        changes = ", ".join(f"{entry} = {as_toml(value)}" for entry, value in self.set.items())
+        in_order = sorted(self.set.items(), key=lambda entry: isinstance(entry[1], Mapping))  # as a TOML file has them
+        changes = ", ".join(f"{entry} = {as_toml(value)}" for entry, value in in_order)
         yield self.begin(f"{link}: {changes}", LinkSettings(self.set))
         if self.to is not None:
             yield Act(self.to, self.kind, self.names, f"{link}: as at first", LinkSettings(None))
