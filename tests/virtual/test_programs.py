@@ -68,7 +68,7 @@ def test_states_that_were_not_published_are_missed(tmp_path: Path) -> None:
     def wrong(numbers: list[int], *, disturbed: bool) -> bool:
         lines = [",".join(map(repr, published[number])) for number in numbers]
         (tmp_path / STATES).write_text("\n".join(["x,v", *lines]) + "\n")
-        return bool(taken_states(tmp_path, SCENARIO, disturbed=disturbed)[1])
+        return bool(taken_states(tmp_path, SCENARIO, disturbed=disturbed)[2])
 
     assert not wrong([3, 4, 5], disturbed=False)
     assert wrong([3, 5], disturbed=False)

@@ -78,8 +78,8 @@ def play_case(
             reference = _amended(reference, case.scenario, run.folder, folder / "amended")
         wrong = list[str]()
         if case.program is not None:
-            taken, wrong = taken_states(run.folder, case.scenario, disturbed=bool(struck))
-            reference = in_memory(taken, folder / "taken")
+            taken, count, wrong = taken_states(run.folder, case.scenario, disturbed=bool(struck))
+            reference = in_memory(taken, folder / "taken").of_states(count)
         return PlayedCase(case, run, struck, (*wrong, *misses(case, run, struck, reference, temporaries)))
 
 

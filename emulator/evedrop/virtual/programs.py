@@ -213,8 +213,8 @@ def drawn_program(seed: int, scenario: Scenario) -> DrawnProgram | None:
     return DrawnProgram(listens, form, mistake, some.randrange(scenario.slots) if late else 0)
 
 
-def taken_states(folder: Path, scenario: Scenario, *, disturbed: bool) -> tuple[Scenario, list[str]]:
-    """The scenario with the states that a run has taken, and what is wrong with them.
+def taken_states(folder: Path, scenario: Scenario, *, disturbed: bool) -> tuple[Scenario, int, list[str]]:
+    """The scenario with the states that a run has taken, their number, and what is wrong with them.
 
     Without disturbance these are states that the program has published one after the other; otherwise some may be left out.
     """
@@ -230,4 +230,4 @@ def taken_states(folder: Path, scenario: Scenario, *, disturbed: bool) -> tuple[
         at = later
     rest = (scenario.process.state_values or [])[len(taken) :]
     tables = scenario.as_tables()
-    return Scenario({**tables, "process": {**tables["process"], "state_values": [*taken, *rest]}}), wrong
+    return Scenario({**tables, "process": {**tables["process"], "state_values": [*taken, *rest]}}), len(taken), wrong

@@ -72,6 +72,14 @@ class RunReference:
         }
         return replace(self, tables={**self.tables, "slots": rows})
 
+    def of_states(self, count: int) -> RunReference:
+        """What is known where only so many states are: no digests if there are fewer than slots.
+
+        Receivers may have told of the last block while its rows, and states, were still to come.
+        """
+        known = {name: rows for name, rows in self.tables.items() if name != "digests"}
+        return self if count >= self.scenario.slots else replace(self, tables=known)
+
     def wrong_rows(self, name: str, table: pa.Table, whole: int | None = None) -> Iterator[str]:
         """Rows of a table on disk that differ from those that are right; rows that must not be there.
 
