@@ -15,6 +15,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+import pyarrow as pa
+
 from evedrop.cli.simulated import program
 from evedrop.virtual.campaign import PlayedCase, play_case
 from evedrop.virtual.campaign import play as play_seed
@@ -113,17 +115,18 @@ def unlike(failed: Sequence[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tup
     return list(first.values())
 
 
-def collect_seldom() -> None:
-    """Let a worker search its new objects for cycles less often, and its modules never."""
+def save_time() -> None:
+    """Let a worker search its new objects for cycles less often, and its modules never; and use no threads for small tables."""
     gc.freeze()
     gc.set_threshold(50_000)
+    pa.set_cpu_count(1)
 
 
 def campaign(seeds: range, workers: int, explained: int, view: Path | None) -> bool:
     """Play the cases of seeds, and explain the first ones that fail in different ways; returns whether none failed."""
     begun, events, total = time.perf_counter(), 0, hashlib.blake2b(digest_size=8)
     failed: list[tuple[int, tuple[str, ...]]] = []
-    with ProcessPoolExecutor(workers, initializer=collect_seldom) as pool:
+    with ProcessPoolExecutor(workers, initializer=save_time) as pool:
         for seed, case, digest, happened, seconds, misses, status in pool.map(
             played, seeds, chunksize=SEEDS_OF_A_SCENARIO
         ):
