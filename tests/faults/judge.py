@@ -244,14 +244,14 @@ def _of_results(status: int, run: Run, hits: Mapping[Fault, float], reference: R
     for folder, expected in folders.items():
         try:
             results = Results.read(folder)
-            dict(tables_of(results))
+            tables = dict(tables_of(results))
         except UsageError as error:
             # Where nothing was measured there is nothing to read.
             if folder in written or (run.done and len(folders) == 1) or (status != KILLED and not disk and not limited):
                 yield f"{folder.name} cannot be read: {error}"
             continue
         summary = results.summary
-        yield from wrong_tables(results, expected, status == 0)
+        yield from wrong_tables(tables, summary, expected, status == 0)
         if not disk:
             yield from _of_summary(status, run, hits, summary, expected)
         yield from failed_looks(folder, reference.folder if summary["slots"] else None)

@@ -182,11 +182,11 @@ def relative_verdict(
     least, most: the same difference from the largest mean that the legitimate error may have, and that the eavesdropper's may
     have: `held` must hold of the first of them as well, and `failed` of the second. None: these are the means of the trials.
     """
-    least, most = (difference if each is None else each for each in (least, most))
     measured = [w for w, row in enumerate(difference) if not np.isnan(row).any()]
     tests = {w: test(difference[w]) for w in measured}
-    failed = rejected({w: max(tests[w].below, test(most[w]).below) for w in measured})
-    doubtful = [w for w in measured if max(tests[w].above, test(least[w]).above) > ERROR_RATE]
+    of_least, of_most = (tests if bound is None else {w: test(bound[w]) for w in measured} for bound in (least, most))
+    failed = rejected({w: max(tests[w].below, of_most[w].below) for w in measured})
+    doubtful = [w for w in measured if max(tests[w].above, of_least[w].above) > ERROR_RATE]
     if failed:
         return Claim.FAILED, _slots_of(failed, slots)
     if doubtful or not tests:

@@ -320,7 +320,7 @@ def _of_results(
         yield from lost_rows(folder)
         try:
             results = Results.read(folder)
-            dict(tables_of(results))
+            tables = dict(tables_of(results))
         except UsageError as error:
             has_rows = last_round(folder).slots > 0 and not any(named_in(case.scenario.as_tables()))
             if done or has_rows or (whole and not lacking and any(slots for _, slots in _progress(run))):
@@ -329,7 +329,7 @@ def _of_results(
         if falsified:  # rows may have a number that was noticed later, when its block was complete
             continue
         summary = results.summary
-        yield from wrong_tables(results, expected, done)
+        yield from wrong_tables(tables, summary, expected, done)
         if lacking and not done:
             continue
         yield from wrong_summary(summary, expected, done)

@@ -11,19 +11,21 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from evedrop.results.crash_proof_tables import last_round, metrics_path
-from evedrop.results.reading import Results
 from evedrop.virtual.metrics import unlike_digests, unlike_memory, unlike_rows
-from evedrop.virtual.reference import RunReference, tables_of
+from evedrop.virtual.reference import RunReference
 from evedrop.virtual.whole import missing_rows
 
 
-def wrong_tables(results: Results, reference: RunReference, done: bool) -> Iterator[str]:
+def wrong_tables(
+    tables: Mapping[str, pa.Table], summary: Mapping[str, Any], reference: RunReference, done: bool
+) -> Iterator[str]:
     """What is wrong with the tables of a run, and with the metrics of its summary, by its tables.
 
     done: whether it ended well.
     """
-    summary, tables = results.summary, dict(tables_of(results))
     for name, table in tables.items():
         yield from reference.wrong_rows(name, table, int(summary["slots"]))
     if tables["slots"].num_rows:
