@@ -1,9 +1,13 @@
 """Whether the simulated world notices mistakes: each mutant is put into a copy of the package, and seeds are played in it.
 
+If no seed notices it, the cases of regressions.toml are played, too.
+
     python -m tests.virtual.mutation
 
-Prints a row for each mutant: what noticed it, and after how many seeds. A seed that breaks a promise without the mistake does
-not count. A mutant that no seed notices shows what the simulation lacks. Source: docs/maintainers/simulated-world.md.
+Prints a row for each mutant: what noticed it, and after how many seeds, or in which case. A seed that breaks a promise without
+the mistake does not count. A mutant that nothing notices shows what the simulation lacks.
+
+Source: docs/maintainers/simulated-world.md.
 """
 
 from __future__ import annotations
@@ -22,9 +26,11 @@ from functools import cache
 from pathlib import Path
 
 from tests.mutants import Mutant, cell, copy_with, mutants
-from tests.virtual.simulated import played
+from tests.virtual.simulated import play, played, read_case
+from tests.virtual.test_campaign_regressions import REGRESSIONS
 
 _ROOT = Path(__file__).parents[2]
+_SEEDS, _CASES = "seeds", "cases"
 _FOREVER_SECONDS = 60.0
 """A seed takes a fraction of a second: one that takes so long does not end."""
 
@@ -39,23 +45,30 @@ class Outcome:
     seeds: int
     """How many seeds had been played by then."""
     seconds: float
+    case: int | None = None
+    """The number of the case that noticed it, from 1; None if a seed did, or nothing."""
 
     def __str__(self) -> str:
-        return f"{self.mutant.row} {self.noticed or 'NOT NOTICED'} | {self.seeds} | {self.seconds:.0f} s |"
+        played = self.seeds if self.case is None else f"{self.seeds}, case {self.case}"
+        return f"{self.mutant.row} {self.noticed or 'NOT NOTICED'} | {played} | {self.seconds:.0f} s |"
 
 
 def tried(mutant: Mutant, seeds: range, seconds: float) -> Outcome:
-    """Play seeds with a mutant until one notices it, for some seconds at most."""
+    """Play seeds with a mutant until one notices it, for some seconds at most, and then the cases."""
     begun, count = time.monotonic(), 0
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         copy_with(mutant, Path(folder))
-        for seed, miss in _played_with(Path(folder), seeds):
+        for seed, miss in zip(seeds, _played_with(Path(folder), _SEEDS, seeds), strict=False):
             count += 1
             took = time.monotonic() - begun
             if miss and not _broken_anyway(seed):
                 return Outcome(mutant, cell(miss), count, took)
             if took > seconds:
                 break
+        cases = range(1, 1 + len(REGRESSIONS))
+        for case, miss in zip(cases, _played_with(Path(folder), _CASES, cases), strict=False):
+            if miss:
+                return Outcome(mutant, cell(miss), count, time.monotonic() - begun, case)
     return Outcome(mutant, None, count, time.monotonic() - begun)
 
 
@@ -65,9 +78,9 @@ def _broken_anyway(seed: int) -> bool:
     return bool(played(seed)[5])
 
 
-def _played_with(folder: Path, seeds: range) -> Iterator[tuple[int, str]]:
-    """The seeds that are played with the copy of the package in a folder, each with its first miss."""
-    words = [sys.executable, "-m", "tests.virtual.mutation", "--play", str(seeds.start), str(len(seeds))]
+def _played_with(folder: Path, what: str, numbers: range) -> Iterator[str]:
+    """The first misses of seeds, or of cases, that are played with the copy of the package in a folder."""
+    words = [sys.executable, "-m", "tests.virtual.mutation", "--play", what, str(numbers.start), str(numbers.stop)]
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     with (
         (folder / "stderr").open("w+") as errors,
@@ -84,24 +97,24 @@ def _played_with(folder: Path, seeds: range) -> Iterator[tuple[int, str]]:
 
         threading.Thread(target=read, daemon=True).start()
         try:
-            for seed in seeds:
+            for _ in numbers:
                 line = lines.get(timeout=_FOREVER_SECONDS)
                 if line is None:
                     process.wait()
                     errors.seek(0)
-                    yield seed, f"in memory: {(errors.read().strip().splitlines() or ['(nothing)'])[-1]}"
+                    yield f"in memory: {(errors.read().strip().splitlines() or ['(nothing)'])[-1]}"
                     return
-                yield seed, line.strip()
+                yield line.strip()
         except queue.Empty:
-            yield seed, "the seed does not end, and no virtual time passes"
+            yield "the run does not end, and no virtual time passes"
         finally:
             process.kill()
 
 
-def _play(seeds: range) -> None:
-    """Play seeds, and print the first miss of each, on a line of its own."""
-    for seed in seeds:
-        misses = played(seed)[5]
+def _play(what: str, numbers: range) -> None:
+    """Play seeds, or cases, and print the first miss of each, on a line of its own."""
+    for number in numbers:
+        misses = played(number)[5] if what == _SEEDS else play(read_case(REGRESSIONS[number - 1]["case"])).misses
         _say(" ".join(misses[0].split()) if misses else "")
 
 
@@ -111,11 +124,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", default="", help="mutants whose description or file contains this")
     parser.add_argument("--seeds", type=int, default=400, help="how many are played with each")
     parser.add_argument("--seconds", type=float, default=120.0, help="for how long they are played at most")
-    parser.add_argument("--play", nargs=2, type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--play", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.play is not None:
-        first, count = options.play
-        _play(range(first, first + count))
+        what, first, stop = options.play
+        _play(what, range(int(first), int(stop)))
         return 0
     chosen = [mutant for mutant in mutants(options.only) if mutant.simulated]
     _say(f"| {len(chosen)} mutants | file | noticed by | seeds | time |\n|---|---|---|---|---|")
