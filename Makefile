@@ -94,7 +94,7 @@ test-simulated: $(READY)
 	$(BIN)/python -m tests.virtual.simulated --seed $(or $(SEED),1) --count $(COUNT) $(if $(EXPLAIN),--explain $(EXPLAIN)) \
 		$(if $(VIEW),--view $(VIEW:window=))
 
-# The same for the simulated world, of the mistakes that it must notice.
+# The same for the simulated world, of the mistakes that it must notice: in some of 400 seeds, or in a case of regressions.toml.
 test-simulated-mutants: $(READY)
 	$(BIN)/python -m tests.virtual.mutation --only "$(ONLY)"
 
