@@ -92,10 +92,14 @@ class Window:
         self._measure()
 
     def go_on(self, k: int, absent: Collection[str]) -> None:
-        """All processes have done all slots below k; do not wait for the absent ones from now on."""
-        self._done = {name: max(done, k) for name, done in self._done.items()}
+        """All receivers have done all slots below k; do not wait for the absent ones from now on.
+
+        The recorder need not have the controller's reports of these slots: the controller keeps those of a window.
+        """
+        self._done = {name: done if name == RECORDER else max(done, k) for name, done in self._done.items()}
         self._absent = absent
         self._measure()
+        self.settle(k, 0.0)
 
     @property
     def _followed(self) -> list[str]:
