@@ -15,6 +15,7 @@ import pytest
 from evedrop.errors import UsageError
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import toml_text
+from evedrop.virtual import notes
 from evedrop.virtual.cases import case_of
 from evedrop.virtual.faults import CutConnection, CutPower, FillDisk, KillProcess, StopProcess
 from evedrop.virtual.run import SimulatedRun
@@ -27,7 +28,7 @@ from evedrop.wire.scenario_network import over_wire
 from evedrop.wire.tallies import LinkTally
 from evedrop.wire.time_steps import StepCounter
 from tests.virtual import simulated, wire_damage, wire_scenarios
-from tests.virtual.small_limits import HUNG, LIMITS
+from tests.virtual.small_limits import FULL, HUNG, LIMITS
 from tests.virtual.wire_cases import EVERY, USUAL_PROGRAMS, WIRE, SimulatedWireCase
 from tests.virtual.wire_commands import (
     DAMAGED,
@@ -47,6 +48,19 @@ from tests.virtual.wire_judge import DISK, WireJudge
 from tests.virtual.wire_mistakes import MISTAKES, TRIALS
 from tests.virtual.wire_programs import Course, WireProgram
 
+_TAPPED = """
+[side.robot]
+listen = "tcp/127.0.0.1:17501"
+
+[side.field]
+connect = "tcp/127.0.0.1:17600"
+
+[[link]]
+from = "robot"
+to = "field"
+tap = true
+duplicate = 0.5
+"""
 PLAIN = SimulatedWireCase(1, (), starts=2, seconds=10.0)
 NUMBERED, TALLIED, MESSAGE, COUNTED = RunningLink._counted, LinkTally.add, _Way.message, StepCounter.add
 
@@ -109,6 +123,21 @@ def test_a_fault_at_any_moment_breaks_no_promise(fault: Any) -> None:
     """Also while the wire starts, and while it ends."""
     for after in (30, 300, 850):
         assert replace(PLAIN, faults=(replace(fault, after=after),)).play().misses == (), after
+
+
+def test_a_message_that_zenoh_drops_at_a_tap_is_no_miss() -> None:
+    """Where a connection is full, the second copy of a message is dropped, and the journal calls both delivered."""
+    case = SimulatedWireCase(
+        1,
+        (),
+        seconds=3.0,
+        file=_TAPPED,
+        programs=(WireProgram(ROBOT, ("large robot/large",)), WireProgram(FIELD, ("listen **",))),
+        further=(FULL,),
+    )
+    played = case.play(keep=True)
+    assert any(note.what == notes.LOST and note.words[-1] == "no room" for note in played.run.happened)
+    assert played.misses == ()
 
 
 @pytest.mark.parametrize("trial", TRIALS)

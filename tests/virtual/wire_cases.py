@@ -30,7 +30,7 @@ from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import KINDS
 from evedrop.virtual.faults import DiskDisturbance, FreezeConnection, StopProcess
 from evedrop.virtual.run import SimulatedRun, SimulatedWorld
-from evedrop.virtual.scheduler import Stuck
+from evedrop.virtual.scheduler import Stuck, VirtualScheduler
 from evedrop.virtual.world import EPOCH
 from evedrop.wire.file import wire_of
 from tests.faults.wires import FILE
@@ -254,6 +254,7 @@ class SimulatedWireCase:
             course, struck = Course(), dict[Disturbance, float]()
             for fault in self.faults:
                 simulated.scheduler.after(fault.after, partial(_strike, fault, simulated, struck))
+            simulated.scheduler.watchers.append(partial(_note_drop, simulated.scheduler, course))
             run = SimulatedRun(simulated.disk.root / "wire")
             if self.trials:
                 return PlayedWire(self, run, self._tried(simulated, run))
@@ -349,6 +350,12 @@ def _faults(draw: random.Random, seconds: float) -> tuple[Disturbance, ...]:
         after = round(draw.uniform(_FIRST, seconds * _PER_SECOND))
         faults.append(KINDS[kind](draw.choice(group[kind]), after, lasting))
     return tuple(faults)
+
+
+def _note_drop(scheduler: VirtualScheduler, course: Course, name: str, what: str, words: tuple[object, ...]) -> None:
+    del name
+    if what == notes.LOST and words[-1] == "no room":
+        course.dropped.append(scheduler.now)
 
 
 def _strike(fault: Disturbance, simulated: SimulatedWorld, struck: dict[Disturbance, float]) -> None:

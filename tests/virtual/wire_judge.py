@@ -50,6 +50,10 @@ _DOUBT = 7.0
 """For how long after a further start, or after a connection may be made again, a reader may still be away."""
 _ARRIVING, _LEAVING = 1.0, 1.0
 """Seconds after a program has begun, and before its end, in which messages may miss it."""
+_DROPPING = 0.5
+"""Seconds from when the wire lets a message go, within which Zenoh may drop it."""
+_ROUNDING = 1e-5
+"""Seconds, more than a time of day is rounded by."""
 _TIMEOUT_BYTES = 7
 """Of the answer with which Zenoh says that a time limit is over."""
 _CUT = {"cut", "overflow", "too_large", "looped"}
@@ -297,6 +301,8 @@ class WireJudge:
             yield begun, begun + _DOUBT
         if self._hung:
             yield 0.0, float("inf")
+        for at in self._course.dropped:
+            yield at - _DROPPING, at + _ROUNDING
         for fault, at in self._struck.items():
             if isinstance(fault, SlowConnection):
                 continue
