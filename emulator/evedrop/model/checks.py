@@ -63,6 +63,15 @@ def number_mistakes(given: Mapping[str, Any], name: str, least: float, most: flo
     return [(name, f"is {as_toml(given[name])}; expected a number from {least:.10g} to {most:.10g}")]
 
 
+def whole_number_mistakes(
+    given: Mapping[str, Any], name: str, least: int, most: int, of: str = ""
+) -> list[tuple[str, str]]:
+    """A mistake if the entry is given and is not a whole number from `least` to `most`; of: what it counts."""
+    if name not in given or (type(given[name]) is int and least <= given[name] <= most):
+        return []
+    return [(name, f"is {as_toml(given[name])}; expected a whole number{of and f' of {of}'} from {least} to {most}")]
+
+
 def probability_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, str]]:
     """A mistake for every one of the names that is given and is not a probability."""
     return [mistake for name in names for mistake in number_mistakes(given, name, 0.0, 1.0)]

@@ -18,6 +18,7 @@ from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import EavesdropperPart, RecorderPart, RouterPart, SensorPart, has_part, read_brief
 from evedrop.live.protocol.json_tables import plain
+from evedrop.model.checks import as_toml
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.scenario.stream_keys import StreamKeys
 from tests.conftest import Evedrop
@@ -260,12 +261,21 @@ def test_a_malformed_outage_is_refused(role: str, outage: list[Any], message: st
     assert message in str(refusal(brief, tmp_path))
 
 
-def test_a_parameter_that_the_strategy_finds_wrong_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("strategy", "parameter", "value"),
+    [
+        ("learning-particle", "particles", 0),
+        ("replay-informed", "learns_at", [[1.0]]),
+        ("replay-informed", "learns_at", -1),
+    ],
+)
+def test_a_parameter_that_the_strategy_finds_wrong_is_refused(
+    strategy: str, parameter: str, value: Any, tmp_path: Path
+) -> None:
     """In the words in which it refuses it in a scenario."""
     brief = json.loads(made(briefed())["doubtful"].text)
-    strategy = "learning-particle"
-    brief["part"] |= {"strategy": strategy, "parameters": {**STRATEGIES[strategy].parameters, "particles": 0}}
-    assert "part.parameters.particles is 0; expected" in str(refusal(brief, tmp_path))
+    brief["part"] |= {"strategy": strategy, "parameters": {**STRATEGIES[strategy].parameters, parameter: value}}
+    assert f"part.parameters.{parameter} is {as_toml(value)}; expected" in str(refusal(brief, tmp_path))
 
 
 @pytest.mark.parametrize("wrong", [[0.5] * 3, [1.5], [-0.1]])

@@ -214,7 +214,7 @@ def test_when_it_climbs() -> None:
         ),
         ({"knows": ["B"]}, "knows", 'is ["B"]; expected'),
         ({"knows": [1]}, "knows", "is [1]; expected"),
-        ({"keeps": 7}, "keeps", "is 7; expected a number from 8 to 4096"),
+        ({"keeps": 7}, "keeps", "is 7; expected a whole number of slots from 8 to 4096"),
         ({"keeps": 9.5}, "keeps", "is 9.5; expected a whole number of slots from 8 to 4096"),
         ({"keeps": True}, "keeps", "is true; expected"),
     ],

@@ -187,7 +187,7 @@ def test_a_delegate_tells_what_its_reader_has_learned() -> None:
     ("given", "entry", "message"),
     [
         ({"knows": ["B"]}, "knows", 'is ["B"]; expected'),
-        ({"particles": 1}, "particles", "is 1; expected a number from 2 to 4096"),
+        ({"particles": 1}, "particles", "is 1; expected a whole number from 2 to 4096"),
         ({"particles": 9.5}, "particles", "is 9.5; expected a whole number from 2 to 4096"),
         ({"particles": False}, "particles", "is false; expected"),
     ],

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
+from evedrop.model.checks import LAST_SLOT, whole_number_mistakes
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
 from evedrop.model.eavesdroppers.readers import READERS
 from evedrop.model.process import Floats
@@ -83,6 +84,11 @@ class ReplayInformed(Delegate):
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
         self._learns_at = int(knowledge.parameters["learns_at"])
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """A slot that is none."""
+        return whole_number_mistakes(given, "learns_at", 0, LAST_SLOT)
 
     @classmethod
     def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:  # noqa: ARG003 - alike for all

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.checks import as_toml, number_mistakes
+from evedrop.model.checks import whole_number_mistakes
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.learner import (
     Known,
@@ -134,7 +134,7 @@ class LearningEm(Learner):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """Names that are known, and a number of slots."""
-        return knowing_mistakes(given) + keeps_mistakes(given)
+        return knowing_mistakes(given) + whole_number_mistakes(given, "keeps", _EACH, _MOST_SLOTS, "slots")
 
     def prior(self, first: int = 0) -> Belief:
         """x̂ = 0, and the covariance I for want of Σ0."""
@@ -208,11 +208,3 @@ def climbing_slots(n: int, keeps: int) -> list[int]:
     while 2 * ages[-1] <= keeps:
         ages.append(2 * ages[-1])
     return ages
-
-
-def keeps_mistakes(given: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """A mistake in `keeps`."""
-    keeps = given.get("keeps", _EACH)
-    if isinstance(keeps, bool) or not isinstance(keeps, int):
-        return [("keeps", f"is {as_toml(keeps)}; expected a whole number of slots from {_EACH} to {_MOST_SLOTS}")]
-    return number_mistakes(given, "keeps", _EACH, _MOST_SLOTS)

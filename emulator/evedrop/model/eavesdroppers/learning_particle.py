@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.checks import as_toml, number_mistakes
+from evedrop.model.checks import whole_number_mistakes
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.learner import (
     Known,
@@ -155,13 +155,7 @@ class LearningParticle(Learner):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """Names that are known, and a number of particles."""
-        particles = given.get("particles", 2)
-        if isinstance(particles, bool) or not isinstance(particles, int):
-            return [
-                *knowing_mistakes(given),
-                ("particles", f"is {as_toml(particles)}; expected a whole number from 2 to {_MOST}"),
-            ]
-        return knowing_mistakes(given) + number_mistakes(given, "particles", 2, _MOST)
+        return knowing_mistakes(given) + whole_number_mistakes(given, "particles", 2, _MOST)
 
     def prior(self, first: int = 0) -> Belief:  # noqa: ARG002 - it knows nothing of earlier slots
         """x̂ = 0, and the covariance I for want of Σ0."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.checks import as_toml, number_mistakes
+from evedrop.model.checks import number_mistakes, whole_number_mistakes
 from evedrop.model.kernels.elementary import exp, log, normal_quantile, sum_in_order
 from evedrop.model.links.counts import Counted, Spectrum
 from evedrop.model.links.loss_model import LossModel, fates_of
@@ -97,11 +97,7 @@ class Distance(LossModel):
         ):
             wrong += number_mistakes(given, name, least, most)
         for name in ("shadowing_block", "fading_block"):
-            value = given.get(name, 1)
-            if type(value) is not int or not 1 <= value <= _LONGEST_BLOCK:
-                wrong.append(
-                    (name, f"is {as_toml(value)}; expected a whole number of slots from 1 to {_LONGEST_BLOCK}")
-                )
+            wrong += whole_number_mistakes(given, name, 1, _LONGEST_BLOCK, "slots")
         if len(ways) == 2 and not any(ways.values()):
             shared_slot = _shared_slot(Way(given["sender"]), Way(given["receiver"]))
             if shared_slot is not None:
