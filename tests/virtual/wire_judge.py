@@ -184,6 +184,7 @@ class WireJudge:
         if MOVED in self._case.further:
             yield RunError.exit_status, "removed or moved"
             yield UsageError.exit_status, "is not empty"
+            yield UsageError.exit_status, "cannot be written (No such file or directory)"
 
     def _of_end(self) -> Iterator[str]:
         """Nothing is left behind, the exit status tells whether expectations held, and wire.toml is the wire."""

@@ -102,6 +102,11 @@ class SimulatedWorld:
         """Where the results of a run are, and where somebody else may move them."""
         self.world = VirtualWorld(self.scheduler, self.machine, self.zenoh, self.disk)
 
+    @property
+    def moved_results(self) -> Path:
+        """Where the results of a run are now."""
+        return self.renamed if self.renamed.is_dir() else self.results
+
     @contextlib.contextmanager
     def entered(self) -> Iterator[None]:
         """Let all programs of the interpreter be in this world while the block runs."""
@@ -187,7 +192,7 @@ def run_in(
         run.ended = ended
         run.errors, run.seconds, run.events = scheduler.errors, scheduler.now, scheduler.events
         run.digest, run.happened = scheduler.digest, scheduler.happened
-        run.folder = world.renamed if world.renamed.is_dir() else world.results
+        run.folder = world.moved_results
     return run
 
 
