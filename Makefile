@@ -8,14 +8,19 @@ READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs-ready
 NOTEBOOKS_READY := $(VENV)/.notebooks-ready
 
-.PHONY: demo test test-wheel test-pictures pictures notebooks bench bench-against coverage test-long test-hosts test-compose test-fresh test-faults test-mutants test-simulated test-simulated-mutants docs lint lint-types lint-rest setup clean
+.PHONY: demo test test-thorough test-wheel test-pictures pictures notebooks bench bench-against coverage test-long test-hosts test-compose test-fresh test-faults test-mutants test-simulated test-simulated-mutants docs lint lint-types lint-rest setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
 
 # What needs more than processors and a disk has a target of its own, below: packages to install, a driver that draws, root.
+ELSEWHERE := long or campaign or hosts or containers or fresh or notebooks or wheel or pictures
 test: $(READY)
-	$(BIN)/python -m pytest -n 6 --dist loadfile --no-loadscope-reorder -m "not (long or campaign or hosts or containers or fresh or notebooks or wheel or pictures)"
+	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m "not (thorough or $(ELSEWHERE))"
+
+# The tests that take a second or more each.
+test-thorough: $(READY)
+	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m "thorough and not ($(ELSEWHERE))"
 
 # The wheel, built and installed into environments of its own.
 test-wheel: $(READY)

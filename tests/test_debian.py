@@ -107,6 +107,7 @@ def unharmed(folder: Path) -> Iterator[None]:
     assert Path("/proc/1/stat").exists()
 
 
+@pytest.mark.thorough
 def test_a_slow_debootstrap_is_given_up_and_leaves_nothing(started: StartedDebootstrap, tmp_path: Path) -> None:
     """It is said that it was slow; neither a mount nor a process nor a file is left."""
     folder = tmp_path / "temporary"

@@ -63,6 +63,7 @@ def environment(evedrop: Evedrop) -> dict[str, str]:
     return {**evedrop.environment, "PYTHONPATH": str(evedrop.folder / "site")}
 
 
+@pytest.mark.thorough
 def test_a_package_with_one_of_each_runs(evedrop: Evedrop, environment: dict[str, str]) -> None:
     """Live and in memory with the same digests; schema, expectations, summary, events, view and help have all of them."""
     assert {name for named in ENTRIES.values() for name in named} == NEW

@@ -50,6 +50,7 @@ def compared(words: list[str], before: str) -> list[str]:
     return said(COMPARED.format(benchmarks=str(BENCHMARKS), words=words, before=before)).splitlines()
 
 
+@pytest.mark.thorough
 def test_a_command_that_fails_now_is_worse_however_fast_it_fails() -> None:
     """And a command that only the earlier commit cannot carry out is left out."""
     row, worse = compared(["run", "no such scenario"], sys.executable)

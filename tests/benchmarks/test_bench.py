@@ -46,6 +46,7 @@ def bench_of(folder: Path, programs: dict[str, str]) -> subprocess.CompletedProc
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120)
 
 
+@pytest.mark.thorough
 def test_programs_that_fail_or_hang_do_not_keep_the_others_from_running(tmp_path: Path) -> None:
     """They are rows of their own, after what they could measure, and the exit status is 1."""
     done = bench_of(tmp_path, {"failing": FAILING, "hanging": HANGING, "good": GOOD})

@@ -32,6 +32,7 @@ def test_the_kernels_are_compared_with_numpy() -> None:
     assert len(re.findall(r"^    [\d.]+ times as fast$", output, re.MULTILINE)) == 4
 
 
+@pytest.mark.thorough
 def test_the_latency_is_that_of_the_real_router() -> None:
     """Small peers that follow the protocol exchange all packets through it, and through raw Zenoh."""
     [line] = quick("latency", "--json").splitlines()

@@ -76,6 +76,7 @@ def test_the_closing_report_can_be_printed_again(evedrop: Evedrop) -> None:
     refused(evedrop("view", "run", "--table"), "summary.json is not a run summary of this version")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("command", "below", "status"), [("run", "1e-9", 1), ("montecarlo", "0.01", 0)])
 def test_json_is_one_object_and_nothing_else(evedrop: Evedrop, command: str, below: str, status: int) -> None:
     """Standard output is the summary of summary.json; standard error is silent; the status tells of expectations."""
@@ -150,6 +151,7 @@ def test_a_folder_that_may_only_be_read_can_be_worked_in(evedrop: Evedrop) -> No
     refused(evedrop.process("run", "eavesdroppers", *QUICK, cwd=where), "cannot be written (")
 
 
+@pytest.mark.thorough
 def test_two_runs_at_once_do_not_meet(evedrop: Evedrop) -> None:
     """Ports, keys and folders are a run's own."""
     runs = [evedrop.live("eavesdroppers", "--slots", "600", "--seed", str(seed), out=f"run{seed}") for seed in (1, 2)]
@@ -329,6 +331,7 @@ def test_other_errors_of_the_system_are_not_blamed_on_the_output(
     assert done.err == "evedrop: [Errno 24] Too many open files; free system resources and try again\n"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("reader", mostly_long(["/dev/full", "gone"], ["gone"]))
 def test_an_interrupt_stays_one_for_every_reader(evedrop: Evedrop, reader: str) -> None:
     """Ctrl-C also ends the reader of the pipe; that our closing table cannot be written changes nothing."""

@@ -32,6 +32,7 @@ def test_values_are_hidden(words: str, shown: str) -> None:
     assert without_values(words.split()) == shown.split()
 
 
+@pytest.mark.thorough
 @needs_proc
 def test_a_running_command_shows_no_seed(evedrop: Evedrop) -> None:
     """Neither it nor any process that it starts, while the run goes on; its environment is as it was."""

@@ -176,6 +176,7 @@ def test_a_scheme_without_such_a_choice_is_refused(evedrop: Evedrop, scheme: str
     assert designed(evedrop, "twin-track", "--set", remedy)["legitimate"]["bound"] == pytest.approx(LOW, abs=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("scheme", ["acknowledged", "scheduled", "encrypted-schedule"])
 def test_a_scheme_that_needs_acknowledgements_is_refused(evedrop: Evedrop, scheme: str) -> None:
     """In one line, with a command that makes a scenario of it which can be designed."""
@@ -208,6 +209,7 @@ def test_figures_that_cannot_be_written_are_refused(evedrop: Evedrop) -> None:
     assert done.err.splitlines()[-1].startswith("evedrop: file cannot be written (")
 
 
+@pytest.mark.thorough
 def test_the_choice_of_a_ratio(evedrop: Evedrop) -> None:
     """`--min-ratio R`: in words, as JSON, and the line it prints gives a scenario that has the ratio."""
     result = designed(evedrop, "numerical", "--min-ratio", "2")
@@ -313,6 +315,7 @@ def test_the_suggestion_is_the_cheapest_with_nearly_the_largest_ratio() -> None:
     assert design("numerical", changes={"eavesdroppers": {}}).suggestion is None
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("suffix", mostly_long(["pdf", "png", "svg"], ["svg"]))
 def test_a_design_has_a_plot(evedrop: Evedrop, suffix: str) -> None:
     """As the kind of file that its name says."""
@@ -322,6 +325,7 @@ def test_a_design_has_a_plot(evedrop: Evedrop, suffix: str) -> None:
     assert path.read_bytes().startswith(begins[suffix])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [

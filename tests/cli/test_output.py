@@ -141,6 +141,7 @@ SETTINGS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", mostly_long(SETTINGS, ["latin-1"]))
 def test_an_output_in_latin_1_ends_no_run(name: str, inputs: Path, tmp_path: Path) -> None:
     """With the processes of a run, which inherit the setting, and with a locale without any encoding."""
@@ -209,6 +210,7 @@ def test_a_full_disk_behind_the_output_is_named_and_costs_no_file(
     assert name == "list" or (evedrop.folder / "out" / "report.html").exists()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("closed", mostly_long(["<&-", ">&-", "2>&-"], [">&-"]))
 def test_a_stream_that_the_shell_closed_does_no_harm(closed: str, inputs: Path, tmp_path: Path) -> None:
     """A run has the status and the files that it always has."""

@@ -169,6 +169,7 @@ def test_none_removes_an_entry() -> None:
     assert [*prepared("vehicle", {"eavesdroppers.naive": None}).eavesdroppers] == ["suspicious", "smart"]
 
 
+@pytest.mark.thorough
 def test_a_class_of_a_module_is_named_and_its_folder_known(own: Any, tmp_path: Path) -> None:
     """Worker processes import it from there: the same digests as in this process, and as by name."""
     made = vehicle(encoding={"scheme": own.Flipped}, eavesdroppers={})

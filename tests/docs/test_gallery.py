@@ -48,6 +48,7 @@ def test_the_demo_comes_first_and_then_what_belongs_together() -> None:
     assert names.index("acknowledged") < names.index("late") < names.index("nemesis") < names.index("microgrid")
 
 
+@pytest.mark.thorough
 def test_a_filter_hides_the_cards_without_its_class() -> None:
     """Some cards have the class, and the button that the rule names is there."""
     page = site_tool("gallery").gallery_page()

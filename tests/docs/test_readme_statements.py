@@ -55,6 +55,7 @@ def test_the_class_keeps_the_rules_and_reads_the_scenario(tmp_path: Path, monkey
     assert cli.main(["montecarlo", "mine.toml", "--trials", "5", "--slots", "50", "--workers", "1"]) == 0
 
 
+@pytest.mark.thorough
 def test_the_test_of_a_radio_passes(tmp_path: Path) -> None:
     """From the repository, as the README shows it; its function has six lines."""
     code, _ = blocks("python")

@@ -78,6 +78,7 @@ def test_a_test_lists_what_it_cannot_decide() -> None:
     assert "FAILED" in undecided.sentence
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("metric", "status"), [("delivery", 1), ("heard", 0)])
 def test_a_wire_that_heard_nothing_fails_unless_it_must_be_silent(
     metric: str, status: int, evedrop: Evedrop, tmp_path: Path

@@ -196,6 +196,7 @@ def progress(done: int, at: float) -> dict[str, Any]:
     return {"event": "progress", "done": done, "at": at}
 
 
+@pytest.mark.thorough
 def test_an_outage_that_is_not_listed_is_seen(ended: Ended, reference: RunReference) -> None:
     """A router was killed at 1.0 s and slots came afterwards; and one that the run told of."""
     ended.told = [progress(100, 0.9), progress(200, 2.0)]
@@ -215,6 +216,7 @@ def test_metrics_without_rows_are_seen(ended: Ended, reference: RunReference) ->
     assert [line for line in ended.misses(reference) if "the tables have no rows of smart" in line]
 
 
+@pytest.mark.thorough
 def test_an_outage_without_a_cause_is_seen(ended: Ended, reference: RunReference) -> None:
     """Of a process that nobody cut off; of one that a fault did, it may be listed."""
     outage = {"process": "smart", "slot": 3, "until": 9, "seconds": 1.0}
@@ -251,6 +253,7 @@ def test_files_that_others_may_read_and_files_of_a_run_that_goes_on_are_seen(
     assert [line for line in misses if "run/control.json is left of the run" in line], misses
 
 
+@pytest.mark.thorough
 def test_messages_on_wrong_keys_must_be_listed(ended: Ended, reference: RunReference) -> None:
     """A router has confused keys, and no process says that it dropped a message; one of few messages confuses none."""
     confused = Fault(CONFUSED, EVERYBODY, Moment("start", 0.0), count=30)
@@ -275,6 +278,7 @@ def test_an_outage_is_explained_by_a_fault_that_can_cause_it(complete: bool) -> 
     assert bool(unexplained("relay", "connection of beta")) == complete
 
 
+@pytest.mark.thorough
 def test_a_panic_of_zenoh_is_no_mistake_where_threads_are_few(ended: Ended, reference: RunReference) -> None:
     """Its own report cannot be helped; anywhere else it is one."""
     log = ended.out / "logs" / "smart.log"
@@ -286,6 +290,7 @@ def test_a_panic_of_zenoh_is_no_mistake_where_threads_are_few(ended: Ended, refe
     assert [line for line in ended.misses(reference, KILL) if "smart.log has a traceback" in line]
 
 
+@pytest.mark.thorough
 def test_a_launcher_may_be_ended_by_the_c_library_where_memory_is_short(ended: Ended, reference: RunReference) -> None:
     """It counts as killed: no process may be left, and what was measured must be there. Elsewhere it is a mistake."""
     ended.launcher.returncode = 127
@@ -311,6 +316,7 @@ def test_digests_that_are_not_those_of_the_rows_are_seen(without: str, ended: En
     assert list(unlike_digests(results.summary, changed))
 
 
+@pytest.mark.thorough
 def test_a_panic_in_zenohs_code_must_cost_nothing(ended: Ended, reference: RunReference) -> None:
     """If it ends the run, the run has not kept its promises; a panic in other code is a mistake of Evedrop's."""
     log = ended.out / "logs" / "relay.log"

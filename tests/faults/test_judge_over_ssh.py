@@ -132,6 +132,7 @@ def test_a_host_that_is_used_no_more_at_the_start_is_named(
     says("status 2", spread.misses(reference, Fault("kill", "smart", Moment("start", 0.5))))
 
 
+@pytest.mark.thorough
 def test_a_run_whose_host_hangs_and_that_ends_late_is_seen(spread: Ended, reference: RunReference) -> None:
     """Half a minute is promised, after the last slot and after a signal."""
     spread.told = [{"event": "progress", "done": 400, "at": 2.0}]
@@ -144,6 +145,7 @@ def test_a_run_whose_host_hangs_and_that_ends_late_is_seen(spread: Ended, refere
     assert [line for line in spread.misses(reference, HANGS, INTERRUPT) if "ended 59 s after" in line]
 
 
+@pytest.mark.thorough
 def test_a_private_folder_on_a_host_is_seen(spread: Ended, reference: RunReference) -> None:
     """Only where the program and its cleaner were killed, the next run there removes it."""
     (spread.folder / "beta" / "evedrop-x").mkdir()

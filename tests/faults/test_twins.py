@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from evedrop.virtual.cases import case_of
 from evedrop.virtual.drawn_faults import KINDS
 from evedrop.virtual.host_faults import HOST_KINDS
@@ -36,6 +38,7 @@ def test_everything_has_a_twin_or_a_reason() -> None:
     assert all(WITHOUT_TWIN.values())
 
 
+@pytest.mark.thorough
 def test_all_twins_are_drawn() -> None:
     """And all other kinds of faults, at all targets, for all variants."""
     cases = [case_of(seed) for seed in range(1, 600)]

@@ -125,6 +125,7 @@ def test_a_report_that_no_run_has_is_refused(evedrop: Evedrop, does: str, messag
     assert "Check that smart speaks docs/protocol.md" in result
 
 
+@pytest.mark.thorough
 def test_what_is_verified_and_what_is_not(evedrop: Evedrop) -> None:
     """The summary says for how many trials digests were recomputed, and which metrics rest on a receiver's own report."""
     done = evedrop(
@@ -181,6 +182,7 @@ SILENT = {
 """The silent process → its scenario, its name, and how it is silent."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "case",
     [name if name == "a receiver in the middle" else pytest.param(name, marks=pytest.mark.long) for name in SILENT],
@@ -237,6 +239,7 @@ PROGRESS = {
 """What a receiver says about its progress → how it says that, and the expected message."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", ["beyond what was sent", pytest.param("no message", marks=pytest.mark.long)])
 def test_malformed_progress_is_its_senders(evedrop: Evedrop, case: str) -> None:
     """The sensor refuses it, and the run ends with the name of the receiver that sent it, not with the sensor's."""

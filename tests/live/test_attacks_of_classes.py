@@ -141,6 +141,7 @@ def written(folder: Path) -> None:
         (folder / f"{name}.py").write_text('import spy\nspy.report("shadow")\nraise SystemExit("taken")\n')
 
 
+@pytest.mark.thorough
 def test_an_eavesdroppers_class_runs_in_its_own_process_alone(evedrop: Evedrop) -> None:
     """Only the eavesdropper's process of a run imports it; the process that it is asked in knows neither seed nor brief."""
     assert all(find_spec(name) for name in OURS)

@@ -63,6 +63,7 @@ TWO = ("--set", "network.routers=2", "--listen", "tls/127.0.0.2:{port}", "--rela
 TWO_CLEAR = ("--set", "network.routers=2", "--listen", "tcp/127.0.0.2:{port}", "--relay", "tcp/127.0.0.3:{port}")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("options", "backwards"),
     [
@@ -308,6 +309,7 @@ def test_who_ends_the_recorder_ends_the_run(evedrop: Evedrop) -> None:
     }
 
 
+@pytest.mark.thorough
 def test_without_a_router_everybody_says_so(evedrop: Evedrop) -> None:
     """If the router is never started, each process names where it should be, exit 3; the recorder leaves no results."""
     endpoint = f"tls/127.0.0.1:{free_port()}"
@@ -322,6 +324,7 @@ def test_without_a_router_everybody_says_so(evedrop: Evedrop) -> None:
     assert list((evedrop.folder / "results").iterdir()) == []
 
 
+@pytest.mark.thorough
 def test_the_results_are_where_the_recorder_is_told(evedrop: Evedrop) -> None:
     """Relative to where it is started; --out has the last word; a folder with something in it is refused."""
     briefs = written(evedrop, "--listen", "tcp/127.0.0.1:7447", "--wait", "1", "--results", "there/results")

@@ -188,6 +188,7 @@ def test_a_verdict_says_what_errors_are_measured_against(tmp_path: Path) -> None
     assert any(line.startswith("the sensor sends its filter's estimate") and "legitimate " in line for line in shown)
 
 
+@pytest.mark.thorough
 def test_sweeps_comparisons_and_views_say_it_too(tmp_path: Path) -> None:
     """A sweep has a column with the ratio against the truth, a comparison a heading, the view the verdict so far."""
     small: dict[str, Any] = {"slots": 60, "trials": 6, "expect": []}
@@ -262,6 +263,7 @@ def test_errors_of_a_shard_that_ended_before_its_first_slot_are_left_out(begun: 
     assert nothing.of_trials == {}
 
 
+@pytest.mark.thorough
 def test_errors_against_the_true_state_have_standard_errors(tmp_path: Path) -> None:
     """Those of runs of one trial each, which have none; z compares the filter's errors with its covariance."""
     filtered = in_memory(tmp_path / "run", **MEASURED).summary["filter"]
@@ -296,6 +298,7 @@ def test_a_singular_noise_runs_and_is_warned_of(evedrop: Evedrop) -> None:
 OFTEN = ("twenty trials", "filtered and betrayed")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "case", [pytest.param(case, marks=[] if case in OFTEN else [pytest.mark.long]) for case in LIVE]
 )
@@ -324,6 +327,7 @@ def test_a_live_loop_is_the_one_in_memory(case: str, tmp_path: Path) -> None:
     assert live.summary["controller"]["mean_solve_seconds"] > 0.0
 
 
+@pytest.mark.thorough
 def test_a_killed_controller_is_named(evedrop: Evedrop) -> None:
     """The run fails, says who is at fault, and keeps what was measured."""
     (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(changed(TANK, slots=200_000, **CALM)))
@@ -341,6 +345,7 @@ def test_a_killed_controller_is_named(evedrop: Evedrop) -> None:
     assert inputs.num_rows == live.results.summary["slots"]
 
 
+@pytest.mark.thorough
 def test_a_loop_can_be_paused_and_steered(evedrop: Evedrop) -> None:
     """The operator holds the run between two slots, changes a link, and lets it go on: as in any run."""
     (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(changed(TANK, slots=200, **CALM)))

@@ -114,6 +114,7 @@ def theory_of(folder: Path) -> object:
     return sorted((slot, peer, f"{trace:.9g}") for slot, peer, trace in zip(*columns.to_pydict().values(), strict=True))
 
 
+@pytest.mark.thorough
 def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> None:
     """Steered in real time, while a receiver is away too: live and in memory its folder gives the same digests again."""
     run = steered(slots=500, pace=0.002, events=KILLED + DELAYED)
@@ -153,6 +154,7 @@ def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> No
     run.live.nothing_left()
 
 
+@pytest.mark.thorough
 def test_a_paused_run_stands_still(steered: Start, evedrop: Evedrop) -> None:
     """No slot passes until it goes on; status and summary say what was done, and who did it."""
     run = steered(pace=0.002)
@@ -181,6 +183,7 @@ def test_a_paused_run_stands_still(steered: Start, evedrop: Evedrop) -> None:
     ]
 
 
+@pytest.mark.thorough
 def test_mistakes_are_told_and_change_nothing(steered: Start) -> None:
     """All mistakes at once, with exit status 2; an unknown command is refused before the run hears of it."""
     run = steered()
@@ -213,6 +216,7 @@ def test_a_step_beyond_the_end_ends_the_run(steered: Start) -> None:
     assert run.end().summary["ended"] == "complete"
 
 
+@pytest.mark.thorough
 def test_a_long_slot_is_not_waited_for(steered: Start) -> None:
     """In a run of a slot an hour the hold comes at once, before the slot that is due next."""
     run = steered("--seed", "11", slots=3, pace=3600.0)
@@ -222,6 +226,7 @@ def test_a_long_slot_is_not_waited_for(steered: Start) -> None:
     assert run.end().status == 130
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("number", mostly_long([signal.SIGINT, signal.SIGKILL], [signal.SIGINT]))
 def test_an_interrupted_pause_leaves_nothing(number: signal.Signals, steered: Start) -> None:
     """Ctrl-C, or the launcher killed, while the run is held: what was measured and done is on disk, the password is not."""
@@ -237,6 +242,7 @@ def test_an_interrupted_pause_leaves_nothing(number: signal.Signals, steered: St
     assert [event["event"] for event in summary["events"]] == ["pause the run", "step 40 slots", "cut smart"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", mostly_long(["sensor", "recorder", "router"], ["router"]))
 def test_who_waits_is_told_of_the_end(name: str, steered: Start, evedrop: Evedrop) -> None:
     """A process that is killed while a step goes on ends the step's command too, with status 2; a router comes back."""

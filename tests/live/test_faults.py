@@ -40,6 +40,7 @@ def tables_whole(live: Live) -> int:
     return slots
 
 
+@pytest.mark.thorough
 def test_a_killed_process_is_named_and_the_results_are_kept(evedrop: Evedrop) -> None:
     """Kill -9 of any process but router and recorder ends the run at once, and costs no slot that was scored."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
@@ -51,6 +52,7 @@ def test_a_killed_process_is_named_and_the_results_are_kept(evedrop: Evedrop) ->
     tables_whole(live)
 
 
+@pytest.mark.thorough
 def test_a_killed_recorder_is_named_and_what_it_wrote_is_kept(evedrop: Evedrop) -> None:
     """The launcher makes whole tables of what the recorder had written; the summary says why."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
@@ -125,6 +127,7 @@ def test_a_router_that_lies_is_found_out(evedrop: Evedrop) -> None:
     assert live.results.summary["slots"] <= 7
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("when", "number"),
     [
@@ -167,6 +170,7 @@ def test_an_interrupted_run_has_no_digest(evedrop: Evedrop) -> None:
     assert all("too few" in verdict["relative"] for verdict in summary["secrecy"].values())
 
 
+@pytest.mark.thorough
 def test_nothing_outlives_a_killed_launcher(evedrop: Evedrop) -> None:
     """Children notice that their launcher is gone; the recorder still writes what there is."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
@@ -194,6 +198,7 @@ def _state(pid: int) -> str:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
 
 
+@pytest.mark.thorough
 def test_a_process_deletes_its_brief_when_it_has_read_it(evedrop: Evedrop) -> None:
     """Its keys do not stay on disk: from the first slot on no brief is left, and none after a process was started again."""
     live = evedrop.live("restart", "--pace", "0", "--paused")
@@ -320,6 +325,7 @@ def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop, name: str) 
     tables_whole(live)
 
 
+@pytest.mark.thorough
 def test_results_that_cannot_be_written_end_the_run(evedrop: Evedrop) -> None:
     """A full disk, played by a limit on the size of files: one clear line, exit 3, nothing left."""
     live = evedrop.live("eavesdroppers", "--slots", "1000000", "--pace", "0.0005", largest_file=200_000)
@@ -331,6 +337,7 @@ def test_results_that_cannot_be_written_end_the_run(evedrop: Evedrop) -> None:
     assert 0 < live.results.slots.num_rows == live.results.journal.num_rows
 
 
+@pytest.mark.thorough
 def test_nobody_has_what_is_sent_to_others_in_its_memory(evedrop: Evedrop) -> None:
     """Large batches too go to each receiver alone: no process maps memory that it shares with another."""
     live = evedrop.live("eavesdroppers", "--trials", "2000", "--slots", "100000")

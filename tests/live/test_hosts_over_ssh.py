@@ -80,6 +80,7 @@ def nothing_left(evedrop: Evedrop) -> None:
     assert sorted(path.name for path in evedrop.temporary.rglob("*")) == sorted(PLACES)
 
 
+@pytest.mark.thorough
 def test_over_ssh_it_is_the_same_run(evedrop: Evedrop, server: Sshd) -> None:
     """Receivers are killed, started again and paused; each host gets what its own processes may know, and not the schedule."""
     changes = ("--trials", "3", "--set", "event.1.state=last", "--set", "expect=[]")
@@ -109,6 +110,7 @@ def running(evedrop: Evedrop, server: Sshd, direct: bool = False) -> Live:
     return live
 
 
+@pytest.mark.thorough
 def test_ctrl_c_ends_everything_on_all_hosts(evedrop: Evedrop, server: Sshd) -> None:
     """The results so far are here."""
     live = running(evedrop, server)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from evedrop.model.kernels import choice
 from evedrop.names import KERNELS_VARIABLE
 from tests.builders import digests_of
@@ -51,6 +53,7 @@ link = { loss = { model = "gilbert-elliott", p = 0.1, r = 0.4 } }
 """
 
 
+@pytest.mark.thorough
 def test_a_live_run_with_numpy_has_the_digests_of_memory_with_c(evedrop: Evedrop) -> None:
     """For all receivers, with late packets and a digest of more than one block; the processes do use numpy."""
     (evedrop.folder / "saying.py").write_text(MODULE)

@@ -108,6 +108,7 @@ def test_where_there_is_no_theory_the_results_say_null(memory: Results) -> None:
     assert memory.summary["secrecy"]["markov"]["relative_by_theory"] is not None
 
 
+@pytest.mark.thorough
 def test_the_report_survives_a_metric_that_is_not_there(every_model: Path, evedrop: Evedrop) -> None:
     """The closing table has a dash, and a sweep goes through."""
     done = evedrop("montecarlo", str(every_model), "--trials", "3", "--slots", "60", "--out", "here")

@@ -94,6 +94,7 @@ def test_a_killed_router_costs_nothing_but_time(case: str, evedrop: Evedrop, tmp
     assert all(outage["seconds"] > 0.0 and 0 < outage["slot"] <= outage["until"] for outage in outages)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [pytest.param("router", marks=long), "relay"])
 def test_either_of_two_linked_routers_may_be_killed(name: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """With a closed loop over both of them: digests and links are those in memory, and the one that was killed is named."""
@@ -263,6 +264,7 @@ def test_a_loop_is_taken_up_where_it_was_cut(name: str, evedrop: Evedrop, tmp_pa
     is_taken_up(name, cut_off, scenario, evedrop, tmp_path)
 
 
+@pytest.mark.thorough
 def test_a_process_that_stays_cut_off_ends_the_run(tmp_path: Path) -> None:
     """Longer than the scenario lets it: the recorder names it, and it ends by itself."""
     _, scenario = scenario_in(tmp_path, slots=1_000_000, longest_outage=2.0)

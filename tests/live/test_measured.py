@@ -5,6 +5,8 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 
+import pytest
+
 from evedrop.cli.api import run
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
@@ -15,6 +17,7 @@ from evedrop.simulate.montecarlo import Plan, simulate
 from tests.builders import digests_of
 
 
+@pytest.mark.thorough
 def test_a_live_run_is_the_one_in_memory(tmp_path: Path) -> None:
     """Digests of all receivers, and every number of the tables."""
     tables = tomllib.loads(shipped()["measured"].read_text(encoding="utf-8"))

@@ -80,6 +80,7 @@ def router_of(live: Live, where: str = "control.json") -> str:
     return endpoint
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shards", mostly_long([1, 2], [1]))
 def test_a_run_opens_no_port(shards: int, evedrop: Evedrop) -> None:
     """No process of it, launcher and fork servers included, has a TCP socket that listens, from the first slot to the last."""
@@ -109,6 +110,7 @@ def test_a_run_opens_no_port(shards: int, evedrop: Evedrop) -> None:
     assert not any(folder.exists() for folder in folders)
 
 
+@pytest.mark.thorough
 def test_another_user_cannot_reach_the_router(evedrop: Evedrop) -> None:
     """As an unprivileged user in a folder that all can enter: no connection, no socket in its place, no list, no removal."""
     if os.getuid() != 0:
@@ -234,6 +236,7 @@ class Routers:
 TWO = "tls/127.0.0.1:1", None, "tls/127.0.0.1:2"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("lines", "started"),
     mostly_long(
@@ -328,6 +331,7 @@ def test_malformed_sockets_are_refused(text: str) -> None:
     assert isinstance(endpoint_in("tcp/127.0.0.1:7447"), Endpoint)
 
 
+@pytest.mark.thorough
 def test_a_port_without_certificates_is_said_to_be_exposed(evedrop: Evedrop) -> None:
     """`brief` and `run` say who can do what, and what to give instead; with certificates they say nothing."""
     port = free_port()

@@ -73,6 +73,7 @@ def test_a_run_that_is_interrupted_while_it_finishes_is_complete(evedrop: Evedro
     assert live.results.trials.num_rows == 4 * 300
 
 
+@pytest.mark.thorough
 def test_a_recorder_that_stands_still_is_named_and_its_rows_are_kept(evedrop: Evedrop) -> None:
     """Stopped, it says nothing; the launcher ends the run and makes tables of what it had written."""
     live = slow(evedrop, 0.0, 2.0, "--slots", "1000000", grace=0.5)

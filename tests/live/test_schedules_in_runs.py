@@ -47,6 +47,7 @@ def tables_of(**more: Any) -> dict[str, Any]:
     }
 
 
+@pytest.mark.thorough
 def test_live_and_memory_agree(tmp_path: Path) -> None:
     """All digests are equal, and the resolved scenario keeps the list."""
     scenario = checked(tables_of(), "it")

@@ -91,6 +91,7 @@ def running(scheme: str, **more: Any) -> Scenario:
     return checked(tables_of(scheme, **more), scheme)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("scheme", mostly_long(RUNS, USUAL))
 def test_live_and_memory_are_the_same_bits(scheme: str, tmp_path: Path) -> None:
     """Equal digests and accounts of every receiver, the same alarms, and no packet unaccounted for."""

@@ -79,6 +79,7 @@ def test_what_is_kept_by_trial_is_the_same_to_the_bit(ran: Ran, other: int) -> N
     assert 0 < summary["household"]["active_windows"] < summary["household"]["windows"] == 29
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("other", [0, 1])
 def test_the_rest_of_the_summary_agrees(ran: Ran, other: int) -> None:
     """Within rounding, of the same keys; against memory but for its mode."""

@@ -84,6 +84,7 @@ def in_order(table: pa.Table) -> dict[str, list[Any]]:
 two_or_three = pytest.mark.parametrize("shards", mostly_long([2, 3], [2]))
 
 
+@pytest.mark.thorough
 @two_or_three
 @pytest.mark.parametrize("name", ["trials", "journal", "digests"])
 def test_what_is_kept_by_trial_is_the_same_to_the_bit(ran: Ran, name: str, shards: int) -> None:
@@ -198,6 +199,7 @@ def test_a_shard_that_was_ended_early_has_done_no_more_than_it_said() -> None:
     assert told[-1] == RunProgress(20, 4.0, "slots/s", {"smart": 3.0})
 
 
+@pytest.mark.thorough
 def test_a_real_time_run_keeps_its_pace_and_an_expectation_that_fails_is_its_status(evedrop: Evedrop) -> None:
     """No shard is done before its slots have passed, and what is expected is judged once, of all trials."""
     done = evedrop(
@@ -279,6 +281,7 @@ def test_a_killed_recorder_costs_no_slot_that_is_on_disk(evedrop: Evedrop) -> No
     assert re.search(r"\(the metrics are as of slot \d+ in shard 2; the tables have more\)$", reason)
 
 
+@pytest.mark.thorough
 def test_an_interrupted_run_leaves_one_folder_and_no_process(evedrop: Evedrop) -> None:
     """Ctrl-C ends all shards: exit 130, what was measured is readable, nothing is left."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
@@ -319,6 +322,7 @@ def test_of_a_killed_launcher_the_shards_are_left(evedrop: Evedrop) -> None:
         load_results(live.folder)
 
 
+@pytest.mark.thorough
 def test_a_run_in_shards_tells_how_it_does_and_is_not_steered(evedrop: Evedrop) -> None:
     """`status` is of all shards; what would change the run in one of them alone is refused with the way out."""
     live = evedrop.live("eavesdroppers", *ENDLESS, "--pace", "0.01")

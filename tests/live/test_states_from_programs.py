@@ -83,6 +83,7 @@ def servers() -> Iterator[None]:
         yield
 
 
+@pytest.mark.thorough
 def test_a_run_over_a_program_can_be_repeated(tmp_path: Path) -> None:
     """At the program's own pace, each message is a slot: the digests are those of its file, and of the recorded run."""
     source = program()

@@ -81,6 +81,7 @@ def test_a_suspended_fork_server_does_not_outlive_a_killed_launcher(evedrop: Eve
     assert list(live.temporary.iterdir()) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("which", mostly_long(["that of recorders", "that of others"], ["that of others"]))
 def test_a_killed_fork_server_is_named_and_no_victim(evedrop: Evedrop, which: str) -> None:
     """Its processes are ended by the launcher: none of them is at fault."""
@@ -172,6 +173,7 @@ def test_an_end_that_no_fork_server_reports_is_seen(tmp_path: Path) -> None:
         process.stdin.close()
 
 
+@pytest.mark.thorough
 def test_ctrl_z_says_that_the_run_goes_on(evedrop: Evedrop) -> None:
     """Only the launcher stops, and the message names the command that pauses the run."""
     live = evedrop.live("eavesdroppers", *ENDLESS)

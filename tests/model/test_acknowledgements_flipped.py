@@ -267,6 +267,7 @@ def test_all_published_numbers(
     assert (np.abs(trace - [legitimate, eve]) < np.maximum(0.02 * trace, 4.5 * np.sqrt(2.0) * error)).all()
 
 
+@pytest.mark.thorough
 def test_live_and_memory_are_the_same_bits(tmp_path: Path) -> None:
     """For both policies under flips, from slot 10 on."""
     from evedrop import run

@@ -93,6 +93,7 @@ def test_it_refuses_a_gap() -> None:
         peer.receive(delivered(1, np.zeros(9, np.bool_), np.zeros((2, 9))))
 
 
+@pytest.mark.thorough
 def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
     """In the place of our estimator, among our router, sensor, eavesdroppers and recorder, it ends with our digest."""
     scenario = load("eavesdroppers", {"slots": 300, "trials": 2})

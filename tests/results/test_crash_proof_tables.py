@@ -100,6 +100,7 @@ def cut_short(live: Live) -> int:
     return slots
 
 
+@pytest.mark.thorough
 def test_a_run_of_which_everything_was_killed_can_be_read(evedrop: Evedrop) -> None:
     """`load_results`, `view`, `view --table` and `diff` open what there is, say that it is cut short, and where."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
@@ -155,6 +156,7 @@ def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, case: str) -> None:
     assert evedrop("view", "run", "--table").status == 0
 
 
+@pytest.mark.thorough
 def test_a_folder_may_be_renamed_while_a_run_goes_on(evedrop: Evedrop) -> None:
     """All results are in it, whole, and the command says where it is."""
     live = evedrop.live("eavesdroppers", "--slots", "600", "--pace", "0.001", "--paused")
@@ -202,6 +204,7 @@ sys.exit(status)
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("size", mostly_long(["256k", "1m"], ["256k"]))
 def test_a_full_disk_ends_the_run_and_what_fitted_can_be_read(evedrop: Evedrop, size: str) -> None:
     """On a disk that is really full: a clear line, exit 3, nothing left, and the tables hold what there was room for."""
@@ -310,6 +313,7 @@ def microgrid() -> Scenario:
     return load("microgrid", {"slots": 200, "expect": []})
 
 
+@pytest.mark.thorough
 def test_no_rows_are_on_disk_before_the_first_metrics(tmp_path: Path) -> None:
     """Or a run that is killed just then could not be looked at: only its own classes could make metrics of nothing."""
     scenario = microgrid()
@@ -334,6 +338,7 @@ def test_no_rows_are_on_disk_before_the_first_metrics(tmp_path: Path) -> None:
         assert Results.read(tmp_path).summary["ended"] == "the run goes on, at slot 10"
 
 
+@pytest.mark.thorough
 def test_rows_whose_first_metrics_cannot_be_written_count_at_the_end(tmp_path: Path) -> None:
     """They are whole; a shard's score, which was saved before, is of them."""
     scenario = microgrid()
@@ -452,6 +457,7 @@ def sizes(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_size for path in (folder / UNFINISHED).iterdir()}
 
 
+@pytest.mark.thorough
 def test_all_rows_are_on_disk_before_the_recorder_waits_for_the_others_to_end(evedrop: Evedrop) -> None:
     """A router that is gone never confirms: a recorder that is killed while it waits has lost nothing."""
     rogue = with_rogue(evedrop, "recorder", WAITS_FOR_OTHERS)

@@ -120,6 +120,7 @@ def each_operation(folder: Path) -> range:
     return range(1, operations + 1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "fault", mostly_long([one for one in DiskFault if one is not DiskFault.POWER_CUT], [DiskFault.KILL, DiskFault.FULL])
 )
@@ -138,6 +139,7 @@ def test_all_rounds_that_were_written_are_read(fault: DiskFault, tmp_path: Path)
             assert not is_unfinished(folder)
 
 
+@pytest.mark.thorough
 def test_a_power_cut_leaves_right_rows_up_to_a_round(tmp_path: Path) -> None:
     """Or a folder of which a line says what it lacks."""
     ends = Counter[int]()

@@ -62,6 +62,7 @@ def watched(live: Live, top: Path) -> list[dict[str, str]]:
     return [*seen, *([bad] if (bad := open_to_others(top)) else [])]
 
 
+@pytest.mark.thorough
 def test_a_run_under_way_and_its_results_are_private(evedrop: Evedrop) -> None:
     """Nothing of a live run is open to others before slot 0, while it runs, and at its end; the view's recording included."""
     live = evedrop.started(
@@ -159,6 +160,7 @@ def test_a_folder_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: pytes
         new_folder(tmp_path)
 
 
+@pytest.mark.thorough
 def test_another_user_of_the_host_gets_nothing(evedrop: Evedrop) -> None:
     """A process of another user lists no folder and reads no file of a run in progress.
 

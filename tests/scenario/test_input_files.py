@@ -157,6 +157,7 @@ def test_rows_beyond_the_last_slot_are_not_read(tmp_path: Path) -> None:
     assert scenario.plant.disturbance_values == [[0.5]] * 50
 
 
+@pytest.mark.thorough
 def test_a_damaged_gz_file_is_refused(tmp_path: Path) -> None:
     """Cut short, or with bytes that decompress to nothing."""
     whole = gzip.compress(b"P_load\n" + b"0.5\n" * 100_000)

@@ -205,6 +205,7 @@ def test_options_out_of_range_are_refused(option: str, value: str, evedrop: Eved
     assert not (evedrop.folder / "runs").exists()
 
 
+@pytest.mark.thorough
 def test_names_that_are_not_utf_8_are_refused(evedrop: Evedrop) -> None:
     """As a results folder, as a scenario and as the current folder: no result and no message could repeat them."""
     odd = os.fsdecode(b"out-\xff")

@@ -222,6 +222,7 @@ def test_whatever_is_drawn_is_a_scenario(
     assert scenario.timeline.acts or faults == ["partition"]
 
 
+@pytest.mark.thorough
 def test_the_same_faults_live_and_in_memory(tmp_path: Path) -> None:
     """All kinds, equal digests of every receiver; and again from what the results have kept."""
     changes: dict[str, Any] = {

@@ -69,6 +69,7 @@ every_batch = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.thorough
 @every_batch
 def test_live_and_memory_are_the_same_bits(name: str, batch: str, twins: Callable[[str, str], Pair]) -> None:
     """Equal digests of every receiver, equal sums, and a verdict that agrees."""
@@ -102,6 +103,7 @@ def test_live_and_memory_are_the_same_bits(name: str, batch: str, twins: Callabl
     assert live.summary.get("integrity", {}).get("digest") == memory.summary.get("integrity", {}).get("digest")
 
 
+@pytest.mark.thorough
 @every_batch
 def test_every_packet_is_accounted_for(name: str, batch: str, twins: Callable[[str, str], Pair]) -> None:
     """Offered is slots times trials; delivered and lost add up to it; the journal says the same, slot by slot."""
@@ -127,6 +129,7 @@ def test_later_trials_are_the_same_alone(tmp_path: Path) -> None:
     assert blocks(few) == {row for row in blocks(many) if 17 <= row[1] < 20}
 
 
+@pytest.mark.thorough
 def test_a_further_eavesdropper_changes_nobody_else(tmp_path: Path, twins: Callable[[str, str], Pair]) -> None:
     """Neither by its presence nor by its place among the others."""
     extra: dict[str, Any] = {"eavesdroppers__extra__strategy": "smart", "eavesdroppers__extra__link__quality": 0.5}
@@ -137,6 +140,7 @@ def test_a_further_eavesdropper_changes_nobody_else(tmp_path: Path, twins: Calla
     assert digests == digests_of(twins("numerical", "a later trial")[1])
 
 
+@pytest.mark.thorough
 def test_the_resolved_scenario_runs_to_the_same_digests(tmp_path: Path, twins: Callable[[str, str], Pair]) -> None:
     """The scenario.toml of a results folder, and the folder itself, repeat the run."""
     live, _ = twins("eavesdroppers", "a later trial")

@@ -103,6 +103,7 @@ def test_metrics_of_ranges_and_quantiles_are_those_of_the_table(made: Runs) -> N
         assert expectation["held"] is True
 
 
+@pytest.mark.thorough
 def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
     """Traces over a range, a link's account, secrecy by theory and run, and the slot by which all were synchronised."""
     results = made("live")

@@ -25,6 +25,7 @@ def leak_of(scenario: str, folder: Path, receiver: str, **changes: Any) -> Any:
     return montecarlo(scenario, out=folder, plan=ALONE, expect=[], **changes).summary["secrecy"][receiver]["leak"]
 
 
+@pytest.mark.thorough
 def test_the_bits_of_a_run_are_those_of_its_innovations(tmp_path: Path) -> None:
     """From the recorded rows: b_k where an innovation was received; states are counted instead. Theory agrees."""
     some: dict[str, Any] = {"slots": 120, "trials": 40, "record_trials": 40}

@@ -65,6 +65,7 @@ def most(studies: int) -> int:
 STUDIES = pytest.mark.parametrize("studies", [200, pytest.param(1000, marks=pytest.mark.long)])
 
 
+@pytest.mark.thorough
 @STUDIES
 @pytest.mark.parametrize("test", [sign_of_mean, sign_of_median])
 def test_failed_is_said_in_error_no_more_often_than_promised(studies: int, test: SignTestOf) -> None:

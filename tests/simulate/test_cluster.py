@@ -130,6 +130,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         dask.end()
 
 
+@pytest.mark.thorough
 def test_a_study_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str) -> None:
     """Digests, tables and summary of `montecarlo --scheduler` are those of one worker here."""
     base = (
@@ -207,6 +208,7 @@ def write_short(file: Path) -> None:
     file.write_text(text.replace("slots = 5000", "slots = 20").replace("below = 0.01", "below = 1e9"), encoding="utf-8")
 
 
+@pytest.mark.thorough
 def test_a_test_in_memory_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str) -> None:
     """Both pass, with the same digests; live, a scheduler is refused."""
     write_short(evedrop.folder / "mine.toml")

@@ -119,6 +119,7 @@ def task_files(folder: Path) -> list[Path]:
 MODES = {"exact": (), "cov": ("--covariance-only",), "err": ("--error-coordinates",)}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("name", "workers"), mostly_long(itertools.product(MODES, "12"), [("exact", "2")]))
 def test_an_interrupted_study_ends_like_a_whole_one(
     name: str, workers: str, evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch, whole: Whole
@@ -153,6 +154,7 @@ main(sys.argv[1:])
 """A command that is killed when the first task is kept."""
 
 
+@pytest.mark.thorough
 def test_a_killed_study_goes_on(evedrop: Evedrop, whole: Whole) -> None:
     """After kill -9, which leaves no summary, the study goes on from the tasks that were finished."""
     live = evedrop.start(["-c", KILLED], (*STUDY, "--out", "cut/run"), {})
@@ -291,6 +293,7 @@ def test_python_resumes_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         montecarlo("eavesdroppers", resume=True, **case)
 
 
+@pytest.mark.thorough
 def test_order_of_recorded_rows_does_not_depend_on_the_tasks(tmp_path: Path) -> None:
     """With more recorded trials than a block has, the tables are the same for any number of workers."""
     case: dict[str, Any] = {"trials": 1100, "slots": 4, "record_trials": 1100}
@@ -314,6 +317,7 @@ STUDIES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("tasks", mostly_long([1, 2], [2]))
 @pytest.mark.parametrize("name", STUDIES)
 def test_other_studies_go_on_too(

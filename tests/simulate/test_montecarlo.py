@@ -45,6 +45,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
     return made
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("case", "workers"),
     mostly_long(product(CASES, [2, 3]), [("two blocks and a part", 3), ("whole blocks, later trials", 2)]),
@@ -139,6 +140,7 @@ def test_the_largest_error_is_not_the_most_surprising_trial(tmp_path: Path) -> N
     assert surprising["trial"] == least_probable(results)[0][0]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shards", mostly_long([1, 2], [2]))
 def test_the_most_surprising_trial_is_the_same_live_and_in_memory(shards: int, tmp_path: Path) -> None:
     """To the bit, for any division of the trials into shards."""
@@ -174,6 +176,7 @@ def test_a_trial_surprises_only_where_its_own_expectation_is_known(
         assert summary["surprising"] == pytest.approx(exact, rel=1e-6)
 
 
+@pytest.mark.thorough
 def test_the_printed_command_shows_the_surprising_trial_live(evedrop: Evedrop) -> None:
     """It is run as printed, with a folder whose name has a blank in it: same digests, same error, one trial."""
     done = evedrop(

@@ -54,6 +54,7 @@ def no_process_left(live: Live) -> None:
     wait_until(lambda: not live.left(), "no process left")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("workers", "number"),
     [(1, signal.SIGTERM), (2, signal.SIGINT)],
@@ -98,6 +99,7 @@ def ended_by_fault(live: Live, done: Done) -> None:
     assert line.startswith("evedrop: ")
 
 
+@pytest.mark.thorough
 def test_a_killed_worker_is_said(evedrop: Evedrop) -> None:
     """Exit 3 and one line with the signal and a remedy; no process left, and no folder that pretends to be a study."""
     live, crew = started(evedrop, 2)
@@ -110,6 +112,7 @@ def test_a_killed_worker_is_said(evedrop: Evedrop) -> None:
     assert not live.folder.exists()
 
 
+@pytest.mark.thorough
 def test_workers_end_with_who_started_them(evedrop: Evedrop) -> None:
     """After kill -9 of the command itself, the workers notice that it is gone, and end."""
     live, _ = started(evedrop, 2)

@@ -85,6 +85,7 @@ def test_every_pair_is_there_or_says_why_not(everything: Everything) -> None:
             assert [cell_ is None for cell_ in played] == [cell.match.not_defined is not None] * 4
 
 
+@pytest.mark.thorough
 def test_a_comparison_is_read_back_and_has_its_page(everything: Everything) -> None:
     """compare.json has the results, except for the sentences of verdicts; every pair has its cell on the page."""
     comparison, folder = everything

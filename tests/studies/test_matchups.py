@@ -178,6 +178,7 @@ def test_the_command_prints_a_table_and_writes_its_folder(evedrop: Evedrop) -> N
     }
 
 
+@pytest.mark.thorough
 def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
     """One line on standard output, as compare.json says it, without numbers that JSON lacks."""
     names = ("--schemes", "innovation,acknowledged", "--adversaries", "naive,reference,forges")

@@ -208,6 +208,7 @@ def in_the_second(*words: str, evedrop: Evedrop) -> Live:
     return live
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("jobs", [pytest.param("1", marks=pytest.mark.long), "2"])
 def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, jobs: str) -> None:
     """Ctrl-C in the middle of a live run: exit 130, a report of what was done, no process and no brief left."""
@@ -281,6 +282,7 @@ def test_tests_end_with_the_process_that_started_them(evedrop: Evedrop) -> None:
     wait_until(lambda: not live.left(), "no process left")
 
 
+@pytest.mark.thorough
 def test_pytest_collects_scenarios_as_tests(evedrop: Evedrop) -> None:
     """One test a file; files that are not scenarios are left alone; failures say found, wanted and command, and no traceback."""
     written(evedrop.folder, fails=FAILS, holds=HOLDS, wrong=WRONG, _not=HOLDS)

@@ -33,6 +33,7 @@ def grid_powers(folder: Path, **changes: Any) -> Floats:
     return powers
 
 
+@pytest.mark.thorough
 def test_metrics_are_those_of_pairs_of_studies(tmp_path: Path) -> None:
     """From three studies of the same trials: with the scheme, with plain, and with a controller that sees the truth."""
     ours = grid_powers(tmp_path / "ours")
@@ -88,6 +89,7 @@ def test_a_days_cost_is_that_of_the_document() -> None:
     assert more["total_energy"].low > 0.0
 
 
+@pytest.mark.thorough
 def test_the_command_prints_the_table_and_json(evedrop: Evedrop) -> None:
     """The same metrics in both, and one line for a scenario or a number of trials that cannot be used."""
     command = ("cost", "microgrid", "--trials", "2", "--slots", "200")

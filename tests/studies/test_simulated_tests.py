@@ -60,6 +60,7 @@ def own(folder: Path, text: str, taken: str = REPEATABLE) -> str:
     return "own.toml"
 
 
+@pytest.mark.thorough
 def test_a_scenario_with_its_own_classes_and_a_nemesis_passes(evedrop: Evedrop) -> None:
     """Four seeds; the results kept are those of the same trials in memory."""
     place = own(evedrop.folder, HOLDS)
@@ -87,6 +88,7 @@ def test_a_long_run_is_not_cut_into_many_messages() -> None:
     assert min(case_with(scenario, seed).ahead for seed in range(1, 50)) >= 250
 
 
+@pytest.mark.thorough
 def test_a_failed_expectation_fails_the_test(evedrop: Evedrop) -> None:
     """With status 1, though no run broke a promise."""
     place = own(evedrop.folder, HOLDS.replace("below = 100.0", "below = 1e-9"))
@@ -97,6 +99,7 @@ def test_a_failed_expectation_fails_the_test(evedrop: Evedrop) -> None:
     assert "0 of which broke a promise" in done.out
 
 
+@pytest.mark.thorough
 def test_a_class_that_cannot_be_repeated_breaks_a_promise(evedrop: Evedrop) -> None:
     """The first failing seed is told with its faults, the command that repeats it, and a shrunk run, in JUnit too."""
     place = own(evedrop.folder, BEGINNING.replace("slots = 40", "slots = 6"), UNREPEATABLE)
@@ -125,6 +128,7 @@ def test_a_class_that_cannot_be_repeated_breaks_a_promise(evedrop: Evedrop) -> N
     assert str(error.text).rstrip().endswith("recorder")
 
 
+@pytest.mark.thorough
 def test_scenarios_are_simulated_at_the_same_time(evedrop: Evedrop) -> None:
     """Each in a process of its own, with the same outcomes."""
     place = own(evedrop.folder, HOLDS)

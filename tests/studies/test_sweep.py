@@ -175,6 +175,7 @@ def test_the_results_reference_has_every_column_of_a_sweep(swept: tuple[pa.Table
     assert {name for name in names if f"`{name}`" not in part} == set()
 
 
+@pytest.mark.thorough
 def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> None:
     """A strategy and slots, covariance-only: the actual trace stands in its own column; the plot is drawn, and the page made."""
     grid: dict[str, list[Any]] = {"eavesdroppers.smart.strategy": ["smart", "naive"], "slots": [10, 20]}
@@ -208,6 +209,7 @@ def test_an_application_that_the_mode_leaves_out_is_not_drawn(tmp_path: Path) ->
     assert {path.name for path in (tmp_path / "run").glob("*.png")} == {"sweep.png"}
 
 
+@pytest.mark.thorough
 def test_the_page_of_a_sweep_over_a_file_has_the_file(tmp_path: Path) -> None:
     """A reader can repeat the sweep with it; the page says which files of the scenario are missing."""
     text = shipped()["eavesdroppers"].read_text()
@@ -224,6 +226,7 @@ def test_the_page_of_a_sweep_over_a_file_has_the_file(tmp_path: Path) -> None:
         assert any("do not travel" in line for line in page.texts) == missing
 
 
+@pytest.mark.thorough
 def test_the_page_quotes_all_values_of_an_entry_if_one_needs_it(tmp_path: Path) -> None:
     """The command line reads them together, so that a comma in a title does not part it."""
     values = ["a, b", "c"]
@@ -239,6 +242,7 @@ def test_the_page_quotes_all_values_of_an_entry_if_one_needs_it(tmp_path: Path) 
 BASE = ("sweep", "eavesdroppers", "--slots", "20", "--out", "run")
 
 
+@pytest.mark.thorough
 def test_the_command_prints_what_it_wrote(evedrop: Evedrop) -> None:
     """--json is the table as strict JSON and nothing else; without it, a table for people."""
     done = evedrop(*BASE, "--over", "encoding.state_probability=0.2:0.4:0.2", "--trials", "12", "--json")
@@ -252,6 +256,7 @@ def test_the_command_prints_what_it_wrote(evedrop: Evedrop) -> None:
         assert words in done.out
 
 
+@pytest.mark.thorough
 def test_the_ratio_is_that_of_the_second_half_of_each_trial(tmp_path: Path) -> None:
     """Against errors of every slot: after the transient, with a standard error for the two together; none for the estimator."""
     changes = {"trials": 40, "slots": 121, "expect": []}

@@ -155,6 +155,7 @@ def test_strangers_at_a_wire_reach_no_terminal(logged: str | None, evedrop: Eved
         assert len(done.err) < MOST
 
 
+@pytest.mark.thorough
 def test_strangers_at_a_router_fill_no_log(evedrop: Evedrop) -> None:
     """Its log ends at the limit, and the run goes on."""
     port = free_port()

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 
+import pytest
+
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.cases import scenario_of
 
@@ -21,6 +23,7 @@ def parts_of(scenario: Scenario) -> Iterator[str]:
         yield "shards with two routers"
 
 
+@pytest.mark.campaign
 def test_all_are_drawn() -> None:
     """Each in some of the first scenarios, and none of them in most."""
     counts = Counter(part for number in range(500) for part in parts_of(scenario_of(number)))

@@ -58,6 +58,7 @@ def test_a_run_ends_as_it_must(fault: Disturbance, status: int, said: str) -> No
     assert (run.status, said in run.said) == (status, True), run.said
 
 
+@pytest.mark.campaign
 def test_a_connection_that_flaps_is_cut_more_than_once() -> None:
     """And made again each time."""
     happened = disturbed(faults.FlapConnection("eve", RUNS, 3.0)).run.happened
@@ -95,6 +96,7 @@ def test_a_router_that_lacks_memory_says_so(after: int) -> None:
     assert "there is not enough memory" in played.run.said
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("fault", "done"),
     [

@@ -121,6 +121,7 @@ def test_a_host_that_cannot_be_used_is_named(oddity: str, said: str) -> None:
     assert said in run.said
 
 
+@pytest.mark.campaign
 def test_hosts_are_written_down() -> None:
     """With their oddities, mistakes and faults."""
     cases = [case for case in map(case_of, range(1, 400)) if case.hosts is not None]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from evedrop.cli.simulated import program
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.campaign import play_case
@@ -27,6 +29,7 @@ def test_a_run_with_own_classes_keeps_its_promises() -> None:
     assert runs[0].run.digest == runs[1].run.digest
 
 
+@pytest.mark.campaign
 def test_own_classes_are_drawn() -> None:
     """Each of them."""
     texts = [case_of(seed).to_text() for seed in range(1, 150)]

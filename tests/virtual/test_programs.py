@@ -77,6 +77,7 @@ def test_states_that_were_not_published_are_missed(tmp_path: Path) -> None:
     assert wrong([4, 3], disturbed=True)
 
 
+@pytest.mark.campaign
 def test_programs_are_drawn_and_written_down() -> None:
     """With and without mistakes."""
     cases = [case for case in map(case_of, range(1, 600)) if case.program is not None]

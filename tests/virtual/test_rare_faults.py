@@ -58,6 +58,7 @@ def test_a_wrong_brief_ends_its_process_alone(seed: int) -> None:
     assert played.run.status == 0
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("what", "status"),
     [
@@ -131,6 +132,7 @@ def test_a_wrong_action_says_of_a_packet_that_it_was_lost_or_was_not() -> None:
     }
 
 
+@pytest.mark.campaign
 def test_all_are_drawn_and_written_down() -> None:
     """In some of the first seeds."""
     cases = [case_of(seed) for seed in range(1, 600)]

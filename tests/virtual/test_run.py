@@ -38,6 +38,7 @@ def test_a_run_ends_by_the_name_of_a_receiver_that_never_sends_its_final_belief(
     assert run.seconds < 60.0
 
 
+@pytest.mark.campaign
 def test_a_process_that_is_cut_off_at_any_moment_is_named() -> None:
     """Before all are there, too: the recorder, which it does not see, is not said to be missing."""
     for events in range(20, 130, 6):
@@ -46,6 +47,7 @@ def test_a_process_that_is_cut_off_at_any_moment_is_named() -> None:
         assert "legitimate" in played.run.said.partition("\n")[0]
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     "fault", [StopProcess("launcher", 0), KillProcess("fork server of the recorder", 0)], ids=lambda fault: fault.target
 )

@@ -115,6 +115,7 @@ def test_no_case_is_played_twice() -> None:
     assert len(texts) == len(set(texts))
 
 
+@pytest.mark.campaign
 def test_a_smaller_case_that_is_lucky_is_tried_in_other_worlds() -> None:
     """Its interleavings are not those of the case."""
     shrunk = shrink(large(), [MISS], lambda case: [MISS] if case.seed == 2 or case == large() else [])
@@ -122,6 +123,7 @@ def test_a_smaller_case_that_is_lucky_is_tried_in_other_worlds() -> None:
     assert shrunk.case.scenario.slots == 1
 
 
+@pytest.mark.campaign
 def test_a_fault_comes_earlier_in_a_shorter_run() -> None:
     """Otherwise it would come after the end."""
     fault = KillProcess("router", 2040)
@@ -178,6 +180,7 @@ def misses_of(case: SimulatedCase) -> Sequence[str]:
     return play_case(case, program).misses
 
 
+@pytest.mark.campaign
 def test_a_recorder_that_forgets_rows_is_shown_by_a_run_without_anything(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not even a fault is needed; and the text of the case is enough to play it again, to the same events."""
     case = where(lambda case: case.scenario.slots > 10 and not case.scenario.relayed and not case.faults)

@@ -66,6 +66,7 @@ def drives(radio: SimulatedWire, seconds: float, **entries: Any) -> int:
     return count
 
 
+@pytest.mark.campaign
 def test_an_hour_of_a_radio(evedrop_simulated_wire: Opener) -> None:
     """Every message has its row, those that arrive are the ones that the journal says, and the wall clock does not count."""
     radio = evedrop_simulated_wire(**WIRE, seconds=2 * HOUR)
@@ -87,6 +88,7 @@ def test_an_hour_of_a_radio(evedrop_simulated_wire: Opener) -> None:
         radio.expect("radio.delivery", above=0.99)
 
 
+@pytest.mark.campaign
 def test_a_wire_is_steered_while_programs_run(evedrop_simulated_wire: Opener) -> None:
     """At moments of virtual time, as a real one."""
     radio = evedrop_simulated_wire(**WIRE)
@@ -110,6 +112,7 @@ def test_a_wire_is_steered_while_programs_run(evedrop_simulated_wire: Opener) ->
     ]
 
 
+@pytest.mark.campaign
 def test_events_of_the_file_come_in_virtual_time(evedrop_simulated_wire: Opener) -> None:
     """An outage from minute 10 to minute 20 loses ten minutes of messages."""
     radio = evedrop_simulated_wire(**WIRE, event=[{"from": 600, "to": 1200, "cut": "radio"}])
@@ -165,6 +168,7 @@ def test_a_simulated_radio_loses_what_the_real_one_loses(evedrop_simulated_wire:
     assert f"\n{' '.join(heard[:20])}\n" in tutorial
 
 
+@pytest.mark.campaign
 def test_two_wires_share_a_world(evedrop_simulated_wire: Opener) -> None:
     """A relay program between them passes on what it hears."""
     first, second = evedrop_simulated_wire(**WIRE), evedrop_simulated_wire(**WIRE, seed=2)
@@ -186,6 +190,7 @@ def test_two_wires_share_a_world(evedrop_simulated_wire: Opener) -> None:
     assert heard == [passed_on[n] for n in arrived][:30]
 
 
+@pytest.mark.campaign
 def test_an_order_decides_again_what_it_has_decided(tmp_path: Path) -> None:
     """The same order is the same test to the last digit; another one is another."""
 
@@ -267,6 +272,7 @@ def test_the_error_of_the_test_comes_first(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "wire" / "summary.json").read_text())["expectations"][0]["held"] is False
 
 
+@pytest.mark.campaign
 def test_an_expectation_of_the_wire_is_judged_at_its_end(tmp_path: Path) -> None:
     """As that of a real one."""
     with pytest.raises(ExpectationFailed, match=r"expected radio\.delivery above 0\.99: FAILED, found 0\.[89]"):
@@ -298,6 +304,7 @@ def test_a_program_that_catches_everything_is_ended(tmp_path: Path) -> None:
     assert not endless.is_running
 
 
+@pytest.mark.campaign
 def test_a_wait_for_what_never_comes_ends_with_the_wires(evedrop_simulated_wire: Opener) -> None:
     """A test that waits without a limit, or for longer, learns why; the wire has ended by itself, in order."""
     radio = evedrop_simulated_wire(**WIRE, seconds=600.0)
@@ -436,6 +443,7 @@ def test_one(evedrop_simulated_wire, request):
 """
 
 
+@pytest.mark.campaign
 def test_the_fixture_is_one_of_the_plugin(tmp_path: Path) -> None:
     """In a project of others; a test cannot have both kinds of wires."""
     (tmp_path / "test_both.py").write_text(BOTH)

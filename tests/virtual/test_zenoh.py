@@ -469,6 +469,7 @@ def test_an_undeclared_subscriber_gets_nothing_more(net: Network) -> None:
     assert got == [b"one"]
 
 
+@pytest.mark.thorough
 @behaviour
 def test_a_channel_that_has_no_room_holds_back_its_sender_and_loses_nothing(net: Network) -> None:
     """If the sender blocks. It sends more than can be under way."""
@@ -519,6 +520,7 @@ def test_a_sender_that_drops_loses_messages_when_the_reader_stands_still(net: Ne
     assert all(one < other for one, other in pairwise(numbers))
 
 
+@pytest.mark.thorough
 @behaviour
 def test_a_sender_that_has_waited_for_room_closes_the_connection(net: Network) -> None:
     """After `wait_before_close`; then what is put is lost, without an error."""
@@ -930,6 +932,7 @@ def test_a_token_goes_when_its_process_is_killed(net: Network) -> None:
     assert seen == [("alive/a", True), ("alive/a", False)] * 2
 
 
+@pytest.mark.thorough
 @behaviour
 def test_a_token_goes_after_the_lease_of_a_suspended_process(net: Network) -> None:
     """And comes again when it goes on and connects again."""
@@ -1210,6 +1213,7 @@ def test_the_clients_of_a_closed_router_notice(net: Network) -> None:
     assert not connected(client)
 
 
+@pytest.mark.thorough
 @behaviour
 def test_the_clients_of_a_suspended_router_notice_after_the_lease(net: Network) -> None:
     """Of their own."""

@@ -235,6 +235,7 @@ def test_liveliness_is_told_until_it_is_asked_no_more(in_world: Callable[[Body],
     in_world(body)
 
 
+@pytest.mark.thorough
 def test_a_router_knows_a_peer_from_a_client(in_world: Callable[[Body], None]) -> None:
     """By its connection."""
 

@@ -98,6 +98,7 @@ def send_until_disconnected(sender: zenoh.Session) -> None:
     listener.undeclare()
 
 
+@pytest.mark.thorough
 def test_a_program_that_zenoh_disconnects_because_the_wire_is_behind_is_named(
     tmp_path: Path, goes_on: Event, linked: Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,6 +148,7 @@ def test_a_program_that_ends_is_not_named(tmp_path: Path) -> None:
     assert at.happened == []
 
 
+@pytest.mark.thorough
 def test_a_program_that_comes_back_is_in_status_summary_and_report(tmp_path: Path) -> None:
     """As an event of the wire."""
     running = wire(side=["robot", "base"], link=[{"from": "robot", "to": "base"}], out=tmp_path / "wire")

@@ -109,6 +109,7 @@ def test_every_record_of_many_threads_is_in_parquet_exactly_once(tmp_path: Path)
     ]  # fmt: skip
 
 
+@pytest.mark.thorough
 def test_the_journal_goes_on_when_a_part_is_made_while_it_looks_at_all_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -389,6 +390,7 @@ print(total)
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("times", mostly_long([3, 8], [3]))
 def test_a_wire_may_be_killed_at_any_moment(times: int, tmp_path: Path) -> None:
     """Kill -9, so many times in one folder: every recorded row is in the journal once, and the numbers of messages go on.
@@ -452,6 +454,7 @@ print(*told, sep="\\n")
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("then", ["full", "room again"])
 def test_on_a_full_disk_the_wire_goes_on(then: str, tmp_path: Path) -> None:
     """Listeners get every record; the journal keeps what the disk has room for, and says once since when it is incomplete.

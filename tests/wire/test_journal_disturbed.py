@@ -130,6 +130,7 @@ def each_operation(folder: Path) -> Iterator[int]:
     yield from range(1 + secrets.randbelow(step), done.operations + 1, step)
 
 
+@pytest.mark.thorough
 def test_a_killed_wire_has_recorded_everything(tmp_path: Path) -> None:
     """And its next start goes on with the numbers after it."""
     for number in each_operation(tmp_path):
@@ -142,6 +143,7 @@ def test_a_killed_wire_has_recorded_everything(tmp_path: Path) -> None:
                 assert messages(wire.folder) == [*range(wire.recorded)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "fault",
     mostly_long([DiskFault.SHORT, DiskFault.FULL_ONCE, DiskFault.FULL, DiskFault.BROKEN], [DiskFault.FULL]),
@@ -158,6 +160,7 @@ def test_what_is_missing_is_counted(fault: DiskFault, tmp_path: Path) -> None:
                 assert len(messages(wire.folder)) + wire.missing == wire.recorded
 
 
+@pytest.mark.thorough
 def test_a_power_cut_takes_records_and_changes_none(tmp_path: Path) -> None:
     """The wire can be started again, and takes nothing of what is left."""
     left = Counter[bool]()

@@ -230,6 +230,7 @@ def test_a_key_that_only_the_journal_remembers_goes_on(lossy: RunningLink, tmp_p
     assert [decide(200.0 + n, 1)[1] for n in range(50)] == [0 if lossless else due[100 + n] for n in range(50)]
 
 
+@pytest.mark.thorough
 def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
     """Each number, with its fate, is given once, also while the settings change."""
     delays: dict[str, Any] = {

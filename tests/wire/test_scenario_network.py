@@ -96,6 +96,7 @@ EVENTS = [
 ]
 
 
+@pytest.mark.thorough
 def test_packets_have_the_fates_of_messages(tmp_path: Path) -> None:
     """With delays, faults, correlation, cuts and changes; live as in memory, and the results folder repeats the run."""
     delay = {"model": "normal", "mean": "40 ms", "standard_deviation": "30 ms"}
@@ -147,6 +148,7 @@ def test_a_program_on_the_wire_loses_what_the_run_loses(tmp_path: Path) -> None:
         assert {k for k, fate in enumerate(delivered(result, receiver)) if fate} == heard[side]
 
 
+@pytest.mark.thorough
 def test_states_may_cross_a_wire(tmp_path: Path) -> None:
     """A player on one side, the sensor on another: the run takes the states that the wire lets through."""
     plan, path = wire(), tmp_path / "pose.csv"

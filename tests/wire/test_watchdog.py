@@ -107,6 +107,7 @@ def is_on_disk(wire: Wire) -> None:
         assert journal.history.start == 2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("how", "where"),
     [
@@ -181,6 +182,7 @@ def test_one_signal_ends_a_wire_whose_side_cannot_be_closed(number: int, tmp_pat
     is_on_disk(wire)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("how", mostly_long(["an_end", "a_start"], ["an_end"]))
 def test_a_second_signal_ends_a_wire_at_once(how: str, tmp_path: Path) -> None:
     """Whatever the main thread waits for: the end of a session, or a side that cannot be opened."""

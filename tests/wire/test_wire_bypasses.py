@@ -83,6 +83,7 @@ def test_a_side_may_allow_mode_peer(tmp_path: Path) -> None:
         assert [str(other.zid()) in line for line in at.told] == [True]
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(sys.platform != "linux", reason="multicast over the loopback interface lo")
 def test_a_program_that_scouts_by_multicast_is_reported_where_mode_peer_is_allowed(
     tmp_path: Path, multicast: dict[str, Any]
@@ -138,6 +139,7 @@ def test_a_wire_past_which_programs_could_speak_has_no_verdict(tmp_path: Path) -
     assert {f"no verdict: {summary.bypasses[0].event}", wire_outcome(summary)[0]} <= set(page.texts)
 
 
+@pytest.mark.thorough
 def test_a_wire_without_expectations_fails_too(tmp_path: Path) -> None:
     """The exit status is 1, which the `with` statement raises as a failure."""
     running = wire(side=["robot", "base"], link=[LINK], out=tmp_path / "wire")

@@ -115,6 +115,7 @@ def test_sides_that_routers_join_outside_the_wire_carry_nothing(tmp_path: Path, 
             assert all(fate == WireFate.LOOPED for fate in wire.fates())
 
 
+@pytest.mark.thorough
 def test_a_program_cannot_say_that_sides_are_joined(tmp_path: Path) -> None:
     """Each side has a router of its own; a probe of the wire that one program reads, another puts at the other side, too late."""
     with router() as (_, first), router() as (_, second):

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from evedrop.wire.file import wire_of
 from evedrop.wire.run import run_wire
 from tests.wire.wire_at_work import sending
 
 
+@pytest.mark.thorough
 def test_a_failed_expectation_is_told_apart_from_the_rest(tmp_path: Path) -> None:
     """The command with `--quiet` prints it on standard error; the exit status is 1."""
     plan = wire_of(

@@ -67,6 +67,7 @@ def heard(running: RunningWire) -> int:
     return running.status().links["scan"].heard
 
 
+@pytest.mark.thorough
 def test_a_wire_is_opened_steered_read_and_judged(tmp_path: Path) -> None:
     """All in one, because a process takes a second to begin: what programs get is what the journal and the summary say."""
     expectation = {"metric": "scan.delivery", "above": 0.9}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from pathlib import Path
 
+import pytest
 import zenoh
 
 from evedrop.model.links.loss_model import Fate
@@ -17,6 +18,7 @@ from tests.wire.wire_links import LOSSES
 COUNT = 2000
 
 
+@pytest.mark.thorough
 def test_what_arrives_is_what_the_fates_say(tmp_path: Path) -> None:
     """For each model, between messages of all the others, in order; the rate is within the 99 % bounds of the distribution."""
     plan = plan_of(

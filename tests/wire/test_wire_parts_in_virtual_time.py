@@ -185,6 +185,7 @@ def test_a_link_that_keeps_the_order_keeps_it(tmp_path: Path) -> None:
     assert all(got == sorted(got) for got in outcome.got.values())
 
 
+@pytest.mark.thorough
 def test_an_hour_of_a_wire_with_a_cut(tmp_path: Path) -> None:
     """From minute 10 to minute 20; the watchdog looks all the time, and finds nothing that hangs."""
     plan = both_ways(LATE, LATE, events=(WireEvent(600.0, 1200.0, cut="robot-base"),))

@@ -99,6 +99,7 @@ def _patient_zenoh(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("evedrop.wire.side.side_config", patient)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("tap", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_stopped_reader_at_a_third_side_holds_up_nobody(tap: bool, tmp_path: Path) -> None:
     """The base has all messages although Zenoh waits for the readers."""
@@ -121,6 +122,7 @@ def test_a_stopped_reader_at_a_third_side_holds_up_nobody(tap: bool, tmp_path: P
         assert wire.fates("robot-base") == [WireFate.DELIVERED] * COUNT
 
 
+@pytest.mark.thorough
 def test_a_stopped_asker_holds_up_nobody_at_the_side_that_answers(tmp_path: Path) -> None:
     """What the server publishes reaches the robot while its replies still wait for the asker."""
     plan = plan_of(

@@ -280,6 +280,7 @@ def test_amended_fates_are_in_the_table(tmp_path: Path) -> None:
     assert "5 underway" in table
 
 
+@pytest.mark.thorough
 def test_a_view_follows_a_running_wire(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """With `--view FILE.rrd`, the file has what crossed and the events; the journal, too, keeps the events."""
     plan = both_ways(LOSSY, events=(WireEvent(0.5, None, partition=("robot", "base")),))

@@ -72,6 +72,7 @@ def test_a_program_may_import_the_scenario_alone() -> None:
     assert done.stdout == "3000\n"
 
 
+@pytest.mark.thorough
 def test_a_live_run_has_the_digests_of_memory_and_leaves_nothing_behind(tmp_path: Path) -> None:
     """Without `out`, in a program of its own that keeps its results until it exits."""
     (tmp_path / "s.toml").write_text(SMALL.to_toml())
@@ -211,6 +212,7 @@ def test_an_unknown_name_is_named_with_the_known_ones(results: RunResults) -> No
     assert (type(copy), str(copy)) == (type(caught.value), str(caught.value))
 
 
+@pytest.mark.thorough
 def test_workers_change_no_digest() -> None:
     """As with the option of the command; 0 is refused."""
     tiny = SMALL.replace(slots=2, eavesdroppers=None)
@@ -227,6 +229,7 @@ def test_errors_alone_can_be_followed_for_any_number_of_slots() -> None:
     assert montecarlo(fast, trials=1, plan=Plan(Mode.ERROR_COORDINATES)).typed_summary.slots == 200
 
 
+@pytest.mark.thorough
 def test_a_sweep_takes_arrays_and_gives_a_table() -> None:
     """A row for each point and receiver, with the numbers of the point's own study; the page has the command that repeats it."""
     over = {"encoding.state_probability": np.array([0.2, 0.6]), "slots": range(5, 8, 2), "title": ["1:2"]}
@@ -303,6 +306,7 @@ def test_a_notebook_shows_progress_and_takes_it_away(cells: list[str]) -> None:
     assert cells[-2] == '<progress max="1" value="0.5000"></progress> 50% · 1,000 slots/s'
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("mode", mostly_long(["auto", "web", "notebook"], ["auto"]))
 def test_a_live_run_is_shown_in_the_cell(mode: str, cells: list[str]) -> None:
     """While it goes on; its page stays when it has ended."""
@@ -311,6 +315,7 @@ def test_a_live_run_is_shown_in_the_cell(mode: str, cells: list[str]) -> None:
     assert data_at(address_in(frame)) == (kept.folder / "recording.rrd").read_bytes()
 
 
+@pytest.mark.thorough
 def test_without_a_notebook_the_address_of_a_live_run_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     """With a function that takes events, it is for that function; and there is no cell to show a view in."""
     events: list[ProgressEvent] = []

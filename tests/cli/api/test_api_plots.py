@@ -53,6 +53,7 @@ def test_errors_are_those_of_the_table_in_the_colours_of_the_view(results: RunRe
     assert (len(axes.get_lines()), len(axes.collections), axes.get_yscale()) == (4, 2, "log")
 
 
+@pytest.mark.thorough
 def test_no_band_where_rare_events_carry_the_mean() -> None:
     """A lost first packet, with Σ0 far above Q: the mean of its slots is too small, and so is its standard error.
 

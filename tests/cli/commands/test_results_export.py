@@ -19,6 +19,7 @@ STUDIES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("study", mostly_long(STUDIES, ["run", "sweep"]))
 def test_the_picture_and_the_tables_of_any_study(study: str, evedrop: Evedrop) -> None:
     """As PDF, PNG and SVG, as CSV and LaTeX; the command says which files it wrote."""
@@ -38,6 +39,7 @@ def test_the_picture_and_the_tables_of_any_study(study: str, evedrop: Evedrop) -
             assert picture.width == 1050
 
 
+@pytest.mark.thorough
 def test_a_panel_is_drawn_alone(evedrop: Evedrop) -> None:
     """The errors of a run are lower than the whole picture, and as wide; other studies have no such panel."""
     assert evedrop(*STUDIES["run"]).status in {0, 1}
@@ -57,6 +59,7 @@ def test_a_panel_is_drawn_alone(evedrop: Evedrop) -> None:
             assert not (evedrop.folder / name).exists()
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_exported(evedrop: Evedrop) -> None:
     """A width without a picture, a folder without results, a file that cannot be written."""
     assert evedrop(*STUDIES["run"]).status in {0, 1}

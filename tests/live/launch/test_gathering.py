@@ -123,6 +123,7 @@ in_parts = given(
 )
 
 
+@pytest.mark.thorough
 @settings(max_examples=examples(16))
 @in_parts
 def test_two_shards_are_the_whole(cut: int, first: list[int], second: list[int], at_once: int, seed: int) -> None:

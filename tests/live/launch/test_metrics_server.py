@@ -42,6 +42,7 @@ def scraped(page: str) -> Samples:
     }
 
 
+@pytest.mark.thorough
 def test_a_scrape_has_the_metrics_of_the_run(tmp_path: Path) -> None:
     """During a real run the slots grow; at its end every metric is that of the summary."""
     scenario = load("restart")
@@ -200,6 +201,7 @@ def test_a_taken_port_is_refused_before_anything_starts(evedrop: Evedrop) -> Non
     assert not (evedrop.folder / "runs").exists()
 
 
+@pytest.mark.thorough
 def test_the_command_prints_the_address(evedrop: Evedrop) -> None:
     """And the run ends as any other does."""
     words = ("--slots", "50", "--view", "off", "--metrics", "127.0.0.1:0", "--out", "run")

@@ -87,6 +87,7 @@ def test_a_process_has_a_folder_a_session_and_a_name_of_its_own(
     assert Path(f"/proc/{router.pid}/cwd").resolve() == tmp_path.resolve()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("role", ["recorder", "sensor"])
 def test_its_status_and_its_complaint_are_its_own(bench: Bench, role: str) -> None:
     """Of two processes that run at the same time, one ends: its status, its log."""
@@ -107,6 +108,7 @@ def test_a_killed_process_has_a_status_too(bench: Bench) -> None:
     assert router.wait(LIMIT) == -signal.SIGKILL
 
 
+@pytest.mark.thorough
 def test_a_signal_that_reaches_a_fork_before_it_runs_is_not_lost(bench: Bench) -> None:
     """Sent as soon as its id is known."""
     for _ in range(20):
@@ -141,6 +143,7 @@ def test_in_a_block_all_runs_have_the_same_servers(
         assert after is before
 
 
+@pytest.mark.thorough
 def test_without_its_server_a_process_is_ended(own_bench: Bench, tmp_path: Path) -> None:
     """Nobody could say any more how it ended. Its run cannot start another process; the next run has other servers."""
     with process_starter() as starter:

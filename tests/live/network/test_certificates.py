@@ -338,6 +338,7 @@ def test_a_router_whose_clock_is_wrong_is_told_apart(stage: Bench) -> None:
         connected(RouterAddress(endpoint, stage.keys.run, config, eve), 20.0)
 
 
+@pytest.mark.thorough
 def test_a_router_that_is_not_there_is_waited_for() -> None:
     """Nobody listens: the process says so when its patience ends, as a failure of the run."""
     calls: list[None] = []

@@ -66,6 +66,7 @@ def test_a_network_that_cuts_connections_is_no_refusal() -> None:
         connecting.connected(address, 6.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("lasting", [0.0, None], ids=["hangs up on everybody", "says nothing"])
 def test_what_ends_connections_by_itself_is_not_the_network(lasting: float | None) -> None:
     """A program that hangs up at once, and one, as a router that refused a brief, that keeps an idle connection."""

@@ -21,6 +21,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("evedrop.live.network.operator._CONNECT_SECONDS", 0.3)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("impatient")
 def test_who_is_ready_is_there_and_who_left_is_not(bench: Callable[..., Bench]) -> None:
     """By its token at the router, not by its process or its connection."""
@@ -49,6 +50,7 @@ def test_behind_certificates_it_is_no_different(tmp_path: Path) -> None:
         assert not is_there(stage.briefs[EVE])
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("impatient")
 def test_the_command_says_so(bench: Callable[..., Bench], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """In words, and by its status."""

@@ -174,6 +174,7 @@ def test_a_malformed_message_of_its_own_key_is_an_error(stage: Stage) -> None:
         assert session.dropped == 0
 
 
+@pytest.mark.thorough
 def test_a_connection_that_comes_and_goes_does_not_hold_up_a_process_for_ever(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -233,6 +234,7 @@ def test_a_lost_connection_is_replaced(stage: Stage) -> None:
     token.undeclare()
 
 
+@pytest.mark.thorough
 def test_a_connection_that_takes_one_key_for_another_is_replaced(stage: Stage) -> None:
     """A message of another key makes a process open another session: nothing of the old one is trusted any more."""
     key, other = stage.keys.downlink("eve"), stage.keys.downlink("mallory")

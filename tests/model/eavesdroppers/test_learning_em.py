@@ -90,6 +90,7 @@ def test_without_innovations_and_losses_it_is_least_squares(knows: list[str]) ->
         assert np.allclose(Q[:, :, r], noise, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_it_learns() -> None:
     """The longer it listens, the less its estimates err, and then it errs little more than one that knows everything."""
     batch = Batch(96, 40)

@@ -31,6 +31,7 @@ def python(code: str, kernels: str | None = None) -> subprocess.CompletedProcess
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
 
 
+@pytest.mark.thorough
 def test_the_selftest_passes_in_numpy_and_says_so() -> None:
     """The golden digests do not depend on the kernels."""
     done = python(SELFTEST, "numpy")

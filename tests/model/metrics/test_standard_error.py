@@ -348,6 +348,7 @@ def test_the_report_has_the_standard_errors_of_a_loop(capsys: pytest.CaptureFixt
     assert [line.count(" ± ") for line in lines] == [0, 0]
 
 
+@pytest.mark.thorough
 def test_the_ratio_of_a_verdict_has_a_standard_error(recorded: Results, tmp_path: Path) -> None:
     """That of the trials' pairs of means in the second half; none for one trial, nor where an error has infinite variance."""
     legitimate, other = (

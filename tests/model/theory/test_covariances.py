@@ -114,6 +114,7 @@ def test_eavesdropper_expectation_is_the_recursion(
     assert close(result, eavesdropper_recursion(process, slots, mu_e, mu_d, b0, b1))
 
 
+@pytest.mark.thorough
 @given(processes(), probabilities, probabilities, probabilities, probabilities)
 @settings(deadline=None, max_examples=examples(40))
 def test_outcomes_are_a_distribution(process: Process, mu_e: float, mu_d: float, b0: float, b1: float) -> None:

@@ -226,6 +226,7 @@ def test_simulated_genies_agree_with_theory() -> None:
                     assert abs(sample.mean() - expected[slot.k]) <= SURE * spread, slot.k
 
 
+@pytest.mark.thorough
 def test_it_bounds_every_strategy() -> None:
     """No strategy that hears the same packets has a smaller mean error in any slot, at 4.5 standard errors of the difference.
 

@@ -41,6 +41,7 @@ def ratio(process: Process, mu: float, mu_e: float, mu_d: float) -> float:
     return smart / legitimate
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("mu_e", mostly_long([0.95, 0.9, 0.85], [0.9]))
 def test_the_cheapest_is_the_largest_of_the_grid(mu_e: float) -> None:
     """No μ_d of a grid above it has the ratio, it has it, and all in the intervals do; a large enough one at every place."""
@@ -59,6 +60,7 @@ def test_the_cheapest_is_the_largest_of_the_grid(mu_e: float) -> None:
         )
 
 
+@pytest.mark.thorough
 def test_the_largest_ratio_is_that_of_a_grid() -> None:
     """Over the admissible μ_d, where it is attained; the refusal says how large it is, and where."""
     result = largest_ratio(UNSTABLE, 0.9, [SMART])

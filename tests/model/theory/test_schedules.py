@@ -200,6 +200,7 @@ def test_changes_of_two_neighbours_find_what_changes_of_one_do_not() -> None:
     assert best.value >= problem.sums(mesh_of(5, 21)).max()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("eavesdropper", ["smart", "naive"])
 def test_no_change_of_one_slot_improves_it(eavesdropper: str) -> None:
     """Every other value of a single μ_d either violates Ω or loses."""
@@ -245,6 +246,7 @@ def test_a_design_as_json() -> None:
     assert ScheduleDesign({}, {"wise": "bayesian"}).as_dict()["left_out"] == {"wise": "bayesian"}
 
 
+@pytest.mark.thorough
 def test_blocks_share_their_probability() -> None:
     """With blocks of three slots μ_d changes at slots 1, 4 and 7 alone; one block is the best constant."""
 

@@ -106,6 +106,7 @@ def test_the_process_that_a_recursion_of_inverses_got_wrong() -> None:
     assert np.all(theoretical_traces(process, Outcomes.legitimate(0.9, 0.9), 60)[1:] < result[1:])
 
 
+@pytest.mark.thorough
 @settings(deadline=None, max_examples=examples(40))
 @given(models(), receivers)
 def test_expectations(model: Model, outcomes: Outcomes) -> None:

@@ -13,6 +13,7 @@ from tests.scenario.conformance.own_classes import ENTRY, HEAD, SCENARIO
 pytestmark = pytest.mark.usefixtures("imports_forgotten")
 
 
+@pytest.mark.thorough
 def test_an_error_in_a_later_slot_names_the_line(evedrop: Evedrop) -> None:
     """In memory as live, by a worker too: status 3, what was raised, and where."""
     body = "Mine(Naive):\n    def uses(self, k):\n        return None if k < 20 else 1 / 0"
@@ -29,6 +30,7 @@ def test_an_error_in_a_later_slot_names_the_line(evedrop: Evedrop) -> None:
         assert "tires.py" in done.err
 
 
+@pytest.mark.thorough
 def test_another_shape_in_a_later_slot_is_not_sent(evedrop: Evedrop) -> None:
     """Turned round, a packet has as many bytes as before: live as in memory the run ends with status 3 and says what it was."""
     lines = (
@@ -170,6 +172,7 @@ def test_every_command_in_memory_names_class_slot_and_trials(
     assert "Traceback" not in done.err
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", mostly_long([case for case in LATER if case != "fates"], ["packet", "follow"]))
 def test_what_breaks_in_a_later_slot_ends_a_live_run(case: str, evedrop: Evedrop) -> None:
     """Its process says the same as a study in memory; the slots of a block depend on how many packets had arrived."""

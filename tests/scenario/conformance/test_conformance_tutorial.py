@@ -39,6 +39,7 @@ def test_the_tutorial_has_short_classes_and_a_scenario() -> None:
     assert all(text.count("\n") < 39 for text in blocks.values())
 
 
+@pytest.mark.thorough
 def test_the_tutorial_works_as_it_is_typed(tutorial: Evedrop) -> None:
     """Its classes are checked, and run live, in memory and again from the results, with the same digests."""
     lines = TEXT.splitlines()

@@ -31,6 +31,7 @@ def with_package(evedrop: Evedrop, code: str) -> dict[str, str]:
     return {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
 
 
+@pytest.mark.thorough
 def test_an_event_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
     """The one of the docs, a file and a line of metadata: in memory and live, with equal digests, and in both summaries."""
     page = (DOCS / "your-own" / "event.md").read_text(encoding="utf-8")

@@ -222,6 +222,7 @@ def test_a_change_names_a_recording_of_the_current_folder(tmp_path: Path, monkey
     assert load(scenario, {"legitimate.link.loss.file": "walk.csv"}).legitimate.link.loss_spec["outcomes"] == "01"
 
 
+@pytest.mark.thorough
 def test_a_live_run_reads_a_recording(evedrop: Evedrop) -> None:
     """The router has the outcomes: all packets are accounted for, and as many are lost as were."""
     write(evedrop.folder, "walk.csv", "received\n" + "1\n0\n1\n1\n" * 10)

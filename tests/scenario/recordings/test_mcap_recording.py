@@ -201,6 +201,7 @@ def test_a_damaged_byte_raises_no_other_error(tmp_path_factory: pytest.TempPathF
         mcap_recording(path)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("spec", mostly_long([{"model": "bernoulli", "quality": 0.8}, BURSTS], [BURSTS]))
 def test_the_fitted_link_loses_as_the_recorded_one_did(spec: dict[str, Any], tmp_path: Path) -> None:
     """Rate and length of bursts of 200 000 messages through the fitted model, within 4 % of the link that was recorded."""

@@ -538,6 +538,7 @@ one_or_all_others = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.thorough
 @one_or_all_others
 def test_a_changed_summary_is_refused_in_a_sentence(others: tuple[Any, ...], study: Path, tmp_path: Path) -> None:
     """Or shown, whatever word or number in it is another one."""
@@ -573,6 +574,7 @@ def test_a_changed_entry_of_an_application_is_refused_in_a_sentence(evedrop: Eve
         assert "has results that this version does not write" in done.err
 
 
+@pytest.mark.thorough
 @one_or_all_others
 @pytest.mark.parametrize(
     ("words", "file"),

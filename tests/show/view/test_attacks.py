@@ -100,6 +100,7 @@ def test_the_lane_is_right_where_receivers_are_away_and_packets_late(
     assert {"acknowledged", "nothing", {"critical": "blocked", "hijack": "ignored"}[attack]} <= set(seen)
 
 
+@pytest.mark.thorough
 def test_a_live_run_shows_what_its_replay_shows(tmp_path: Path) -> None:
     """Its acknowledgements in every slot, the words at the top of the plane, the marks on the path, and the events."""
     folder = run("acknowledged", trials=2, out=tmp_path / "run", view="web").folder

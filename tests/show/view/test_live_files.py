@@ -88,6 +88,7 @@ def given_at_once(followed: Followed, file: Path) -> list[Chunk]:
     return [*RrdReader(file).stream()]
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_late_viewer_gets_large_chunks_and_every_row_once(run: Simulated, tmp_path: Path) -> None:
     """It has fewer chunks than a viewer that followed from slot 0 on, and both have every row of the recording, once.

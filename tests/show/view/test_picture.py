@@ -130,6 +130,7 @@ def test_a_panel_that_the_recording_lacks_is_refused(simulated: Callable[..., Si
     assert [path.name for path in tmp_path.iterdir()] == ["r.rrd"]
 
 
+@pytest.mark.thorough
 def test_missing_driver_is_named(
     simulated: Callable[..., Simulated], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

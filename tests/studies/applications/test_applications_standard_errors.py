@@ -59,6 +59,7 @@ def check(together: Mapping[str, Any], alone: list[Mapping[str, Any]], ignored: 
         assert error == pytest.approx(np.std(values.astype(float), ddof=1) / math.sqrt(TRIALS), rel=1e-9), place
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("scenario", "application"),
     mostly_long([("heated-room", "comfort"), ("microgrid", "household")], [("heated-room", "comfort")]),

@@ -71,6 +71,7 @@ def test_totals_of_parts_are_the_totals(tmp_path: Path) -> None:
     assert (first["attack_from"], first["detected_fraction"], first["expected_delay"]) == (None, None, None)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("policy", mostly_long(["always", "parsimonious"], ["parsimonious"]))
 def test_live_and_memory_have_the_same_digest(policy: str, tmp_path: Path) -> None:
     """With an attack that begins and ends, over links that lose packets, and limits that clip the inputs."""

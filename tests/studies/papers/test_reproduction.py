@@ -111,6 +111,7 @@ def test_the_papers_are_listed(evedrop: Evedrop) -> None:
     assert listed["kennedy2022"]["published"] == "arXiv 2212.08234, 2022"
 
 
+@pytest.mark.thorough
 def test_a_paper_is_printed_and_written(evedrop: Evedrop, tmp_path: Path) -> None:
     """The table with notes; the folder gets JSON and Markdown; `--json` prints one line."""
     folder = tmp_path / "new" / "folder"

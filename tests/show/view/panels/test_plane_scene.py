@@ -86,6 +86,7 @@ def recorded_texts(run: Simulated, path: Path, length: int) -> dict[int, str]:
     return {slot: str(text[0]) for slot, text in rows(path, "title", "TextDocument:text").items()}
 
 
+@pytest.mark.thorough
 def test_the_verdict_is_recorded_so_far_and_at_the_end(tmp_path: Path) -> None:
     """Sixty times in a run that is as fast as possible, never from later slots, and the verdict on the run at its last slot."""
     run: Simulated = simulate(orbit(), 1500)
