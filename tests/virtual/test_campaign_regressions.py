@@ -8,9 +8,7 @@ from typing import Any
 
 import pytest
 
-from evedrop.cli.simulated import program
-from evedrop.virtual.campaign import play_case
-from evedrop.virtual.cases import case_from
+from tests.virtual.simulated import play, read_case
 
 REGRESSIONS = tomllib.loads(Path(__file__).with_name("regressions.toml").read_text("utf-8"))["regression"]
 
@@ -24,4 +22,4 @@ REGRESSIONS = tomllib.loads(Path(__file__).with_name("regressions.toml").read_te
 )
 def test_a_case_that_broke_a_promise_keeps_it(regression: dict[str, Any]) -> None:
     """Every entry of regressions.toml."""
-    assert play_case(case_from(str(regression["case"])), program).misses == ()
+    assert play(read_case(str(regression["case"]))).misses == ()

@@ -313,6 +313,7 @@ class SimulatedWireCase:
                             at_work = ProgramAtWork(drawn, place, numbers[drawn], course)
                             begin(drawn.side, partial(at_work.run, endpoint, side.get("users"), EPOCH))
                     scheduler.run(scheduler.now + longest, lambda wire=wire: not wire.task.alive)  # type: ignore[misc]
+                    course.ended.append(scheduler.now)
                     simulated.disk.make_room()
                     moment = scheduler.now + _AGAIN
                     scheduler.at(moment, lambda: None)

@@ -58,6 +58,8 @@ class Course:
     got: Counter[Message] = field(default_factory=Counter)
     begun: list[float] = field(default_factory=list)
     """When each start of the wire began, in virtual seconds."""
+    ended: list[float] = field(default_factory=list)
+    """When each of them was over."""
     dropped: list[float] = field(default_factory=list)
     """When Zenoh dropped a message for which a connection had no room: it tells nobody, not even the wire."""
     processes: list[VirtualProcess] = field(default_factory=list)
