@@ -68,6 +68,17 @@ def test_a_full_disk_stays_full_until_there_is_room(fault: DiskFault, tmp_path: 
         assert (disk.root / "third").read_bytes() == b"abcdefgh"
 
 
+@pytest.mark.parametrize("name", ["beside", "disk/../beside"])
+def test_no_program_writes_outside_its_disk(name: str, tmp_path: Path) -> None:
+    """The files of the machine are no part of the simulation."""
+    with simulated(tmp_path) as (scheduler, disk):
+        outside = disk.root.parent / name
+        with pytest.raises(AssertionError, match="is not on the simulated disk"):
+            run_program(scheduler, lambda: write_twice(outside))
+        scheduler.errors.clear()
+        assert not outside.exists()
+
+
 def test_a_process_that_is_gone_changes_nothing_any_more(tmp_path: Path) -> None:
     """What it was to remove in the end stays."""
     with simulated(tmp_path, faults=at(4, DiskFault.KILL)) as (scheduler, disk):

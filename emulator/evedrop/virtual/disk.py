@@ -193,9 +193,11 @@ class VirtualDisk(Disk):
         return current.task
 
     def begin(self, what: str, path: Path, *words: object) -> DiskFault | None:
-        """An operation begins; returns what goes wrong at it."""
+        """An operation begins; returns what goes wrong at it. Raises AssertionError outside the folder of the disk."""
         if (caller := self.caller()) is None:
             return None
+        if not os.path.abspath(path).startswith(f"{self.root}/"):
+            raise AssertionError(f"{caller.name} {what} {path}, which is not on the simulated disk")
         caller.allocate()
         self.operations += 1
         self._scheduler.note(notes.WRITES, caller.name, what, str(path).removeprefix(f"{self.root}/"), *words)
