@@ -344,9 +344,9 @@ def _of_results(
 
 
 def _falsified(run: SimulatedRun, struck: Iterable[Disturbance]) -> bool:
-    """Whether a run that has failed may have rows with a wrong number: it says so, unless a signal came first."""
+    """Whether a run that has failed may have rows with a wrong number: it says so, unless something else ended it before."""
     wrong = any(isinstance(fault, BreakMessage) and fault.target == RECORDER for fault in struck)
-    return any(text in run.said for text in CONTRADICTIONS) or (wrong and run.status == Interrupted.exit_status)
+    return wrong or any(text in run.said for text in CONTRADICTIONS)
 
 
 def _of_course(
