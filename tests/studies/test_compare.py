@@ -26,6 +26,8 @@ from evedrop.simulate.simulation import Mode
 from evedrop.studies.matchups import ATTACKERS, usual_adversaries
 from tests.pages import Checked, checked
 
+pytestmark = pytest.mark.thorough
+
 MARGINAL: dict[str, Any] = {"slots": 60, "trials": 30, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}
 """Changes of `bayesian`: long enough for verdicts, and trials that lose the first slot do not dominate the mean."""
 

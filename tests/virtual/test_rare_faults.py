@@ -25,6 +25,7 @@ RUNS = 90
 """Events after which all processes are there."""
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("fault", "scenario", "status", "said"),
     [
@@ -48,6 +49,7 @@ def test_a_run_ends_as_it_must(fault: Disturbance, scenario: Scenario, status: i
     assert (run.status, said in run.said) == (status, True), run.said
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(12))
 def test_a_wrong_brief_ends_its_process_alone(seed: int) -> None:
     """Whichever entry is wrong: the run goes on."""
@@ -58,6 +60,7 @@ def test_a_wrong_brief_ends_its_process_alone(seed: int) -> None:
     assert played.run.status == 0
 
 
+@pytest.mark.campaign
 @pytest.mark.campaign
 @pytest.mark.parametrize(
     ("what", "status"),
