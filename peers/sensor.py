@@ -94,7 +94,8 @@ class Window:
     def go_on(self, k: int, absent: Collection[str]) -> None:
         """All receivers have done all slots below k; do not wait for the absent ones from now on.
 
-        The recorder need not have the controller's reports of these slots: the controller keeps those of a window.
+        The recorder need not have the controller's reports of these slots: the controller keeps those of a window. What it has
+        told of its progress counts at once, or else the next messages would have fewer slots than the window allows.
         """
         self._done = {name: done if name == RECORDER else max(done, k) for name, done in self._done.items()}
         self._absent = absent

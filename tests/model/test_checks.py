@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.model.checks import as_toml, count_mistakes, flag_mistakes
+from evedrop.model.checks import as_toml, flag_mistakes, whole_number_mistakes
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.delays import DELAY_MODELS, LONGEST, DelayModel, delay_of
 from evedrop.model.links import LOSS_MODELS, loss_of
@@ -176,8 +176,8 @@ def test_checks_of_flags_and_counts() -> None:
     """A parameter that is not given has no mistake."""
     flags = {"once": True, "random_start": 1}
     assert flag_mistakes(flags, "once", "random_start", "absent") == [("random_start", "is 1; expected true or false")]
-    assert count_mistakes({"count": 1_000_000}, "count") == []
-    assert [entry for entry, _ in count_mistakes({"count": 1_000_001}, "count")] == ["count"]
+    assert whole_number_mistakes({"count": 1_000_000}, "count", 1, 1_000_000) == []
+    assert [entry for entry, _ in whole_number_mistakes({"count": 1_000_001}, "count", 1, 1_000_000)] == ["count"]
 
 
 def test_losses_of_states_are_looked_up_in_either_way() -> None:

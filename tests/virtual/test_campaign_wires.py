@@ -136,7 +136,7 @@ def test_a_message_that_zenoh_drops_at_a_tap_is_no_miss() -> None:
         further=(FULL,),
     )
     played = case.play(keep=True)
-    assert any(note.what == notes.LOST and note.words[-1] == "no room" for note in played.run.happened)
+    assert any(note.what == notes.LOST and note.words[-1] == notes.NO_ROOM for note in played.run.happened)
     assert played.misses == ()
 
 

@@ -61,7 +61,6 @@ def test_a_wrong_brief_ends_its_process_alone(seed: int) -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("what", "status"),
     [

@@ -355,7 +355,7 @@ def _faults(draw: random.Random, seconds: float) -> tuple[Disturbance, ...]:
 
 def _note_drop(scheduler: VirtualScheduler, course: Course, name: str, what: str, words: tuple[object, ...]) -> None:
     del name
-    if what == notes.LOST and words[-1] == "no room":
+    if what == notes.LOST and words[-1] == notes.NO_ROOM:
         course.dropped.append(scheduler.now)
 
 

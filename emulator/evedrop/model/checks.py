@@ -88,14 +88,6 @@ def probabilities_mistakes(given: Mapping[str, Any], name: str) -> list[tuple[st
     return [] if value else [(name, "is an empty list; expected a number from 0 to 1, or one for each slot")]
 
 
-def count_mistakes(given: Mapping[str, Any], name: str, most: int = MOST_SLOTS) -> list[tuple[str, str]]:
-    """A mistake if the entry is given and is not a whole number from 1 to `most`, such as a number of slots."""
-    value = given.get(name, 1)
-    if type(value) is int and 1 <= value <= most:
-        return []
-    return [(name, f"is {value!r}; expected a whole number from 1 to {most}")]
-
-
 def flag_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, str]]:
     """A mistake for every one of the names that is given and neither true nor false."""
     return [

@@ -59,7 +59,7 @@ class OperatorCommand(_Outsider):
     @staticmethod
     def _type(world: SimulatedWorld, *words: str) -> bool:
         """Carry out a command, such as `pause RUN`; returns whether the run did it, rather than to refuse."""
-        status = world.machine.program([words[0], str(world.moved_results), *words[1:]])
+        status = world.machine.program([words[0], str(world.results_now), *words[1:]])
         if status not in {0, UsageError.exit_status}:
             raise AssertionError(f"{' '.join(words)} ends with status {status}")
         return status == 0

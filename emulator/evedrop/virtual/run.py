@@ -103,8 +103,8 @@ class SimulatedWorld:
         self.world = VirtualWorld(self.scheduler, self.machine, self.zenoh, self.disk)
 
     @property
-    def moved_results(self) -> Path:
-        """Where the results of a run are now."""
+    def results_now(self) -> Path:
+        """Where the results of a run are: somebody may have moved them."""
         return self.renamed if self.renamed.is_dir() else self.results
 
     @contextlib.contextmanager
@@ -192,7 +192,7 @@ def run_in(
         run.ended = ended
         run.errors, run.seconds, run.events = scheduler.errors, scheduler.now, scheduler.events
         run.digest, run.happened = scheduler.digest, scheduler.happened
-        run.folder = world.moved_results
+        run.folder = world.results_now
     return run
 
 

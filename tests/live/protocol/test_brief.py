@@ -267,6 +267,8 @@ def test_a_malformed_outage_is_refused(role: str, outage: list[Any], message: st
         ("learning-particle", "particles", 0),
         ("replay-informed", "learns_at", [[1.0]]),
         ("replay-informed", "learns_at", -1),
+        ("colluding", "particles", "x"),
+        ("suspicious", "use_state", "x"),
     ],
 )
 def test_a_parameter_that_the_strategy_finds_wrong_is_refused(
@@ -274,7 +276,10 @@ def test_a_parameter_that_the_strategy_finds_wrong_is_refused(
 ) -> None:
     """In the words in which it refuses it in a scenario."""
     brief = json.loads(made(briefed())["doubtful"].text)
-    brief["part"] |= {"strategy": strategy, "parameters": {**STRATEGIES[strategy].parameters, parameter: value}}
+    parameters = {**STRATEGIES["learning-particle"].parameters, **STRATEGIES[strategy].parameters}
+    if "reads_as" in parameters:
+        parameters["reads_as"] = "learning-particle"
+    brief["part"] |= {"strategy": strategy, "parameters": {**parameters, parameter: value}}
     assert f"part.parameters.{parameter} is {as_toml(value)}; expected" in str(refusal(brief, tmp_path))
 
 

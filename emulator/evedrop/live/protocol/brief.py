@@ -32,6 +32,8 @@ from evedrop.model.acknowledgements import ATTACKS, AckChannelSpec
 from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.detection import Chart
 from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
+from evedrop.model.eavesdroppers.readers import READERS
 from evedrop.model.integrity.monitor import Monitor, MonitorPlan
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, mistakes_of
@@ -316,16 +318,22 @@ class EavesdropperPart:
         """Look for the class, its parameters, the keys of its streams and the absence before a restart; make the noise."""
         _expect_return(brief, self.outages)
         kind, n, noise = STRATEGIES[self.strategy], brief.model.process.n, self.noise_distribution
-        lacking = sorted(set(kind.parameters) - set(self.parameters))
-        if lacking:
-            raise BriefError(f"part.parameters.{lacking[0]} is missing, which the strategy needs; {WRITE_AGAIN}")
         with _using("part.parameters"):
-            _expect_right("part.parameters", kind.mistakes(self.parameters))
+            self._expect_parameters(kind)
+            if "reads_as" in kind.parameters:
+                self._expect_parameters(READERS[self.parameters["reads_as"]])
             streams = kind.streams(self.parameters)
         brief.expect_keys(streams)
         with _using("part.noise_covariance"):
             if noise is not None and noise.factors(brief.model.process).block(range(1, 2)).shape[1:] != (n, n):
                 raise ValueError(f"it does not have {n} states, as the model does")
+
+    def _expect_parameters(self, kind: type[Eavesdropper]) -> None:
+        """Raise BriefError unless the parameters of a strategy, or of the one that it reads as, are there and right."""
+        lacking = sorted(set(kind.parameters) - set(self.parameters))
+        if lacking:
+            raise BriefError(f"part.parameters.{lacking[0]} is missing, which the strategy needs; {WRITE_AGAIN}")
+        _expect_right("part.parameters", kind.mistakes(self.parameters))
 
 
 @dataclass(frozen=True)

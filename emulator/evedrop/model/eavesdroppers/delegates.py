@@ -87,7 +87,7 @@ class ReplayInformed(Delegate):
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """A slot that is none."""
+        """A mistake if `learns_at` is not the number of a slot."""
         return whole_number_mistakes(given, "learns_at", 0, LAST_SLOT)
 
     @classmethod

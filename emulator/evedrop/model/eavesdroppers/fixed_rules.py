@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from evedrop.model import update
+from evedrop.model.checks import probability_mistakes
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader, PacketTaker
 from evedrop.model.receiver import Action, Belief, Flags, Reception
 from evedrop.model.schedule import Schedule
@@ -91,6 +92,11 @@ class Suspicious(PacketTaker):
         self._use_state, self._use_innovation = self.use_probabilities(knowledge.parameters)
         self._coins = BlockReader(knowledge.keys["coin"], batch, 1)
         self._used = Ahead(self._coins.ahead, self._tossed)
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """Mistakes in the two probabilities."""
+        return probability_mistakes(given, "use_state", "use_innovation")
 
     @classmethod
     def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003 - alike for all

@@ -14,7 +14,7 @@ import numpy as np
 
 from evedrop.model import update
 from evedrop.model.acknowledgements import HoldingTime
-from evedrop.model.checks import MOST_SLOTS, count_mistakes, number_mistakes
+from evedrop.model.checks import MOST_SLOTS, number_mistakes, whole_number_mistakes
 from evedrop.model.number_codes import MOST_BITS, DitheredQuantiser, LevelPad, Mask
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
@@ -96,7 +96,7 @@ class EncryptedSchedule(Scheme):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A threshold is a number of slots."""
-        return count_mistakes(given, "threshold")
+        return whole_number_mistakes(given, "threshold", 1, MOST_SLOTS)
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """The pads."""
@@ -216,7 +216,7 @@ class QuantisedSchedule(Scheme):
         """A threshold below 1, a number of bits that is not whole, or a range that is empty."""
         return [
             *number_mistakes(given, "threshold", 1.0, MOST_SLOTS),
-            *count_mistakes(given, "bits", MOST_BITS),
+            *whole_number_mistakes(given, "bits", 1, MOST_BITS),
             *number_mistakes(given, "standard_deviations", 1.0, _WIDEST),
         ]
 

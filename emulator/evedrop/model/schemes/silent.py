@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from evedrop.model.acknowledgements import HoldingTime
-from evedrop.model.checks import as_toml, count_mistakes, is_number, probability_mistakes
+from evedrop.model.checks import MOST_SLOTS, as_toml, is_number, probability_mistakes, whole_number_mistakes
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schedule import Schedule
@@ -141,7 +141,7 @@ class Scheduled(Scheme):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A threshold is a number of slots."""
-        return count_mistakes(given, "threshold")
+        return whole_number_mistakes(given, "threshold", 1, MOST_SLOTS)
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """Nothing."""

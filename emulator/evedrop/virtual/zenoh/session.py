@@ -430,7 +430,7 @@ class VirtualSession:
                 continue
             read = any(intersects(pattern, frame.key) for pattern in end.subscribed)
             if read and self.lets_out(end, "put", frame.key) and not end.send(frame, wait=frame.details.waits):
-                end.lose(frame, "no room")
+                end.lose(frame, notes.NO_ROOM)
 
     def _confuse(self, frame: TransportFrame) -> None:
         """A message arrives at the subscriber of another key, which says that it is that key's."""
