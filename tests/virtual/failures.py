@@ -34,7 +34,9 @@ def text_of(mutant: Mutant, case: str) -> str:
     lines = difflib.unified_diff(
         before.splitlines(), changed.splitlines(), mutant.file, "with the mistake", "", "", 1, ""
     )
-    return f"{mutant.breaks}\n\n" + "\n".join(lines) + f"\n\nThe case:\n\n    {case}\n\n{said}"
+    # Without line numbers, which change with every edit above the mistake.
+    change = ("@@" if line.startswith("@@") else line for line in lines)
+    return f"{mutant.breaks}\n\n" + "\n".join(change) + f"\n\nThe case:\n\n    {case}\n\n{said}"
 
 
 def again(text: str) -> str:
