@@ -120,6 +120,7 @@ lint: lint-types lint-rest
 
 lint-types: $(READY)
 	$(BIN)/mypy
+	$(BIN)/mypy benchmarks/*.py
 
 lint-rest: $(READY)
 	$(BIN)/ruff check .

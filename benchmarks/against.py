@@ -169,7 +169,7 @@ def main(words: Sequence[str] | None = None, root: Path = ROOT) -> int:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="small sizes, too small to judge by")
     options = parser.parse_args(words)
-    base = options.base or (None if options.python else last_tag(root))
+    base: str | None = options.base or (None if options.python else last_tag(root))
     if base is None and options.python is None:
         print("There is no tag yet, so there is nothing to compare with. BASE=COMMIT compares with a commit.")
         return 0
@@ -178,7 +178,7 @@ def main(words: Sequence[str] | None = None, root: Path = ROOT) -> int:
     print("| what | median of ratios | |\n|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as folder:
         rows = measurements(Path(folder), options.quick)
-        if options.python is not None:
+        if base is None:
             worse = compare(rows, options.python, rounds)
         else:
             with installed(base) as before:

@@ -25,12 +25,13 @@ import numpy as np
 from live_run import measured, scenario_file, slots_on_disk
 from processes import processes_of
 
-from evedrop.show.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
+from evedrop.show.view.figure_style import GREY, panels
+from evedrop.show.view.palette import RESERVE, hexadecimal
 
 _POLL_SECONDS = 0.03
 _STEADY = 0.2  # from this part of the slots on
 _STRATEGIES = ("naive", "suspicious", "smart")
-COLOURS = (BLUE, ORANGE, GREEN, RED, GREY)
+COLOURS = tuple(map(hexadecimal, RESERVE))
 
 
 @dataclass(frozen=True)

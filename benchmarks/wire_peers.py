@@ -86,11 +86,16 @@ def _started(role: str, endpoint: str, traffic: Traffic) -> subprocess.Popen[str
     )
 
 
+def _await_line(going: threading.Event) -> None:
+    if sys.stdin.readline():
+        going.set()
+
+
 def _send(session: zenoh.Session, traffic: Traffic) -> None:
     control = zenoh.CongestionControl.BLOCK if traffic.block else zenoh.CongestionControl.DROP
     publishers = [session.declare_publisher(key, congestion_control=control) for key in traffic.keys]
     going = threading.Event()
-    threading.Thread(target=lambda: sys.stdin.readline() and going.set(), daemon=True).start()
+    threading.Thread(target=_await_line, args=(going,), daemon=True).start()
     while not going.wait(0.02):
         session.put("trial", TRIAL)
     rest = b"\0" * (traffic.size - _LATENCY_BYTES)

@@ -23,7 +23,7 @@ def quick(name: str, *words: str) -> str:
     return done.stdout
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 def test_the_kernels_are_compared_with_numpy() -> None:
     """Two lines for each of four cases, and how much faster the first is."""
     output = quick("kernels")
@@ -42,7 +42,7 @@ def test_the_latency_is_that_of_the_real_router() -> None:
     assert re.fullmatch(r"raw Zenoh: median [\d,]+ µs, 99 % [\d,]+ µs", row["yardstick"])
 
 
-@pytest.mark.long
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "line"),
     [
