@@ -26,7 +26,7 @@ from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import KINDS, faults_of
 from evedrop.virtual.drawn_hosts import DrawnHosts, drawn_hosts, kind_with
 from evedrop.virtual.drawn_plants import with_more
-from evedrop.virtual.faults import ShortenMessage
+from evedrop.virtual.faults import ClogRouter, ShortenMessage
 from evedrop.virtual.programs import DrawnProgram, drawn_program, with_states
 from evedrop.virtual.rare_faults import RARE_KINDS, rare_faults
 from evedrop.virtual.runs_by_hand import RunByHand
@@ -47,6 +47,7 @@ _OWN = 0.03
 """The fraction of classes that are not built in."""
 _RELAYED_SHARDS = 0.3
 """The fraction of the runs in shards with two routers in each."""
+_ALL_KINDS: Mapping[str, type[Disturbance]] = {**KINDS, **RARE_KINDS, ClogRouter.kind: ClogRouter}
 _UNSTABLE, _STABLE = 1.02, 0.9
 _LOOP: Mapping[str, Any] = {
     "plant": {"inputs": ["u"], "input_matrix": [[0.1], [0.0]], "noise": [[1e-4, 0.0], [0.0, 1e-4]]},
@@ -100,9 +101,7 @@ def case_from(text: str) -> SimulatedCase:
         described = json.loads(text)
         if isinstance(described, int):
             return case_of(described)
-        faults = tuple(
-            (kind_with(kind, rest[0]) or {**KINDS, **RARE_KINDS}[kind])(*rest) for kind, *rest in described["faults"]
-        )
+        faults = tuple((kind_with(kind, rest[0]) or _ALL_KINDS[kind])(*rest) for kind, *rest in described["faults"])
         scenario, ahead = Scenario(described["scenario"]), described.get("ahead", MOST_SLOTS_AHEAD)
         hosts = DrawnHosts.of_lists(described["hosts"]) if "hosts" in described else None
         program = DrawnProgram(*described["program"]) if "program" in described else None

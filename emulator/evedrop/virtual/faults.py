@@ -266,6 +266,22 @@ class FreezeConnection(_OfConnection):
 
 
 @final
+class ClogRouter(Disturbance):
+    """A router passes nothing on, though all its connections seem alive. Only in cases: it is not drawn."""
+
+    kind, share, only_target = "clog", 0, ROUTER
+
+    def strike(self, world: SimulatedWorld) -> bool:
+        """Clog it."""
+        return world.zenoh.clog(self.target)
+
+    @property
+    def blamed(self) -> tuple[str, ...]:
+        """It alone: nobody else can answer."""
+        return (f"{self.target}: alive, and silent",)
+
+
+@final
 class SlowConnection(_OfConnection):
     """Everything takes longer on the connection of a process."""
 

@@ -22,7 +22,7 @@ from evedrop.names import LEGITIMATE, RECORDER, ROUTER, SENSOR
 from evedrop.scenario.tables import Scenario
 from evedrop.system.world import world as here
 from evedrop.virtual.by_hand import CLOCKS, LACKS, Brief, ByHand
-from evedrop.virtual.disturbance import KILLED
+from evedrop.virtual.disturbance import KILLED, ROUTERS
 from evedrop.virtual.endings import status_of
 from evedrop.virtual.notes import BY_HAND
 
@@ -38,6 +38,8 @@ _INTERRUPTED, _STRANGE, _WRONG_CLOCK, _TAKEN = (
     *("a run that is interrupted", "a run with a brief of another run"),
     *("a run with a wrong clock", "a run where another program listens"),
 )
+_WITHOUT_RECORDER = "a run without a recorder"
+"""Only in cases: it is not drawn."""
 _ENDED = frozenset({0, 1, UsageError.exit_status, RunError.exit_status, Interrupted.exit_status, KILLED})
 Briefs = dict[str, Brief]
 """Process → its brief."""
@@ -45,6 +47,10 @@ Briefs = dict[str, Brief]
 
 def _without_receiver(briefs: Briefs) -> None:
     del briefs[LEGITIMATE]
+
+
+def _without_recorder(briefs: Briefs) -> None:
+    del briefs[RECORDER]
 
 
 def _wrong_password(briefs: Briefs) -> None:
@@ -77,6 +83,7 @@ _RUNS: Mapping[str, tuple[str, Callable[[Briefs], None]]] = {
     _WRONG_CLOCK: ("tls", _unchanged),
     "a run with the certificate of another process": ("tls", _other_certificate),
     "a run at another name": ("tls", _other_name),
+    _WITHOUT_RECORDER: ("tcp", _without_recorder),
 }
 """What is run → the protocol of its routers, and what is changed in its briefs."""
 
@@ -93,7 +100,7 @@ class RunByHand(ByHand):
     def targets(cls, scenario: Scenario) -> Sequence[str]:
         """Whole runs, and those in which a process or a brief is not the right one."""
         del scenario
-        return [*_RUNS]
+        return [name for name in _RUNS if name != _WITHOUT_RECORDER]
 
     def _act(self, world: SimulatedWorld) -> int:
         scenario, folder = world.scenario, world.disk.root / f"by hand {self.after}"
@@ -114,6 +121,7 @@ class RunByHand(ByHand):
         for name, process in processes.items():
             if process.task.status not in _ENDED or "Traceback" in process.printed:
                 raise AssertionError(f"{name} ends with status {process.task.status}: {process.printed[-500:]}")
+        self._check_refusals(processes)
         done = RECORDER in processes and processes[RECORDER].task.status == 0
         if self.target == _RECORDED:
             self._check_recording(folder / "results" / "recording.rrd", done)
@@ -143,9 +151,20 @@ class RunByHand(ByHand):
         deadline = here().monotonic() + _RUN_SECONDS
         while any(process.task.alive for process in processes.values()) and here().monotonic() < deadline:
             here().sleep(_POLL_SECONDS)
+        waiting = [name for name, process in processes.items() if process.task.alive and name not in ROUTERS]
+        if self.target == _WITHOUT_RECORDER and waiting:
+            raise AssertionError(f"{', '.join(waiting)}: still waiting for a recorder after {_RUN_SECONDS:.0f} s")
         for process in processes.values():
             process.signal(signal.SIGKILL)  # something cut them off from each other
         return processes
+
+    @staticmethod
+    def _check_refusals(processes: Mapping[str, VirtualProcess]) -> None:
+        """Who cannot read a message tells the recorder, which does not take it for cut off."""
+        said = processes[RECORDER].printed if RECORDER in processes else ""
+        for name, process in processes.items():
+            if "malformed message" in process.printed and f"{name} cut off" in said:
+                raise AssertionError(f"{name} has refused a message, and the recorder says: {said[-500:]}")
 
     @staticmethod
     def _check_recording(path: Path, done: bool) -> None:

@@ -282,6 +282,13 @@ class VirtualZenoh:
             self._cut[process] = float("inf") if seconds is None else self.scheduler.now + seconds
         return hit
 
+    def clog(self, router: str) -> bool:
+        """Let nothing through the connections of a router for good, though both ends of each take the other for alive."""
+        connections = [*self._connections(router)]
+        for connection in connections:
+            connection.freeze(None, None)
+        return bool(connections)
+
     def unplug(self, host: str, seconds: float | None) -> None:
         """Let nothing through between the processes of a host and all others for some time, or for good."""
         self._unplugged[host] = float("inf") if seconds is None else self.scheduler.now + seconds

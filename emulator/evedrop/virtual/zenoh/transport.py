@@ -195,14 +195,17 @@ class VirtualConnection:
                 moment = begun + self._scheduler.random.expovariate(1.0 / _NOTICE_SECONDS)
                 self._scheduler.at(moment, lambda end=end: end.session.inbox.put((end, None, 0)))  # type: ignore[misc]
 
-    def freeze(self, seconds: float | None, lease: float) -> None:
-        """Let nothing through for some time, or for good; after the lease, both ends take the other one for gone."""
+    def freeze(self, seconds: float | None, lease: float | None) -> None:
+        """Let nothing through for some time, or for good; after the lease, both ends take the other one for gone.
+
+        lease: None if they take it for alive.
+        """
         if self.held is None:
             self.held = []
         self._scheduler.note(notes.FREEZES, self.ends[0].session.name, self.ends[1].session.name)
-        if seconds is None or seconds >= lease:
+        if lease is not None and (seconds is None or seconds >= lease):
             self._scheduler.at(self._scheduler.now + lease, lambda: self.close("nothing came for the lease"))
-        else:
+        elif seconds is not None:
             self._scheduler.at(self._scheduler.now + seconds, self._thaw)
 
     def _thaw(self) -> None:
