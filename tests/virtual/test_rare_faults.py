@@ -37,7 +37,7 @@ RUNS = 90
         (SteerRun("run", RUNS), SCENARIO, 0, ""),
         *((WriteBriefs(what, RUNS), SCENARIO, 0, "") for what in dict.fromkeys(WriteBriefs.targets(SCENARIO))),
         (WriteBriefs("briefs for a host", RUNS), RELAYED, 0, ""),
-        (WriteBriefs("briefs for one router", RUNS), RELAYED, 0, ""),
+        (WriteBriefs("briefs with wrong options", RUNS), RELAYED, 0, ""),
         *((RunWrongly(what, RUNS), SCENARIO, 0, "") for what in RunWrongly.targets(SCENARIO)),
         *((RunWrongly(what, RUNS), RELAYED, 0, "") for what in RunWrongly.targets(RELAYED)),
     ],
@@ -55,7 +55,7 @@ def test_a_wrong_brief_ends_its_process_alone(seed: int) -> None:
     """Whichever entry is wrong: the run goes on."""
     played = disturbed(WriteBriefs("briefs", RUNS), seed=seed)
     ends = [note.words for note in played.run.happened if note.what == notes.ENDS and note.words[0] == "by hand"]
-    assert len(ends) == 12
+    assert 0 < len(ends) <= 3 * 14  # until time is up
     assert {status for _, status in ends} <= {2, 3, 130, -9}
     assert played.run.status == 0
 
@@ -71,7 +71,6 @@ def test_a_wrong_brief_ends_its_process_alone(seed: int) -> None:
         ("a run that is recorded for views", 0),
         ("a run with certificates", 0),
         ("a run with a brief of another run", 3),
-        ("a run with a health file", 0),
         ("a run where another program listens", 2),
         ("a run with a wrong clock", 3),
         ("a run with the certificate of another process", 3),

@@ -20,7 +20,8 @@ from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.campaign import PlayedCase, play_case
-from evedrop.virtual.cases import CaseDraw, case_with
+from evedrop.virtual.cases import case_with
+from evedrop.virtual.drawn_scenarios import CaseDraw
 from evedrop.virtual.reference import in_memory
 from evedrop.wire.file import wire_of
 from evedrop.wire.plan import WirePlan
