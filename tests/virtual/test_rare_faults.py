@@ -9,15 +9,18 @@ from typing import Any
 import msgpack
 import pytest
 
+from evedrop.cli.simulated import program
 from evedrop.live.protocol.codec import enclosed, pack
 from evedrop.model.receiver import Action
 from evedrop.scenario.tables import Scenario
-from evedrop.virtual import by_hand, notes
+from evedrop.virtual import by_hand, notes, rereading
 from evedrop.virtual.broken_messages import BreakMessage, broken
 from evedrop.virtual.by_hand import WriteBriefs
-from evedrop.virtual.cases import case_from, case_of
+from evedrop.virtual.campaign import play_case
+from evedrop.virtual.cases import SimulatedCase, case_from, case_of
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.rare_faults import RARE_KINDS, ReadMetrics, SteerRun, TakePort
+from evedrop.virtual.rereading import RereadMessages
 from evedrop.virtual.runs_by_hand import RunByHand, RunWrongly
 from tests.virtual.disturbed_runs import RELAYED, SCENARIO, disturbed
 
@@ -34,6 +37,7 @@ RUNS = 90
         (BreakMessage("recorder", RUNS), SCENARIO, 3, "broke the protocol"),
         (BreakMessage("eve", RUNS + 1), SCENARIO, 3, "broke the protocol"),
         (ReadMetrics("run", RUNS), SCENARIO, 0, ""),
+        (RereadMessages("run", 1), RELAYED, 0, ""),
         (SteerRun("run", RUNS), SCENARIO, 0, ""),
         *((WriteBriefs(what, RUNS), SCENARIO, 0, "") for what in dict.fromkeys(WriteBriefs.targets(SCENARIO))),
         (WriteBriefs("briefs for a host", RUNS), RELAYED, 0, ""),
@@ -47,6 +51,17 @@ def test_a_run_ends_as_it_must(fault: Disturbance, scenario: Scenario, status: i
     """With the right status and words."""
     run = disturbed(fault, scenario=scenario).run
     assert (run.status, said in run.said) == (status, True), run.said
+
+
+def test_a_reader_that_fails_on_a_wrong_message_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If its error names no sender."""
+
+    def read(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(rereading, "read_command", read)
+    played = play_case(SimulatedCase(1, SCENARIO, (RereadMessages("run", 1),)), program)
+    assert [miss for miss in played.misses if "ZeroDivisionError" in miss]
 
 
 @pytest.mark.campaign
