@@ -37,7 +37,7 @@ _OPTIONS: Mapping[str, Sequence[str]] = {
     "unencrypted briefs": ("--listen", "tcp/127.0.0.1:{port}"),
     "briefs for a host": ("--listen", "tcp/0.0.0.0:{port}", "--connect", "tcp/router.lan:{port}", "--insecure"),
     "briefs for an unknown host": (
-        *("--listen", "tcp/unknown:{port}", "--connect", "tcp/unknown:{port}", "--insecure"),
+        *("--listen", "tcp/unknown:{port}", "--connect", "tcp/unknown:{port}", "--insecure", "--wait", "4"),
     ),
 }
 """What is written → the options for it, in a run with one router; with two, those of the relay are added."""
@@ -146,10 +146,10 @@ class WriteBriefs(ByHand):
     def _written(self, world: SimulatedWorld, folder: Path, options: Sequence[str], *, refused: bool) -> bool:
         """Write files with these options; returns whether they are there."""
         words, port = ["brief", str(folder / "scenario.toml")], _PORT + 2 * self.after % _PORT
-        words += [option.format(port=port, relay_port=port + 1) for option in options]
         if "--listen" in options:
             words += ["--wait", _WAIT_SECONDS, "--results", str(folder / "results"), "--out"]
-        status = world.machine.program([*words, str(folder / "written")])
+        words += [str(folder / "written"), *(option.format(port=port, relay_port=port + 1) for option in options)]
+        status = world.machine.program(words)
         expected = UsageError.exit_status if refused else 0
         if status != expected and not any(lack in world.machine.current.printed for lack in LACKS):
             raise AssertionError(f"to write {self.target} with {' '.join(options)} ends with status {status}")
