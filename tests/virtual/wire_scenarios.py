@@ -29,7 +29,7 @@ from evedrop.wire.scenario_network import over_wire
 from tests.virtual.wire_draws import BASE, ROBOT, Tables
 from tests.virtual.wire_judge import fates_by_model
 
-_DRAWS = 16
+_DRAWS = 24
 _KEYS = (f"{ROBOT}/data", f"{ROBOT}/data", f"{ROBOT}/data", "other", f"{ROBOT}/**", "//", None)
 _MOST_SLOTS = 60
 _SPARING = {"withholding", "scheduled"}

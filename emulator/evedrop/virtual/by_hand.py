@@ -64,8 +64,9 @@ _AGAIN = (
 _TOO_LARGE = 2**30 + 1
 _WAIT_SECONDS, _POLL_SECONDS = "1", 0.2
 LACKS = ("No space left on device", "Input/output error", "not enough memory", "no further process or thread")
-_PATIENCE_SECONDS = 10.0
-_SCENARIOS, _STARTED, _STARTING_SECONDS = 3, 14, 40.0
+_PATIENCE_SECONDS, _SOON_SECONDS = 10.0, 0.2
+"""For a process to end by itself; most are told to end soon, once they must have read their briefs."""
+SCENARIOS, _STARTED, _STARTING_SECONDS = 3, 30, 40.0
 """For how many scenarios files are written, how many processes of each are started, and for how long in all."""
 CLOCKS = (-90.0 * 86_400.0, 90.0 * 86_400.0)
 """By how many seconds a clock is wrong, so that no certificate is valid."""
@@ -75,7 +76,7 @@ _WRONG: Sequence[Any] = (None, True, -1, 2**70, float("inf"), "", "x", "/nowhere
 """What an entry of a brief is replaced with."""
 _IS_ENDPOINT, _ENDPOINTS = (
     re.compile("t(cp|ls)/"),
-    ("unixsock-stream/x", "unixsock-stream//x", "unixsock-stream//tmp/x"),
+    ("unixsock-stream/x", "unixsock-stream//x", "unixsock-stream//tmp/x", f"unixsock-stream//{'x' * 200}"),
 )
 """What is an endpoint, and places at which nobody can listen."""
 Brief = dict[str, Any]
@@ -121,7 +122,7 @@ class WriteBriefs(ByHand):
             return 0
         folder.mkdir(0o700)
         some, deadline = random.Random(here().token(8)), here().monotonic() + _STARTING_SECONDS  # noqa: S311 - to be repeated
-        for number, written in enumerate([scenario, *(_any_scenario(some) for _ in range(1, _SCENARIOS))]):
+        for number, written in enumerate([scenario, *(any_scenario(some) for _ in range(1, SCENARIOS))]):
             own = folder / str(number)
             own.mkdir(0o700)
             write_resolved(own, written)
@@ -147,12 +148,16 @@ class WriteBriefs(ByHand):
         """Write files with these options; returns whether they are there."""
         words, port = ["brief", str(folder / "scenario.toml")], _PORT + 2 * self.after % _PORT
         if "--listen" in options:
-            words += ["--wait", _WAIT_SECONDS, "--results", str(folder / "results"), "--out"]
-        words += [str(folder / "written"), *(option.format(port=port, relay_port=port + 1) for option in options)]
+            words += ["--wait", _WAIT_SECONDS, "--results", str(folder / "results")]
+            options = [*options, "--out"]
+        words += [*(option.format(port=port, relay_port=port + 1) for option in options), str(folder / "written")]
         status = world.machine.program(words)
         expected = UsageError.exit_status if refused else 0
         if status != expected and not any(lack in world.machine.current.printed for lack in LACKS):
-            raise AssertionError(f"to write {self.target} with {' '.join(options)} ends with status {status}")
+            printed = world.machine.current.printed[-300:]
+            raise AssertionError(
+                f"to write {self.target} with {' '.join(options)} ends with status {status}: {printed}"
+            )
         return status == 0
 
     def _options(self, scenario: Scenario) -> Sequence[str]:
@@ -201,11 +206,11 @@ class WriteBriefs(ByHand):
             if chance > 0.99:
                 os.truncate(path, _TOO_LARGE)
             path.chmod(0o644 if some.random() < 0.03 else 0o600)
-            _start(world, role, path, clock)
+            _start(world, role, path, clock, some.choice((*[_SOON_SECONDS] * 4, _PATIENCE_SECONDS)))
             path.write_text(json.dumps(briefs[path]))
 
 
-def _any_scenario(some: random.Random) -> Scenario:
+def any_scenario(some: random.Random) -> Scenario:
     """A drawn scenario; if it has given states, a program at which the sensor connects has them."""
     scenario = scenario_of(some.getrandbits(32))
     if scenario.process.source != "file":
@@ -213,14 +218,15 @@ def _any_scenario(some: random.Random) -> Scenario:
     return DrawnProgram(listens=True, form=some.choice(FORMS)).scenario(scenario)
 
 
-def _start(world: SimulatedWorld, role: str, path: Path, clock: float) -> None:
-    """Start a process with a brief that is wrong, or where a clock is; it ends, and says why."""
+def _start(world: SimulatedWorld, role: str, path: Path, clock: float, patience: float) -> None:
+    """Start a process with a brief that is wrong, or where a clock is; it ends, and says why, or is told to end."""
     process = world.machine.begin(BY_HAND, lambda: world.machine.program([role, str(path)]))
     process.task.clock = clock
-    deadline = here().monotonic() + _PATIENCE_SECONDS
-    while process.task.status is None and here().monotonic() < deadline:
-        here().sleep(_POLL_SECONDS)
-    process.signal(signal.SIGKILL)  # the wrong entry may be how long it waits for others
+    for seconds, sign in ((patience, signal.SIGTERM), (_PATIENCE_SECONDS, signal.SIGKILL)):
+        deadline = here().monotonic() + seconds
+        while process.task.status is None and here().monotonic() < deadline:
+            here().sleep(_POLL_SECONDS)
+        process.signal(sign)  # the wrong entry may be how long it waits for others
     ended = process.task.status in {UsageError.exit_status, RunError.exit_status, Interrupted.exit_status, KILLED}
     if not ended or "Traceback" in process.printed:
         raise AssertionError(

@@ -17,13 +17,13 @@ from evedrop.errors import Contradiction, Gap, MalformedMessage, Refusal
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import Brief, RecorderPart
-from evedrop.live.protocol.codec import Reader, named_in, payload_of
+from evedrop.live.protocol.codec import Reader, enclosed, named_in, payload_of
 from evedrop.live.protocol.commands import Bounds, is_process_status, read_command, read_process_status
-from evedrop.live.protocol.keys import reader_of, writer_of
+from evedrop.live.protocol.keys import RunKeys, reader_of, writer_of
 from evedrop.live.protocol.notices import EndReport, RefusalNotice
 from evedrop.live.protocol.packets import is_barrier, read_delivery
 from evedrop.live.recorder.intake import Intake
-from evedrop.names import RECORDER
+from evedrop.names import LEGITIMATE, RECORDER
 from evedrop.scenario.tables import Scenario
 from evedrop.score.run_tally import RunTally
 from evedrop.system.world import world as here
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 _MOST = 60
 """How many messages to the recorder, and to all others, are read again."""
-_TIMES = 40
+_TIMES = 60
 """How often those to the recorder, and to all others, are read, each time with one wrong."""
 _NAMED = (MalformedMessage, Gap, Contradiction, Refusal)
 """The errors that name the sender of a wrong message."""
@@ -50,7 +50,7 @@ _OF_RECORDER = frozenset({"telemetry", "journal"})
 class RereadMessages(Disturbance):
     """Somebody keeps the first messages of a run, and reads them as its processes do, each time with one of them wrong."""
 
-    kind, share = "reread the messages of", 6
+    kind, share = "reread the messages of", 8
     only_target, harmless, early = "run", True, True
 
     def strike(self, world: SimulatedWorld) -> bool:
@@ -104,6 +104,10 @@ class _MessageReader:
     ) -> None:
         self._scenario, self._of_recorder, self._of_others = scenario, of_recorder, of_others
         self._random = random.Random(here().token(8))  # noqa: S311 - to be repeated, not to be secret
+        if of_recorder:
+            keys = RunKeys(_reader(of_recorder[0]).key.split("/")[1])
+            notice = RefusalNotice.of(keys.downlink(LEGITIMATE), "wrong").pack()
+            self._of_recorder = [*of_recorder, enclosed(keys.telemetry(LEGITIMATE), notice)]
         endpoints = endpoints_at(_AT, relay=_RELAY_AT if scenario.relayed else None)
         briefs = briefs_of(scenario, endpoints, RecorderTask(Path("nowhere"), recording=False), ahead=ahead)
         self._brief = cast("Brief[RecorderPart]", briefs[RECORDER])
@@ -124,10 +128,10 @@ class _MessageReader:
                 )
 
     def _any_of(self, messages: Sequence[bytes]) -> int:
-        """The place of any message, of each key as often as of any other."""
-        at: dict[str, list[int]] = {}
+        """The place of any message, of each key with some fields as often as of any other."""
+        at: dict[tuple[str, ...], list[int]] = {}
         for place, message in enumerate(messages):
-            at.setdefault(_within(message), []).append(place)
+            at.setdefault((_within(message), *map(str, _reader(message).fields)), []).append(place)
         return self._random.choice(at[self._random.choice([*at])])
 
     def _record(self, messages: Sequence[bytes]) -> None:

@@ -23,7 +23,7 @@ from evedrop.names import LEGITIMATE, RECORDER, ROUTER, SENSOR
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario.tables import Scenario
 from evedrop.system.world import world as here
-from evedrop.virtual.by_hand import CLOCKS, LACKS, Brief, ByHand
+from evedrop.virtual.by_hand import CLOCKS, LACKS, SCENARIOS, Brief, ByHand, any_scenario
 from evedrop.virtual.disturbance import KILLED
 from evedrop.virtual.drawn_hosts import MISTAKES, DrawnHost, DrawnHosts
 from evedrop.virtual.endings import status_of
@@ -198,7 +198,10 @@ class RunWrongly(ByHand):
     def _act(self, world: SimulatedWorld) -> int:
         if world.scenario is not None:
             process, before = world.machine.current, 0
-            for run, said in self._runs(world, world.scenario):
+            some = random.Random(here().token(8))  # noqa: S311 - to be repeated, not to be secret
+            scenarios = [world.scenario, *(any_scenario(some) for _ in range(1, SCENARIOS))]
+            (world.disk.root / f"by hand {self.after}").mkdir(0o700)
+            for run, said in (tried for scenario in scenarios for tried in self._runs(world, scenario)):
                 status, printed = status_of(run), process.printed[before:]
                 before += len(printed)
                 if (status != UsageError.exit_status or said not in printed) and not any(
@@ -211,7 +214,7 @@ class RunWrongly(ByHand):
 
     def _runs(self, world: SimulatedWorld, scenario: Scenario) -> Iterator[tuple[Callable[[], int], str]]:
         """What is tried, each with a text that is printed."""
-        folder = world.disk.root / f"by hand {self.after}"
+        folder = world.disk.root / f"by hand {self.after}" / "results"
 
         def run(listen: str | None = None, relay: str | None = None, *, paused: bool = False) -> int:
             return launch(scenario, folder, "off", listen, lambda _: None, relay, paused=paused).status
@@ -221,8 +224,7 @@ class RunWrongly(ByHand):
             if scenario.shards > 1:
                 yield partial(run, paused=True), "--paused"
             return
-        file = folder / "hosts.toml"
-        folder.mkdir(0o700)
+        file = folder.with_name("hosts.toml")
 
         def load(hosts: DrawnHosts) -> int:
             file.write_text(hosts.text(scenario))
@@ -231,5 +233,5 @@ class RunWrongly(ByHand):
 
         for mistake in MISTAKES:
             hosts = DrawnHosts((DrawnHost("alpha", processes_of(scenario)),), mistake)
-            if (said := hosts.refused(scenario)) is not None:
-                yield partial(load, hosts), said
+            if hosts.refused(scenario) == MISTAKES[mistake].message:
+                yield partial(load, hosts), MISTAKES[mistake].message
