@@ -66,7 +66,7 @@ _WAIT_SECONDS, _POLL_SECONDS = "1", 0.2
 LACKS = ("No space left on device", "Input/output error", "not enough memory", "no further process or thread")
 _PATIENCE_SECONDS, _SOON_SECONDS = 10.0, 0.2
 """For a process to end by itself; most are told to end soon, once they must have read their briefs."""
-SCENARIOS, _STARTED, _STARTING_SECONDS = 3, 30, 40.0
+SCENARIOS, _STARTED, _STARTING_SECONDS = 3, 30, 30.0
 """For how many scenarios files are written, how many processes of each are started, and for how long in all."""
 CLOCKS = (-90.0 * 86_400.0, 90.0 * 86_400.0)
 """By how many seconds a clock is wrong, so that no certificate is valid."""
