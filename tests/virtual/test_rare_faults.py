@@ -80,6 +80,7 @@ def test_a_wrong_brief_ends_its_process_alone(seed: int) -> None:
     ("what", "status"),
     [
         ("a run", 0),
+        ("a run that begins paused", 0),
         ("a run without a receiver", 3),
         ("a run that is interrupted", 130),
         ("a run with a wrong password", 3),

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 _MOST_SLOTS = 40
 _POLL_SECONDS, _RUN_SECONDS = 0.2, 40.0
+_PAUSED = "a run that begins paused"
 _RECORDED, _RECORDING = "a run that is recorded for views", b"RRF2"
 """How Rerun's files begin."""
 _INTERRUPTED, _STRANGE, _WRONG_CLOCK, _TAKEN = (
@@ -63,12 +64,17 @@ def _other_name(briefs: Briefs) -> None:
         brief["router"] = brief["router"].replace("127.0.0.1", "localhost")
 
 
+def _paused(briefs: Briefs) -> None:
+    briefs[RECORDER]["part"]["paused"] = True
+
+
 def _unchanged(briefs: Briefs) -> None:
     del briefs
 
 
 _RUNS: Mapping[str, tuple[str, Callable[[Briefs], None]]] = {
     "a run": ("tcp", _unchanged),
+    _PAUSED: ("tcp", _paused),
     _TAKEN: ("tcp", _unchanged),
     "a run without a receiver": ("tcp", _without_receiver),
     _INTERRUPTED: ("tcp", _unchanged),
@@ -141,8 +147,9 @@ class RunByHand(ByHand):
             processes[RECORDER].interrupt()
         elif paths and (status := world.machine.program(["health", str(some.choice([*paths.values()]))])) not in _ENDED:
             raise AssertionError(f"who asks for the health of a process is told status {status}")
-        deadline = here().monotonic() + _RUN_SECONDS
+        deadline, resumed = here().monotonic() + _RUN_SECONDS, self.target != _PAUSED
         while any(process.task.alive for process in processes.values()) and here().monotonic() < deadline:
+            resumed = resumed or world.machine.program(["resume", str(folder / "results")]) == 0
             here().sleep(_POLL_SECONDS)
         for process in processes.values():
             process.signal(signal.SIGKILL)  # something cut them off from each other
