@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from evedrop.scenario.tables import Scenario
-from evedrop.virtual.cases import scenario_of
+from evedrop.virtual.drawn_scenarios import scenario_of
 
 
 def parts_of(scenario: Scenario) -> Iterator[str]:

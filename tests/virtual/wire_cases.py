@@ -79,7 +79,7 @@ _FIRST, _PER_SECOND = 20, 80
 """Events before which no fault strikes, and about how many there are in a second."""
 _BROKEN = 0.15
 """The fraction of cases that only try what may be in a file."""
-_TRIALS = 8
+_TRIALS = 40
 """How many of it each of them tries."""
 _AGAIN = 0.5
 """After the end of the wire, until it is started again, or its programs are asked what they got."""

@@ -39,14 +39,14 @@ Afterwards copies of its folder are damaged, as `wire_damage.py` says.
 """
 FURTHER = {
     VIEW: 0.06,
-    REPLAY: 0.06,
-    OPENED: 0.1,
+    REPLAY: 0.1,
+    OPENED: 0.15,
     SCENARIO: 0.12,
-    JOINED: 0.06,
+    JOINED: 0.15,
     MOVED: 0.03,
     DAMAGED: 0.1,
     **dict.fromkeys(LIMITS, 0.12),
-    HUNG: 0.04,
+    HUNG: 0.08,
 }
 """How often each of it is drawn, and each of the limits."""
 _FITS: tuple[tuple[str, ...], ...] = (

@@ -29,7 +29,7 @@ from evedrop.wire.records import RECORD, STORED
 from tests.virtual.wire_draws import BASE, ENDPOINTS, Tables
 
 Entry = dict[str, Any]
-_EACH = 4
+_EACH = 8
 """How many damages are tried of a wire."""
 _SECONDS = 60.0
 """In which a command ends."""

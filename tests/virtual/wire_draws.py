@@ -83,7 +83,7 @@ def _side(draw: random.Random, name: str) -> Tables:
         made["users"] = dict(USER)
     if draw.random() < 0.1:
         made["keys"] = [*(["*/data"] if draw.random() < 0.5 else []), *_PUBLISHED, "ask/**", "alive/**"]
-    if draw.random() < 0.1:
+    if draw.random() < 0.25:
         made["peers"] = True
     return made
 
@@ -192,8 +192,8 @@ def _program(draw: random.Random, side: str, seconds: float, limited: bool) -> W
         (f"named {side}/named", 0.08),
         (f"ros {side}2", 0.1),
         (f"vary {side}/vary", 0.1),
-        ("peer quiet", 0.04),
-        ("peer heard", 0.04),
+        ("peer quiet", 0.08),
+        ("peer heard", 0.08),
         ("leave", 0.5),
     ):
         if draw.random() < chance:

@@ -81,6 +81,13 @@ def _other_model(tables: Tables) -> str:
     return "event.0.set"
 
 
+def _chain(tables: Tables) -> str:
+    loss, tie = {"model": "bernoulli", "quality": 0.6}, {"strength": 0.5}
+    _two_links(tables, {"loss": loss}, {"loss": loss, "correlation": {"with": "l0", **tie}})
+    tables["link"].append({"from": ROBOT, "to": BASE, "loss": loss, "correlation": {"with": "l1", **tie}})
+    return "link.2.correlation.with"
+
+
 def _two_connect(tables: Tables) -> str:
     for side in (ROBOT, BASE):
         tables["side"][side] = {"connect": OUTSIDE}
@@ -165,6 +172,8 @@ MISTAKES: dict[str, Callable[[Tables], str]] = {
     "an event that parts a side from nothing": _add("event", {"partition": [ROBOT, BASE], "at": "noon"}, "at"),
     "a list for a loss model": _put("link", 0, "loss", value=[1, 0]),
     "a tied link that is given another model": _other_model,
+    "a link that is tied to a tied one": _chain,
+    "a text that runs backwards": _put("side", ROBOT, "listen", value="tcp/\u202e127.0.0.1:1"),
     "a router to which two sides connect": _two_connect,
     "one socket twice": _one_socket,
     "an unknown protocol": _put("side", ROBOT, "listen", value="smoke/127.0.0.1:17701"),

@@ -20,7 +20,8 @@ from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.campaign import PlayedCase, play_case
-from evedrop.virtual.cases import CaseDraw, case_with
+from evedrop.virtual.cases import case_with
+from evedrop.virtual.drawn_scenarios import CaseDraw
 from evedrop.virtual.reference import in_memory
 from evedrop.wire.file import wire_of
 from evedrop.wire.plan import WirePlan
@@ -28,7 +29,7 @@ from evedrop.wire.scenario_network import over_wire
 from tests.virtual.wire_draws import BASE, ROBOT, Tables
 from tests.virtual.wire_judge import fates_by_model
 
-_DRAWS = 16
+_DRAWS = 24
 _KEYS = (f"{ROBOT}/data", f"{ROBOT}/data", f"{ROBOT}/data", "other", f"{ROBOT}/**", "//", None)
 _MOST_SLOTS = 60
 _SPARING = {"withholding", "scheduled"}

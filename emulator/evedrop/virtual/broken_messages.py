@@ -76,19 +76,22 @@ class BreakMessage(Disturbance):
         return ("broke the protocol", *CONTRADICTIONS, *super().blamed)
 
 
-def broken(some: random.Random, message: bytes, *, checked: bool = False) -> bytes:
+def broken(some: random.Random, message: bytes, *, checked: bool = False, harmless: bool = False) -> bytes:
     """A message whose envelope is right, and a field of which is wrong, or which is no map.
 
-    checked: whether its reader holds the numbers in it against others, so that they may be wrong, too.
+    checked: whether its reader holds the numbers in it against others, so that they may be wrong, too; harmless: whether all
+    numbers may be wrong, since nobody uses them.
     """
     key, head, fields = _unpacked(message)
     kind, _, name = key.partition("/")
     if name == CONTROLLER or (isinstance(fields, dict) and "leaves" in fields and fields["k"] == 0):
         checked = False  # of a receiver that is away from the beginning, no report tells of its belief
-    numbers = _CHECKED.get(kind, frozenset()) if checked else frozenset()
+    numbers: frozenset[Any] = _CHECKED.get(kind, frozenset()) if checked else frozenset()
     if name == SENSOR:
         numbers &= _OF_SENSOR
     places = [*_places(fields)]
+    if harmless:
+        numbers = frozenset(name for place in places for name in place)
     rarer = [place for place in places if place[-1] not in _COMMON]
     if rarer and some.random() < 0.8:
         places = rarer
@@ -124,7 +127,7 @@ def _has_maps(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
 
 
-def _changed(some: random.Random, value: Any, place: _Place, numbers: frozenset[str], within: _Place = ()) -> Any:
+def _changed(some: random.Random, value: Any, place: _Place, numbers: frozenset[Any], within: _Place = ()) -> Any:
     """The same map or list with something wrong at a place; numbers: the fields in which numbers may be wrong."""
     (name, *rest), copy = place, value.copy()
     if rest:
@@ -137,7 +140,7 @@ def _changed(some: random.Random, value: Any, place: _Place, numbers: frozenset[
     return copy
 
 
-def _wrong_value(some: random.Random, value: Any, names: Collection[str], numbers: frozenset[str]) -> Any:
+def _wrong_value(some: random.Random, value: Any, names: Collection[str], numbers: frozenset[Any]) -> Any:
     """Another value of the fields with these names, within each other."""
     others = [*_WRONG]
     if some.random() < 0.8:
@@ -154,7 +157,7 @@ def _wrong_value(some: random.Random, value: Any, names: Collection[str], number
     return some.choice(others)
 
 
-def _wrong_bytes(some: random.Random, value: bytes, names: Collection[str], numbers: frozenset[str]) -> list[bytes]:
+def _wrong_bytes(some: random.Random, value: bytes, names: Collection[str], numbers: frozenset[Any]) -> list[bytes]:
     """Other bytes for those of an array."""
     at = some.randrange(len(value))
     if not numbers.isdisjoint(names) and some.random() < 0.7:
@@ -162,7 +165,7 @@ def _wrong_bytes(some: random.Random, value: bytes, names: Collection[str], numb
             return [value[: at // 8 * 8] + _LARGE + value[at // 8 * 8 + 8 :]]
         if "action" in names:  # what was done with a packet that arrived is the receiver's own affair
             return [value[:at] + bytes([Action.STATE if value[at] == Action.LOST else Action.LOST]) + value[at + 1 :]]
-        return [value[:at] + bytes([value[at] ^ 1 << some.randrange(8)]) + value[at + 1 :]]
+        return [value[:at] + bytes([value[at] ^ 1 << min(some.randrange(8), some.randrange(8))]) + value[at + 1 :]]
     if not _SUMS.isdisjoint(names) and some.random() < 0.5:
         return [value[:-8] + _BELOW]
     beyond = [value[:-2] + _BEYOND if len(value) > 1 else b"", b"\xff" * len(value)]

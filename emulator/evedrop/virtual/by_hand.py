@@ -19,40 +19,40 @@ from typing import TYPE_CHECKING, Any, final
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.names import ROUTER
+from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario.tables import Scenario
 from evedrop.system.world import world as here
 from evedrop.virtual.disturbance import KILLED, Disturbance
+from evedrop.virtual.drawn_scenarios import scenario_of
 from evedrop.virtual.notes import BY_HAND
+from evedrop.virtual.programs import FORMS, DrawnProgram
 
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld
 
 _PORT = 20_000
 _AT, _RELAY_AT = "tls/127.0.0.1:{port}", "tls/127.0.0.1:{relay_port}"
-_ONE_ROUTER = "briefs for one router"
 _OPTIONS: Mapping[str, Sequence[str]] = {
     "briefs": ("--listen", _AT),
     "unencrypted briefs": ("--listen", "tcp/127.0.0.1:{port}"),
     "briefs for a host": ("--listen", "tcp/0.0.0.0:{port}", "--connect", "tcp/router.lan:{port}", "--insecure"),
     "briefs for an unknown host": (
-        *("--listen", "tcp/unknown:{port}", "--connect", "tcp/unknown:{port}", "--insecure"),
+        *("--listen", "tcp/unknown:{port}", "--connect", "tcp/unknown:{port}", "--insecure", "--wait", "4"),
     ),
-    "files for containers": (),
 }
 """What is written → the options for it, in a run with one router; with two, those of the relay are added."""
-_WRONG_OPTIONS: Mapping[str, Sequence[str]] = {
-    "briefs without encryption": ("--listen", "tcp/0.0.0.0:{port}", "--connect", "tcp/router.lan:{port}"),
-    "briefs for everywhere": ("--listen", "tls/0.0.0.0:{port}"),
-    "briefs for two protocols": ("--listen", _AT, "--connect", "tcp/router.lan:{port}"),
-    "briefs for a sixth version": ("--listen", "tls/[fd00::1]:{port}"),
-    "briefs for no endpoint": ("--listen", "nowhere"),
-    _ONE_ROUTER: ("--listen", _AT),
-    "briefs for a needless relay": ("--listen", _AT, "--relay-connect", _RELAY_AT),
-    "briefs for two at one place": ("--listen", _AT, "--relay", _AT),
-    "briefs for a mixture": ("--listen", _AT, "--relay", "tcp/127.0.0.1:{relay_port}"),
-}
-"""The same, for what is refused in any case, or for two routers."""
-_CONTAINERS = "files for containers"
+_WRONG_OPTIONS: Sequence[Sequence[str]] = (
+    ("--listen", "tcp/0.0.0.0:{port}", "--connect", "tcp/router.lan:{port}"),
+    ("--listen", "tls/0.0.0.0:{port}"),
+    ("--listen", _AT, "--connect", "tcp/router.lan:{port}"),
+    ("--listen", "tls/[fd00::1]:{port}"),
+    ("--listen", "nowhere"),
+    ("--listen", _AT, "--relay-connect", _RELAY_AT),
+    ("--listen", _AT, "--relay", _AT),
+    ("--listen", _AT, "--relay", "tcp/127.0.0.1:{relay_port}"),
+)
+"""Options that are refused for each scenario."""
+_REFUSED, _CONTAINERS = "briefs with wrong options", "files for containers"
 _AGAIN = (
     (("{own}", "{folder}"), UsageError.exit_status),
     (("{own}", "{folder}", "--overwrite", "--set", "title=Other"), UsageError.exit_status),
@@ -64,9 +64,10 @@ _AGAIN = (
 _TOO_LARGE = 2**30 + 1
 _WAIT_SECONDS, _POLL_SECONDS = "1", 0.2
 LACKS = ("No space left on device", "Input/output error", "not enough memory", "no further process or thread")
-_PATIENCE_SECONDS = 10.0
-_STARTED, _STARTING_SECONDS = 12, 40.0
-"""How many processes are started, one after the other."""
+_PATIENCE_SECONDS, _SOON_SECONDS = 10.0, 0.2
+"""For a process to end by itself; most are told to end soon, once they must have read their briefs."""
+SCENARIOS, _STARTED, _STARTING_SECONDS = 3, 30, 30.0
+"""For how many scenarios files are written, how many processes of each are started, and for how long in all."""
 CLOCKS = (-90.0 * 86_400.0, 90.0 * 86_400.0)
 """By how many seconds a clock is wrong, so that no certificate is valid."""
 _PATHS = frozenset({"last_word", "modules", "results", "state_file"})
@@ -75,7 +76,7 @@ _WRONG: Sequence[Any] = (None, True, -1, 2**70, float("inf"), "", "x", "/nowhere
 """What an entry of a brief is replaced with."""
 _IS_ENDPOINT, _ENDPOINTS = (
     re.compile("t(cp|ls)/"),
-    ("unixsock-stream/x", "unixsock-stream//x", "unixsock-stream//tmp/x"),
+    ("unixsock-stream/x", "unixsock-stream//x", "unixsock-stream//tmp/x", f"unixsock-stream//{'x' * 200}"),
 )
 """What is an endpoint, and places at which nobody can listen."""
 Brief = dict[str, Any]
@@ -113,67 +114,81 @@ class WriteBriefs(ByHand):
     def targets(cls, scenario: Scenario) -> Sequence[str]:
         """What is written: mostly what somebody could use."""
         del scenario
-        return [*[*_OPTIONS] * 3, *_WRONG_OPTIONS]
+        return [*[*_OPTIONS] * 3, _CONTAINERS, _CONTAINERS, _REFUSED, _REFUSED]
 
     def _act(self, world: SimulatedWorld) -> int:
         scenario, folder = world.scenario, world.disk.root / f"by hand {self.after}"
         if scenario is None or folder.exists():
             return 0
         folder.mkdir(0o700)
-        written = folder / "written"
-        status = world.machine.program([*self._words(scenario, folder), str(written)])
-        expected = UsageError.exit_status if self._refused(scenario) else 0
-        if status != expected and not any(lack in world.machine.current.printed for lack in LACKS):
-            raise AssertionError(f"to write {self.target} ends with status {status}")
-        if status == 0 and self.target == _CONTAINERS:
-            text = (written / "docker-compose.yml").read_text()
-            lacking = [name for name in (ROUTER, *scenario.receivers) if f"{name}:" not in text]
-            if lacking:
-                raise AssertionError(f"no container is for {', '.join(lacking)}")
-            self._write_again(world, written)
-        elif status == 0:
-            self._start_some(world, {path: json.loads(path.read_text()) for path in sorted(written.glob("*.json"))})
+        some, deadline = random.Random(here().token(8)), here().monotonic() + _STARTING_SECONDS  # noqa: S311 - to be repeated
+        for number, written in enumerate([scenario, *(any_scenario(some) for _ in range(1, SCENARIOS))]):
+            own = folder / str(number)
+            own.mkdir(0o700)
+            write_resolved(own, written)
+            self._write(world, written, own, some, deadline)
         return 0
 
+    def _write(
+        self, world: SimulatedWorld, scenario: Scenario, folder: Path, some: random.Random, deadline: float
+    ) -> None:
+        """Write what is to be written for a scenario, which is in a folder, and use it until a deadline."""
+        if self.target == _CONTAINERS:
+            refused = scenario.shards > 1 or scenario.modules is not None or scenario.process.source == "zenoh"
+            if self._written(world, folder, ["--compose"], refused=refused):
+                self._check_containers(world, scenario, folder / "written")
+        elif self.target == _REFUSED:
+            for options in (*_WRONG_OPTIONS, *([("--listen", _AT)] if scenario.relayed else [])):
+                self._written(world, folder, options, refused=True)
+        elif self._written(world, folder, self._options(scenario), refused=scenario.shards > 1):
+            paths = sorted((folder / "written").glob("*.json"))
+            self._start_some(world, {path: json.loads(path.read_text()) for path in paths}, some, deadline)
+
+    def _written(self, world: SimulatedWorld, folder: Path, options: Sequence[str], *, refused: bool) -> bool:
+        """Write files with these options; returns whether they are there."""
+        words, port = ["brief", str(folder / "scenario.toml")], _PORT + 2 * self.after % _PORT
+        if "--listen" in options:
+            words += ["--wait", _WAIT_SECONDS, "--results", str(folder / "results")]
+            options = [*options, "--out"]
+        words += [*(option.format(port=port, relay_port=port + 1) for option in options), str(folder / "written")]
+        status = world.machine.program(words)
+        expected = UsageError.exit_status if refused else 0
+        if status != expected and not any(lack in world.machine.current.printed for lack in LACKS):
+            printed = world.machine.current.printed[-300:]
+            raise AssertionError(
+                f"to write {self.target} with {' '.join(options)} ends with status {status}: {printed}"
+            )
+        return status == 0
+
+    def _options(self, scenario: Scenario) -> Sequence[str]:
+        options = _OPTIONS[self.target]
+        if not scenario.relayed:
+            return options
+        options = [*options, "--relay", options[1].replace("{port}", "{relay_port}")]
+        if "--connect" in options:
+            options += ["--relay-connect", options[3].replace("{port}", "{relay_port}")]
+        return options
+
     @staticmethod
-    def _write_again(world: SimulatedWorld, written: Path) -> None:
+    def _check_containers(world: SimulatedWorld, scenario: Scenario, written: Path) -> None:
+        """A container is for each process, and files are written over others only if that is asked for, and possible."""
+        text = (written / "docker-compose.yml").read_text()
+        lacking = [name for name in (ROUTER, *scenario.receivers) if f"{name}:" not in text]
+        if lacking:
+            raise AssertionError(f"no container is for {', '.join(lacking)}")
         for words, expected in _AGAIN:
             own, folder, *options = (word.format(own=written / "scenario.toml", folder=written) for word in words)
             status = world.machine.program(["brief", own, "--compose", folder, *options])
             if status != expected:
                 raise AssertionError(f"files for containers of {own} end with status {status}: {' '.join(options)}")
 
-    def _words(self, scenario: Scenario, folder: Path) -> list[str]:
-        from evedrop.results.resolved_scenario import write_resolved  # noqa: PLC0415
-
-        write_resolved(folder, scenario)
-        words = ["brief", str(folder / "scenario.toml")]
-        if self.target == _CONTAINERS:
-            return [*words, "--compose"]
-        options = _OPTIONS.get(self.target) or _WRONG_OPTIONS[self.target]
-        if scenario.relayed and self.target in _OPTIONS:
-            options = [*options, "--relay", options[1].replace("{port}", "{relay_port}")]
-            if "--connect" in options:
-                options += ["--relay-connect", options[3].replace("{port}", "{relay_port}")]
-        port = _PORT + 2 * self.after % _PORT
-        words += [option.format(port=port, relay_port=port + 1) for option in options]
-        return [*words, "--wait", _WAIT_SECONDS, "--results", str(folder / "results"), "--out"]
-
-    def _refused(self, scenario: Scenario) -> bool:
-        if self.target == _CONTAINERS:
-            return scenario.shards > 1 or scenario.modules is not None or scenario.process.source == "zenoh"
-        wrong = scenario.relayed if self.target == _ONE_ROUTER else self.target in _WRONG_OPTIONS
-        return wrong or scenario.shards > 1
-
     @staticmethod
-    def _start_some(world: SimulatedWorld, briefs: Mapping[Path, Brief]) -> None:
+    def _start_some(world: SimulatedWorld, briefs: Mapping[Path, Brief], some: random.Random, deadline: float) -> None:
         """Start processes with briefs in which an entry is wrong, each kind of entry as often as any other."""
-        some = random.Random(here().token(8))  # noqa: S311 - to be repeated, not to be secret
         of_kind: dict[str, list[tuple[Path, list[Any]]]] = {}
         for path, brief in briefs.items():
             for place in _places(brief):
                 of_kind.setdefault(str(next(name for name in reversed(place) if name != 0)), []).append((path, place))
-        deadline = here().monotonic() + _STARTING_SECONDS
         for _ in range(_STARTED):
             if here().monotonic() > deadline:
                 return
@@ -191,18 +206,27 @@ class WriteBriefs(ByHand):
             if chance > 0.99:
                 os.truncate(path, _TOO_LARGE)
             path.chmod(0o644 if some.random() < 0.03 else 0o600)
-            _start(world, role, path, clock)
+            _start(world, role, path, clock, some.choice((*[_SOON_SECONDS] * 4, _PATIENCE_SECONDS)))
             path.write_text(json.dumps(briefs[path]))
 
 
-def _start(world: SimulatedWorld, role: str, path: Path, clock: float) -> None:
-    """Start a process with a brief that is wrong, or where a clock is; it ends, and says why."""
+def any_scenario(some: random.Random) -> Scenario:
+    """A drawn scenario; if it has given states, a program at which the sensor connects has them."""
+    scenario = scenario_of(some.getrandbits(32))
+    if scenario.process.source != "file":
+        return scenario
+    return DrawnProgram(listens=True, form=some.choice(FORMS)).scenario(scenario)
+
+
+def _start(world: SimulatedWorld, role: str, path: Path, clock: float, patience: float) -> None:
+    """Start a process with a brief that is wrong, or where a clock is; it ends, and says why, or is told to end."""
     process = world.machine.begin(BY_HAND, lambda: world.machine.program([role, str(path)]))
     process.task.clock = clock
-    deadline = here().monotonic() + _PATIENCE_SECONDS
-    while process.task.status is None and here().monotonic() < deadline:
-        here().sleep(_POLL_SECONDS)
-    process.signal(signal.SIGKILL)  # the wrong entry may be how long it waits for others
+    for seconds, sign in ((patience, signal.SIGTERM), (_PATIENCE_SECONDS, signal.SIGKILL)):
+        deadline = here().monotonic() + seconds
+        while process.task.status is None and here().monotonic() < deadline:
+            here().sleep(_POLL_SECONDS)
+        process.signal(sign)  # the wrong entry may be how long it waits for others
     ended = process.task.status in {UsageError.exit_status, RunError.exit_status, Interrupted.exit_status, KILLED}
     if not ended or "Traceback" in process.printed:
         raise AssertionError(
@@ -239,8 +263,11 @@ def _break(some: random.Random, brief: Brief, place: Sequence[Any]) -> None:
     table: Any = brief
     for name in path:
         table = table[name]
-    if some.random() < 0.15:
+    chance = some.random()
+    if chance < 0.15:
         del table[last]
+    elif chance < 0.25:
+        table[last] = None
     elif last in _PATHS:
         table[last] = some.choice([value for value in _WRONG if not isinstance(value, str)])
     else:

@@ -17,8 +17,9 @@ from evedrop.errors import UsageError
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual import notes
-from evedrop.virtual.cases import SEEDS_OF_A_SCENARIO, SimulatedCase, case_of, scenario_of
+from evedrop.virtual.cases import SEEDS_OF_A_SCENARIO, SimulatedCase, case_of
 from evedrop.virtual.disturbance import Disturbance, processes_of
+from evedrop.virtual.drawn_scenarios import scenario_of
 from evedrop.virtual.judge import misses
 from evedrop.virtual.moments import EVENTS, is_counted
 from evedrop.virtual.processes import Program

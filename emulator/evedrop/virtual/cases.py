@@ -1,4 +1,4 @@
-"""Runs drawn from a seed: a scenario with any scheme, strategy, link and event, and the faults that disturb it.
+"""Runs drawn from a seed: a drawn scenario, and the faults that disturb it.
 
 Source: docs/maintainers/simulated-world.md.
 """
@@ -9,50 +9,29 @@ import json
 import random
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass
-from functools import lru_cache
-from typing import Any, final
 
-from evedrop.errors import ScenarioError, UsageError
+from evedrop.errors import UsageError
 from evedrop.live.launch.briefs import MOST_SLOTS_AHEAD
-from evedrop.model.delays import DELAY_MODELS
-from evedrop.model.eavesdroppers import STRATEGIES
-from evedrop.model.links import LOSS_MODELS
-from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.loading import Scenario
-from evedrop.virtual import own_classes
 from evedrop.virtual.broken_messages import BreakMessage
 from evedrop.virtual.by_hand import WriteBriefs
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import KINDS, faults_of
 from evedrop.virtual.drawn_hosts import DrawnHosts, drawn_hosts, kind_with
-from evedrop.virtual.drawn_plants import with_more
+from evedrop.virtual.drawn_scenarios import scenario_of
 from evedrop.virtual.faults import ClogRouter, ShortenMessage
-from evedrop.virtual.programs import DrawnProgram, drawn_program, with_states
+from evedrop.virtual.programs import DrawnProgram, drawn_program
 from evedrop.virtual.rare_faults import RARE_KINDS, rare_faults
 from evedrop.virtual.runs_by_hand import RunByHand
 
 SEEDS_OF_A_SCENARIO = 6
 """How many seeds after each other play the same scenario: the same trials in memory are computed once for all of them."""
-_MOST_SLOTS, _MOST_TRIALS = 40, 4
 _AHEAD = (2, 3, 5, 8, 16, 40, MOST_SLOTS_AHEAD)
 _LIMITED = 0.6
 """The fraction of the runs with enough slots in which the sensor has to wait for the others."""
-_COSTLY: Mapping[str, Mapping[str, Any]] = {"learning-em": {"keeps": 4}, "learning-particle": {"particles": 4}}
-"""Strategies that take longer than all other processes of a run together → how they take less."""
 _MOST_BLOCKS = 40
 """How often the sensor may have to wait, where it need not be ahead of others by little."""
-_PACES = (0.001, 0.01, 0.1, 0.3)
-"""Seconds of a slot: a run of half a minute is written to the disk while it goes on, and outlasts the longest outage."""
-_OWN = 0.03
-"""The fraction of classes that are not built in."""
-_RELAYED_SHARDS = 0.3
-"""The fraction of the runs in shards with two routers in each."""
 _ALL_KINDS: Mapping[str, type[Disturbance]] = {**KINDS, **RARE_KINDS, ClogRouter.kind: ClogRouter}
-_UNSTABLE, _STABLE = 1.02, 0.9
-_LOOP: Mapping[str, Any] = {
-    "plant": {"inputs": ["u"], "input_matrix": [[0.1], [0.0]], "noise": [[1e-4, 0.0], [0.0, 1e-4]]},
-    "controller": {"strategy": "lqr", "state_weights": [1.0, 1.0], "input_weights": [0.1]},
-}
 
 
 @dataclass(frozen=True)
@@ -127,21 +106,6 @@ def case_of(seed: int) -> SimulatedCase:
     return SimulatedCase(seed, scenario, faults, ahead, hosts, program)
 
 
-@lru_cache(maxsize=1)
-def scenario_of(number: int) -> Scenario:
-    """The scenario that some seeds play."""
-    drawn = CaseDraw(random.Random(f"drawn {number}")).scenario()  # noqa: S311 - to be repeated, not to be secret
-    return with_states(number, with_two_routers(number, with_more(number, drawn)))
-
-
-def with_two_routers(number: int, scenario: Scenario) -> Scenario:
-    """A drawn scenario, which has two routers in each shard for some numbers."""
-    some = random.Random(f"routers {number}")  # noqa: S311 - to be repeated, not to be secret
-    if scenario.shards == 1 or some.random() >= _RELAYED_SHARDS:
-        return scenario
-    return Scenario({**scenario.as_tables(), "network": {"routers": 2}})
-
-
 def case_with(scenario: Scenario, seed: int) -> SimulatedCase:
     """The case of a seed with this scenario: what is drawn are the faults, and how far the sensor may be ahead."""
     source = random.Random(f"scenario {seed}")  # noqa: S311 - to be repeated, not to be secret
@@ -150,111 +114,3 @@ def case_with(scenario: Scenario, seed: int) -> SimulatedCase:
     ]  # or a long run would have too many messages
     ahead = source.choice(few or [MOST_SLOTS_AHEAD])
     return SimulatedCase(seed, scenario, faults_of(source, scenario, ahead), ahead)
-
-
-@final
-class CaseDraw:
-    """Draws the parts of a scenario."""
-
-    def __init__(self, source: random.Random) -> None:
-        self.random = source
-
-    def scenario(self) -> Scenario:
-        """A scenario that fits together: a draw that does not is drawn again."""
-        while True:
-            try:
-                return Scenario(self._tables())
-            except ScenarioError:
-                continue
-
-    def _tables(self) -> dict[str, Any]:
-        some, chance = self.random, self._chance
-        trials = some.randint(1, _MOST_TRIALS)
-        tables: dict[str, Any] = {
-            "title": "Drawn",
-            "slots": round(_MOST_SLOTS ** some.random() ** 0.7),
-            "seed": some.getrandbits(32),
-            "trials": trials,
-            "record_trials": some.randint(1, trials),
-            "longest_outage": some.choice([3.0, 30.0]),
-            "pace": some.choice(_PACES) if chance(0.3) else 0.0,
-            "process": self._process(),
-            "encoding": self._encoding(),
-            "legitimate": self._receiver(),
-            "eavesdroppers": {f"eve{i}": self._eavesdropper() for i in range(some.randint(0, 3))},
-        }
-        if SCHEMES[tables["encoding"]["scheme"]].needs_acknowledgements:
-            tables["acknowledgements"] = {"link": {"quality": self._quality()}}
-            if chance(0.6) and tables["eavesdroppers"]:
-                tables["acknowledgements"] |= {"attack": some.choice(["critical", "hijack"]), "jammer": "eve0"}
-        if chance(0.2):
-            tables |= _LOOP
-            loop = {"period": some.randint(1, 4), "acts_on": some.choice(["truth", "estimate"])}
-            tables["controller"] = {**tables["controller"], **loop}
-            tables["legitimate"]["knows_input"] = chance(0.7)
-        if chance(0.15):
-            tables["network"] = {"routers": 2}
-        if chance(0.15) and trials > 1 and "network" not in tables:
-            tables["shards"] = 2
-        if chance(0.5):
-            tables["event"] = [self._event(tables) for _ in range(some.randint(1, 3))]
-        return tables
-
-    def _process(self) -> dict[str, Any]:
-        growth = self.random.choice([_STABLE, 1.0, _UNSTABLE])
-        return {
-            "A": [[growth, 0.1], [0.0, 0.9]],
-            "Q": [[0.01, 0.0], [0.0, 0.01]],
-            "initial_covariance": [[1.0, 0.0], [0.0, 1.0]],
-        }
-
-    def _encoding(self) -> dict[str, Any]:
-        name = own_classes.SCHEME if self._chance(_OWN) else self.random.choice(sorted(SCHEMES.names))
-        return {"scheme": name, **SCHEMES[name].parameters}
-
-    def _eavesdropper(self) -> dict[str, Any]:
-        names = sorted(STRATEGIES.names)
-        name = self.random.choice(names)
-        if name in _COSTLY and self._chance(0.9):
-            name = self.random.choice([cheap for cheap in names if cheap not in _COSTLY])
-        if self._chance(_OWN / 3.0):  # it is asked in a process of its own, which takes a second
-            name = own_classes.STRATEGY
-        return {"strategy": name, **self._receiver(), **STRATEGIES[name].parameters, **_COSTLY.get(name, {})}
-
-    def _receiver(self) -> dict[str, Any]:
-        """The link of a receiver, and for how long a late packet is of use to it."""
-        link = self._link()
-        waits = self._chance(0.7 if "delay" in link else 0.1)
-        return {"link": link, **({"window": self.random.randint(1, 4)} if waits else {})}
-
-    def _link(self) -> dict[str, Any]:
-        link: dict[str, Any] = {}
-        if self._chance(0.5):
-            link["quality"] = self._quality()
-        else:
-            name = own_classes.LOSS_MODEL if self._chance(_OWN) else self.random.choice(sorted(LOSS_MODELS.names))
-            link["loss"] = {"model": name, **LOSS_MODELS[name].parameters}
-        if self._chance(0.3):
-            name = self.random.choice(sorted(DELAY_MODELS.names))
-            link["delay"] = {"model": name, **DELAY_MODELS[name].parameters}
-        if self._chance(0.2):
-            link["duplicate"] = 0.1
-        if self._chance(0.2):
-            link["corrupt"] = 0.05
-        return link
-
-    def _event(self, tables: Mapping[str, Any]) -> dict[str, Any]:
-        some, slots = self.random, int(tables["slots"])
-        receiver = some.choice(["legitimate", *tables["eavesdroppers"]])
-        first = some.randrange(slots)
-        span = {"from": first, "to": some.randint(first + 1, slots)}
-        kind = some.choice(["set", "kill", "kill", "pause", "pause", "cut"])
-        if kind == "set":
-            return {"at": first, "link": receiver, "set": {"quality": self._quality()}}
-        return {**span, kind: receiver, **({"state": some.choice(["prior", "last"])} if kind == "kill" else {})}
-
-    def _quality(self) -> float:
-        return round(self.random.uniform(0.3, 1.0), 2)
-
-    def _chance(self, probability: float) -> bool:
-        return self.random.random() < probability

@@ -57,6 +57,8 @@ class Disturbance(ABC):
     """Whether it changes the scenario of the run, which then has other results."""
     cuts_off: ClassVar[bool] = False
     """Whether all that it does is to cut its target off from the others."""
+    early: ClassVar[bool] = False
+    """Whether it strikes before everything else."""
     only_target: ClassVar[str]
     """What it hits, if that is the same in every run."""
     harmless: ClassVar[bool | None] = None

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, final
 from evedrop.live.launch.hosts_file import processes_of
 from evedrop.names import RELAY, ROUTER
 from evedrop.scenario.tables import Scenario
-from evedrop.virtual.disturbance import Disturbance
+from evedrop.virtual.disturbance import LAUNCHER, Disturbance
 from evedrop.virtual.faults import (
     HangUpProcess,
     InterruptProcess,
@@ -40,6 +40,8 @@ _PART_KINDS: Mapping[type[Disturbance], float] = {
 }
 _PARTS = (SSH, PROGRAM, SESSION, HOST_FORK_SERVER)
 _MOST_FAULTS, _FIRST = 2, 5
+_AT_ONCE, _CONNECTED = 0.1, 25
+"""The fraction of faults that end the launcher, and the events within which it does not wait for all hosts any more."""
 
 
 class Mistake(NamedTuple):
@@ -215,6 +217,8 @@ def drawn_hosts(seed: int, scenario: Scenario) -> tuple[DrawnHosts | None, tuple
 
 
 def _fault(some: random.Random, host: str) -> Disturbance:
+    if some.random() < _AT_ONCE:
+        return InterruptProcess(LAUNCHER, some.randint(_FIRST, _CONNECTED))
     if some.random() < 0.5:
         [kind] = some.choices([*_PART_KINDS], [*_PART_KINDS.values()])
         target = part_on(some.choice(_PARTS), host)

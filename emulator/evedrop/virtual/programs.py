@@ -56,7 +56,7 @@ MISTAKES: Mapping[str, str] = {
 """What a program does wrong → part of what the run prints."""
 _OF_BYTES = frozenset({"no listener", "silence", "no number", "a large number", "a large message", "too few bytes"})
 """What a program may do wrong that sends bytes instead of text."""
-_FORMS = ("object", "list", "bytes")
+FORMS = ("object", "list", "bytes")
 
 
 @final
@@ -201,7 +201,7 @@ def drawn_program(seed: int, scenario: Scenario) -> DrawnProgram | None:
     some = random.Random(f"program {seed}")  # noqa: S311 - to be repeated, not to be secret
     if scenario.process.source != "file" or some.random() < _WITHOUT:
         return None
-    form, mistake = some.choice(_FORMS), ""
+    form, mistake = some.choice(FORMS), ""
     if some.random() < _MISTAKEN:
         rare = {"a flood"} if some.random() < _NO_FLOOD else set[str]()
         mistake = some.choice(

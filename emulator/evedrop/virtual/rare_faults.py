@@ -21,6 +21,7 @@ from evedrop.virtual.drawn_faults import events_of
 from evedrop.virtual.faults import CutConnection, RenameResults
 from evedrop.virtual.moments import COMMANDS, DECISIONS, FINAL_BELIEFS, PROGRESS_OF_RECEIVERS
 from evedrop.virtual.outsiders import ChangeLink, OperatorCommand, PauseRun
+from evedrop.virtual.rereading import RereadMessages
 from evedrop.virtual.runs_by_hand import RunByHand, RunWrongly
 
 if TYPE_CHECKING:
@@ -145,13 +146,15 @@ class SteerRun(OperatorCommand):
 
 
 RARE_KINDS: Mapping[str, type[Disturbance]] = {
-    kind.kind: kind for kind in (BreakMessage, ReadMetrics, RunByHand, RunWrongly, SteerRun, TakePort, WriteBriefs)
+    kind.kind: kind
+    for kind in (*(BreakMessage, ReadMetrics, RereadMessages, RunByHand, RunWrongly, SteerRun, TakePort, WriteBriefs),)
 }
 _WITH: Mapping[type[Disturbance], Sequence[tuple[type[Disturbance], float | None]]] = {
     BreakMessage: ((PauseRun, 0.5), (ChangeLink, None), (CutConnection, 0.3)),
     ReadMetrics: ((PauseRun, 1.0), (RenameResults, None)),
+    RereadMessages: ((PauseRun, 0.5), (ChangeLink, None), (CutConnection, 0.3)),
 }
-"""Kind → those of which one may come before it, and for how long that lasts."""
+"""Kind → those of which one may come with it, and for how long that lasts."""
 
 
 def rare_faults(seed: int, scenario: Scenario, ahead: int) -> tuple[Disturbance, ...]:
@@ -164,7 +167,7 @@ def rare_faults(seed: int, scenario: Scenario, ahead: int) -> tuple[Disturbance,
     last = events_of(scenario, ahead)
     after = int(some.uniform(1, last) if some.random() < 0.5 else max(2.0, last) ** some.random())
     seconds = round(10.0 ** some.uniform(-2.0, 1.0), 3) if kind.lasts and some.random() < 0.6 else None
-    fault = kind(target, after, seconds)
+    fault = kind(target, 1 if kind.early else after, seconds)
     if kind is BreakMessage and some.random() < _NOTABLE:
         moment = some.choice(_notable(target, scenario))
         fault = kind(target, some.choice((1, 1, 1, 2, 2, 3)), None, moment)

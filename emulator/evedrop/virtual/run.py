@@ -92,6 +92,8 @@ class SimulatedWorld:
         self.disk = VirtualDisk(self.scheduler, root)
         self.scenario: Scenario | None = None
         """What is run there."""
+        self.ahead = MOST_SLOTS_AHEAD
+        """How many slots its sensor may be ahead."""
         self.told: list[tuple[float, ProgressEvent]] = []
         """The events that its launcher got."""
         self.places: Mapping[str, str] = {}
@@ -144,7 +146,7 @@ def run_in(
     hosts_file: that of `--hosts`, if the world has other hosts. begin: begins other programs, before the launcher.
     """
     run = SimulatedRun(world.results)
-    world.scenario, world.told = scenario, run.told
+    world.scenario, world.ahead, world.told = scenario, ahead, run.told
     given = {ROUTER: _ROUTER, RELAY: _RELAY} if scenario.relayed and scenario.shards == 1 else {}
     world.places = given if hosts_file is None else LISTENS
     scheduler = world.scheduler

@@ -10,19 +10,22 @@ import json
 import os
 import random
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, final
 
 from evedrop.errors import Interrupted, RunError, UsageError
+from evedrop.live.launch.hosts_file import load_hosts, processes_of
 from evedrop.live.launch.launcher import launch
 from evedrop.live.network.connection import VARIABLE
 from evedrop.names import LEGITIMATE, RECORDER, ROUTER, SENSOR
+from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario.tables import Scenario
 from evedrop.system.world import world as here
-from evedrop.virtual.by_hand import CLOCKS, LACKS, Brief, ByHand
+from evedrop.virtual.by_hand import CLOCKS, LACKS, SCENARIOS, Brief, ByHand, any_scenario
 from evedrop.virtual.disturbance import KILLED, ROUTERS
+from evedrop.virtual.drawn_hosts import MISTAKES, DrawnHost, DrawnHosts
 from evedrop.virtual.endings import status_of
 from evedrop.virtual.notes import BY_HAND
 
@@ -30,9 +33,10 @@ if TYPE_CHECKING:
     from evedrop.virtual.processes import VirtualProcess
     from evedrop.virtual.run import SimulatedWorld
 
-_MOST_SLOTS = 20
+_MOST_SLOTS = 40
 _POLL_SECONDS, _RUN_SECONDS = 0.2, 40.0
-_WATCHED, _RECORDED, _RECORDING = "a run with a health file", "a run that is recorded for views", b"RRF2"
+_PAUSED = "a run that begins paused"
+_RECORDED, _RECORDING = "a run that is recorded for views", b"RRF2"
 """How Rerun's files begin."""
 _INTERRUPTED, _STRANGE, _WRONG_CLOCK, _TAKEN = (
     *("a run that is interrupted", "a run with a brief of another run"),
@@ -66,13 +70,17 @@ def _other_name(briefs: Briefs) -> None:
         brief["router"] = brief["router"].replace("127.0.0.1", "localhost")
 
 
+def _paused(briefs: Briefs) -> None:
+    briefs[RECORDER]["part"]["paused"] = True
+
+
 def _unchanged(briefs: Briefs) -> None:
     del briefs
 
 
 _RUNS: Mapping[str, tuple[str, Callable[[Briefs], None]]] = {
     "a run": ("tcp", _unchanged),
-    _WATCHED: ("tcp", _unchanged),
+    _PAUSED: ("tcp", _paused),
     _TAKEN: ("tcp", _unchanged),
     "a run without a receiver": ("tcp", _without_receiver),
     _INTERRUPTED: ("tcp", _unchanged),
@@ -92,7 +100,7 @@ _RUNS: Mapping[str, tuple[str, Callable[[Briefs], None]]] = {
 class RunByHand(ByHand):
     """The same scenario is run beside the run, all of whose processes somebody starts by hand, in any order."""
 
-    kind, share = "start by hand", 2
+    kind, share = "start by hand", 4
     awaited_seconds = 60.0
     """Its processes wait for one that is missing, or that an event has ended: no launcher starts it again."""
 
@@ -112,8 +120,7 @@ class RunByHand(ByHand):
         if briefs:
             _RUNS[self.target][1](briefs)
         file = folder / "health"
-        if self.target == _WATCHED:
-            os.environ[VARIABLE] = str(file)
+        os.environ[VARIABLE] = str(file)
         try:
             processes = self._run(world, folder, briefs)
         finally:
@@ -125,7 +132,7 @@ class RunByHand(ByHand):
         done = RECORDER in processes and processes[RECORDER].task.status == 0
         if self.target == _RECORDED:
             self._check_recording(folder / "results" / "recording.rrd", done)
-        if self.target == _WATCHED and done and not file.exists():
+        if done and not file.exists():
             raise AssertionError("no process has touched the health file")
         return 0
 
@@ -148,8 +155,9 @@ class RunByHand(ByHand):
             processes[RECORDER].interrupt()
         elif paths and (status := world.machine.program(["health", str(some.choice([*paths.values()]))])) not in _ENDED:
             raise AssertionError(f"who asks for the health of a process is told status {status}")
-        deadline = here().monotonic() + _RUN_SECONDS
+        deadline, resumed = here().monotonic() + _RUN_SECONDS, self.target != _PAUSED
         while any(process.task.alive for process in processes.values()) and here().monotonic() < deadline:
+            resumed = resumed or world.machine.program(["resume", str(folder / "results")]) == 0
             here().sleep(_POLL_SECONDS)
         waiting = [name for name, process in processes.items() if process.task.alive and name not in ROUTERS]
         if self.target == _WITHOUT_RECORDER and waiting:
@@ -178,8 +186,6 @@ class RunByHand(ByHand):
 
     def _briefs(self, world: SimulatedWorld, scenario: Scenario, folder: Path) -> Briefs:
         """Write the briefs, and read them; none if the disk does not take them."""
-        from evedrop.results.resolved_scenario import write_resolved  # noqa: PLC0415
-
         folder.mkdir(0o700)
         write_resolved(folder, scenario)
         written, at = folder / "written", f"{_RUNS[self.target][0]}/127.0.0.1"
@@ -193,38 +199,65 @@ class RunByHand(ByHand):
 
 
 _AT = "tls/127.0.0.1:17480"
-_OPTIONS: Mapping[str, tuple[str, str | None]] = {
-    "a port that others reach": ("tls/0.0.0.0:17480", None),
-    "no endpoint": ("nowhere", None),
-    "two routers at one place": (_AT, _AT),
-    "two routers of two kinds": (_AT, "tcp/127.0.0.1:17481"),
-}
-"""What is wrong → where the router and the relay are to listen."""
+_OPTIONS: Sequence[tuple[str, str | None]] = (
+    ("tls/0.0.0.0:17480", None),  # others reach it
+    ("nowhere", None),
+    (_AT, _AT),
+    (_AT, "tcp/127.0.0.1:17481"),
+)
+"""Where a router and a relay are to listen that cannot."""
+_WRONG_OPTIONS, _WRONG_HOSTS = "wrong options", "wrong hosts"
 
 
 @final
 class RunWrongly(ByHand):
-    """The same scenario is to be run beside the run, with options that no run may have."""
+    """The same scenario is to be run beside the run, with options that no run may have, or files of hosts with mistakes."""
 
-    kind, share = "run beside it with", 1
+    kind, share = "run beside it with", 2
 
     @classmethod
     def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """Each of them."""
+        """Both."""
         del scenario
-        return [*_OPTIONS]
+        return [_WRONG_OPTIONS, _WRONG_HOSTS]
 
     def _act(self, world: SimulatedWorld) -> int:
-        scenario = world.scenario
-        if scenario is None:
-            return 0
-        listen, relay = _OPTIONS[self.target]
-        folder = world.disk.root / f"by hand {self.after}"
-
-        def run() -> int:
-            return launch(scenario, folder, "off", listen, lambda _: None, relay).status
-
-        status = status_of(run)
-        if status != UsageError.exit_status and not any(lack in world.machine.current.printed for lack in LACKS):
-            raise AssertionError(f"to run with {self.target} ends with status {status}")
+        if world.scenario is not None:
+            process, before = world.machine.current, 0
+            some = random.Random(here().token(8))  # noqa: S311 - to be repeated, not to be secret
+            scenarios = [world.scenario, *(any_scenario(some) for _ in range(1, SCENARIOS))]
+            (world.disk.root / f"by hand {self.after}").mkdir(0o700)
+            for run, said in (tried for scenario in scenarios for tried in self._runs(world, scenario)):
+                status, printed = status_of(run), process.printed[before:]
+                before += len(printed)
+                if (status != UsageError.exit_status or said not in printed) and not any(
+                    lack in printed for lack in LACKS
+                ):
+                    raise AssertionError(
+                        f"to run with {self.target} ends with status {status}, without {said!r}: {printed}"
+                    )
         return 0
+
+    def _runs(self, world: SimulatedWorld, scenario: Scenario) -> Iterator[tuple[Callable[[], int], str]]:
+        """What is tried, each with a text that is printed."""
+        folder = world.disk.root / f"by hand {self.after}" / "results"
+
+        def run(listen: str | None = None, relay: str | None = None, *, paused: bool = False) -> int:
+            return launch(scenario, folder, "off", listen, lambda _: None, relay, paused=paused).status
+
+        if self.target == _WRONG_OPTIONS:
+            yield from ((partial(run, *places), "") for places in _OPTIONS)
+            if scenario.shards > 1:
+                yield partial(run, paused=True), "--paused"
+            return
+        file = folder.with_name("hosts.toml")
+
+        def load(hosts: DrawnHosts) -> int:
+            file.write_text(hosts.text(scenario))
+            load_hosts(file, scenario)
+            return 0
+
+        for mistake in MISTAKES:
+            hosts = DrawnHosts((DrawnHost("alpha", processes_of(scenario)),), mistake)
+            if hosts.refused(scenario) == MISTAKES[mistake].message:
+                yield partial(load, hosts), MISTAKES[mistake].message

@@ -107,6 +107,8 @@ class VirtualZenoh:
         """Process → what becomes of the next message to it."""
         self._occupied: dict[Address, bytes] = {}
         """Address at which another program listens → what that says."""
+        self.listeners: list[Callable[[str, bytes], object]] = []
+        """Are called with each message that arrives at a session, and the name of its process."""
         scheduler.on_stop = self._stopped
 
     # What programs call
@@ -322,6 +324,8 @@ class VirtualZenoh:
 
     def changed(self, session: VirtualSession, message: bytes) -> bytes:
         """What arrives at a session of a message."""
+        for listener in self.listeners:
+            listener(session.name, message)
         change = self._changes.get(session.name)
         other = None if change is None else change(message)
         if other is None:
