@@ -417,7 +417,15 @@ class VirtualScheduler:
                     thread.greenlet.throw(Ended)
                 else:
                     _UNENDING.append(thread.greenlet)
+                thread.greenlet = None
         self.current = None
+        # Arrow's writers refer to files without Python's knowledge: a world that can be reached from a file would never be freed.
+        for task in self.tasks:
+            task.threads.clear()
+            task.held.clear()
+            task.waiting.clear()
+        self._ready.clear()
+        self._timers.clear()
 
 
 @final
