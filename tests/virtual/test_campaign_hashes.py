@@ -11,7 +11,7 @@ import pytest
 
 from tests.virtual.simulated import played
 
-HASH = "f3bd1bbd9644ce82"
+HASH = "17b55fdd32b6c586"
 """Of the seeds 1 to 30."""
 _PLAY = """
 from evedrop.results.reading import Results
