@@ -63,7 +63,7 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None, verb
     shown = closing.receivers_table(summary, wide)
     console.show(closing.receivers_table(summary, judged=True), shown, tight=not wide, heads="" if wide else "short")
     if summary.verdict is not None:
-        console.say(summary.verdict.sentence, f"bold {_STYLES.get(SecrecyOutcome(summary.verdict.outcome), '')}")
+        console.say(summary.verdict.sentence, f"bold {_STYLES.get(summary.verdict.outcome, '')}")
         for outcome, line in closing.verdict_lines(summary):
             console.say(f"  {line}", _STYLES.get(outcome, ""))
     for line in closing.remarks(summary):

@@ -123,11 +123,7 @@ class Cell:
     @property
     def verdict(self) -> SecrecyOutcome | None:
         """The verdict of the run; None if the pair is not defined."""
-        return (
-            None
-            if self.secrecy is None or self.secrecy.verdict is None
-            else SecrecyOutcome(self.secrecy.verdict.outcome)
-        )
+        return None if self.secrecy is None or self.secrecy.verdict is None else self.secrecy.verdict.outcome
 
     def as_dict(self) -> dict[str, Any]:
         """The cell in the form of compare.json."""

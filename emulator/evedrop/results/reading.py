@@ -101,7 +101,8 @@ class Results:
     def remark(self) -> str | None:
         """A remark on a run that did not complete; None for a complete run."""
         ended = str(self.summary.get("ended", "complete"))
-        return None if ended == "complete" else f"{self.folder}: {ended.splitlines()[0]}"
+        first = next(iter(ended.splitlines()), "ended in an unknown way")
+        return None if ended == "complete" else f"{self.folder}: {first}"
 
     @property
     def events(self) -> list[RunEvent]:

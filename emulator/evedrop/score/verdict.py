@@ -56,8 +56,7 @@ _SMALLER = 0.8  # times the legitimate error: less is "more than the estimator",
 class Verdict:
     """Whether the state is kept secret."""
 
-    outcome: str
-    """The value of an `SecrecyOutcome`."""
+    outcome: SecrecyOutcome
     reason: str
     """The rest of the sentence: the distances of both, and how many times larger the eavesdropper's squared error is."""
     eavesdropper: str
@@ -68,7 +67,7 @@ class Verdict:
     @property
     def headline(self) -> str:
         """Glyph and word, such as "✓ secret"."""
-        return SecrecyOutcome(self.outcome).headline
+        return self.outcome.headline
 
     @property
     def sentence(self) -> str:
@@ -105,7 +104,7 @@ def verdict_on(compared: Compared, unit: str = "", *, best: bool = False) -> Ver
     """The verdict on an eavesdropper; unit: of the distances; best: whether it is the best one of several."""
     name, values, outcome = compared.eavesdropper, compared.after_start, compared.outcome
     if math.isnan(values.ratio):
-        return Verdict(outcome.value, values.why_open or "nothing was measured", name)
+        return Verdict(outcome, values.why_open or "nothing was measured", name)
     who = f"the best eavesdropper ({name})" if best else name
     times = times_text(values.ratio, values.interval)
     off = "off" if compared.true is None else "off the sensor's estimate"
@@ -126,14 +125,14 @@ def verdict_on(compared: Compared, unit: str = "", *, best: bool = False) -> Ver
             knows = "more than" if values.ratio < _SMALLER else "as much as"
             if compared.denied and values.larger is None:
                 reason = f"by theory, {name} knows as much as the estimator in the long run; here {numbers}"
-                return Verdict(outcome.value, reason, name, times)
-            return Verdict(outcome.value, f"{name} knows {knows} the estimator; {numbers}", name, times)
+                return Verdict(outcome, reason, name, times)
+            return Verdict(outcome, f"{name} knows {knows} the estimator; {numbers}", name, times)
         case SecrecyOutcome.OPEN:
-            return Verdict(outcome.value, f"{values.why_open}; {numbers}", name, times)
+            return Verdict(outcome, f"{values.why_open}; {numbers}", name, times)
         case SecrecyOutcome.PERFECT:
-            return Verdict(outcome.value, f"{numbers}, and growing", name, times)
+            return Verdict(outcome, f"{numbers}, and growing", name, times)
         case SecrecyOutcome.RELATIVE:
-            return Verdict(outcome.value, numbers, name, times)
+            return Verdict(outcome, numbers, name, times)
 
 
 def verdict_of(compared: Iterable[Compared], unit: str = "") -> Verdict | None:

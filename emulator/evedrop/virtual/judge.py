@@ -123,7 +123,8 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
         if status != UsageError.exit_status or (refused not in run.said and not fatal):
             yield f"status {status}, although the run cannot begin ({refused}): {complaint}"
     elif program is not None and not fatal:
-        if status != RunError.exit_status or program not in run.said:
+        completes = status == good and case.program is not None and case.program.tolerated
+        if not completes and (status != RunError.exit_status or program not in run.said):
             yield f"status {status}, although a program is wrong ({program}): {complaint}"
     elif status == good:
         yield from _of_ignored_signals(case, run, {fault: struck[fault] for fault in fatal})

@@ -94,6 +94,11 @@ class DrawnProgram:
         """A text that the failing run prints; None if it need not fail."""
         return MISTAKES[self.mistake] if self.mistake else None
 
+    @property
+    def tolerated(self) -> bool:
+        """Whether the run may complete all the same: a short one may have its states before too many wait."""
+        return self.mistake == "a flood"
+
     def seconds(self, scenario: Scenario) -> float:
         """For how much longer a run may take because of it."""
         patience = 30.0 + max(5.0, scenario.longest_outage) if self.mistake else 0.0

@@ -15,7 +15,7 @@ from scipy import stats
 
 from evedrop.model.process import Floats
 from evedrop.score.synchronisation import FACTOR, Synchronisation
-from evedrop.score.verdict import Verdict, distance_text
+from evedrop.score.verdict import SecrecyOutcome, Verdict, distance_text
 from evedrop.show.view.lanes import KNOWLEDGE, SPIED, ErrorDistance, KnowledgeLane, knowledge
 from evedrop.show.view.panels.fates import WhoKnowsWhat
 from evedrop.show.view.panels.texts import VerdictLine
@@ -173,7 +173,7 @@ def test_titles_in_any_letters_are_drawn() -> None:
 
 def title_of(scene: Scene) -> str:
     """The title below the verdict, in Markdown."""
-    (column,) = VerdictLine(scene).conclusion(scene.slots - 1, Verdict("secret", "far off", "smart"))
+    (column,) = VerdictLine(scene).conclusion(scene.slots - 1, Verdict(SecrecyOutcome.RELATIVE, "far off", "smart"))
     assert column.slots.tolist() == [scene.slots - 1]
     texts = [text for values in column.values for text in values.as_arrow_array().to_pylist() if "secret" in text[0]]
     headline, _, title = str(texts[0][0]).partition("\n\n")

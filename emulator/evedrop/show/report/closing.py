@@ -57,7 +57,7 @@ def outcome(summary: Summary) -> tuple[str, bool | None]:
     sentence = sentence[0].upper() + sentence[1:]
     if summary.verdict is None:
         return sentence, good
-    secret = _GOOD[SecrecyOutcome(summary.verdict.outcome)]
+    secret = _GOOD[summary.verdict.outcome]
     both = secret if good is not False else False
     return f"{summary.verdict.sentence}. {sentence}", both
 
@@ -201,7 +201,7 @@ def verdict_lines(summary: Summary) -> Iterator[tuple[SecrecyOutcome, str]]:
             claims = summary.secrecy[name]
             times += " (by means of infinite variance)" if claims.judged_by == "median" else ""
             times += "; perfect by theory, which trials may never show" if claims.perfect_by_theory else ""
-        yield SecrecyOutcome(verdict.outcome), f"{verdict.headline:{words}}  {name:{names}}  {times}".rstrip()
+        yield verdict.outcome, f"{verdict.headline:{words}}  {name:{names}}  {times}".rstrip()
 
 
 def details(summary: Summary) -> Iterator[str]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.score.verdict import Verdict
+from evedrop.score.verdict import SecrecyOutcome, Verdict
 from evedrop.show.view.panels.panel import PlacedView
 from evedrop.show.view.panels.plane import StatePlane, TruthDirection, heading_strips, scale_bars
 from evedrop.show.view.recording import MOST_WORLDS, PanelSet, ViewRecording, _rows
@@ -81,7 +81,7 @@ def recorded_texts(run: Simulated, path: Path, length: int) -> dict[int, str]:
     recording = ViewRecording(path, run.scene)
     for slots in run.chunks(length):
         recording.add(slots)
-    recording.conclude(Verdict("secret", "the end", "smart"))
+    recording.conclude(Verdict(SecrecyOutcome.RELATIVE, "the end", "smart"))
     assert recording.close()
     return {slot: str(text[0]) for slot, text in rows(path, "title", "TextDocument:text").items()}
 
