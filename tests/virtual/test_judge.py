@@ -28,6 +28,7 @@ from evedrop.virtual.faults import (
 )
 from evedrop.virtual.judge import misses
 from evedrop.virtual.notes import PutMessage
+from evedrop.virtual.programs import DrawnProgram
 from evedrop.virtual.reference import RunReference
 from evedrop.virtual.run import SimulatedRun
 
@@ -48,13 +49,20 @@ TOLD = InterruptProcess("launcher", 60)
 
 
 def judged(
-    folder: Path, struck: Mapping[Disturbance, float], ahead: int = 8, scenario: Scenario = SCENARIO, **run: object
+    folder: Path,
+    struck: Mapping[Disturbance, float],
+    ahead: int = 8,
+    scenario: Scenario = SCENARIO,
+    program: DrawnProgram | None = None,
+    **run: object,
 ) -> list[str]:
     """The misses of a run without results; ahead: how far the sensor may be ahead."""
     (folder / "temporary").mkdir(parents=True, exist_ok=True)
     faults = tuple(struck)
     ended = SimulatedRun(folder / "results", **run)  # type: ignore[arg-type]
-    return misses(SimulatedCase(1, scenario, faults, ahead), ended, struck, REFERENCE, {"": folder / "temporary"})
+    return misses(
+        SimulatedCase(1, scenario, faults, ahead, program=program), ended, struck, REFERENCE, {"": folder / "temporary"}
+    )
 
 
 def with_outage(first: int, end: int) -> Scenario:
@@ -246,3 +254,23 @@ def test_metrics_are_of_rows_that_are_there(metrics: int, rows: int, missed: boo
     (unfinished / "rounds").write_bytes(json.dumps({"at": "slot 9", "slots": rows, "tables": {}}).encode() + b"\n")
     broken = judged(tmp_path, {CutPower("disk", 60): 0.5}, status=-9)
     assert (f"there are metrics of {metrics} slots, and rows of {rows}" in broken) is missed
+
+
+@pytest.mark.parametrize(
+    ("mistake", "status", "said", "missed"),
+    [
+        ("no JSON", 3, "evedrop: robot/pose: expected JSON such as [1.0, 2.0]", False),
+        ("no JSON", 3, "evedrop: sensor was ended by signal 9", True),
+        ("no JSON", 0, "", True),
+        ("a flood", 3, "evedrop: robot/pose: the program sends faster than the run", False),
+        ("a flood", 0, "", False),
+        ("a flood", 3, "evedrop: sensor was ended by signal 9", True),
+    ],
+)
+def test_a_program_that_is_wrong_ends_its_run(
+    mistake: str, status: int, said: str, missed: bool, tmp_path: Path
+) -> None:
+    """But a short run may have its states before a flood is too much."""
+    program = DrawnProgram(True, "list", mistake)
+    broken = judged(tmp_path, {}, program=program, status=status, said=said)
+    assert any("although a program is wrong" in miss for miss in broken) is missed
