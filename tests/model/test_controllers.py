@@ -173,3 +173,17 @@ def test_the_strategy_is_registered_with_defaults() -> None:
     """A scenario may leave horizon and soft out."""
     assert CONTROLLERS["mpc"] is Mpc
     assert MappingProxyType({"horizon": 60, "soft": 1000.0}) == Mpc.optional
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"period": 0}, "period is 0, expected 1 to 1000000"),
+        ({"period": 10**12}, "period is 1000000000000, expected 1 to 1000000"),
+        ({"slot_seconds": -1.0}, "slot_seconds is -1.0, expected 0 or more"),
+    ],
+)
+def test_an_assignment_that_nobody_can_follow_is_refused(changed: dict[str, Any], said: str) -> None:
+    """A controller multiplies matrices for each slot of a period, which would take for ever."""
+    with pytest.raises(ValueError, match=said):
+        assigned(**changed)

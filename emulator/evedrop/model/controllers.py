@@ -33,6 +33,9 @@ from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Limits, Process, product
 from evedrop.model.receiver import Flags
 
+LONGEST_PERIOD = 1_000_000
+"""The most slots between two decisions: a controller multiplies matrices for each of them when it begins."""
+
 
 @dataclass(frozen=True)
 class Assignment:
@@ -61,8 +64,10 @@ class Assignment:
         expect_shapes(
             self, {"state_weights": (n,), **dict.fromkeys(("input_weights", "rate_weights", "rate_limits"), (m,))}
         )
-        if self.period < 1 or self.slot_seconds < 0.0:
-            raise ValueError(f"period is {self.period} and slot_seconds {self.slot_seconds}, expected 1, 0 or more")
+        if not 1 <= self.period <= LONGEST_PERIOD:
+            raise ValueError(f"period is {self.period}, expected 1 to {LONGEST_PERIOD}")
+        if self.slot_seconds < 0.0:
+            raise ValueError(f"slot_seconds is {self.slot_seconds}, expected 0 or more")
 
 
 class Controller(ABC):

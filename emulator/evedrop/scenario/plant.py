@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
 
-from evedrop.model.controllers import CONTROLLERS, Assignment
+from evedrop.model.controllers import CONTROLLERS, LONGEST_PERIOD, Assignment
 from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.plant import Plant
 from evedrop.model.process import MOST_STATES, Floats, Process
@@ -136,7 +136,7 @@ class ControllerTable(Table):
 
     strategy: Annotated[str, Field(strict=True, examples=["lqr"]), AfterValidator(one_of(CONTROLLERS))]
     """How the controller decides. Its parameters are further entries."""
-    period: Annotated[int, Field(strict=True, ge=1, le=1_000_000, examples=[60])] = 1
+    period: Annotated[int, Field(strict=True, ge=1, le=LONGEST_PERIOD, examples=[60])] = 1
     """Slots between two decisions; inputs are held in between."""
     acts_on: Annotated[Literal["estimate", "truth"], Field(examples=["estimate"])] = "estimate"
     """The legitimate estimate, or, for comparison, the true state."""
