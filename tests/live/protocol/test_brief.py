@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -137,6 +138,16 @@ def test_refuses_what_is_no_brief(value: object, tmp_path: Path) -> None:
     ) as caught:
         read_brief(path)
     assert caught.value.exit_status == 2
+
+
+@pytest.mark.parametrize("number", [math.inf, math.nan])
+def test_refuses_numbers_that_json_has_not(number: float, tmp_path: Path) -> None:
+    """Python reads them in any table, and no brief with them can be written."""
+    path = tmp_path / "brief.json"
+    path.write_text(json.dumps({**PLAIN, "slots": number}))
+    path.chmod(0o600)
+    with pytest.raises(BriefError, match=r"\((Infinity|NaN) is not a number in JSON\)"):
+        read_brief(path)
 
 
 def test_refuses_what_is_not_there(tmp_path: Path) -> None:
