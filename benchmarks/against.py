@@ -164,8 +164,9 @@ def installed(commit: str) -> Iterator[str]:
 def main(words: Sequence[str] | None = None, root: Path = ROOT) -> int:
     """Print the table; returns 1 if a row became slower."""
     parser = argparse.ArgumentParser(description="This checkout against an earlier commit.")
-    parser.add_argument("base", nargs="?", help="the earlier commit; without it, the last tag")
-    parser.add_argument("--python", help="the interpreter of an earlier installation, in place of a commit")
+    either = parser.add_mutually_exclusive_group()
+    either.add_argument("base", nargs="?", help="the earlier commit; without it, the last tag")
+    either.add_argument("--python", help="the interpreter of an earlier installation, in place of a commit")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="small sizes, too small to judge by")
     options = parser.parse_args(words)

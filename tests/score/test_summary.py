@@ -73,6 +73,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     [
         (("trials",), "two"),
         (("ended",), None),
+        (("ended",), ""),
+        (("verdict", "outcome"), "perhaps"),
         (("peers", "smart", "digest"), 5),
         (("peers", "smart", "used_fraction"), "many"),
         (("links", "smart", "lost"), [1]),

@@ -27,7 +27,6 @@ from evedrop.virtual.steps import Step, steps_of
 from tests.virtual.wire_cases import EVERY, PlayedWire, SimulatedWireCase
 
 AnyCase = SimulatedCase | SimulatedWireCase
-_FREED_EVERY = 100
 WINDOW = Path()
 """What `--view` is without a file: the viewer is opened."""
 
@@ -118,19 +117,9 @@ def unlike(failed: Sequence[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tup
 
 def save_time() -> None:
     """Let a worker search its new objects for cycles less often, and its modules never; and use no threads for small tables."""
-    gc.unfreeze()
-    gc.collect()  # twice: the first one ends the greenlets of threads
-    gc.collect()
     gc.freeze()
     gc.set_threshold(50_000)
     pa.set_cpu_count(1)
-
-
-def _played_in_turn(seed: int) -> tuple[int, str, str, int, float, tuple[str, ...], int | None]:
-    """The same in a worker, which frees from time to time what the wires of a simulated world have frozen with `gc.freeze`."""
-    if seed % _FREED_EVERY == 0:
-        save_time()
-    return played(seed)
 
 
 def campaign(seeds: range, workers: int, explained: int, view: Path | None) -> bool:
@@ -139,7 +128,7 @@ def campaign(seeds: range, workers: int, explained: int, view: Path | None) -> b
     failed: list[tuple[int, tuple[str, ...]]] = []
     with ProcessPoolExecutor(workers, initializer=save_time) as pool:
         for seed, case, digest, happened, seconds, misses, status in pool.map(
-            _played_in_turn, seeds, chunksize=SEEDS_OF_A_SCENARIO
+            played, seeds, chunksize=SEEDS_OF_A_SCENARIO
         ):
             events += happened
             total.update(digest.encode())

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections import deque
 from collections.abc import Callable
 from itertools import pairwise
 from queue import Empty
 
+import pyarrow as pa
 import pytest
 
 from evedrop.virtual.pipes import Pipe
@@ -433,3 +436,45 @@ def test_a_wait_for_less_than_the_clock_can_measure_ends() -> None:
 
     finish(scheduler, started(scheduler, "program", waits))
     assert ended == [pytest.approx(5.1)]
+
+
+class _OpenFile:
+    """A file that knows its world, as those of a simulated disk do."""
+
+    closed = False
+
+    def __init__(self, scheduler: VirtualScheduler) -> None:
+        self.scheduler = scheduler
+
+    def write(self, data: bytes) -> int:
+        return len(data)
+
+    def flush(self) -> None:
+        pass
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def taken_down() -> weakref.ref[VirtualScheduler]:
+    """A world in which a thread that was killed has not closed its writer."""
+    scheduler = VirtualScheduler(1)
+    task = scheduler.process("killed")
+
+    def write() -> None:
+        writer = pa.PythonFile(_OpenFile(scheduler), mode="w")
+        task.held.append(writer.flush)
+        scheduler.wait(deque(), None)
+
+    scheduler.thread("writes", write, task).start()
+    scheduler.run(1.0, lambda: bool(task.held))
+    scheduler.take_down()
+    return weakref.ref(scheduler)
+
+
+def test_a_world_that_is_taken_down_is_freed() -> None:
+    """Arrow keeps the file of a writer, and Python does not see that."""
+    world = taken_down()
+    gc.collect()
+    gc.collect()
+    assert world() is None

@@ -100,9 +100,8 @@ class Results:
     @property
     def remark(self) -> str | None:
         """A remark on a run that did not complete; None for a complete run."""
-        ended = str(self.summary.get("ended", "complete"))
-        first = next(iter(ended.splitlines()), "ended in an unknown way")
-        return None if ended == "complete" else f"{self.folder}: {first}"
+        ended = str(self.summary.get("ended", "complete")) or "ended in an unknown way"
+        return None if ended == "complete" else f"{self.folder}: {ended.splitlines()[0]}"
 
     @property
     def events(self) -> list[RunEvent]:

@@ -446,9 +446,11 @@ _NEWER = {"directions", "verdict"}
 
 
 def _expect_possible(summary: Summary) -> None:
-    """Raise ValueError for a mode and counts that no run has."""
+    """Raise ValueError for a mode, an end and counts that no run has."""
     if summary.mode not in MODES:
         raise ValueError(f"mode is {summary.mode!r}; expected {', '.join(MODES)}")
+    if not summary.ended:
+        raise ValueError("ended is empty; expected complete, or why the run did not")
     for name, count, least in (("slots", summary.slots, 0), ("trials", summary.trials, 1)):
         if count < least:  # a run may be interrupted before its first slot
             raise ValueError(f"{name} is {count}; expected {least} or more")

@@ -92,7 +92,11 @@ class ThisProcess(ABC):
 
     @abstractmethod
     def prepare_for_messages(self, largest: int) -> None:
-        """Keep memory for messages of up to `largest` bytes, and let no collection of garbage look at imported modules."""
+        """Keep memory for messages of up to `largest` bytes, and modules."""
+
+    @abstractmethod
+    def keep_modules(self) -> None:
+        """Let no collection of garbage look at imported modules."""
 
     @abstractmethod
     def keep_files_private(self) -> None:
@@ -202,6 +206,10 @@ class RealProcess(ThisProcess):
     def prepare_for_messages(self, largest: int) -> None:
         """Keep memory, and modules: a collection that looks at them holds up packets."""
         keep_for_messages(largest)
+        self.keep_modules()
+
+    def keep_modules(self) -> None:
+        """Nor at anything else that there is."""
         gc.freeze()
 
     def keep_files_private(self) -> None:

@@ -86,7 +86,7 @@ def broken(some: random.Random, message: bytes, *, checked: bool = False, harmle
     kind, _, name = key.partition("/")
     if name == CONTROLLER or (isinstance(fields, dict) and "leaves" in fields and fields["k"] == 0):
         checked = False  # of a receiver that is away from the beginning, no report tells of its belief
-    numbers: frozenset[Any] = _CHECKED.get(kind, frozenset()) if checked else frozenset()
+    numbers: frozenset[object] = _CHECKED.get(kind, frozenset()) if checked else frozenset()
     if name == SENSOR:
         numbers &= _OF_SENSOR
     places = [*_places(fields)]
@@ -127,7 +127,7 @@ def _has_maps(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
 
 
-def _changed(some: random.Random, value: Any, place: _Place, numbers: frozenset[Any], within: _Place = ()) -> Any:
+def _changed(some: random.Random, value: Any, place: _Place, numbers: frozenset[object], within: _Place = ()) -> Any:
     """The same map or list with something wrong at a place; numbers: the fields in which numbers may be wrong."""
     (name, *rest), copy = place, value.copy()
     if rest:
@@ -140,7 +140,7 @@ def _changed(some: random.Random, value: Any, place: _Place, numbers: frozenset[
     return copy
 
 
-def _wrong_value(some: random.Random, value: Any, names: Collection[str], numbers: frozenset[Any]) -> Any:
+def _wrong_value(some: random.Random, value: Any, names: Collection[str], numbers: frozenset[object]) -> Any:
     """Another value of the fields with these names, within each other."""
     others = [*_WRONG]
     if some.random() < 0.8:
@@ -157,7 +157,7 @@ def _wrong_value(some: random.Random, value: Any, names: Collection[str], number
     return some.choice(others)
 
 
-def _wrong_bytes(some: random.Random, value: bytes, names: Collection[str], numbers: frozenset[Any]) -> list[bytes]:
+def _wrong_bytes(some: random.Random, value: bytes, names: Collection[str], numbers: frozenset[object]) -> list[bytes]:
     """Other bytes for those of an array."""
     at = some.randrange(len(value))
     if not numbers.isdisjoint(names) and some.random() < 0.7:
@@ -165,7 +165,8 @@ def _wrong_bytes(some: random.Random, value: bytes, names: Collection[str], numb
             return [value[: at // 8 * 8] + _LARGE + value[at // 8 * 8 + 8 :]]
         if "action" in names:  # what was done with a packet that arrived is the receiver's own affair
             return [value[:at] + bytes([Action.STATE if value[at] == Action.LOST else Action.LOST]) + value[at + 1 :]]
-        return [value[:at] + bytes([value[at] ^ 1 << min(some.randrange(8), some.randrange(8))]) + value[at + 1 :]]
+        bit = min(some.randrange(8), some.randrange(8))  # flags have only the lower ones
+        return [value[:at] + bytes([value[at] ^ 1 << bit]) + value[at + 1 :]]
     if not _SUMS.isdisjoint(names) and some.random() < 0.5:
         return [value[:-8] + _BELOW]
     beyond = [value[:-2] + _BEYOND if len(value) > 1 else b"", b"\xff" * len(value)]

@@ -9,7 +9,6 @@ Source: docs/maintainers/simulated-world.md, tests of wires.
 from __future__ import annotations
 
 import contextlib
-import gc
 import subprocess
 import sys
 import threading
@@ -75,7 +74,6 @@ class CallerWorld:
         self.machine.adopt(self._process)
         self.scheduler.hub = hub = greenlet(self._let_others_go_on)
         with contextlib.ExitStack() as stack:
-            stack.callback(gc.unfreeze)  # the command of a wire keeps what there is
             stack.enter_context(inside(self.world))
             stack.enter_context(self._instead(zenoh, "open", self._open))
             for name in ("FifoChannel", "RingChannel", "Callback"):

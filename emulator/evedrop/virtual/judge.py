@@ -122,9 +122,8 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
     if refused is not None and (status == UsageError.exit_status or not fatal):
         if status != UsageError.exit_status or (refused not in run.said and not fatal):
             yield f"status {status}, although the run cannot begin ({refused}): {complaint}"
-    elif program is not None and not fatal:
-        completes = status == good and case.program is not None and case.program.tolerated
-        if not completes and (status != RunError.exit_status or program not in run.said):
+    elif program is not None and not fatal and not (status == good and _may_complete(case)):
+        if status != RunError.exit_status or program not in run.said:
             yield f"status {status}, although a program is wrong ({program}): {complaint}"
     elif status == good:
         yield from _of_ignored_signals(case, run, {fault: struck[fault] for fault in fatal})
@@ -165,6 +164,11 @@ def _of_blame(
 def _wrong_program(case: SimulatedCase) -> str | None:
     """A text that the run prints because a program of states is wrong; None if none is."""
     return None if case.program is None else case.program.refused
+
+
+def _may_complete(case: SimulatedCase) -> bool:
+    """Whether the run may complete although its program of states is wrong."""
+    return case.program is not None and case.program.tolerated
 
 
 def _is_worse_for_others(fault: Disturbance) -> bool:

@@ -188,6 +188,9 @@ class VirtualProcess(ThisProcess):
     def prepare_for_messages(self, largest: int) -> None:
         """Its memory is the interpreter's."""
 
+    def keep_modules(self) -> None:
+        """They are those of the interpreter, and so would all worlds be kept."""
+
     def keep_files_private(self) -> None:
         """The files of all simulated processes are private."""
 

@@ -147,7 +147,16 @@ class SteerRun(OperatorCommand):
 
 RARE_KINDS: Mapping[str, type[Disturbance]] = {
     kind.kind: kind
-    for kind in (*(BreakMessage, ReadMetrics, RereadMessages, RunByHand, RunWrongly, SteerRun, TakePort, WriteBriefs),)
+    for kind in (
+        BreakMessage,
+        ReadMetrics,
+        RereadMessages,
+        RunByHand,
+        RunWrongly,
+        SteerRun,
+        TakePort,
+        WriteBriefs,
+    )
 }
 _WITH: Mapping[type[Disturbance], Sequence[tuple[type[Disturbance], float | None]]] = {
     BreakMessage: ((PauseRun, 0.5), (ChangeLink, None), (CutConnection, 0.3)),

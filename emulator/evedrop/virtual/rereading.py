@@ -18,10 +18,11 @@ from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import Brief, RecorderPart
 from evedrop.live.protocol.codec import Reader, enclosed, named_in, payload_of
-from evedrop.live.protocol.commands import Bounds, is_process_status, read_command, read_process_status
+from evedrop.live.protocol.commands import Bounds, read_command
 from evedrop.live.protocol.keys import RunKeys, reader_of, writer_of
 from evedrop.live.protocol.notices import EndReport, RefusalNotice
 from evedrop.live.protocol.packets import is_barrier, read_delivery
+from evedrop.live.recorder.direction import status_in
 from evedrop.live.recorder.intake import Intake
 from evedrop.names import LEGITIMATE, RECORDER
 from evedrop.scenario.tables import Scenario
@@ -78,7 +79,7 @@ class RereadMessages(Disturbance):
 
 @final
 class _Departures:
-    """What an `Intake` tells of the receivers that leave, and asks."""
+    """In place of a recorder's `Steering`: remembers which receivers have left."""
 
     def __init__(self) -> None:
         self._left: dict[str, int] = {}
@@ -141,11 +142,7 @@ class _MessageReader:
         for payload in messages:
             message = _reader(payload)
             source = writer_of(message.key)
-            if (refusal := RefusalNotice.read(message, source)) is not None:
-                raise refusal
-            if is_process_status(message):
-                read_process_status(message, scenario.slots)
-            elif EndReport.read(message) is None:
+            if status_in(message, source, scenario.slots) is None and EndReport.read(message) is None:
                 intake.take(source, message, steering)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import sys
 from pathlib import Path
 
@@ -47,7 +46,7 @@ def wire(options: argparse.Namespace) -> int:
     from evedrop.system.world import world
     from evedrop.wire.run import run_wire
 
-    gc.freeze()  # imported modules stay: the collections that new keys cause need not look at them
+    world().process.keep_modules()  # new keys cause collections
     with results_folder(options.out, f"wire-{options.file.stem}") as folder:
         options.out = folder
         speaking = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}

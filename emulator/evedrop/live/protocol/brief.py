@@ -615,7 +615,7 @@ def read_brief(path: Path, role: str | None = None) -> AnyBrief:
     try:
         if content is None:
             raise ValueError(f"it has more than {_MOST_BYTES} bytes")
-        brief = brief_from(json.loads(content.decode("utf-8"), parse_constant=_refuse_constant))
+        brief = brief_from(msgspec.json.decode(content))
     except (ValueError, RecursionError) as error:
         raise BriefError(f"{path} is not a brief of this version ({error}); {WRITE_AGAIN}") from error
     if role is not None and brief.role != role:
@@ -623,10 +623,6 @@ def read_brief(path: Path, role: str | None = None) -> AnyBrief:
             f"{path} is the brief of a {brief.role}; expected one of a {role}: start `evedrop {brief.role}`"
         )
     return brief
-
-
-def _refuse_constant(word: str) -> None:
-    raise ValueError(f"{word} is not a number in JSON")
 
 
 def brief_from(entries: Any) -> AnyBrief:

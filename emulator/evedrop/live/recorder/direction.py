@@ -15,7 +15,7 @@ from evedrop.live.network.launcher_pipe import emit
 from evedrop.live.network.operator import Answer, Order
 from evedrop.live.protocol.brief import Brief, RecorderPart
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.commands import ReportStatus, is_process_status, read_process_status
+from evedrop.live.protocol.commands import ProcessStatus, ReportStatus, is_process_status, read_process_status
 from evedrop.live.protocol.notices import RefusalNotice
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.recorder.conductor import Conductor
@@ -25,6 +25,17 @@ from evedrop.live.recorder.steering import Steering, status_of
 from evedrop.names import CONTROLLER, OPERATOR, RELAY, ROUTER
 from evedrop.scenario.progress_events import Started
 from evedrop.system.threads import Queue
+
+
+def status_in(message: Reader, source: str, slots: int) -> ProcessStatus | None:
+    """The status that a process reports; None for any other message. slots: of the run.
+
+    Raises the refusal of which a process tells, or MalformedMessage.
+    """
+    refusal = RefusalNotice.read(message, source)
+    if refusal is not None:
+        raise refusal
+    return read_process_status(message, slots) if is_process_status(message) else None
 
 
 @final
@@ -63,11 +74,9 @@ class Direction:
             return
         source, payload = item
         message = Reader(self._conductor.keys[source], payload)
-        refusal = RefusalNotice.read(message, source)
-        if refusal is not None:
-            raise refusal
-        if is_process_status(message):
-            self._stall.add_answer(source, read_process_status(message, self._run.score.scenario.slots))
+        status = status_in(message, source, self._run.score.scenario.slots)
+        if status is not None:
+            self._stall.add_answer(source, status)
             return
         before = self._run.settled
         self._run.take(source, message, self._steering)
