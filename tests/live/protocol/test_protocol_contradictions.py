@@ -211,7 +211,7 @@ UNUSABLE: dict[str, list[tuple[Callable[[dict[str, Any]], None], str]]] = {
         (other_scheme, "part.scheme.colour is not a parameter of the scheme"),
     ],
     "microgrid/controller": [
-        (set_in("part.assignment.period", 0), "period is 0 and slot_seconds "),
+        (set_in("part.assignment.period", 0), "period is 0, expected 1 to 1000000"),
         (set_in("part.assignment.rate_limits", []), "rate_limits has the shape (0,), expected "),
         (set_in("part.assignment.process.Q", [[1.0]]), "its process is not that of the model"),
         (other_controller, "part.strategy is pid, expected one of "),
