@@ -121,7 +121,7 @@ class WireJudge:
             rows = {number: [row for row in some if not _has_no_name(row)] for number, some in rows.items()}
         flat = [row for some in rows.values() for row in some]
         yield from self._wrong_fates(flat)
-        yield from self._too_early(rows)
+        yield from self._too_early(flat)
         if not self._disk:
             yield from wrong_numbers(_numbered(rows))
         if JOINED not in self._case.further:
@@ -216,13 +216,16 @@ class WireJudge:
             elif name not in changed:
                 yield from self._wrong_stream(link, kind, key, of_stream)
 
-    def _too_early(self, rows: Mapping[int, list[Row]]) -> Iterator[str]:
+    def _too_early(self, rows: Iterable[Row]) -> Iterator[str]:
         """No message is delivered whose delay is longer than the wire was there."""
-        for start, end in enumerate(self._course.ended, 1):
-            some = [row for row in rows[start] if row["fate"] == "delivered"]
-            early = [row for row in some if row["time"] + row["delay"] - EPOCH > end + _ROUNDING]
-            if early:
-                yield f"start {start} ended before {len(early)} messages of {early[0]['key']} that the journal calls delivered"
+        early = []
+        for row in rows:
+            heard = row["time"] - EPOCH
+            end = next((end for end in self._course.ended if end + _ROUNDING >= heard), 0.0)
+            if row["fate"] == "delivered" and heard + row["delay"] > end + _ROUNDING:
+                early.append(row)
+        if early:
+            yield f"the wire ended before {len(early)} messages of {early[0]['key']} that the journal calls delivered"
 
     def _wrong_stream(self, link: WireLink, kind: str, key: str, rows: Mapping[int, Row]) -> Iterator[str]:
         fates = fates_by_model(link, self._plan.seed, kind, key, max(rows) + 1)

@@ -32,7 +32,7 @@ def guard_of(folder: Path) -> subprocess.Popen[bytes]:
 
 
 def dismiss(guard: subprocess.Popen[bytes]) -> None:
-    """End the shell, which finds nothing to remove."""
+    """End the shell, which removes what is left of the folder."""
     assert guard.stdin is not None  # noqa: S101 - it was started with a pipe
     guard.stdin.close()
     guard.send_signal(signal.SIGCONT)

@@ -84,7 +84,10 @@ class ThisProcess(ABC):
 
     @abstractmethod
     def removed_with_it(self, folder: Path) -> AbstractContextManager[None]:
-        """Have a folder, which is made in the block, removed should this process die, however it dies. Raises OSError."""
+        """Have a folder, which is made in the block, removed after it, or should this process die, however it dies.
+
+        Raises OSError.
+        """
 
     @abstractmethod
     def switch_threads_soon(self) -> None:

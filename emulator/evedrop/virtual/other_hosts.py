@@ -222,7 +222,7 @@ class VirtualSsh:
         self.answers = cast("IO[bytes]", PipeFile(answers))
         self._to_launcher = answers
         [count] = re.findall(r"ServerAliveCountMax=(\d+)", " ".join(command))
-        self._most_silent = int(count) * _ALIVE_SECONDS
+        self._most_unanswered = int(count)
         name = part_on(SSH, host.name)
         launcher = machine.current
         self._process = VirtualProcess(scheduler, scheduler.process(name), None, self._orders, self._to_launcher)
@@ -263,13 +263,13 @@ class VirtualSsh:
 
     def _arriving(self) -> Iterator[bytes | int | str]:
         """What arrives, until the server has not answered for too long."""
-        silent = 0.0
-        while silent < self._most_silent:
+        unanswered = 0
+        while unanswered <= self._most_unanswered:  # then the next question would be due, and the real one gives up
             try:
                 yield self._host.connection.answers.receive(_ALIVE_SECONDS)
-                silent = 0.0
+                unanswered = 0
             except Empty:
-                silent = 0.0 if self._host.responds else silent + _ALIVE_SECONDS
+                unanswered = 0 if self._host.responds else unanswered + 1
 
     # What the launcher asks
 

@@ -168,7 +168,7 @@ class VirtualProcess(ThisProcess):
 
     @contextmanager
     def removed_with_it(self, folder: Path) -> Iterator[None]:
-        """Have a folder removed a moment after its death."""
+        """Have a folder removed a moment after its death, and what is left of it after the block."""
 
         def remove() -> None:
             self._scheduler.at(
@@ -181,6 +181,7 @@ class VirtualProcess(ThisProcess):
         finally:
             if self.task.alive:
                 self.task.held.remove(remove)
+                shutil.rmtree(folder, ignore_errors=True)
 
     def switch_threads_soon(self) -> None:
         """Its threads take turns by the seed."""

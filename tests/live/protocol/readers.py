@@ -30,6 +30,14 @@ K = 4
 """The slot that is due everywhere."""
 
 
+def delays_of(slots: LinkSlots, window: int) -> np.ndarray:
+    """Delays that packets with these fates may have, as a journal has them: those that have no fate yet are one slot late."""
+    late = slots.lost[:, REASONS.index("late")].sum()
+    under_way = slots.delivered.size - slots.delivered.sum() - slots.lost.sum() - slots.unsent.sum()
+    within = [under_way, *[0] * (window - 1)] if window else []
+    return np.array([slots.delivered.sum(), *within, late], np.uint32)
+
+
 def _on(path: str, read: Callable[[Reader], Any]) -> tuple[str, Callable[[bytes], Any]]:
     key = f"evedrop/r1/{path}"
     return key, lambda payload: read(Reader(key, payload))
@@ -76,7 +84,7 @@ def _accounts() -> dict[str, Account]:
     def account(window: int) -> Account:
         late = np.zeros((2, TRIALS), np.uint16) if window else None
         slots = LinkSlots(K, delivered, lost, unsent, late)
-        return Account(slots, bursts, np.array([6, *[0] * (window + 1)], np.uint32))
+        return Account(slots, bursts, delays_of(slots, window))
 
     return {"legitimate": account(0), "eve": account(WINDOW)}
 

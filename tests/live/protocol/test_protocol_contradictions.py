@@ -44,6 +44,17 @@ def many_delays(fields: dict[str, Any]) -> None:
     fields["links"]["eve"]["delays"] = u4(6, 1, 0, 0)
 
 
+def no_delay(fields: dict[str, Any]) -> None:
+    """A packet that is under way, and has no delay."""
+    fields["links"]["eve"]["delivered"] = bytes([7, 6])
+
+
+def too_late(fields: dict[str, Any]) -> None:
+    """A delay beyond the window of a packet that was not lost."""
+    fields["links"]["eve"]["delivered"] = bytes([7, 6])
+    fields["links"]["eve"]["delays"] = u4(5, 0, 0, 1)
+
+
 def negative_seconds(fields: dict[str, Any]) -> None:
     """A decision that took less than no time."""
     fields["seconds"] = np.array([-1.0]).tobytes()
@@ -53,7 +64,12 @@ CONTRADICTIONS = {
     "delivery": (late_packets, "more than 6 entries in late of slot 4; expected at most two for each slot from 2 to 4"),
     "report": (more_used, "more in late_used than in late; expected at most as many late packets used as arrived"),
     "journal": (two_fates, "fates of legitimate's packets of slot 4; expected 3 fates"),
-    "journal of delays": (many_delays, "more delays than packets of eve; expected at most 6"),
+    "journal of many delays": (
+        many_delays,
+        "eve's packets for [6, 1, 0] in their slots, within the window and after it",
+    ),
+    "journal without a delay": (no_delay, "eve's packets for [6, 0, 0] in their slots, within the window and after it"),
+    "journal with a long delay": (too_late, "after it; expected those of [5, 1, 0]"),
     "decisions": (negative_seconds, "seconds of -1; expected numbers of at least 0"),
 }
 

@@ -29,7 +29,7 @@ from evedrop.model.slot.link_core import Arrivals, Late
 from evedrop.model.slot.records import LinkSlots, PacketSlots, ReceiverSlots, SensorSlots
 from tests.builders import mirrored
 from tests.examples import examples
-from tests.live.protocol.readers import EXAMPLES, READERS, fields_of
+from tests.live.protocol.readers import EXAMPLES, READERS, delays_of, fields_of
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
 SLOTS = st.integers(0, 2**40)
@@ -202,10 +202,9 @@ def account_of(delivered: np.ndarray, window: int = 0, **changes: Any) -> Accoun
     count, trials = delivered.shape
     lost = np.zeros((count, len(REASONS)), np.uint32)
     lost[:, 0] = trials - delivered.sum(axis=1)
-    bursts, delays = np.zeros(COUNTED_BURSTS, np.uint32), np.zeros(window + 2, np.uint32)
     late = np.zeros((count, trials), np.uint16) if window else None
     slots = replace(LinkSlots(0, delivered, lost, np.zeros(count, np.uint32), late), **changes)
-    return Account(slots, bursts, delays)
+    return Account(slots, np.zeros(COUNTED_BURSTS, np.uint32), delays_of(slots, window))
 
 
 @settings(deadline=None)
@@ -221,11 +220,9 @@ def test_journal(data: st.DataObject, k: int, trials: int, count: int) -> None:
         lost = np.zeros((count, len(REASONS)), np.uint32)
         lost[:, data.draw(st.integers(0, len(REASONS) - 1))] = most - unsent
         late = data.draw(arrays(np.uint16, (count, trials), elements=st.integers(0, window))) if window else None
-        links[name] = Account(
-            LinkSlots(k, delivered, lost, unsent, late),
-            data.draw(arrays(np.uint32, 64, elements=st.integers(0, count * trials))),
-            np.array([delivered.sum(), *[0] * (window + 1)], np.uint32),
-        )
+        slots = LinkSlots(k, delivered, lost, unsent, late)
+        bursts = data.draw(arrays(np.uint32, 64, elements=st.integers(0, count * trials)))
+        links[name] = Account(slots, bursts, delays_of(slots, window))
     raw = telemetry.Journal(k, count, links).pack()
     journal = telemetry.read_journal(Reader("j", raw), k, windows, extent(1, trials))
     assert (journal.first, journal.count, set(journal.links)) == (k, count, set(links))
@@ -373,8 +370,9 @@ def test_a_journal_without_a_receiver_is_refused() -> None:
 @pytest.mark.parametrize("reasons", [0, 1, 7, 9])
 def test_a_journal_with_other_reasons_is_refused(reasons: int) -> None:
     """A journal counts for every reason of the links and for no other: columns of messages must fit together."""
-    lost = np.zeros((1, reasons), np.uint32)
-    raw = telemetry.Journal(0, 1, dict.fromkeys("ab", account_of(np.ones((1, 3), bool), lost=lost))).pack()
+    account = account_of(np.ones((1, 3), bool))
+    wrong = replace(account, slots=replace(account.slots, lost=np.zeros((1, reasons), np.uint32)))
+    raw = telemetry.Journal(0, 1, dict.fromkeys("ab", wrong)).pack()
     with pytest.raises(
         MalformedMessage, match=rf"lost of {4 * reasons} bytes; expected 32 bytes, <u4 of shape \(1, 8\)"
     ):

@@ -22,6 +22,7 @@ from evedrop.model.slot.link import COUNTED_BURSTS, Account
 from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
 from evedrop.score.slots import Slots
 from tests.builders import mirrored
+from tests.live.protocol.readers import delays_of
 
 SLOTS, N, TRIALS, RECORDED = 300, 2, 5, 2
 EXTENT = Extent(SLOTS, 300, N, TRIALS, RECORDED, inputs=1, measures=True, monitored=True)
@@ -62,7 +63,7 @@ def report_of(window: int) -> Report:
     )
 
 
-def account_of(window: int) -> Account:
+def link_of(window: int) -> LinkSlots:
     """What the router journals of all slots of a link; a different number of packets is lost for each reason."""
     delivered = RNG.random((SLOTS, TRIALS)) < 0.5
     unsent = (RNG.random(SLOTS) < 0.5).astype(np.uint32) * (~delivered).any(axis=1)
@@ -70,12 +71,11 @@ def account_of(window: int) -> Account:
     kind = RNG.integers(0, len(REASONS), SLOTS)
     lost = np.where(np.arange(len(REASONS)) == kind[:, None], missing[:, None], 0).astype(np.uint32)
     late = RNG.integers(0, window + 1, (SLOTS, TRIALS)).astype(np.uint16) if window else None
-    nothing = np.zeros(COUNTED_BURSTS, np.uint32), np.zeros(window + 2, np.uint32)
-    return Account(LinkSlots(0, delivered, lost, unsent.astype(np.uint32), late), *nothing)
+    return LinkSlots(0, delivered, lost, unsent.astype(np.uint32), late)
 
 
 REPORTS = {name: report_of(window) for name, window in WINDOWS.items()}
-ACCOUNTS = {name: account_of(window) for name, window in WINDOWS.items()}
+LINKS = {name: link_of(window) for name, window in WINDOWS.items()}
 
 
 def truth(start: int, stop: int) -> bytes:
@@ -94,7 +94,9 @@ def report(name: str, start: int, stop: int) -> bytes:
 
 def journal(start: int, stop: int) -> bytes:
     """The router's journal of some slots."""
-    links = {name: replace(whole, slots=whole.slots.rows(slice(start, stop))) for name, whole in ACCOUNTS.items()}
+    slots = {name: link.rows(slice(start, stop)) for name, link in LINKS.items()}
+    bursts = np.zeros(COUNTED_BURSTS, np.uint32)
+    links = {name: Account(link, bursts, delays_of(link, WINDOWS[name])) for name, link in slots.items()}
     return Journal(start, stop - start, links).pack()
 
 
@@ -161,7 +163,7 @@ def test_every_number_is_joined_in_its_place(messages: list[tuple[str, int, int]
     expect_equal(SensorSlots.joined([slots.sensor for slots in joined]), TRUTH)
     for name in WINDOWS:
         expect_equal(ReceiverSlots.joined([slots.receivers[name] for slots in joined]), REPORTS[name].slots)
-        expect_equal(LinkSlots.joined([slots.links[name] for slots in joined]), ACCOUNTS[name].slots)
+        expect_equal(LinkSlots.joined([slots.links[name] for slots in joined]), LINKS[name])
 
 
 def expect_equal(record: Record, expected: Record) -> None:

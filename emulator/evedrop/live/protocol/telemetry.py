@@ -22,6 +22,8 @@ from evedrop.model.receiver import Action, Belief, Flags, asymmetry, packed_flag
 from evedrop.model.slot.link import COUNTED_BURSTS, Account
 from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
 
+_LATE = REASONS.index("late")
+
 
 @dataclass(frozen=True)
 class Extent:
@@ -254,7 +256,10 @@ def read_journal(message: Reader, first: int, windows: Mapping[str, int], extent
 
 
 def _check_account(message: Reader, name: str, link: Account, window: int) -> None:
-    """Check that every packet has one fate: delivered in its slot, lost, not sent, or, if packets may be late, under way."""
+    """Check that every packet has one fate: delivered in its slot, lost, not sent, or, if packets may be late, under way.
+
+    Its delay must be one that this fate can have.
+    """
     slots = link.slots
     trials = slots.delivered.shape[1]
     fates = np.count_nonzero(slots.delivered, axis=1) + slots.lost.sum(axis=1, dtype=np.int64) + slots.unsent
@@ -264,8 +269,14 @@ def _check_account(message: Reader, name: str, link: Account, window: int) -> No
         raise message.malformed(
             f"{int(fates[row])} fates of {name}'s packets of slot {message.integer('k') + row}", f"{trials} fates"
         )
-    if int(link.delays.sum(dtype=np.int64)) > slots.delivered.size:
-        raise message.malformed(f"more delays than packets of {name}", f"at most {slots.delivered.size}")
+    in_time, late = int(np.count_nonzero(slots.delivered)), int(slots.lost[:, _LATE].sum(dtype=np.int64))
+    expected = (in_time, slots.delivered.size - int(fates.sum()), late)
+    delays = (int(link.delays[0]), int(link.delays[1:-1].sum(dtype=np.int64)), int(link.delays[-1]))
+    if delays != expected:
+        raise message.malformed(
+            f"delays of {name}'s packets for {shown(list(delays))} in their slots, within the window and after it",
+            f"those of {shown(list(expected))}",
+        )
 
 
 def known(name: str, k: int, x: Floats) -> bytes:
