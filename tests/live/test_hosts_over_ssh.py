@@ -347,8 +347,21 @@ def test_what_ssh_is_given_never_asks_and_has_no_secret(tmp_path: Path) -> None:
     words = ssh_command(plan.hosts["beta"], plan.ssh_config, 30.0)
     assert words[0] == "ssh"
     assert words[words.index("BatchMode=yes") - 1] == "-o"
-    assert "ServerAliveCountMax=8" in words
     assert words[-7:] == ["-l", "lab", "-p", "2222", "--", "beta.lan", "cd '/a b' && exec '/opt/my env/evedrop' host"]
+
+
+@pytest.mark.parametrize("longest_outage", [1.0, 3.0, 5.0, 7.5, 11.0, 30.0, 100.0])
+def test_ssh_gives_up_later_than_a_run_tolerates_and_hardly_before_its_processes_are_lost(
+    longest_outage: float, tmp_path: Path
+) -> None:
+    """It asks every second, and gives up when one more question is due than it may leave unanswered."""
+    (tmp_path / "hosts.toml").write_text(NO_CLASSES)
+    table = next(iter(load_hosts(tmp_path / "hosts.toml", load("restart")).hosts.values()))
+    words = ssh_command(table, None, longest_outage)
+    options = dict(word.split("=") for word in words if word.startswith("ServerAlive"))
+    interval, most = int(options["ServerAliveInterval"]), int(options["ServerAliveCountMax"])
+    assert most * interval >= 0.8 * longest_outage
+    assert (most + 1) * interval <= max(longest_outage, 0.8 * longest_outage + 2.0)
 
 
 @pytest.mark.long

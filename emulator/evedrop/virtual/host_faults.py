@@ -54,6 +54,10 @@ class FreezeSsh(HostDisturbance):
     kind, share = "freeze", 3
     lasts = True
 
+    def survived(self, longest_outage: float) -> bool:
+        """As docs/hosts.md says."""
+        return self.seconds is not None and self.seconds < 0.8 * longest_outage
+
     def disturb(self, world: SimulatedWorld, host: OtherHost) -> None:
         """Let nothing through."""
         del world

@@ -5,7 +5,6 @@ Source: docs/maintainers/simulated-world.md.
 
 from __future__ import annotations
 
-import re
 import signal
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,8 +26,6 @@ from evedrop.virtual.world import TEMPORARY
 from evedrop.virtual.zenoh import VirtualZenoh
 
 _CONNECT_SECONDS, _DELAY_SECONDS = 0.2, 1e-3
-_ALIVE_SECONDS = 3.0
-"""How often ssh asks whether the server is still there."""
 _FAILED = 255
 """The status of an ssh whose connection failed."""
 _MOST_BYTES = 1 << 15
@@ -221,8 +218,8 @@ class VirtualSsh:
         self._orders, answers = Pipe(scheduler), Pipe(scheduler)
         self.answers = cast("IO[bytes]", PipeFile(answers))
         self._to_launcher = answers
-        [count] = re.findall(r"ServerAliveCountMax=(\d+)", " ".join(command))
-        self._most_unanswered = int(count)
+        options = dict(word.split("=") for word in command if word.startswith("ServerAlive"))
+        self._asks_after, self._most_unanswered = (int(options[f"ServerAlive{of}"]) for of in ("Interval", "CountMax"))
         name = part_on(SSH, host.name)
         launcher = machine.current
         self._process = VirtualProcess(scheduler, scheduler.process(name), None, self._orders, self._to_launcher)
@@ -266,7 +263,7 @@ class VirtualSsh:
         unanswered = 0
         while unanswered <= self._most_unanswered:  # then the next question would be due, and the real one gives up
             try:
-                yield self._host.connection.answers.receive(_ALIVE_SECONDS)
+                yield self._host.connection.answers.receive(self._asks_after)
                 unanswered = 0
             except Empty:
                 unanswered = 0 if self._host.responds else unanswered + 1
