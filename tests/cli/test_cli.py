@@ -64,6 +64,7 @@ def test_a_run_prints_its_results_and_passes(evedrop: Evedrop) -> None:
     }  # fmt: skip
 
 
+@pytest.mark.thorough
 def test_the_closing_report_can_be_printed_again(evedrop: Evedrop) -> None:
     """`view --table` of a live run and of a study prints what they ended with; a broken summary is refused."""
     for words in (("run", "--view", "off"), ("montecarlo", "--trials", "12")):
@@ -143,6 +144,7 @@ def test_without_permission_nothing_is_started(evedrop: Evedrop) -> None:
     refused(evedrop("run", "eavesdroppers", *QUICK, "--out", f"{where}/x"), f"{where}/x cannot be written (")
 
 
+@pytest.mark.thorough
 def test_a_folder_that_may_only_be_read_can_be_worked_in(evedrop: Evedrop) -> None:
     """The current folder is written to only where no --out is given, and then the refusal is one line."""
     where = unwritable(evedrop.folder)

@@ -128,6 +128,7 @@ def test_a_trace_that_cannot_be_kept_is_refused(evedrop: Evedrop, wanted: str, g
     golden("design", done.err)
 
 
+@pytest.mark.thorough
 def test_the_least_choice_is_in_the_json_if_asked_for(evedrop: Evedrop) -> None:
     """`minimum` is given with bound and trace; at that μ_d the trace is Ω."""
     least = designed(evedrop, "numerical", "--max-trace", "0.01")["legitimate"]["minimum"]

@@ -90,6 +90,7 @@ def test_every_command_that_prints_a_table_writes_it() -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.thorough
 def test_tables_are_written(name: str, evedrop: Evedrop) -> None:
     """The rows on the terminal are in the file, numbers can be read, and LaTeX has nothing that it would stumble over."""
     if name == "view":

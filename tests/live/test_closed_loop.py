@@ -467,6 +467,7 @@ def test_other_modes_say_what_they_make_of_a_loop(tmp_path: Path) -> None:
     assert with_loop.summary["controller"] is None
 
 
+@pytest.mark.thorough
 def test_workers_change_nothing(tmp_path: Path) -> None:
     """Trials of several blocks, by one worker and by two."""
     changes = {"slots": 20, "trials": 1100, "eavesdroppers": {}}

@@ -101,6 +101,7 @@ def test_decisions_are_those_of_all_shards(ran: Ran) -> None:
     assert two["longest_solve_seconds"] >= two["mean_solve_seconds"] > 0.0
 
 
+@pytest.mark.thorough
 def test_the_folder_is_that_of_a_loop(ran: Ran) -> None:
     """With the disturbances that its scenario names, which runs again; and the logs of both controllers."""
     folder = ran(2).folder

@@ -146,6 +146,7 @@ def test_digests_are_those_of_memory(ran: Ran, shards: int) -> None:
     assert None not in digests.values()
 
 
+@pytest.mark.thorough
 def test_nothing_is_left_of_the_shards_but_their_logs(ran: Ran) -> None:
     """One folder, as of any run, whose scenario says that it was in shards and runs again."""
     folder = ran(2).folder
@@ -372,6 +373,7 @@ def test_a_secret_that_is_gone_leaves_no_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.thorough
 def test_shards_that_cannot_be_made_one_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that is full at the end costs nothing: each shard's results are where the message says."""
 

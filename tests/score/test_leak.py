@@ -120,6 +120,7 @@ def test_where_it_is_not_known(tmp_path: Path) -> None:
     assert covariances.summary["secrecy"]["smart"]["leak"] is None
 
 
+@pytest.mark.thorough
 def test_a_comparison_has_the_leak_of_schemes_and_pairs(tmp_path: Path) -> None:
     """Per packet for a scheme, whatever the link, and per slot for a pair, as in the summary; a dash where it is not known."""
     schemes = ["plain", "cipher", "innovation", "twin-track"]

@@ -213,6 +213,7 @@ def test_a_damaged_part_is_not_used(damage: Callable[[Path], None], cut: Path, e
     assert files(cut) == whole(STUDY)
 
 
+@pytest.mark.thorough
 def test_a_part_of_another_study_is_not_used(cut: Path, evedrop: Evedrop, whole: Whole) -> None:
     """A file with the right name from a study with another seed is as good as damaged."""
     other = evedrop.folder / "other/run"

@@ -84,6 +84,7 @@ def test_the_same_case_shrinks_to_the_same_case() -> None:
     assert shrink(large(), [MISS], killed_after_five) == shrink(large(), [MISS], killed_after_five)
 
 
+@pytest.mark.thorough
 def test_another_broken_promise_does_not_count() -> None:
     """A smaller case that fails in another way explains nothing."""
     shrunk = shrink(large(), [MISS], lambda case: [MISS] if case.faults == large().faults else ["sensor is left"])
