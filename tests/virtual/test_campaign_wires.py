@@ -19,6 +19,7 @@ from evedrop.virtual import notes
 from evedrop.virtual.cases import case_of
 from evedrop.virtual.faults import CutConnection, CutPower, FillDisk, KillProcess, StopProcess
 from evedrop.virtual.run import SimulatedRun
+from evedrop.virtual.world import EPOCH
 from evedrop.wire.file import wire_of
 from evedrop.wire.liveliness import LivelinessRelay
 from evedrop.wire.publications import _Way
@@ -246,6 +247,19 @@ def test_a_wire_says_what_happens_to_it(what: str, words: str) -> None:
     played = replace(PLAIN, starts=1, further=(what,)).play()
     assert played.misses == ()
     assert words in played.run.said
+
+
+def test_no_message_is_delivered_after_the_wire_has_ended() -> None:
+    """The wire ran until 2 s, and again until 5 s; a start in between was refused, and has no number in the journal."""
+    judge = WireJudge(PLAIN, wire_of(PLAIN.tables), Course(ended=[2.0, 3.0, 5.0]), SimulatedRun(Path()), {})
+
+    def row(heard: float, delay: float, fate: str = "delivered") -> dict[str, Any]:
+        return {"key": "scan", "time": EPOCH + heard, "delay": delay, "fate": fate}
+
+    in_time = [row(1.5, 0.4), row(3.5, 1.4), row(1.9, 0.4, "held up")]
+    assert [*judge._too_early(in_time)] == []
+    (miss,) = judge._too_early([*in_time, row(1.9, 0.4), row(4.9, 0.2), row(5.5, 0.0)])
+    assert "ended before 3 messages of scan" in miss
 
 
 @pytest.mark.campaign

@@ -67,6 +67,23 @@ def test_a_run_ends_as_it_must(fault: Disturbance, status: int, said: str) -> No
     assert (run.status, said in run.said) == (status, True), run.said
 
 
+SHORT = Scenario({**SCENARIO.as_tables(), "longest_outage": 3.0})
+
+
+@pytest.mark.parametrize("moment", range(RUNS, RUNS + 60, 10))
+def test_a_short_silence_of_a_host_is_tolerated_whenever_it_begins(moment: int) -> None:
+    """A little less than four fifths of the longest outage, between any two questions of ssh."""
+    assert played(host_faults.FreezeSsh("connection of host beta", moment, 2.39), scenario=SHORT).run.status == 0
+
+
+def test_ssh_gives_up_on_a_host_that_stays_silent() -> None:
+    """When the question after the last one that may be without an answer is due."""
+    fault = host_faults.FreezeSsh("connection of host beta", RUNS)
+    silent = played(fault, scenario=SHORT)
+    assert "server beta not responding" in silent.run.said
+    assert 3.0 < silent.run.ends["ssh of host beta"][0] - silent.struck[fault] <= 4.0
+
+
 def test_a_host_that_hears_nothing_from_the_beginning_ends() -> None:
     """The connection seems open, and not even the first heartbeat comes."""
     run = played(host_faults.FreezeSsh("connection of host beta", 6), hosts=DrawnHosts(HOSTS.hosts[1:])).run

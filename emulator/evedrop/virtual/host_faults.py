@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, final
 
+from evedrop.live.launch.other_hosts import TOLERATED
 from evedrop.virtual.disk import DiskFault
 from evedrop.virtual.disturbance import ROUTERS, Disturbance
 from evedrop.virtual.host_parts import CONNECTION, HOST_DISK, MACHINE, host_of
@@ -55,8 +56,8 @@ class FreezeSsh(HostDisturbance):
     lasts = True
 
     def survived(self, longest_outage: float) -> bool:
-        """As docs/hosts.md says."""
-        return self.seconds is not None and self.seconds < 0.8 * longest_outage
+        """Whether it is short enough for ssh."""
+        return self.seconds is not None and self.seconds < TOLERATED * longest_outage
 
     def disturb(self, world: SimulatedWorld, host: OtherHost) -> None:
         """Let nothing through."""

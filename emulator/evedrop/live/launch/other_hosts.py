@@ -157,10 +157,11 @@ _SEND_SECONDS = 10.0  # for ssh to take some bytes; a suspended one takes none
 _POLL_SECONDS = 0.05
 _MOST_BYTES = 2**16
 _ALIVE_SECONDS = 1
-_TOLERATED = 0.8  # of the longest outage: a shorter silence of a host never ends a run
 _BEAT_SECONDS = 30.0
 SILENCE_SECONDS = 600.0
 """After which a host considers a silent launcher gone; a user may suspend it for a while."""
+TOLERATED = 0.8
+"""The fraction of the longest outage for which a host may be cut off: a run goes on."""
 _OPTIONS = (
     "-T",
     *("-o", "BatchMode=yes"),  # never ask for a password or a key
@@ -380,10 +381,10 @@ def ssh_words(table: HostTable) -> list[str]:
 def ssh_command(table: HostTable, config: Path | None, longest_outage: float) -> list[str]:
     """The command that starts Evedrop's program on a host; nothing in it is secret.
 
-    longest_outage: as for `SshHost`. ssh asks a silent host again and again, and gives up when one more question is due than may
-    be without an answer: somewhat before the processes there count as lost, so that the host is named.
+    longest_outage: as for `SshHost`. ssh asks a silent host every second. It gives up when the next question is due after too
+    many without an answer: soon after what is tolerated, and before the processes there count as lost, so that it is named.
     """
-    alive = ["-o", f"ServerAliveCountMax={max(1, math.ceil(_TOLERATED * longest_outage / _ALIVE_SECONDS))}"]
+    alive = ["-o", f"ServerAliveCountMax={max(1, math.ceil(TOLERATED * longest_outage / _ALIVE_SECONDS))}"]
     given = [] if config is None else ["-F", str(config)]
     folder = "" if table.folder is None else f"cd {shlex.quote(table.folder)} && "
     return ["ssh", *given, *_OPTIONS, *alive, *ssh_words(table), f"{folder}exec {shlex.join([*table.command, 'host'])}"]

@@ -262,20 +262,21 @@ def _check_account(message: Reader, name: str, link: Account, window: int) -> No
     """
     slots = link.slots
     trials = slots.delivered.shape[1]
-    fates = np.count_nonzero(slots.delivered, axis=1) + slots.lost.sum(axis=1, dtype=np.int64) + slots.unsent
+    delivered, late = slots.delivered.sum(axis=1), slots.lost[:, _LATE].tolist()
+    fates = delivered + slots.lost.sum(axis=1, dtype=np.int64) + slots.unsent
     wrong = (fates > trials) if window else (fates != trials)
     if wrong.any():
         row = int(np.argmax(wrong))
         raise message.malformed(
             f"{int(fates[row])} fates of {name}'s packets of slot {message.integer('k') + row}", f"{trials} fates"
         )
-    in_time, late = int(np.count_nonzero(slots.delivered)), int(slots.lost[:, _LATE].sum(dtype=np.int64))
-    expected = (in_time, slots.delivered.size - int(fates.sum()), late)
-    delays = (int(link.delays[0]), int(link.delays[1:-1].sum(dtype=np.int64)), int(link.delays[-1]))
+    in_time, *within, after = link.delays.tolist()
+    delays = [in_time, sum(within), after]
+    expected = [sum(delivered.tolist()), slots.delivered.size - sum(fates.tolist()), sum(late)]
     if delays != expected:
         raise message.malformed(
-            f"delays of {name}'s packets for {shown(list(delays))} in their slots, within the window and after it",
-            f"those of {shown(list(expected))}",
+            f"delays of {name}'s packets for {delays} in their slots, within the window and after it",
+            f"those of {expected}",
         )
 
 
