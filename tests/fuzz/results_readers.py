@@ -14,6 +14,7 @@ import numpy as np
 
 from evedrop.errors import EvedropError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network.control_file import Control, read_controls
 from evedrop.live.protocol.brief import read_brief
 from evedrop.results.diff import difference
@@ -115,7 +116,9 @@ def _briefs() -> list[bytes]:
     briefs = []
     for name in ("eavesdroppers", "acknowledged", "microgrid", "restart"):
         scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": []})
-        for brief in briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False)).values():
+        for brief in briefs_of(
+            scenario, endpoints_at("tcp/127.0.0.1:1"), RecorderTask(Path("nowhere"), False)
+        ).values():
             briefs.append(json.dumps({**json.loads(brief.text), "run": "r00000000", "password": "p"}).encode())
     return briefs
 

@@ -15,6 +15,7 @@ from typing import Any, cast
 import pytest
 
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, RouterPart, SensorPart
 from evedrop.live.protocol.codec import Reader
@@ -98,7 +99,7 @@ class Run:
     """All processes but the recorder, each in a thread of its own; the test is the recorder and conductor."""
 
     def __init__(self, of: Scenario, flow: Flow, holds: tuple[int, ...] = ()) -> None:
-        made = briefs_of(of, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
+        made = briefs_of(of, endpoints_at("tcp/127.0.0.1:1"), RecorderTask(Path("nowhere"), False))
         self.briefs: dict[str, AnyBrief] = {name: replace(brief, flow=flow, run="r") for name, brief in made.items()}
         sensor = part_of(self.briefs["sensor"], SensorPart)
         holding = tuple(sorted({*sensor.holds, *holds}))

@@ -15,6 +15,7 @@ from evedrop import montecarlo, run
 from evedrop.cli.api import design, design_schedule
 from evedrop.errors import BriefError, ScenarioError, UsageError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import read_brief
 from evedrop.scenario.loading import checked
 from evedrop.scenario.theory import expectations_of
@@ -114,7 +115,9 @@ def test_the_design_of_one_probability_refuses_a_list() -> None:
 @pytest.mark.parametrize("wrong", [[0.5] * 7, [0.5] * 7 + [1.5], 0.5])
 def test_a_brief_with_other_numbers_is_refused(wrong: object, tmp_path: Path) -> None:
     """A process refuses a list that is not one probability for each slot."""
-    made = briefs_of(checked(tables_of(), "it"), "tcp/127.0.0.1:1", RecorderTask(tmp_path / "results", False))["smart"]
+    made = briefs_of(
+        checked(tables_of(), "it"), endpoints_at("tcp/127.0.0.1:1"), RecorderTask(tmp_path / "results", False)
+    )["smart"]
     path = made.write(tmp_path)
     assert read_brief(path).model.state_probabilities == tuple(MU_D)
     table = json.loads(path.read_text())

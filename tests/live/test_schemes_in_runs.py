@@ -11,6 +11,7 @@ import pytest
 from evedrop import montecarlo, run
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import RouterPart, SensorPart
 from evedrop.model.acknowledgements import OVERHEARING
 from evedrop.model.detection import Chart
@@ -118,7 +119,7 @@ def test_live_and_memory_are_the_same_bits(scheme: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("scheme", RUNS)
 def test_who_is_given_what(scheme: str) -> None:
     """Only the sensor's brief has what only it needs, and the leaks' states; only the router's has the acknowledgements' link."""
-    briefs = briefs_of(running(scheme), "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
+    briefs = briefs_of(running(scheme), endpoints_at("tcp/127.0.0.1:1"), RecorderTask(Path("nowhere"), False))
     scenario = running(scheme)
     kind = scheme_of(scenario.process.process, scenario.encoding.spec)
     assert set(briefs["sensor"].keys) == {"process", *kind.secret_streams}

@@ -14,6 +14,7 @@ import pytest
 
 from evedrop import montecarlo
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import telemetry
 from evedrop.live.protocol.packets import delivery
@@ -52,7 +53,7 @@ def test_same_deliveries_same_bits(process: Process, slots: int, first_trial: in
     """Fed with the deliveries of a run, `most` slots in a message, it has our digest, and reports what we report."""
     scenario = scenario_of(process, slots=slots, first_trial=first_trial, **TABLES)
     keys, batch = StreamKeys.from_scenario(scenario), Batch(slots, 9, first_trial)
-    made = briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
+    made = briefs_of(scenario, endpoints_at("tcp/127.0.0.1:1"), RecorderTask(Path("nowhere"), False))
     peer = Estimator(json.loads(made["legitimate"].text))
     model = scenario.process.process
     trajectory = Trajectory(model, keys.process, batch)
@@ -87,7 +88,7 @@ def test_same_deliveries_same_bits(process: Process, slots: int, first_trial: in
 def test_it_refuses_a_gap() -> None:
     """A slot that is not due is an error, as the protocol says."""
     scenario = scenario_of(UNSTABLE, slots=10, **TABLES)
-    made = briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
+    made = briefs_of(scenario, endpoints_at("tcp/127.0.0.1:1"), RecorderTask(Path("nowhere"), False))
     peer = Estimator(json.loads(made["legitimate"].text))
     with pytest.raises(ValueError, match="slot 1 arrived, slot 0 was due"):
         peer.receive(delivered(1, np.zeros(9, np.bool_), np.zeros((2, 9))))
@@ -99,7 +100,7 @@ def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
     scenario = load("eavesdroppers", {"slots": 300, "trials": 2})
     out = tmp_path / "out"
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    briefs = briefs_of(scenario, endpoint, RecorderTask(out, False), ends_with_stdin=False)
+    briefs = briefs_of(scenario, endpoints_at(endpoint), RecorderTask(out, False), ends_with_stdin=False)
     with ExitStack() as stack:
         running = {}
         for name, brief in briefs.items():

@@ -14,6 +14,7 @@ import pytest
 
 from evedrop.errors import EvedropError, Gap, MalformedMessage
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network.process_session import ReplayBuffer
 from evedrop.live.network.reporting import is_due
 from evedrop.live.protocol import codec as wire
@@ -53,7 +54,9 @@ TABLES: dict[str, Any] = {
 def briefs(**changes: Any) -> dict[str, AnyBrief]:
     """Briefs with a small window."""
     made = briefs_of(
-        scenario_of(PROCESS, **{**TABLES, **changes}), "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False)
+        scenario_of(PROCESS, **{**TABLES, **changes}),
+        endpoints_at("tcp/127.0.0.1:1"),
+        RecorderTask(Path("nowhere"), False),
     )
     return {name: replace(brief, flow=Flow(WINDOW, BATCH)) for name, brief in made.items()}
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import EndRun, Start
 from evedrop.model.process import Floats
@@ -63,7 +64,9 @@ def test_slots_after_a_late_state_are_due_that_much_later() -> None:
         "encoding": {"scheme": "plain"},
         "legitimate": link,
     }
-    made = briefs_of(checked(tables, "file"), "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))["sensor"]
+    made = briefs_of(checked(tables, "file"), endpoints_at("tcp/127.0.0.1:1"), RecorderTask(Path("nowhere"), False))[
+        "sensor"
+    ]
     thread = threading.Thread(
         target=sense, args=(replace(made, flow=Flow(12, 4)), stage.session, opened, clock), daemon=True
     )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import EavesdropperPart
 from evedrop.model.local_filter import settled
 from evedrop.model.schedule import PACKETS, NoiseDistribution
@@ -62,7 +63,7 @@ def test_an_eavesdropper_knows_the_distribution_of_the_noise_and_no_more() -> No
     """Its brief has the covariance, which is public, and no key; a scheme without noise packets leaves the entry out."""
     for name, distribution in (("noise-before", "matrix"), ("noise", PACKETS), ("bayesian", None)):
         scenario = load(name)
-        brief = briefs_of(scenario, "tcp/127.0.0.1:1", _TASK)["bayesian"]
+        brief = briefs_of(scenario, endpoints_at("tcp/127.0.0.1:1"), _TASK)["bayesian"]
         part = part_of(brief, EavesdropperPart)
         assert brief.keys == {}
         if distribution is None:

@@ -16,6 +16,7 @@ import pytest
 from evedrop.errors import Interrupted, MalformedMessage, MissingProcesses
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.children import Children, ProcessExit
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.launch.process_set import follow_to_end
 from evedrop.live.launch.starter import FORK_SERVER_LOST
 from evedrop.live.protocol.brief import read_brief
@@ -80,7 +81,7 @@ class Bench:
         self.private, self.results = folder / "private", new_folder(folder / "run")
         self.private.mkdir()
         (self.results / "logs").mkdir(exist_ok=True)
-        self.briefs = briefs_of(small_network(), "tcp/127.0.0.1:1", RecorderTask(self.results, False))
+        self.briefs = briefs_of(small_network(), endpoints_at("tcp/127.0.0.1:1"), RecorderTask(self.results, False))
         self.starter = FakeStarter()
         self.held = HeldFolder(self.results)
         self.children = Children(self.held, self.private, starter=self.starter)

@@ -207,7 +207,7 @@ def test_a_router_is_trusted_at_its_own_addresses_alone(stage: Bench) -> None:
 
 def test_another_runs_router_is_told_apart(stage: Bench) -> None:
     """A brief of another run says whose router it found, within seconds."""
-    other = briefs_of(stage.scenario, stage.briefs[EVE].router, RecorderTask(Path("nowhere"), False))[EVE]
+    other = briefs_of(stage.scenario, endpoints_at(stage.briefs[EVE].router), RecorderTask(Path("nowhere"), False))[EVE]
     with pytest.raises(BriefError) as caught:
         connected(router_address_of(other), 60.0)
     assert f"has a certificate of evedrop {stage.keys.run}, and this brief is of run {other.run}" in str(caught.value)

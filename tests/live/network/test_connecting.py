@@ -15,6 +15,7 @@ import pytest
 
 from evedrop.errors import RunError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network import connecting
 from evedrop.live.network.connecting import Failures, RouterAddress
 from evedrop.live.network.session import Session
@@ -26,7 +27,9 @@ from tests.live.network.bench import small_network
 def test_a_process_says_that_it_waits_for_its_router(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Every few seconds, on standard error: who waits, for which router, for how long, and what came of the last attempt."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    brief = briefs_of(small_network(), endpoint, RecorderTask(tmp_path, False), ends_with_stdin=False)["eve"]
+    brief = briefs_of(small_network(), endpoints_at(endpoint), RecorderTask(tmp_path, False), ends_with_stdin=False)[
+        "eve"
+    ]
     with pytest.raises(RunError, match="no router answered"):
         Session(replace(brief, patience=10), clock=TestClock())
     lines = capfd.readouterr().err.splitlines()
@@ -78,7 +81,9 @@ def test_a_connection_that_ends_before_there_is_a_certificate_is_no_refusal(tmp_
     """A proxy accepts and hangs up while its router is down: a process waits for it as for one that does not listen."""
     with listener(0.0) as address:
         endpoint = address.router.replace("tcp/", "tls/")
-        brief = briefs_of(small_network(), endpoint, RecorderTask(tmp_path, False), ends_with_stdin=False)["eve"]
+        brief = briefs_of(
+            small_network(), endpoints_at(endpoint), RecorderTask(tmp_path, False), ends_with_stdin=False
+        )["eve"]
         assert brief.identity is not None
         with pytest.raises(RunError, match=r"no router answered at .* within 10 s"):
             Session(replace(brief, patience=10), clock=TestClock())

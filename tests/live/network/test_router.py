@@ -19,6 +19,7 @@ from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
 from evedrop.errors import RunError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import telemetry
@@ -64,7 +65,7 @@ class MemoryBench:
 
     def __init__(self, **changes: Any) -> None:
         self.scenario = small_network(**changes)
-        self.briefs = briefs_of(self.scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
+        self.briefs = briefs_of(self.scenario, endpoints_at("tcp/127.0.0.1:1"), RecorderTask(Path("nowhere"), False))
         brief = self.briefs["router"]
         assert isinstance(brief.part, RouterPart)
         self.brief = cast(Brief[RouterPart], replace(brief, flow=Flow(32, 8, self.scenario.longest_outage)))

@@ -17,6 +17,7 @@ import zenoh
 
 from evedrop.errors import MalformedMessage, MissingProcesses
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network.access import users_file
 from evedrop.live.network.connection import Question, SubscriptionClosedError
 from evedrop.live.network.control_file import Control
@@ -49,7 +50,7 @@ class Stage:
         port = free_port()
         self.cable: Cable = stack.enter_context(cable(port))
         task = RecorderTask(folder / "results", False)
-        self.briefs = briefs_of(small_network(), self.cable.endpoint, task, ends_with_stdin=False)
+        self.briefs = briefs_of(small_network(), endpoints_at(self.cable.endpoint), task, ends_with_stdin=False)
         with users_file(
             {"operator": "password", **{brief.user: brief.password for brief in self.briefs.values()}}
         ) as users:

@@ -8,6 +8,7 @@ from typing import Any
 
 from evedrop.errors import BriefError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import AnyBrief, Brief, EavesdropperPart, Flow, Model, read_brief
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
@@ -49,7 +50,7 @@ def briefed(seed: int = 3, **changes: Any) -> Scenario:
 
 def made(scenario: Scenario) -> dict[str, AnyBrief]:
     """The briefs of a scenario."""
-    return briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
+    return briefs_of(scenario, endpoints_at("tcp/127.0.0.1:1"), RecorderTask(Path("nowhere"), False))
 
 
 _NONE: dict[str, Any] = {}

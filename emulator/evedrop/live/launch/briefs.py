@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, final
 
 from evedrop.errors import NoAnswer, UsageError
-from evedrop.live.launch.ports import RouterEndpoints, Routers, endpoints_at, identities_of
+from evedrop.live.launch.ports import RouterEndpoints, Routers, identities_of
 from evedrop.live.protocol.brief import (
     AnyBrief,
     Brief,
@@ -134,7 +134,7 @@ class RecorderTask:
 
 def briefs_of(
     scenario: Scenario,
-    endpoints: RouterEndpoints | str,
+    endpoints: RouterEndpoints,
     task: RecorderTask,
     ends_with_stdin: bool = True,
     patience: int = LAUNCHED_PATIENCE,
@@ -142,13 +142,11 @@ def briefs_of(
 ) -> dict[str, AnyBrief]:
     """Process name → brief, with a new run name, new passwords and, if the router takes them, new certificates.
 
-    endpoints: a string is the endpoint of one router, both to listen on and to connect to. ahead: as for `flow_of`.
+    ahead: as for `flow_of`.
 
     Raises UsageError if the number of endpoints differs from the scenario's number of routers.
     """
     run = f"r{world().token(4).hex()}"
-    if isinstance(endpoints, str):
-        endpoints = endpoints_at(endpoints)
     endpoints.check(scenario.relayed)
     keys = StreamKeys.from_scenario(scenario)
     steered = () if scenario.controller is None else (CONTROLLER,)
