@@ -41,11 +41,16 @@ def mutants(only: str = "") -> list[Mutant]:
 
 
 def mutated(mutant: Mutant, text: str) -> str:
-    """The text of the mutant's file with its mistake. Raises ValueError unless the file has the old text exactly once."""
+    """The text of the mutant's file with its mistake.
+
+    Raises ValueError unless the file has the old text exactly once, and SyntaxError if the new one is no Python.
+    """
     count = text.count(mutant.old)
     if count != 1:
         raise ValueError(f"{mutant.file} has the text of the mutant {mutant.breaks!r} {count} times, not once")
-    return text.replace(mutant.old, mutant.new)
+    text = text.replace(mutant.old, mutant.new)
+    compile(text, mutant.file, "exec")
+    return text
 
 
 def copy_with(mutant: Mutant, folder: Path) -> None:

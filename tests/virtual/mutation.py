@@ -6,6 +6,7 @@ If no seed notices it, the cases of regressions.toml are played, too.
 
 Prints a row for each mutant: what noticed it, and after how many seeds, or in which case. A seed that breaks a promise without
 the mistake does not count. A mutant that nothing notices shows what the simulation lacks.
+Each processor tries one mutant at a time.
 
 Source: docs/maintainers/simulated-world.md.
 """
@@ -20,13 +21,15 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 from tests.mutants import Mutant, cell, copy_with, mutants
-from tests.virtual.simulated import play, played, read_case
+from tests.virtual.simulated import play, played, read_case, save_time
 from tests.virtual.test_campaign_regressions import REGRESSIONS
 
 _ROOT = Path(__file__).parents[2]
@@ -58,17 +61,19 @@ def tried(mutant: Mutant, seeds: range, seconds: float) -> Outcome:
     begun, count = time.monotonic(), 0
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         copy_with(mutant, Path(folder))
-        for seed, miss in zip(seeds, _played_with(Path(folder), _SEEDS, seeds), strict=False):
-            count += 1
-            took = time.monotonic() - begun
-            if miss and not _broken_anyway(seed):
-                return Outcome(mutant, cell(miss), count, took)
-            if took > seconds:
-                break
+        with closing(_played_with(Path(folder), _SEEDS, seeds)) as misses:
+            for seed, miss in zip(seeds, misses, strict=False):
+                count += 1
+                took = time.monotonic() - begun
+                if miss and not _broken_anyway(seed):
+                    return Outcome(mutant, cell(miss), count, took)
+                if took > seconds:
+                    break
         cases = range(1, 1 + len(REGRESSIONS))
-        for case, miss in zip(cases, _played_with(Path(folder), _CASES, cases), strict=False):
-            if miss:
-                return Outcome(mutant, cell(miss), count, time.monotonic() - begun, case)
+        with closing(_played_with(Path(folder), _CASES, cases)) as misses:
+            for case, miss in zip(cases, misses, strict=False):
+                if miss:
+                    return Outcome(mutant, cell(miss), count, time.monotonic() - begun, case)
     return Outcome(mutant, None, count, time.monotonic() - begun)
 
 
@@ -78,10 +83,11 @@ def _broken_anyway(seed: int) -> bool:
     return bool(played(seed)[5])
 
 
-def _played_with(folder: Path, what: str, numbers: range) -> Iterator[str]:
+def _played_with(folder: Path, what: str, numbers: range) -> Generator[str]:
     """The first misses of seeds, or of cases, that are played with the copy of the package in a folder."""
     words = [sys.executable, "-m", "tests.virtual.mutation", "--play", what, str(numbers.start), str(numbers.stop)]
-    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    # The class of an eavesdropper may have a process of its own, which ends a little later than this one: it writes nothing.
+    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     with (
         (folder / "stderr").open("w+") as errors,
         subprocess.Popen(
@@ -100,10 +106,8 @@ def _played_with(folder: Path, what: str, numbers: range) -> Iterator[str]:
             for _ in numbers:
                 line = lines.get(timeout=_FOREVER_SECONDS)
                 if line is None:
-                    process.wait()
                     errors.seek(0)
-                    yield f"in memory: {(errors.read().strip().splitlines() or ['(nothing)'])[-1]}"
-                    return
+                    raise RuntimeError(f"the interpreter of a mutant ended with {process.wait()}: {errors.read()}")
                 yield line.strip()
         except queue.Empty:
             yield "the run does not end, and no virtual time passes"
@@ -113,8 +117,12 @@ def _played_with(folder: Path, what: str, numbers: range) -> Iterator[str]:
 
 def _play(what: str, numbers: range) -> None:
     """Play seeds, or cases, and print the first miss of each, on a line of its own."""
+    save_time()
     for number in numbers:
-        misses = played(number)[5] if what == _SEEDS else play(read_case(REGRESSIONS[number - 1]["case"])).misses
+        try:
+            misses = played(number)[5] if what == _SEEDS else play(read_case(REGRESSIONS[number - 1]["case"])).misses
+        except Exception as error:
+            misses = (f"in memory: {type(error).__name__}: {error}",)
         _say(" ".join(misses[0].split()) if misses else "")
 
 
@@ -133,10 +141,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = [mutant for mutant in mutants(options.only) if mutant.simulated]
     _say(f"| {len(chosen)} mutants | file | noticed by | seeds | time |\n|---|---|---|---|---|")
     missed = 0
-    for mutant in chosen:
-        outcome = tried(mutant, range(1, 1 + options.seeds), options.seconds)
-        missed += outcome.noticed is None
-        _say(str(outcome))
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        for outcome in pool.map(partial(tried, seeds=range(1, 1 + options.seeds), seconds=options.seconds), chosen):
+            missed += outcome.noticed is None
+            _say(str(outcome))
     _say(f"\n{len(chosen) - missed} of {len(chosen)} mutants were noticed")
     return 1 if missed else 0
 

@@ -30,6 +30,8 @@ from evedrop.system.world import world
 
 _POLL_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
+_LONGER = 1.1
+"""How much longer than a relay waits for a router on another host the launcher waits for the relay, which knows why it gives up."""
 
 
 @dataclass(frozen=True)
@@ -128,9 +130,9 @@ def _endpoints(given: RouterEndpoints | None, private: Path) -> Iterator[RouterE
 def _wait_until_listening(children: Children, router: str, stop: ThreadEvent, patience: float) -> None:
     """Wait until a router says that it listens: a process that is started earlier might connect to another program there.
 
-    Raises RunError if the router ends, or is silent for `patience` seconds; Interrupted if stopped meanwhile.
+    Raises RunError if the router ends, or is silent for longer than `patience` seconds; Interrupted if stopped meanwhile.
     """
-    deadline = world().monotonic() + patience
+    deadline = world().monotonic() + _LONGER * patience
     while not children.listens(router):
         if stop.is_set():
             raise Interrupted
@@ -139,7 +141,7 @@ def _wait_until_listening(children: Children, router: str, stop: ThreadEvent, pa
             raise RunError(children.failure_report(event, None))
         if world().monotonic() > deadline:
             raise RunError(
-                f"{router} did not listen within {patience:.0f} s of its start, so no other process was started; run again, and "
+                f"{router} did not listen within {_LONGER * patience:.0f} s of its start, so no other process was started; run again, and "
                 f"look at logs/{router}.log if it happens again"
             )
 
