@@ -20,6 +20,7 @@ from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.links import LOSS_MODELS, loss_of, pooled_spec
 from evedrop.model.links.loss_model import LossModel
 from evedrop.model.registry import asked
+from evedrop.model.slot.link import MOST_QUEUED, MOST_RATE
 from evedrop.model.streams import root_of_seed, stream_key
 from evedrop.scenario.table import Mistake, Probability, Table, model_mistakes, one_of, refuse, registered
 from evedrop.scenario.words import as_toml, listed, no_entry
@@ -77,9 +78,9 @@ class LinkTable(Table):
     """The probability that a packet arrives twice. Receivers recognise it, so estimates do not change."""
     corrupt: Annotated[Probability, Field(examples=[0.01])] = 0.0
     """The probability that a packet is damaged. Its checksum shows it, and it counts as lost."""
-    rate: Annotated[float | None, Field(strict=True, gt=0.0, le=1e6, examples=[0.9])] = None
+    rate: Annotated[float | None, Field(strict=True, gt=0.0, le=MOST_RATE, examples=[0.9])] = None
     """The capacity of the link, in packets a slot. Below 1, the queue fills."""
-    queue: Annotated[int | None, Field(strict=True, ge=0, le=1_000_000, examples=[100])] = None
+    queue: Annotated[int | None, Field(strict=True, ge=0, le=MOST_QUEUED, examples=[100])] = None
     """How many packets wait before a link of limited rate; 100 by default. Further ones are lost."""
 
     def mistakes(self) -> Iterator[Mistake]:

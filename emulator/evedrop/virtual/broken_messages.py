@@ -41,6 +41,10 @@ _WANTED = ("journal", "telemetry", "telemetry")
 """The messages to the recorder of which one is wrong, by how their keys begin."""
 _COMMON = frozenset({"k", "c", "n", "do"})
 """What nearly all messages have: it is wrong less often than what few have."""
+_CHANGES = frozenset({"changes", "links"})
+"""Fields with changes of links."""
+_OF_LINK = frozenset({"link", "loss", "model", "quality"})
+"""What each change of a link has; if something else is wrong in it, the router cannot know that another change was meant."""
 _Place = tuple[Any, ...]
 """The names, and the numbers in lists, that lead to a value in a message."""
 CONTRADICTIONS = ("but the journal says", "and what it reported of these slots", "contradicts")
@@ -92,6 +96,8 @@ def broken(some: random.Random, message: bytes, *, checked: bool = False, harmle
     places = [*_places(fields)]
     if harmless:
         numbers = frozenset(name for place in places for name in place)
+    else:
+        places = [place for place in places if _CHANGES.isdisjoint(place) or place[-1] in _OF_LINK]
     rarer = [place for place in places if place[-1] not in _COMMON]
     if rarer and some.random() < 0.8:
         places = rarer

@@ -221,6 +221,38 @@ def test_a_malformed_command_ends_the_router() -> None:
         loop.carry_on()
 
 
+TRUE = {"loss": {"model": "bernoulli", "quality": True}}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (Change(12, TRUE), "quality is true; expected a number from 0 to 1"),
+        (Change(12, {"loss": {}}), r"invalid settings \(KeyError\('model'\)\)"),
+        (Change(11, cut=True), "a change before the hold; expected slots from 12 on"),
+    ],
+)
+def test_a_wrong_change_of_a_link_ends_the_router(change: Change, message: str) -> None:
+    """Rather than that the link is another one than the operator asked for."""
+    bench = MemoryBench(**LATE)
+    loop = RouterLoop(bench.brief, bench.stage.session(bench.brief))
+    send(bench, range(12))
+    bench.put("sensor", bench.keys.uplink, packets.barrier(12))
+    bench.stage.commands.put(LinkChange("eve", (change,)).pack())
+    with pytest.raises(MalformedMessage, match=message):
+        loop.carry_on()
+
+
+def test_a_wrong_change_that_is_told_again_ends_the_router() -> None:
+    """One that was started in the place of another is told of all changes so far."""
+    bench = MemoryBench(**LATE)
+    loop = RouterLoop(bench.brief, bench.stage.session(bench.brief))
+    bench.stage.commands.put(Again(1, 0, {"eve": (Change(12, TRUE),)}).pack())
+    announce(bench, 1, 0, 0)
+    with pytest.raises(MalformedMessage, match="quality is true"):
+        loop.carry_on()
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_barrier_is_passed_on_and_a_changed_link_is_changed_from_there_on(kept: bool) -> None:
     """All slots before it are delivered and journaled first; nothing follows until the conductor lets the router continue.

@@ -198,13 +198,14 @@ UNUSABLE: dict[str, list[tuple[Callable[[dict[str, Any]], None], str]]] = {
         ),
         (set_in("part.acknowledgements.attack", "smile"), "part.acknowledgements.attack is smile"),
         (set_in("part.links.legitimate.window", 10**9), "its window is above 100000000 slots"),
-        (set_in("part.links.legitimate.settings", {}), "or its settings have no loss"),
+        (set_in("part.links.legitimate.settings", {}), "its settings have no loss"),
         (set_in("part.links.legitimate.settings.loss.quality", "x"), 'quality is "x"'),
         (set_in("part.links.legitimate.settings.delay", {"model": "constant", "value": -1.0}), "value is -1.0"),
         *(
-            (set_in(f"part.links.legitimate.settings.{name}", "x"), f"{name} is 'x', expected a number of at least 0")
+            (set_in(f"part.links.legitimate.settings.{name}", "x"), f'{name} is "x"; expected a')
             for name in ("reorder", "duplicate", "corrupt", "rate", "queue")
         ),
+        (set_in("part.links.legitimate.settings.reorder", 2**63), "expected a number from 0 to 1"),
         (set_in("part.links.legitimate.settings.rate", 1.0), "it has a rate, and no queue"),
         (set_in("part.links.legitimate.settings.delay", {"model": "constant", "colour": 1}), "'colour'"),
         (
@@ -212,6 +213,13 @@ UNUSABLE: dict[str, list[tuple[Callable[[dict[str, Any]], None], str]]] = {
                 "part.links.legitimate.changes", [{"at": 1, "settings": {"loss": {"model": "bernoulli", "colour": 1}}}]
             ),
             "part.links.legitimate cannot be used",
+        ),
+        (
+            set_in(
+                "part.links.legitimate.changes",
+                [{"at": 1, "settings": {"loss": {"model": "bernoulli", "quality": True}}}],
+            ),
+            "quality is true; expected a number from 0 to 1",
         ),
         (set_in("part.links.legitimate.outages", [[1, 2, 77]]), "Invalid enum value 77"),
         (set_in("part.links.legitimate.changes", [{"at": -1}]), "-1 is not a slot"),

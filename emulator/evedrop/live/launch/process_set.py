@@ -31,7 +31,7 @@ from evedrop.system.world import world
 _POLL_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
 _LONGER = 1.1
-"""How much longer than a relay waits for a router on another host the launcher waits for the relay, which knows why it gives up."""
+"""How much longer the launcher waits for a relay than that for a router on another host: the relay knows why it gives up."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,8 @@ def _wait_until_listening(children: Children, router: str, stop: ThreadEvent, pa
 
     Raises RunError if the router ends, or is silent for longer than `patience` seconds; Interrupted if stopped meanwhile.
     """
-    deadline = world().monotonic() + _LONGER * patience
+    limit = _LONGER * patience
+    deadline = world().monotonic() + limit
     while not children.listens(router):
         if stop.is_set():
             raise Interrupted
@@ -141,8 +142,8 @@ def _wait_until_listening(children: Children, router: str, stop: ThreadEvent, pa
             raise RunError(children.failure_report(event, None))
         if world().monotonic() > deadline:
             raise RunError(
-                f"{router} did not listen within {_LONGER * patience:.0f} s of its start, so no other process was started; run again, and "
-                f"look at logs/{router}.log if it happens again"
+                f"{router} did not listen within {limit:.0f} s of its start, so no other process was started; run again, "
+                f"and look at logs/{router}.log if it happens again"
             )
 
 

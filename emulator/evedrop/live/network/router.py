@@ -26,7 +26,7 @@ from typing import final
 
 import numpy as np
 
-from evedrop.errors import EvedropError, NotRegistered
+from evedrop.errors import EvedropError, MalformedMessage
 from evedrop.live.network.access import access_control, at_relay, at_router, grants, until_all_left, users_file
 from evedrop.live.network.connecting import connected
 from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession
@@ -351,7 +351,7 @@ class RouterLoop:
             self._stale = True
             return
         for name, changes in (again.links or {}).items():
-            self._schedules[name] = replace(self._schedules[name], changes=changes)
+            self._schedules[name] = self._changed(name, changes, again)
         self._begin(start, done)
 
     def _journal(self, end: int) -> None:
@@ -378,15 +378,25 @@ class RouterLoop:
     def _amend(self, command: LinkChange, k: int) -> None:
         """Change a link from slot k on, as the conductor's command says."""
         name, changes = command.link, command.changes
+        earlier = [change for change in self._schedules[name].changes if change.at < k]
+        schedule = self._changed(name, (*earlier, *changes), command)
+        if any(change.at < k for change in changes):
+            raise self._malformed(command, "a change before the hold", f"slots from {k} on")
+        self._downlinks[name].amend(k, changes)
+        self._schedules[name] = schedule
+
+    def _changed(self, name: str, changes: tuple[Change, ...], command: LinkChange | Again) -> LinkSchedule:
+        """The schedule of a link with these changes, which a command asks for. Raises MalformedMessage if they are wrong."""
+        schedule = replace(self._schedules[name], changes=changes)
         try:
-            self._downlinks[name].amend(k, changes)
-        except (KeyError, TypeError, ValueError, NotRegistered) as error:
-            message = Reader(self._session.keys.control(ROUTER), command.pack())
-            raise message.malformed(f"invalid settings ({error!r:.80})", f"settings of the link of {name}") from error
-        schedule = self._schedules[name]
-        self._schedules[name] = replace(
-            schedule, changes=(*(change for change in schedule.changes if change.at < k), *changes)
-        )
+            schedule.expect_possible()
+        except (KeyError, TypeError, ValueError) as error:
+            wrong = f"invalid settings ({error!r:.80})"
+            raise self._malformed(command, wrong, f"settings of the link of {name}") from error
+        return schedule
+
+    def _malformed(self, command: LinkChange | Again, found: str, expected: str) -> MalformedMessage:
+        return Reader(self._session.keys.control(ROUTER), command.pack()).malformed(found, expected)
 
 
 def _opened(brief: Brief[RouterPart], access: ZenohConfig) -> Session:

@@ -148,11 +148,10 @@ class RouterPart:
             brief.expect_keys(streams_of(name, schedule))
             keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, schedule)}
             later = [change.settings for change in schedule.changes if change.settings is not None]
-            for settings in (schedule.settings, *later):
-                with _using(f"part.links.{name}"):
-                    at_first = replace(schedule, settings=settings)
-                    at_first.expect_possible()
-                    Link(at_first, name, keys, brief.batch)
+            with _using(f"part.links.{name}"):
+                schedule.expect_possible()
+                for settings in (schedule.settings, *later):
+                    Link(replace(schedule, settings=settings), name, keys, brief.batch)
         if self.acknowledgements is not None:
             brief.expect_keys([f"link/{ACKNOWLEDGEMENTS}"])
             if self.acknowledgements.attack not in ATTACKS:

@@ -6,7 +6,6 @@ Its account has the outcomes of its packets, slot by slot, and the distributions
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -15,7 +14,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.checks import LAST_SLOT, expect_slots
+from evedrop.model.checks import LAST_SLOT, expect_slots, number_mistakes, probability_mistakes, whole_number_mistakes
 from evedrop.model.delays import DELAY_MODELS, DelayModel, delay_of
 from evedrop.model.kernels.current import kernels
 from evedrop.model.links import LOSS_MODELS, loss_of, single_specs
@@ -77,7 +76,10 @@ class ReceiverOutage(NamedTuple):
     """Whether it continues from its last belief; otherwise from the prior of the slot in which it went away."""
 
 
-_NUMBERS = frozenset({"reorder", "duplicate", "corrupt", "rate", "queue"})
+MOST_RATE = 1e6
+"""The highest rate of a link, in packets a slot."""
+MOST_QUEUED = 1_000_000
+"""The longest queue of a link, in packets."""
 
 
 @dataclass(frozen=True)
@@ -106,21 +108,35 @@ class LinkSchedule:
     """The receiver whose losses these are tied to, and how strongly."""
 
     def expect_possible(self) -> None:
-        """Raise ValueError unless window, changes and outages are within a run's slots, and there is a loss model."""
+        """Raise ValueError unless window, changes and outages are within a run's slots, and all settings are right.
+
+        Settings that lack a name, or have one that is not registered, raise KeyError.
+        """
         outages = (slot for outage in self.outages for slot in (outage.start, outage.stop))
         expect_slots(self.window, *(change.at for change in self.changes), *outages)
-        if self.window > MOST_SLOTS or not isinstance(self.settings.get("loss"), Mapping):
-            raise ValueError(f"its window is above {MOST_SLOTS} slots, or its settings have no loss")
-        for spec in single_specs(self.settings["loss"]):
-            _expect_right(LOSS_MODELS[spec["model"]], spec)
-        for name in _NUMBERS & self.settings.keys():
-            value = self.settings[name]
-            if not isinstance(value, (int, float)) or not 0.0 <= value < math.inf:
-                raise ValueError(f"{name} is {value!r:.40}, expected a number of at least 0")
-        if self.settings.get("rate") and "queue" not in self.settings:
-            raise ValueError("it has a rate, and no queue")
-        if (delay := self.settings.get("delay")) is not None:
-            _expect_right(DELAY_MODELS[delay["model"]], delay)
+        if self.window > MOST_SLOTS:
+            raise ValueError(f"its window is above {MOST_SLOTS} slots")
+        for settings in (self.settings, *(change.settings for change in self.changes if change.settings is not None)):
+            _expect_settings(settings)
+
+
+def _expect_settings(settings: Mapping[str, Any]) -> None:
+    """Raise ValueError or KeyError for a mistake in the settings of a link."""
+    if not isinstance(settings.get("loss"), Mapping):
+        raise ValueError("its settings have no loss")
+    for spec in single_specs(settings["loss"]):
+        _expect_right(LOSS_MODELS[spec["model"]], spec)
+    mistakes = [
+        *probability_mistakes(settings, "reorder", "duplicate", "corrupt"),
+        *number_mistakes(settings, "rate", 0.0, MOST_RATE),
+        *whole_number_mistakes(settings, "queue", 0, MOST_QUEUED),
+    ]
+    for entry, problem in mistakes:
+        raise ValueError(f"{entry} {problem}")
+    if settings.get("rate") and "queue" not in settings:
+        raise ValueError("it has a rate, and no queue")
+    if (delay := settings.get("delay")) is not None:
+        _expect_right(DELAY_MODELS[delay["model"]], delay)
 
 
 def _expect_right(kind: type[LossModel | DelayModel], spec: Mapping[str, Any]) -> None:
