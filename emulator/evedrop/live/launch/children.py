@@ -303,6 +303,8 @@ class Children:
             broken_by = None
             if word is not None and first.status == CONNECTION_LOST:
                 head = f"{first.process} was lost: {word.sentence}"
+            elif word is not None and word.cause is Cause.NO_CONNECTION:
+                head = f"{head}: {word.sentence}"
             elif word is not None and word.cause is Cause.BROKEN_PROTOCOL:
                 broken_by, why = next(iter(word.blamed), None), word.sentence
         elif suspects:
