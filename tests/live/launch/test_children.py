@@ -217,9 +217,8 @@ def test_a_router_that_all_have_lost_is_at_fault(bench: Bench) -> None:
     for name in bench.briefs:
         bench.children.start(bench.briefs[name])
     bench.leaves("eve", CUT_OFF)
-    assert bench.children.failure_report(ProcessExit("eve", 3), RunEnded(3, "", suspects=["eve"])).startswith(
-        "eve ended with"
-    )
+    report = bench.children.failure_report(ProcessExit("eve", 3), RunEnded(3, "", suspects=["eve"]))
+    assert report.startswith(f"eve ended with status 3: {CUT_OFF.sentence}\n")
     for name in bench.briefs.keys() - {"router", "recorder"}:
         bench.leaves(name, CUT_OFF)
     assert bench.children.failure_report(ProcessExit("eve", 3), None).startswith("router ended with")
