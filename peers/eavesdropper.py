@@ -20,6 +20,7 @@ def eavesdrop(brief: Brief[EavesdropperPart], connect: Callable[[AnyBrief], Proc
     model, distribution = brief.model, brief.part.noise_distribution
     mu_d, mu_d_of_slots = model.state_probability, model.state_probabilities
     knowledge = Knowledge(model.process, mu_d, parameters, brief.stream_keys, mu_d_of_slots, distribution)
-    receiver = STRATEGIES.imported(strategy)(knowledge, brief.batch)
+    kind = STRATEGIES.imported(strategy)
     problem = Problem(model.process, brief.batch)
-    follow(brief, checked_eavesdropper(receiver, brief.process, strategy, parameters, problem), connect=connect)
+    receiver = checked_eavesdropper(kind(knowledge, brief.batch), brief.process, strategy, parameters, problem)
+    follow(brief, receiver, betrayed=kind.betrayed(parameters), connect=connect)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import final
 
 import numpy as np
 
+from evedrop.errors import MalformedMessage
 from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession
 from evedrop.live.network.reporting import BeliefReporter
 from evedrop.live.network.session import Session
@@ -28,16 +30,17 @@ def follow(
     acknowledges: bool = False,
     consult: Callable[[ProcessSession], Consultation] | None = None,
     connect: Callable[[AnyBrief], ProcessSession] = Session,
+    betrayed: int | None = None,
 ) -> None:
     """Run a receiver over all slots of its brief, except those in which it is away.
 
     It may acknowledge packets, and send its estimate to a controller. Deliveries that it already had are acknowledged
-    again, and otherwise ignored. connect: opens its session.
+    again, and otherwise ignored. connect: opens its session; betrayed: the slot whose state it is told.
     """
     core = _core_of(brief, receiver)
     with connect(brief) as session:
         replies = ReceiverReplies(brief, session, acknowledges, None if consult is None else consult(session))
-        loop = ReceiverLoop(brief, core, replies, session)
+        loop = ReceiverLoop(brief, core, replies, session, betrayed)
         session.ready()
         loop.carry_on()
         replies.acknowledge_after_end(loop.deliveries)
@@ -49,10 +52,16 @@ class ReceiverLoop:
     """A receiver's work on a session that is being opened."""
 
     def __init__(
-        self, brief: Brief[ReceiverPart], core: ReceiverCore, replies: ReceiverReplies, session: ProcessSession
+        self,
+        brief: Brief[ReceiverPart],
+        core: ReceiverCore,
+        replies: ReceiverReplies,
+        session: ProcessSession,
+        betrayed: int | None,
     ) -> None:
         name, key = brief.process, session.keys.downlink(brief.process)
         self._brief, self._core, self._replies, self._status = brief, core, replies, session.status
+        self._betrayed = betrayed
         self._outages = _outages_of(brief)
         self.deliveries = Pending(session.subscribe(key), key)
         self._put_telemetry = session.replaying_publisher(session.keys.telemetry(name), brief.flow.window + 1)
@@ -109,6 +118,8 @@ class ReceiverLoop:
         message = self.deliveries.drop()
         arrivals = read_delivery(message, k, shape, brief.model.header, brief.part.window, most)
         slots = range(k, k + len(arrivals.gamma))
+        if self._betrayed is not None and self._betrayed in slots and self._betrayed - k not in arrivals.truth:
+            raise message.malformed("no truth", f"truth, the state of slot {self._betrayed}, which is betrayed")
         self._replies.before(k, arrivals.gamma[0])
         followed = self._core.take_slots(slots, arrivals)
         self._replies.after(k, self._core.belief)
@@ -156,8 +167,9 @@ class ReceiverReplies:
 
     def _go_on(self, deliveries: Iterable[Reader]) -> None:
         for message in deliveries:
-            if not is_barrier(message):
-                self.acknowledge_again(message.integer("k"), message)
+            with suppress(MalformedMessage):  # its slots are over: nobody waits for this process to refuse it
+                if not is_barrier(message):
+                    self.acknowledge_again(message.integer("k"), message)
 
 
 def _acknowledged(delivery: Reader, k: int, trials: int) -> bytes:

@@ -172,6 +172,15 @@ def test_receiver_refuses(case: str, name: str, stage: Stage) -> None:
     assert caught.value.exit_status == 3
 
 
+def test_who_is_to_be_told_a_state_is_told_it(stage: Stage) -> None:
+    """Else the delivery is malformed, which its sender is to blame for."""
+    told = {"told": listener("replay-informed", 0.8, learns_at=2, reads_as="smart")}
+    brief = briefs(eavesdroppers=told)["told"]
+    stage.fill(RunKeys(brief.run).downlink("told"), deliveries())
+    with pytest.raises(MalformedMessage, match="no truth; expected truth, the state of slot 2, which is betrayed"):
+        eavesdrop(brief, stage.session)
+
+
 @pytest.mark.parametrize("name", ["legitimate", "smart"])
 def test_receiver_takes_each_slot_once(name: str, stage: Stage) -> None:
     """Slots that arrive again, barriers too, and slots before the one that is due do not change its reports."""

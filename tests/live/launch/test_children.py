@@ -287,6 +287,7 @@ MALFORMED = {
     b'{"event": "ended", "status": "0", "how": ""}': "Expected `int`, got `str` - at `$.status`",
     b'{"event": "started", "k": 1}': "unknown field `k`",
     b'{"event": "act", "do": "dance", "process": "eve", "first": 0, "number": 1}': "Invalid enum value 'dance'",
+    b'{"event": "act", "do": "end", "process": "nobody", "first": 0, "number": 1}': "there is no process nobody",
     b'{"event": "progress", "done": 1, "rate": true, "rate_unit": "", "squared_errors": {}}': "got `bool` - at `$.rate`",
     b'{"event": "progress", "done": -1, "rate": 1, "rate_unit": "", "squared_errors": {}}': "Expected `int` >= 0 - at `$.done`",
 }

@@ -21,6 +21,7 @@ from evedrop.live.launch.other_hosts import (
     Greeting,
     HostedProcess,
     LauncherHeartbeat,
+    LogText,
     Order,
     ProcessEnded,
     SshHost,
@@ -130,6 +131,21 @@ def test_the_last_word_of_a_process_there_is_read_here(connect: Connect, tmp_pat
     host._take(answer_in(line_of(ProcessEnded(7, 3, word))))
     assert process.poll() == 3
     assert read_last_word(file) == word
+    host.close(time.monotonic() + LIMIT)
+
+
+def test_half_a_character_is_written_as_its_number(connect: Connect, tmp_path: Path) -> None:
+    """Rather than that it ends the connection; a last word with one is none."""
+    host = connect(GREETING)
+    ready(host)
+    file, word = last_word_file(tmp_path, "eve"), LastWord(Cause.FAILURE, "why \ud800")
+    with (tmp_path / "eve.log").open("wb") as log:
+        process = host.start(7, replace(brief_of_eve(), last_word=str(file)).write(tmp_path), log, {})
+    host._take(LogText(7, "half \ud800"))
+    host._take(ProcessEnded(7, 3, word))
+    assert process.poll() == 3
+    assert (tmp_path / "eve.log").read_text() == "half \\ud800"
+    assert read_last_word(file) is None
     host.close(time.monotonic() + LIMIT)
 
 

@@ -253,6 +253,16 @@ def test_a_wrong_change_that_is_told_again_ends_the_router() -> None:
         loop.carry_on()
 
 
+def test_a_packet_without_the_state_that_is_betrayed_ends_the_router() -> None:
+    """In the slot in which an eavesdropper is told; in all others, packets have none."""
+    eve = {"strategy": "replay-informed", "reads_as": "smart", "learns_at": 3, "link": {"quality": 1.0}}
+    bench = MemoryBench(**{**LATE, "eavesdroppers": {"eve": eve}})
+    loop = RouterLoop(bench.brief, bench.stage.session(bench.brief))
+    send(bench, range(4))
+    with pytest.raises(MalformedMessage, match="no truth; expected truth, the state of slot 3, which is betrayed"):
+        loop.carry_on()
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_barrier_is_passed_on_and_a_changed_link_is_changed_from_there_on(kept: bool) -> None:
     """All slots before it are delivered and journaled first; nothing follows until the conductor lets the router continue.

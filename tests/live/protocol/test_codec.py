@@ -106,6 +106,9 @@ def test_the_reasons_and_the_alarms_of_the_sensor_are_read_as_sent() -> None:
     assert (result.statistic, result.watermark) == (None, None)
     bare = read_truth(Reader(KEY, truth(SensorSlots(4, slots.x, slots.nu))), 4, Extent(9, 3, 2, 3))
     assert (bare.sent, bare.alarms) == (None, None)
+    for needed in ({"silent": True}, {"watched": True}):
+        with pytest.raises(MalformedMessage, match="sent of None" if "silent" in needed else "alarms of None"):
+            read_truth(Reader(KEY, truth(SensorSlots(4, slots.x, slots.nu))), 4, Extent(9, 3, 2, 3, **needed))
 
 
 def test_statistic_and_watermark_of_a_detector_are_read_as_sent() -> None:

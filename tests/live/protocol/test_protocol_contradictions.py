@@ -60,6 +60,11 @@ def negative_seconds(fields: dict[str, Any]) -> None:
     fields["seconds"] = np.array([-1.0]).tobytes()
 
 
+def half_a_decision(fields: dict[str, Any]) -> None:
+    """Not all slots in which it holds."""
+    fields["c"] = 3
+
+
 CONTRADICTIONS = {
     "delivery": (late_packets, "more than 6 entries in late of slot 4; expected at most two for each slot from 2 to 4"),
     "report": (more_used, "more in late_used than in late; expected at most as many late packets used as arrived"),
@@ -71,6 +76,7 @@ CONTRADICTIONS = {
     "journal without a delay": (no_delay, "eve's packets for [6, 0, 0] in their slots, within the window and after it"),
     "journal with a long delay": (too_late, "after it; expected those of [5, 1, 0]"),
     "decisions": (negative_seconds, "seconds of -1; expected numbers of at least 0"),
+    "decisions of some slots": (half_a_decision, "slots to 7; expected all slots of each decision, which holds for 4"),
 }
 
 
@@ -142,6 +148,17 @@ def other_controller(brief: dict[str, Any]) -> None:
     brief["part"]["strategy"] = "pid"
 
 
+def no_horizon(brief: dict[str, Any]) -> None:
+    """True counts as 1 where nobody looks."""
+    brief["part"]["strategy"] = "mpc"
+    brief["part"]["assignment"]["parameters"] = {"horizon": True, "soft": 1.0}
+
+
+def no_recording(brief: dict[str, Any]) -> None:
+    """The same."""
+    brief["part"]["monitor"] |= {"attack": "replay", "attack_data": {"recorded": True}}
+
+
 def fewer_states(brief: dict[str, Any]) -> None:
     """The plant and the model are not of the same system."""
     noise = brief["part"]["plant"]["noise"]
@@ -207,6 +224,8 @@ UNUSABLE: dict[str, list[tuple[Callable[[dict[str, Any]], None], str]]] = {
         ),
         (set_in("part.links.legitimate.settings.reorder", 2**63), "expected a number from 0 to 1"),
         (set_in("part.links.legitimate.settings.rate", 1.0), "it has a rate, and no queue"),
+        (set_in("part.links.legitimate.settings.colour", 1.0), "colour is no setting of a link"),
+        (set_in("part.links.legitimate.settings.loss", {"model": "pooled", "links": []}), "its loss pools no links"),
         (set_in("part.links.legitimate.settings.delay", {"model": "constant", "colour": 1}), "'colour'"),
         (
             set_in(
@@ -239,7 +258,15 @@ UNUSABLE: dict[str, list[tuple[Callable[[dict[str, Any]], None], str]]] = {
         (set_in("part.assignment.rate_limits", []), "rate_limits has the shape (0,), expected "),
         (set_in("part.assignment.process.Q", [[1.0]]), "its process is not that of the model"),
         (other_controller, "part.strategy is pid, expected one of "),
+        (no_horizon, "part.assignment.parameters.horizon is True; expected a whole number from 1 to 1000"),
         (free_input, "part: the input_weights leave an input without weight; expected input_weights, or rate_weights"),
+    ],
+    "replay-attack/sensor": [
+        (
+            set_in("part.monitor.parameters.threshold", -1.0),
+            "part.monitor.parameters.threshold is -1.0; expected a number",
+        ),
+        (no_recording, "recorded is True, expected a number of slots from 1 to 1000000"),
     ],
     "microgrid/sensor": [
         (fewer_states, "noise has the shape "),

@@ -158,6 +158,8 @@ class Children:
                         event = read_event(line)
                         if name != RECORDER and event != RouterListens(name):
                             raise ValueError("only the recorder sends such events")
+                        if isinstance(event, ProcessRequest) and event.process not in self._processes:
+                            raise ValueError(f"there is no process {event.process:.40}")
                         self._events.put(event)
                     except ValueError as error:
                         self._refuse(name, error)

@@ -190,7 +190,7 @@ class HostedProcess(ReportedProcess):
     def write(self, text: str) -> None:
         """Write to its log."""
         with contextlib.suppress(OSError):  # the disk is full
-            self._log.write(text.encode())
+            self._log.write(text.encode(errors="backslashreplace"))
 
     def lose(self, why: str) -> None:
         """Note that it was lost with its host, and write why into its log."""

@@ -221,6 +221,7 @@ class RouterLoop:
     def __init__(self, brief: Brief[RouterPart], session: ProcessSession) -> None:
         self._brief, self._session = brief, session
         self._packets = packet_format(len(brief.model.A), brief.trials, brief.model.header)
+        self._betrayed = frozenset(brief.part.leaks.values())
         self._uplink = Pending(session.subscribe(session.keys.uplink), session.keys.uplink)
         self._due = GapDetector(session.keys.uplink, brief.flow.longest_outage)
         self._put_journal = session.publisher(session.keys.journal)
@@ -316,6 +317,8 @@ class RouterLoop:
             return
         most = 1 if self._ack_link is not None else self._slots.stop - k
         packets = read_uplink(self._uplink.drop(), k, self._packets, most)
+        if packets.truth is None and k in self._betrayed:
+            raise message.malformed("no truth", f"truth, the state of slot {k}, which is betrayed")
         if k < self._done < packets.slots.stop:
             self._route(packets.rows(slice(0, self._done - k)))
             packets = packets.rows(slice(self._done - k, None))

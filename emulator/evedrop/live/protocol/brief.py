@@ -34,6 +34,7 @@ from evedrop.model.detection import Chart
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
 from evedrop.model.eavesdroppers.readers import READERS
+from evedrop.model.integrity import POLICIES
 from evedrop.model.integrity.monitor import Monitor, MonitorPlan
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, mistakes_of
@@ -255,6 +256,9 @@ class SensorPart:
                 if self.plant is None or self.plant.output_matrix is None:
                     raise ValueError("there is no filter whose innovations could be tested")
                 self.monitor.expect_sizes(len(self.plant.output_matrix), self.plant.inputs)
+                _expect_right(
+                    "part.monitor.parameters", POLICIES[self.monitor.policy].mistakes(self.monitor.parameters)
+                )
                 Monitor(self.monitor, bytes(KEY_BYTES), brief.batch)
                 self.monitor.spoofing(bytes(KEY_BYTES), brief.batch)
         with _using("part.states"):
@@ -357,6 +361,7 @@ class ControllerPart:
             given, own = brief.model.process, self.assignment.process
             if not all(np.array_equal(*two) for two in zip(given.matrices, own.matrices, strict=True)):
                 raise ValueError("its process is not that of the model")
+            _expect_right("part.assignment.parameters", CONTROLLERS[self.strategy].mistakes(self.assignment.parameters))
             objections = CONTROLLERS[self.strategy].objections(self.assignment)
         if objections:
             raise BriefError(f"part: the {objections[0][0]} {objections[0][1]}")

@@ -89,6 +89,8 @@ class Go(ControlCommand, frozen=True, tag="go"):
             raise message.malformed("absent = None", "a list absent of strings")
         if bounds.receivers is not None and not set(self.absent) <= set(bounds.receivers):
             raise message.malformed(f"absent = {shown(self.absent)}", f"some of {', '.join(bounds.receivers)}")
+        if self.until is not None and self.until <= self.slot:
+            raise message.malformed(f"until = {self.until}", f"a slot after {self.slot}")
 
 
 class LinkChange(ControlCommand, frozen=True, tag="change"):
@@ -124,7 +126,9 @@ class Again(ControlCommand, frozen=True, tag="again"):
         return pack(to_builtins(self) | ({} if self.links is None else {"links": links}))
 
     def expect(self, message: Reader, bounds: Bounds) -> None:
-        """The router needs the changed links, which are of the run."""
+        """The round and the slot are possible. The router needs the changed links, which are of the run."""
+        if self.round < 1 or self.slot > bounds.slots:
+            raise message.malformed(f"n = {self.round}, k = {self.slot}", f"n from 1 on, and k up to {bounds.slots}")
         if reader_of(message.key) == ROUTER:
             if self.links is None:
                 raise message.malformed("links = None", "a map links")

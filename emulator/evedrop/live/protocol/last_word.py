@@ -57,7 +57,7 @@ class LastWord(Struct, frozen=True, forbid_unknown_fields=True):
     def leave(self, file: str | Path | None) -> None:
         """Write it into a file, if that is possible; None: nobody asks for it."""
         if file is not None:
-            with suppress(OSError):
+            with suppress(OSError, UnicodeEncodeError):
                 world().disk.write(Path(file), json.encode(self))
 
 

@@ -42,6 +42,10 @@ class Extent:
     """Whether the sensor filters its measurements."""
     monitored: bool = False
     """Whether the plant's side has a watermark and a detector."""
+    silent: bool | None = None
+    """Whether the sensor may send nothing in a slot; None: not known."""
+    watched: bool | None = None
+    """Whether the sensor watches its acknowledgements; None: not known."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -61,6 +65,8 @@ def sensor_format(extent: Extent) -> RecordFormat[SensorSlots]:
         **dict.fromkeys(("u", "failed"), bool(extent.inputs)),
         "true": extent.measures,
         **dict.fromkeys(("statistic", "watermark"), extent.monitored),
+        "sent": extent.silent,
+        "alarms": extent.watched,
     }
     absent, present = ([name for name, there in depending.items() if there is kind] for kind in (False, True))
     return RecordFormat(SensorSlots, extent.axes, absent, present)
@@ -325,6 +331,8 @@ class Decisions:
 def read_decisions(message: Reader, first: int, extent: Extent, blocks: Blocks, period: int) -> Decisions:
     """Decode the controller's telemetry, which must begin at slot `first`, with a decision every `period` slots."""
     c = message.span(first, extent.slots, extent.batch + period)
+    if (first + c) % period and first + c != extent.slots:
+        raise message.malformed(f"slots to {first + c}", f"all slots of each decision, which holds for {period}")
     made = len(range(-(-first // period) * period, first + c, period))
     seconds = message.finite("seconds", (made,))
     if seconds.size and float(seconds.min()) < 0.0:

@@ -21,6 +21,7 @@ from evedrop.live.protocol.commands import Go, Hold, LinkChange
 from evedrop.live.protocol.launcher_events import ProcessRequest
 from evedrop.live.protocol.requests import LinkRequest, LinkStatus, PauseRequest, ResumeRequest, RunStatus, StepRequest
 from evedrop.live.recorder.conductor import Conductor
+from evedrop.model.checks import LAST_SLOT
 from evedrop.model.metrics.built_in import LinkAccount
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR, ProcessAction
@@ -226,7 +227,7 @@ class Steering:
                 )
             case StepRequest(slots):
                 self._note(k, f"step {slots} slots" if slots > 1 else "step 1 slot", "operator")
-                self._step, self.paused = OperatorStep(order, k, k + slots), False
+                self._step, self.paused = OperatorStep(order, k, min(k + slots, LAST_SLOT)), False
 
     def _change(self, k: int, order: Order, event: Mapping[str, Any]) -> None:
         """Add an event at slot k to the scenario, and send the router the changes of its links from then on."""

@@ -24,6 +24,7 @@ from evedrop.model.slot.records import LinkSlots, ReceiverSlots
 from evedrop.names import ROUTER, SENSOR
 from evedrop.scenario.closed_loop import monitor_of
 from evedrop.scenario.tables import Scenario
+from evedrop.score.links import chart_of
 from evedrop.score.slots import Slots
 
 _ROUNDING = 1e-9  # sums of a thousand traces in different orders differ by less
@@ -218,4 +219,6 @@ def extent_of(scenario: Scenario, batch: int) -> Extent:
         0 if plant is None or scenario.controller is None else plant.inputs,
         plant is not None and plant.output_matrix is not None,
         monitor_of(scenario) is not None,
+        scenario.scheme.may_be_silent,
+        chart_of(scenario) is not None,
     )

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
+from evedrop.model.checks import MOST_SLOTS
 from evedrop.model.integrity.loop import Source, WatermarkedLoop, spread, stationary
 from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.process import Floats, product
@@ -219,7 +220,10 @@ class Replay(SensorAttack):
     @classmethod
     def read(cls, plain: Mapping[str, Any]) -> Replay:
         """The attack with this data."""
-        return cls(plain[RECORDED])
+        recorded = plain[RECORDED]
+        if type(recorded) is not int or not 1 <= recorded <= MOST_SLOTS:
+            raise ValueError(f"{RECORDED} is {recorded!r:.40}, expected a number of slots from 1 to {MOST_SLOTS}")
+        return cls(recorded)
 
     def feed(self, key: bytes, batch: Batch) -> MeasurementFeed:
         """The recording of every trial."""

@@ -76,6 +76,7 @@ class ReceiverOutage(NamedTuple):
     """Whether it continues from its last belief; otherwise from the prior of the slot in which it went away."""
 
 
+_SETTINGS = frozenset({"loss", "delay", "reorder", "duplicate", "corrupt", "rate", "queue"})
 MOST_RATE = 1e6
 """The highest rate of a link, in packets a slot."""
 MOST_QUEUED = 1_000_000
@@ -122,9 +123,13 @@ class LinkSchedule:
 
 def _expect_settings(settings: Mapping[str, Any]) -> None:
     """Raise ValueError or KeyError for a mistake in the settings of a link."""
+    if unknown := sorted(settings.keys() - _SETTINGS):
+        raise ValueError(f"{unknown[0]:.40} is no setting of a link")
     if not isinstance(settings.get("loss"), Mapping):
         raise ValueError("its settings have no loss")
-    for spec in single_specs(settings["loss"]):
+    if not (specs := single_specs(settings["loss"])):
+        raise ValueError("its loss pools no links")
+    for spec in specs:
         _expect_right(LOSS_MODELS[spec["model"]], spec)
     mistakes = [
         *probability_mistakes(settings, "reorder", "duplicate", "corrupt"),
