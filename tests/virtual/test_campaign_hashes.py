@@ -11,7 +11,7 @@ import pytest
 
 from tests.virtual.simulated import played
 
-HASH = "17b55fdd32b6c586"
+HASH = "a5442c9bb3caf79e"
 """Of the seeds 1 to 30."""
 _PLAY = """
 from evedrop.results.reading import Results

@@ -44,7 +44,7 @@ _COMMON = frozenset({"k", "c", "n", "do"})
 _CHANGES = frozenset({"changes", "links"})
 """Fields with changes of links."""
 _OF_LINK = frozenset({"link", "loss", "model", "quality"})
-"""What each change of a link has; if something else is wrong in it, the router cannot know that another change was meant."""
+"""What each change of a link has. Anything else in it may be left out, or be another value that is right."""
 _Place = tuple[Any, ...]
 """The names, and the numbers in lists, that lead to a value in a message."""
 CONTRADICTIONS = ("but the journal says", "and what it reported of these slots", "contradicts")
@@ -97,10 +97,7 @@ def broken(some: random.Random, message: bytes, *, checked: bool = False, harmle
     if harmless:
         numbers = frozenset(name for place in places for name in place)
     else:
-        places = [place for place in places if _CHANGES.isdisjoint(place) or place[-1] in _OF_LINK]
-        places = [
-            place for place in places if place[0] != "late" or place[-1] != "k"
-        ]  # a packet of another slot, as late
+        places = [place for place in places if not _is_plausible(kind, place)]
     rarer = [place for place in places if place[-1] not in _COMMON]
     if rarer and some.random() < 0.8:
         places = rarer
@@ -110,6 +107,13 @@ def broken(some: random.Random, message: bytes, *, checked: bool = False, harmle
     while wrong == fields:
         wrong = _changed(some, fields, some.choice(places), numbers)
     return head + bytes(msgpack.packb(wrong))
+
+
+def _is_plausible(kind: str, place: _Place) -> bool:
+    """Whether another value there may be one that the sender could have meant."""
+    if kind == "downlink":
+        return place[0] == "late" and place[-1] == "k"  # a late packet of another slot
+    return kind == "control" and not _CHANGES.isdisjoint(place) and place[-1] not in _OF_LINK
 
 
 def _unpacked(message: bytes) -> tuple[str, bytes, Any]:

@@ -15,6 +15,7 @@ import pytest
 from evedrop.errors import MalformedMessage
 from evedrop.live.protocol.keys import RunKeys, low_pass, reader_of, writer_of
 from evedrop.model.links.loss_model import REASONS
+from evedrop.model.slot.link import LinkSchedule
 from tests.live.protocol.made_briefs import BRIEFS, refusal
 from tests.live.protocol.readers import EXAMPLES, READERS, TRIALS, fields_of
 
@@ -295,6 +296,13 @@ def test_a_brief_whose_parts_do_not_fit_together_is_refused(name: str, tmp_path:
         refused = refusal(brief, tmp_path)
         assert refused is not None
         assert message in refused, json.dumps(refused)
+
+
+def test_links_share_causes_with_a_probability() -> None:
+    """A brief that says otherwise is refused with it."""
+    schedule = LinkSchedule({"loss": {"model": "bernoulli", "quality": 0.5}}, correlation=("eve", 7.0))
+    with pytest.raises(ValueError, match="its correlation is 7, expected a number from 0 to 1"):
+        schedule.expect_possible()
 
 
 def test_an_estimator_that_knows_the_inputs_has_the_plant_of_its_model(tmp_path: Path) -> None:

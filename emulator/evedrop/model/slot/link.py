@@ -14,7 +14,14 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.checks import LAST_SLOT, expect_slots, number_mistakes, probability_mistakes, whole_number_mistakes
+from evedrop.model.checks import (
+    LAST_SLOT,
+    expect_slots,
+    is_probability,
+    number_mistakes,
+    probability_mistakes,
+    whole_number_mistakes,
+)
 from evedrop.model.delays import DELAY_MODELS, DelayModel, delay_of
 from evedrop.model.kernels.current import kernels
 from evedrop.model.links import LOSS_MODELS, loss_of, single_specs
@@ -117,6 +124,8 @@ class LinkSchedule:
         expect_slots(self.window, *(change.at for change in self.changes), *outages)
         if self.window > MOST_SLOTS:
             raise ValueError(f"its window is above {MOST_SLOTS} slots")
+        if self.correlation is not None and not is_probability(self.correlation[1]):
+            raise ValueError(f"its correlation is {self.correlation[1]:g}, expected a number from 0 to 1")
         for settings in (self.settings, *(change.settings for change in self.changes if change.settings is not None)):
             _expect_settings(settings)
 
