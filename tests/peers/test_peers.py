@@ -178,7 +178,7 @@ def test_who_is_to_be_told_a_state_is_told_it(stage: Stage) -> None:
     brief = briefs(eavesdroppers=told)["told"]
     stage.fill(RunKeys(brief.run).downlink("told"), deliveries())
     with pytest.raises(MalformedMessage, match="no truth; expected truth, the state of slot 2, which is betrayed"):
-        eavesdrop(brief, stage.session)
+        RECEIVERS["smart"](brief, stage.session)
 
 
 @pytest.mark.parametrize("name", ["legitimate", "smart"])

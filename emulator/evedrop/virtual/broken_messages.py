@@ -112,7 +112,7 @@ def broken(some: random.Random, message: bytes, *, checked: bool = False, harmle
 def _is_plausible(kind: str, place: _Place) -> bool:
     """Whether another value there may be one that the sender could have meant."""
     if kind == "downlink":
-        return place[0] == "late" and place[-1] == "k"  # a late packet of another slot
+        return (place[0], place[-1]) == ("late", "k")  # a late packet of another slot
     return kind == "control" and not _CHANGES.isdisjoint(place) and place[-1] not in _OF_LINK
 
 
