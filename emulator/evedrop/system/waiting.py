@@ -30,7 +30,10 @@ def wait_for_thread(thread: Thread, seconds: float = THREAD_SECONDS) -> None:
 
 @final
 class Alarm:
-    """Does something once some time has passed, on a thread of its own, unless it is set again or put off before."""
+    """Does something once some time has passed, on a thread of its own, unless it is set again or put off before.
+
+    Time in which the process was suspended hardly counts: it waits in steps.
+    """
 
     def __init__(self, act: Callable[[], object]) -> None:
         self._act, self._off = act, world().event()
@@ -45,8 +48,12 @@ class Alarm:
                 world().thread(self._wait, self._off, seconds, name="alarm").start()
 
     def _wait(self, off: ThreadEvent, seconds: float) -> None:
-        if not off.wait(seconds):
-            self._act()
+        step, left = max(1.0, seconds / 8.0), seconds
+        while left > 0.0:
+            if off.wait(min(step, left)):
+                return
+            left -= step
+        self._act()
 
 
 T = TypeVar("T")

@@ -8,7 +8,7 @@ Source: docs/maintainers/simulated-world.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,8 @@ from evedrop.virtual.faults import (
     ShortenMessage,
     StopProcess,
 )
-from evedrop.virtual.host_faults import LosePower
-from evedrop.virtual.host_parts import SESSION, host_of, part_of
+from evedrop.virtual.host_faults import FreezeSsh, LosePower
+from evedrop.virtual.host_parts import PROGRAM, SESSION, host_of, part_of
 from evedrop.virtual.processes import FORK_SERVERS
 from evedrop.virtual.reference import RunReference, tables_of
 from evedrop.virtual.results import lost_rows, wrong_outages, wrong_summary, wrong_tables
@@ -86,7 +86,12 @@ def misses(
         if isinstance(fault, StopProcess) and fault.seconds is None
         if at >= min(killed, cut.get(host_of(fault.target), math.inf))
     }
-    deaf = {host_of(name) for name in unheard} - {""}
+    for_good = [fault for fault in struck if fault.seconds is None]
+    stopped = {(part_of(fault.target), host_of(fault.target)) for fault in for_good if isinstance(fault, StopProcess)}
+    frozen = {host_of(fault.target) for fault in for_good if isinstance(fault, FreezeSsh)}
+    # Whom nobody tells that the connection has ended lets nobody go on.
+    untold = {host for part, host in stopped if part == PROGRAM and (host in frozen or (SESSION, host) in stopped)}
+    deaf = {host_of(name) for name in unheard} - {""} | untold
     broken = [f"{name} is left" for name in run.left if name not in unheard and host_of(name) not in deaf]
     broken += [f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors]
     broken += _of_status(case, run, struck, reference.status)
@@ -126,7 +131,7 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
         if status != RunError.exit_status or program not in run.said:
             yield f"status {status}, although a program is wrong ({program}): {complaint}"
     elif status == good:
-        yield from _of_ignored_signals(case, run, {fault: struck[fault] for fault in fatal})
+        yield from _of_ignored_signals(case, run, struck, fatal)
     elif not fatal:
         yield f"status {status}, although nothing of this may end a run: {complaint}"
     elif not any(status in fault.statuses for fault in fatal):
@@ -174,17 +179,25 @@ def _may_complete(case: SimulatedCase) -> bool:
 def _is_worse_for_others(fault: Disturbance) -> bool:
     """Whether because of it a run may not survive another fault.
 
-    A recorder that nothing reaches does not see that others are connected again, and without a fork server no router is started
-    again.
+    A recorder that nothing reaches does not see that others are connected again, and without a launcher, or a fork server, no
+    router is started again.
     """
-    return fault.target in FORK_SERVERS or (fault.cuts_off and fault.target in (RECORDER, EVERYBODY))
+    return fault.target in (*FORK_SERVERS, LAUNCHER) or (fault.cuts_off and fault.target in (RECORDER, EVERYBODY))
 
 
-def _of_ignored_signals(case: SimulatedCase, run: SimulatedRun, fatal: Mapping[Disturbance, float]) -> Iterator[str]:
-    """A launcher that is told to end while slots are to come ends the run, rather than complete it."""
-    for fault, at in fatal.items():
+def _of_ignored_signals(
+    case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float], fatal: Collection[Disturbance]
+) -> Iterator[str]:
+    """A launcher that is told to end while slots are to come ends the run, rather than complete it, once it is not suspended."""
+    for fault in fatal:
+        at = struck[fault]
         if Interrupted.exit_status in fault.statuses and fault.target == LAUNCHER:
-            late = at + _HEEDED_SECONDS
+            stops = [
+                since + (stop.seconds or math.inf)
+                for stop, since in struck.items()
+                if isinstance(stop, StopProcess) and stop.target == LAUNCHER
+            ]
+            late = max([at, *stops]) + _HEEDED_SECONDS
             if any(moment > late and done < case.scenario.slots for moment, done in _progress(run)):
                 yield f"the run went on to its end, {_HEEDED_SECONDS:.0f} s and more after {fault}"
 
@@ -344,7 +357,9 @@ def _of_results(
         is_over = reference.shards == 1 and any(message.said == "end" for message in run.put)
         if is_over and summary["slots"] < reference.scenario.slots:
             yield f"all slots were done, and the summary has {summary['slots']}"
-        if not any(fault.ends_at_once(RECORDER) for fault in struck):
+        # A recorder that is killed has no time to save what it told.
+        killed = run.ends.get(RECORDER, (0.0, 0))[1] == KILLED or any(fault.ends_at_once(RECORDER) for fault in struck)
+        if not killed:
             yield from _of_course(case, run, struck, summary, expected, whole)
 
 

@@ -46,6 +46,10 @@ class Conducted:
         """These vanish."""
         self.lost |= dict.fromkeys(names, self.clock.monotonic())
 
+    def wait_longer(self, seconds: float) -> None:
+        """Give those that are lost more time."""
+        self.lost = {name: at + seconds for name, at in self.lost.items()}
+
     def router_changed(self) -> bool:
         """As the test says."""
         return self.another_router
@@ -131,6 +135,18 @@ def recovery_of(conducted: Conducted, clock: TestClock, longest_outage: float, p
         lambda _: None,
         clock,
     )
+
+
+def test_time_in_which_the_recorder_did_not_run_does_not_count() -> None:
+    """It could not hear that those who were lost are back."""
+    conducted, clock = Conducted(), TestClock()
+    recovery = recovery_of(conducted, clock, 3.0)
+    recovery.poll(10)
+    conducted.lose("smart")
+    recovery.poll(10)
+    clock.now += 3600.0
+    recovery.poll(10)
+    assert clock.now - conducted.lost["smart"] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("awaits_belief", [False, True])

@@ -16,7 +16,7 @@ from evedrop.live.launch.briefs import LAUNCHED_PATIENCE, MOST_SLOTS_AHEAD, Reco
 from evedrop.live.launch.children import SILENCE_SECONDS, Children, ProcessExit
 from evedrop.live.launch.ports import RouterEndpoints, socket_endpoints
 from evedrop.live.launch.private_folder import private_folder, socket_folder
-from evedrop.live.launch.starter import Starter
+from evedrop.live.launch.starter import FORK_SERVER_LOST, Starter
 from evedrop.live.network.control_file import remove_control
 from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.results.folder import HeldFolder, make_private, new_folder
@@ -209,5 +209,10 @@ def _stopped(children: Children, on_event: OnEvent) -> RunEnded:
 
 
 def _meant_us_too(ended: ProcessExit, stop: ThreadEvent) -> bool:
-    """Whether the signal that ended a child soon reaches the launcher, too, as when a closing terminal hangs up on all."""
+    """Whether the signal that ended a child soon reaches the launcher, too, as when a closing terminal hangs up on all.
+
+    A fork server that several shards share is given up by the first of them that hears it.
+    """
+    if ended.status == FORK_SERVER_LOST:
+        return stop.is_set()
     return ended.status == INTERRUPTED and stop.wait(AFTERTHOUGHT_SECONDS)

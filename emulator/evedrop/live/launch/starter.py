@@ -277,10 +277,12 @@ class ForkServer:
         with self._asking:
             try:
                 self._channel.send(json.dumps(request).encode(), files)
+                begun = self._answer(stop)
             except (ConnectionError, TimeoutError):
-                raise OSError(*_GONE) from None
-            begun = self._answer(stop)
+                begun = OSError(*_GONE)
         if isinstance(begun, OSError):
+            if stop is not None and stop.is_set():  # whoever asked before has given the server up
+                raise Interrupted
             raise begun
         return begun
 

@@ -221,9 +221,13 @@ class GapDetector:
     """Handles messages of slots that are not due: ignores earlier slots, and for later ones waits for the missing slot."""
 
     def __init__(self, key: str, patience: float, clock: Clock = SYSTEM_CLOCK) -> None:
-        """patience: for how many seconds later slots may arrive while the due one does not."""
+        """patience: for how many seconds later slots may arrive while the due one does not.
+
+        Time in which this process did not run hardly counts: what is due may wait for it.
+        """
         self._key, self._patience, self._clock = key, patience, clock
-        self._slot, self._since = -1, 0.0
+        self._step = max(1.0, patience / 4.0)
+        self._slot, self._last, self._missing = -1, 0.0, 0.0
 
     def take_message(self, receive: Callable[[], Reader], due: int) -> Reader:
         """Wait for the message of slot `due`. Raises Gap as `missed` does."""
@@ -237,6 +241,9 @@ class GapDetector:
         if slot < due:
             return
         if self._slot != due:
-            self._slot, self._since = due, now
-        elif now - self._since > self._patience:
+            self._slot, self._missing = due, 0.0
+        else:
+            self._missing += min(now - self._last, self._step)
+        self._last = now
+        if self._missing > self._patience:
             raise Gap(self._key, due, slot)

@@ -23,6 +23,7 @@ from evedrop.system.world import world
 
 _ABANDON_SECONDS = 2.0  # for processes to leave when told to
 _POLL_SECONDS = 0.05  # how soon a signal is noticed
+_LOST_TOGETHER_SECONDS = 1.0  # in which a router's processes are missed that are lost with it
 _END_SECONDS = 0.5  # how often a process that is still present is told that the run is over
 _RETURN_SECONDS = 3.0  # within which a process may return that was told to end and vanished without confirming it
 _ROUTERS_SECONDS = 5.0  # for a router to confirm
@@ -260,12 +261,24 @@ class Conductor:
         except Empty:
             return None
 
+    def wait_longer(self, seconds: float) -> None:
+        """Give processes that are missing more time to come back."""
+        if seconds > 0.0:
+            self.lost = {name: at + seconds for name, at in self.lost.items()}
+
+    def _restart_time_of_others(self, at: float) -> None:
+        """A router that was lost at some time is back: those that were lost with it can connect from now on only."""
+        now = self._clock.monotonic()
+        self.lost = {name: now if lost > at - _LOST_TOGETHER_SECONDS else lost for name, lost in self.lost.items()}
+
     def _note(self, item: tuple[str, bytes | bool] | None) -> None:
         if item is None or not isinstance(item[1], bool):
             return
         name, there = item[0], item[1]
         self._present[name] = there
         if there:
-            self.lost.pop(name, None)
+            at = self.lost.pop(name, None)
+            if name in {ROUTER, RELAY} and at is not None:
+                self._restart_time_of_others(at)
         else:
             self.lost.setdefault(name, self._clock.monotonic())

@@ -214,13 +214,16 @@ class Recovery:
         self._number = 0
         self.outages: list[ConnectionOutage] = []
         """All outages so far."""
+        self._polled = self._clock.monotonic()
 
     def poll(self, done: int) -> None:
         """Handle lost connections, given that all slots below `done` are joined.
 
-        Raises RunError if a process has been missing for too long.
+        Raises RunError if a process has been missing for too long. Time in which the recorder itself did not run does not count.
         """
         now = self._clock.monotonic()
+        self._conductor.wait_longer(max(0.0, now - self._polled - _STEP_SECONDS))
+        self._polled = now
         if done > self._done:
             self._go_on(done, now)
         if self._conductor.missing:

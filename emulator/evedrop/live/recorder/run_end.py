@@ -10,6 +10,7 @@ from typing import final
 
 from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError, UnwrittenResults
 from evedrop.live.protocol.last_word import protocol_breaker
+from evedrop.names import RELAY, ROUTER
 from evedrop.results.summary_file import unwritten
 from evedrop.scenario.progress_events import RunEnded
 from evedrop.score.scorekeeper import RunOutcome
@@ -46,6 +47,9 @@ class RunEnd:
     def blame(self, missing: list[str], error: EvedropError) -> None:
         """Note which processes are at fault for the error; missing: those that are not on the network."""
         # Some may be missing just now, too: a cut connection does not fill the disk.
+        missing = next(
+            ([name] for name in (RELAY, ROUTER) if name in missing), missing
+        )  # the others are missed with it
         self.suspects = () if isinstance(error, UnwrittenResults) else tuple(missing)
         self.accused = error.at_fault if isinstance(error, RunError) else ()
         self.broken_by = protocol_breaker(error)
