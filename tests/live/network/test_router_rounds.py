@@ -14,7 +14,7 @@ from evedrop.live.launch.briefs import history_of
 from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.commands import Again, Go, LinkChange
+from evedrop.live.protocol.commands import Again, EndRun, Go, LinkChange
 from evedrop.live.protocol.record_messages import packed
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.slot.link import Change
@@ -241,6 +241,7 @@ def test_a_wrong_change_of_a_link_ends_the_router(change: Change, message: str) 
     bench.stage.commands.put(LinkChange("eve", (change,)).pack())
     with pytest.raises(MalformedMessage, match=message):
         loop.carry_on()
+    bench.stage.commands.put(EndRun().pack())
 
 
 def test_a_wrong_change_that_is_told_again_ends_the_router() -> None:
@@ -251,6 +252,7 @@ def test_a_wrong_change_that_is_told_again_ends_the_router() -> None:
     announce(bench, 1, 0, 0)
     with pytest.raises(MalformedMessage, match="quality is true"):
         loop.carry_on()
+    bench.stage.commands.put(EndRun().pack())
 
 
 def test_a_packet_without_the_state_that_is_betrayed_ends_the_router() -> None:
@@ -261,6 +263,7 @@ def test_a_packet_without_the_state_that_is_betrayed_ends_the_router() -> None:
     send(bench, range(4))
     with pytest.raises(MalformedMessage, match="no truth; expected truth, the state of slot 3, which is betrayed"):
         loop.carry_on()
+    bench.stage.commands.put(EndRun().pack())
 
 
 @pytest.mark.parametrize("kept", [True, False])
