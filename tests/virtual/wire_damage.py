@@ -108,7 +108,7 @@ DAMAGES: dict[str, Damage] = {
     "a start with a wrong number": Damage(
         _edited(lambda entries: entries[0].update(start=-1)), "is not the history of a wire"
     ),
-    "a wrong probability": Damage(_in_settings("corrupt", 2.0), "corrupt is 2.0; expected a probability"),
+    "a wrong probability": Damage(_in_settings("corrupt", 2.0), "corrupt is 2.0; expected a number from 0 to 1"),
     "a wrong loss model": Damage(
         _in_settings("loss", {"model": "bernoulli", "quality": 7.0}), "has settings of the link"
     ),

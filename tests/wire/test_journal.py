@@ -150,6 +150,19 @@ def test_a_row_says_all_that_was_recorded(tmp_path: Path) -> None:
     assert journal.counts == {("scan", "scan/ä", "put"): 5}
 
 
+def test_records_without_a_history_are_not_written_over(tmp_path: Path) -> None:
+    """A history that was removed, or lost the line of a start, knows nothing of the records of that start."""
+    with WireJournal(tmp_path, wire_plan()) as journal:
+        put(journal, 0)
+    before = rows_of(tmp_path)
+    (tmp_path / "journal" / "history.jsonl").unlink()
+    with pytest.raises(
+        UsageError, match="has records of start 1, of which its history knows nothing; give another folder"
+    ):
+        WireJournal(tmp_path, wire_plan())
+    assert rows_of(tmp_path) == before
+
+
 def test_another_wire_on_the_same_folder_is_refused(tmp_path: Path) -> None:
     """While the first one runs; afterwards it may have the folder, but not with another seed."""
     with WireJournal(tmp_path, wire_plan()) as journal:

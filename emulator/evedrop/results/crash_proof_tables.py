@@ -25,6 +25,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from evedrop.results.folder import UNFINISHED, make_private, replace_private
+from evedrop.results.resolved_scenario import STATES
 from evedrop.results.tables import NULLABLE
 from evedrop.system.disk import write_all
 from evedrop.system.files import LineFile, is_locked, lines_in, try_lock
@@ -277,11 +278,14 @@ def metrics_path(folder: Path) -> Path:
 
 
 def keep(folder: Path) -> TableRound:
-    """Let a power cut leave all rows that count; returns their round. Raises OSError."""
+    """Let a power cut leave all rows that count, and the states that they are of; returns their round. Raises OSError."""
     latest = last_round(folder)
-    for file in (*(file for file, _ in latest.tables.values()), _ROUNDS):
+    files = [folder / UNFINISHED / file for file in (*(file for file, _ in latest.tables.values()), _ROUNDS)]
+    if (folder / STATES).exists():
+        files.insert(0, folder / STATES)
+    for file in files:
         with contextlib.suppress(FileNotFoundError):  # of a table that is a Parquet file already
-            world().disk.sync(folder / UNFINISHED / file)
+            world().disk.sync(file)
     return latest
 
 

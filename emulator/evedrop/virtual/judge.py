@@ -14,6 +14,7 @@ from typing import Any
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.briefs import LAUNCHED_PATIENCE
+from evedrop.live.launch.other_hosts import TOLERATED
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.names import RECORDER, ROUTER, SENSOR
 from evedrop.results.crash_proof_tables import last_round
@@ -59,6 +60,10 @@ _PATIENCES = 2.0
 """How many times the longest outage a run may wait before it gives up."""
 _HOSTS_SECONDS = 180.0
 """For which a run also waits for other hosts, and processes there for others."""
+_RECONNECTS_SECONDS = 0.5
+"""For a process that can connect again to do so."""
+_HUBS = frozenset({*ROUTERS, EVERYBODY, LAUNCHER, *FORK_SERVERS})
+"""Whose faults hit all others."""
 _SILENT = "stopped responding"
 """What a run that fails says of a process that fell silent for a reason it does not know."""
 _GOES_ON = ("control.json", "unfinished")
@@ -120,7 +125,7 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
     status = run.status
     program = _wrong_program(case)
     complaint = next((line for line in run.said.splitlines() if line.strip() and "warning" not in line), "")
-    fatal = [fault for fault in struck if not fault.survived(case.scenario.longest_outage)]
+    fatal = _fatal(case, struck)
     if run.suspended:
         return
     refused = None if case.hosts is None else case.hosts.refused(case.scenario)
@@ -144,7 +149,7 @@ def _of_blame(
     case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float], complaint: str
 ) -> Iterator[str]:
     """Whether a run that failed names what has made it fail; complaint: the first line of what it said."""
-    fatal = [fault for fault in struck if not fault.survived(case.scenario.longest_outage)]
+    fatal = _fatal(case, struck)
     first = min(struck[fault] for fault in fatal)  # what comes later, or lasts until then, hits a run that fails
     counted = [
         fault
@@ -174,6 +179,29 @@ def _wrong_program(case: SimulatedCase) -> str | None:
 def _may_complete(case: SimulatedCase) -> bool:
     """Whether the run may complete although its program of states is wrong."""
     return case.program is not None and case.program.tolerated
+
+
+def _fatal(case: SimulatedCase, struck: Mapping[Disturbance, float]) -> list[Disturbance]:
+    """The faults that may end the run: those that do so alone, and those that follow each other and last too long together."""
+    longest = case.scenario.longest_outage
+    fatal = [fault for fault in struck if not fault.survived(longest)]
+    lasting = [fault for fault in struck if fault not in fatal and fault.seconds is not None and fault.harmless is None]
+    for first in lasting:
+        joined, end = [first], struck[first] + (first.seconds or 0.0)
+        for fault in sorted(lasting, key=struck.__getitem__):
+            if struck[first] <= struck[fault] <= end + _RECONNECTS_SECONDS and fault != first and _meet(first, fault):
+                joined.append(fault)
+                end = max(end, struck[fault] + (fault.seconds or 0.0))
+        most = TOLERATED * longest if any(isinstance(fault, FreezeSsh) for fault in joined) else longest
+        if len(joined) > 1 and end - struck[first] >= most - _RECONNECTS_SECONDS:
+            fatal += [fault for fault in joined if fault not in fatal]
+    return fatal
+
+
+def _meet(one: Disturbance, other: Disturbance) -> bool:
+    """Whether somebody whom the one cuts off, or suspends, may be cut off by the other, too."""
+    hosts = {host_of(one.target), host_of(other.target)}
+    return one.target == other.target or hosts != {""} or not _HUBS.isdisjoint({one.target, other.target})
 
 
 def _is_worse_for_others(fault: Disturbance) -> bool:
@@ -219,11 +247,12 @@ def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
         most += fault.seconds or 0.0
         if fault.target == EVERYBODY or scenario.timeline.holds:  # what was lost may have to be asked for twice
             most += _FAULT_SECONDS
-    if any(not fault.survived(scenario.longest_outage) for fault in struck):
+    fatal = _fatal(case, struck)
+    if fatal:
         most += _PATIENCES * scenario.longest_outage + LAUNCHED_PATIENCE
     most += max((fault.awaited_seconds for fault in struck), default=0.0)
     took = run.seconds if case.hosts is None else run.ended  # programs on other hosts may wait for a launcher
-    if case.hosts is not None and any(not fault.survived(scenario.longest_outage) for fault in struck):
+    if case.hosts is not None and fatal:
         most += _HOSTS_SECONDS
     if took > most and not run.suspended:
         yield f"the run took {took:.1f} s, and not {most:.1f} s at most"

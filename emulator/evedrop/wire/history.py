@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, final
 
 from evedrop.errors import UsageError
-from evedrop.model.checks import as_toml
+from evedrop.model.checks import probability_mistakes
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.slot.link import NEVER, Change
@@ -143,12 +143,10 @@ class WireHistory:
                     (f"loss.{name}", sentence)
                     for name, sentence in model_mistakes(change.settings["loss"], LOSS_MODELS)
                 ]
-                if "delay" in change.settings:
+                if change.settings.get("delay") is not None:
                     wrong = model_mistakes(change.settings["delay"], DELAY_MODELS)
                     mistakes += [(f"delay.{name}", reason) for name, reason in wrong]
-                corrupt = change.settings.get("corrupt", 0.0)
-                if not isinstance(corrupt, float | int) or not 0.0 <= corrupt <= 1.0:
-                    mistakes.append(("corrupt", f"is {as_toml(corrupt)}; expected a probability"))
+                mistakes += probability_mistakes(change.settings, "corrupt", "duplicate", "reorder")
                 for name, reason in mistakes:
                     raise UsageError(f"{self.folder / _FILE} has settings of the link {link} in which {name} {reason}")
 
@@ -161,12 +159,15 @@ class WireHistory:
             )
 
     def _write(self, entry: Mapping[str, Any]) -> None:
+        lasting = "start" in entry or "end" in entry  # records after a start are nothing without it
         with self._lock:
             path = self.folder / _FILE
+            if not lasting:  # it is in force, even if it cannot be written
+                self._take(json.loads(json.dumps(entry)))
             with LineFile(path) as file:
                 line = file.append(entry)
-            self._take(json.loads(line))
-            if "start" in entry or "end" in entry:  # records after a start are nothing without it
+            if lasting:
+                self._take(json.loads(line))
                 world().disk.sync(path)
 
     def _take(self, entry: Mapping[str, Any]) -> None:

@@ -608,8 +608,9 @@ class JournalPlace:
         """This folder, or the one inside it, if it was removed or moved since the wire began, as of the last `poll`."""
         self.unfinished = journal / UNFINISHED
         """The folder inside it for records that are not yet in a Parquet file."""
+        make_private(journal)
+        self._lock = locked(journal)  # before anything is made that a wire which uses the folder might remove
         make_private(self.unfinished)
-        self._lock = locked(journal)
         self._alive: FileIO | None = None
         self._telling = world().rlock()  # so that threads that miss something at once tell so once
 
@@ -691,7 +692,12 @@ def recover(journal: Path, history: WireHistory) -> int:
     """
     place = journal / UNFINISHED
     recovered, alive = 0, last_beat(place)
-    names = [name for name in part_names(journal) if int(name.partition("-")[0]) == history.start]
+    starts = {name: int(name.partition("-")[0]) for name in part_names(journal)}
+    if (latest := max(starts.values(), default=0)) > history.start:  # else the next start would write over them
+        raise UsageError(
+            f"{journal} has records of start {latest}, of which its history knows nothing; give another folder"
+        )
+    names = [name for name, start in starts.items() if start == history.start]
     counts = dict(history.counts)
     for name in names:
         path = parquet_path(journal, name)

@@ -24,6 +24,7 @@ from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
 from evedrop.score.summary import Summary
 from evedrop.score.verdict import Verdict
+from evedrop.system.world import world
 
 
 @final
@@ -56,6 +57,7 @@ class RunFolder:
         """Replace the scenario with one that the operator has amended. Raises RunError if it cannot be written."""
         try:
             write_resolved(self.now, scenario)
+            world().disk.sync(self.now / "scenario.toml")  # its new name, too: rows of the changed link follow
         except OSError as error:
             raise UnwrittenResults(unwritten(error)) from error
         self._score.scenario = scenario
