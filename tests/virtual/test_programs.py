@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.cli.simulated import program
-from evedrop.results.resolved_scenario import STATES
+from evedrop.results.folder import STATES
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.campaign import play_case
 from evedrop.virtual.cases import SimulatedCase, case_from, case_of

@@ -157,7 +157,7 @@ def test_records_without_a_history_are_not_written_over(tmp_path: Path) -> None:
     before = rows_of(tmp_path)
     (tmp_path / "journal" / "history.jsonl").unlink()
     with pytest.raises(
-        UsageError, match="has records of start 1, of which its history knows nothing; give another folder"
+        UsageError, match="has records of start 1, but its history lacks that start; give another folder"
     ):
         WireJournal(tmp_path, wire_plan())
     assert rows_of(tmp_path) == before

@@ -24,8 +24,7 @@ import pyarrow.parquet as pq
 import xxhash
 from numpy.typing import NDArray
 
-from evedrop.results.folder import UNFINISHED, make_private, replace_private
-from evedrop.results.resolved_scenario import STATES
+from evedrop.results.folder import STATES, UNFINISHED, make_private, replace_private
 from evedrop.results.tables import NULLABLE
 from evedrop.system.disk import write_all
 from evedrop.system.files import LineFile, is_locked, lines_in, try_lock

@@ -23,6 +23,8 @@ from evedrop.system.files import shown
 from evedrop.system.signals import leave_after
 from evedrop.system.world import world
 
+STATES = "states.csv"
+"""The file in a results folder if its states were given."""
 UNFINISHED = "unfinished"
 """The folder inside a results folder that contains what only a run in progress needs, such as unfinished tables."""
 

@@ -15,16 +15,13 @@ from typing import Any, final
 import numpy as np
 
 from evedrop.model.process import Floats
-from evedrop.results.folder import replace_private
+from evedrop.results.folder import STATES, replace_private
 from evedrop.scenario.plugins import sources_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.recordings.disturbance_file import number_lines, table_head, table_text
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import toml_text
 from evedrop.system.world import world
-
-STATES = "states.csv"
-"""The file in a results folder if its states were given."""
 
 
 @final

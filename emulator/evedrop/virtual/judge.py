@@ -94,7 +94,7 @@ def misses(
     for_good = [fault for fault in struck if fault.seconds is None]
     stopped = {(part_of(fault.target), host_of(fault.target)) for fault in for_good if isinstance(fault, StopProcess)}
     frozen = {host_of(fault.target) for fault in for_good if isinstance(fault, FreezeSsh)}
-    # Whom nobody tells that the connection has ended lets nobody go on.
+    # A program that never hears that the connection has ended resumes nobody.
     untold = {host for part, host in stopped if part == PROGRAM and (host in frozen or (SESSION, host) in stopped)}
     deaf = {host_of(name) for name in unheard} - {""} | untold
     broken = [f"{name} is left" for name in run.left if name not in unheard and host_of(name) not in deaf]
@@ -189,7 +189,11 @@ def _fatal(case: SimulatedCase, struck: Mapping[Disturbance, float]) -> list[Dis
     for first in lasting:
         joined, end = [first], struck[first] + (first.seconds or 0.0)
         for fault in sorted(lasting, key=struck.__getitem__):
-            if struck[first] <= struck[fault] <= end + _RECONNECTS_SECONDS and fault != first and _meet(first, fault):
+            if (
+                struck[first] <= struck[fault] <= end + _RECONNECTS_SECONDS
+                and fault != first
+                and _meet(case, first, fault)
+            ):
                 joined.append(fault)
                 end = max(end, struck[fault] + (fault.seconds or 0.0))
         most = TOLERATED * longest if any(isinstance(fault, FreezeSsh) for fault in joined) else longest
@@ -198,10 +202,16 @@ def _fatal(case: SimulatedCase, struck: Mapping[Disturbance, float]) -> list[Dis
     return fatal
 
 
-def _meet(one: Disturbance, other: Disturbance) -> bool:
-    """Whether somebody whom the one cuts off, or suspends, may be cut off by the other, too."""
-    hosts = {host_of(one.target), host_of(other.target)}
-    return one.target == other.target or hosts != {""} or not _HUBS.isdisjoint({one.target, other.target})
+def _meet(case: SimulatedCase, one: Disturbance, other: Disturbance) -> bool:
+    """Whether both faults may cut off or suspend the same process."""
+    first, second = _hit(case, one), _hit(case, other)
+    return bool(first & second) or not _HUBS.isdisjoint(first | second)
+
+
+def _hit(case: SimulatedCase, fault: Disturbance) -> set[str]:
+    """What a fault hits: its target, or a host and the processes there."""
+    host = host_of(fault.target)
+    return {host, *case.hosts.processes_on(host)} if host and case.hosts is not None else {fault.target}
 
 
 def _is_worse_for_others(fault: Disturbance) -> bool:
@@ -223,7 +233,7 @@ def _of_ignored_signals(
             stops = [
                 since + (stop.seconds or math.inf)
                 for stop, since in struck.items()
-                if isinstance(stop, StopProcess) and stop.target == LAUNCHER
+                if isinstance(stop, StopProcess) and stop.target == LAUNCHER and since <= at + _HEEDED_SECONDS
             ]
             late = max([at, *stops]) + _HEEDED_SECONDS
             if any(moment > late and done < case.scenario.slots for moment, done in _progress(run)):

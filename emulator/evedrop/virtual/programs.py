@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, final
 import zenoh
 
 from evedrop.errors import ScenarioError
-from evedrop.results.resolved_scenario import STATES
+from evedrop.results.folder import STATES
 from evedrop.scenario.loading import Scenario
 from evedrop.system.world import world as here
 from evedrop.virtual.disturbance import LAUNCHER

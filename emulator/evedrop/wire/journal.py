@@ -695,7 +695,7 @@ def recover(journal: Path, history: WireHistory) -> int:
     starts = {name: int(name.partition("-")[0]) for name in part_names(journal)}
     if (latest := max(starts.values(), default=0)) > history.start:  # else the next start would write over them
         raise UsageError(
-            f"{journal} has records of start {latest}, of which its history knows nothing; give another folder"
+            f"{journal} has records of start {latest}, but its history lacks that start; give another folder"
         )
     names = [name for name, start in starts.items() if start == history.start]
     counts = dict(history.counts)

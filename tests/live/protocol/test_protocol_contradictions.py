@@ -225,7 +225,7 @@ UNUSABLE: dict[str, list[tuple[Callable[[dict[str, Any]], None], str]]] = {
         ),
         (set_in("part.links.legitimate.settings.reorder", 2**63), "expected a number from 0 to 1"),
         (set_in("part.links.legitimate.settings.rate", 1.0), "it has a rate, and no queue"),
-        (set_in("part.links.legitimate.settings.colour", 1.0), "colour is no setting of a link"),
+        (set_in("part.links.legitimate.settings.colour", 1.0), "a link has no setting colour"),
         (set_in("part.links.legitimate.settings.loss", {"model": "pooled", "links": []}), "its loss pools no links"),
         (set_in("part.links.legitimate.settings.delay", {"model": "constant", "colour": 1}), "'colour'"),
         (

@@ -31,7 +31,7 @@ from evedrop.system.world import world
 _POLL_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
 _LONGER = 1.1
-"""How much longer the launcher waits for a relay than that for a router on another host: the relay knows why it gives up."""
+"""How many times as long the launcher waits for a relay as the relay for its router: the relay can say why it gave up."""
 
 
 @dataclass(frozen=True)

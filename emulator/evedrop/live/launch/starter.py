@@ -281,7 +281,7 @@ class ForkServer:
             except (ConnectionError, TimeoutError):
                 begun = OSError(*_GONE)
         if isinstance(begun, OSError):
-            if stop is not None and stop.is_set():  # whoever asked before has given the server up
+            if stop is not None and stop.is_set():  # another shard has already given up the server
                 raise Interrupted
             raise begun
         return begun

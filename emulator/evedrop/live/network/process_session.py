@@ -223,7 +223,7 @@ class GapDetector:
     def __init__(self, key: str, patience: float, clock: Clock = SYSTEM_CLOCK) -> None:
         """patience: for how many seconds later slots may arrive while the due one does not.
 
-        Time in which this process did not run hardly counts: what is due may wait for it.
+        Time in which this process did not run hardly counts: the message may already be here, unread.
         """
         self._key, self._patience, self._clock = key, patience, clock
         self._step = max(1.0, patience / 4.0)

@@ -46,10 +46,9 @@ class RunEnd:
 
     def blame(self, missing: list[str], error: EvedropError) -> None:
         """Note which processes are at fault for the error; missing: those that are not on the network."""
+        # Without the router no other process can be seen.
+        missing = next(([name] for name in (RELAY, ROUTER) if name in missing), missing)
         # Some may be missing just now, too: a cut connection does not fill the disk.
-        missing = next(
-            ([name] for name in (RELAY, ROUTER) if name in missing), missing
-        )  # the others are missed with it
         self.suspects = () if isinstance(error, UnwrittenResults) else tuple(missing)
         self.accused = error.at_fault if isinstance(error, RunError) else ()
         self.broken_by = protocol_breaker(error)

@@ -133,7 +133,7 @@ class LinkSchedule:
 def _expect_settings(settings: Mapping[str, Any]) -> None:
     """Raise ValueError or KeyError for a mistake in the settings of a link."""
     if unknown := sorted(settings.keys() - _SETTINGS):
-        raise ValueError(f"{unknown[0]:.40} is no setting of a link")
+        raise ValueError(f"a link has no setting {unknown[0]:.40}")
     if not isinstance(settings.get("loss"), Mapping):
         raise ValueError("its settings have no loss")
     if not (specs := single_specs(settings["loss"])):

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from evedrop.results.resolved_scenario import DISTURBANCES, STATES
+from evedrop.results.folder import STATES
+from evedrop.results.resolved_scenario import DISTURBANCES
 from evedrop.show.report.page import made
 from evedrop.system.files import Unreadable, text_of
 
