@@ -64,7 +64,7 @@ class BreakMessage(Disturbance):
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Let it be wrong."""
-        some = random.Random(world.scheduler.random.getrandbits(64))  # noqa: S311 - to be repeated, not to be secret
+        some = random.Random(f"{world.scheduler.seed} {self}")  # noqa: S311 - to be repeated, whatever happened before it
         scenario = world.scenario
         checked = self.target == RECORDER and scenario is not None and scenario.record_trials == scenario.trials
         wanted = some.choice(_WANTED) if self.target == RECORDER else ""

@@ -171,6 +171,7 @@ class VirtualScheduler:
 
     def __init__(self, seed: int, keep: bool = False) -> None:
         """keep: whether to keep what happened, to be shown; its hash is made in any case."""
+        self.seed = seed
         self.random = random.Random(seed)  # noqa: S311 - to be repeated, not to be secret
         self.now = 0.0
         self.hub = getcurrent()

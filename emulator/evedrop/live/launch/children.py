@@ -362,8 +362,6 @@ class Children:
             return missed
         place = self._briefs[name].router
         hub = RELAY if RELAY in self._processes and name != SENSOR else ROUTER
-        if world().is_suspended(self._processes[hub].pid):
-            return hub
         others = [process for process, brief in self._briefs.items() if brief.router == place and process not in _HUBS]
         deadline = world().monotonic() + (_GONE_SECONDS if len(others) > 1 and not suspects else 0.0)
         while world().monotonic() < deadline:

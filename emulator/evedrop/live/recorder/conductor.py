@@ -222,9 +222,13 @@ class Conductor:
     def _end_router(self, name: str) -> None:
         """Tell a router that the run is over until it confirms it: the router by a message, the relay by its token."""
         deadline = self._clock.monotonic() + _ROUTERS_SECONDS
-        sent = 0.0
+        sent, cut_off = 0.0, -math.inf
         while self._clock.monotonic() < deadline and name not in self.misdelivered:
-            if name == RELAY and not self._present[name] and self._session.linked():
+            if not (self._session.linked() and self._present[ROUTER]):
+                cut_off = (
+                    self._clock.monotonic()
+                )  # all tokens vanish with the connection, and return one after the other
+            elif name == RELAY and not self._present[name] and self._clock.monotonic() - cut_off > _RETURN_SECONDS:
                 return
             if self._clock.monotonic() - sent > _END_SECONDS:
                 sent = self._clock.monotonic()
