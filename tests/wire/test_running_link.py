@@ -83,6 +83,46 @@ def test_a_message_waits_for_those_before_it(tmp_path: Path) -> None:
     assert [decision[3] for decision in sent] == [True, True, False, True, True, False]
 
 
+@pytest.mark.parametrize(("rate", "sent_at"), [(2000.0, 101.0), (500.0, 102.2), (10_000.0, 101.0), (0.0, 100.0)])
+def test_what_waits_at_a_change_of_the_rate_passes_at_the_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate: float, sent_at: float
+) -> None:
+    """Its bytes fill the queue until then, and no later message overtakes it; without a rate, there is no queue."""
+    now = [100.0]
+    monkeypatch.setattr(world(), "monotonic", lambda: now[0])
+    plan = both_ways({**PERFECT, "rate": 1000.0, "queue": 1000}, largest=1000)
+    with WireJournal(tmp_path, plan) as journal:
+        state = RunningLink(plan.links[0], plan, journal)
+        decide = state.lane("put", "scan", lossless=False)
+        assert decide(now[0], 1000)[:3] == (0, 0, 1.0)
+        state.change({**PERFECT, "rate": rate, "queue": 1000})
+        assert decide(now[0], 100)[1] == (WireFate.OVERFLOW if rate else 0)
+        room_at = 100.0 + 100 / rate if rate else 100.0
+        assert decide(room_at - 0.01, 100)[1] == (WireFate.OVERFLOW if rate else 0)
+        fate, delay = decide(room_at + 0.001, 100)[1:3]
+        assert fate == 0
+        assert delay == pytest.approx(max(0.0, sent_at - room_at - 0.001) if rate else 0.0, abs=1e-9)
+
+
+def test_a_higher_rate_after_a_lower_one_makes_room_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The messages that overflowed while the link was slow are the last ones that do."""
+    now = [100.0]
+    monkeypatch.setattr(world(), "monotonic", lambda: now[0])
+    fast, slow = ({**PERFECT, "rate": rate, "queue": 256_000} for rate in (2e6, 1e3))
+    plan = both_ways(fast, largest=10_000)
+    overflowed = []
+    with WireJournal(tmp_path, plan) as journal:
+        state = RunningLink(plan.links[0], plan, journal)
+        decide = state.lane("put", "scan", lossless=False)
+        for n in range(800):
+            now[0] = 100.0 + n / 20
+            state.change(slow if 200 <= n < 400 else fast)
+            if decide(now[0], 6000)[1] == WireFate.OVERFLOW:
+                overflowed.append(n)
+    assert overflowed
+    assert {*overflowed} <= {*range(200, 402)}
+
+
 def test_what_is_not_delivered_has_no_delay_and_no_copy(tmp_path: Path) -> None:
     """Whatever the reason; and a link without a rate has no queue."""
     plan = both_ways(SLOW, largest=LARGEST)
@@ -170,7 +210,7 @@ def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
             now[0] = 100.0 + n / 100
             code, delay, _ = fates.next()
             due = max(latest, now[0] + delay)
-            at, fate, waits, _ = decide(0.0, 1)
+            at, fate, waits, _ = decide(now[0], 1)
             assert (at, fate) == (n, code)
             assert waits == pytest.approx(due - now[0] if code == 0 else 0.0, abs=1e-9)
             latest = due if code == 0 else latest
@@ -183,7 +223,7 @@ def test_an_order_is_kept_until_its_last_message_is_due(tmp_path: Path, monkeypa
     plan = plan_of(link("robot", "base", {**PERFECT, "delay": {"model": "constant", "value": 5.0}}, ordered=True))
     with WireJournal(tmp_path, plan) as journal:
         state = RunningLink(plan.links[0], plan, journal)
-        state.lane("put", "scan", lossless=False)(0.0, 1)
+        state.lane("put", "scan", lossless=False)(now[0], 1)
         order = state.order("put", "scan")
         state.forget("put", "scan")
         assert order is not None

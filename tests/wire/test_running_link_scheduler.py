@@ -67,6 +67,18 @@ def test_an_order_is_kept() -> None:
     assert held.sent == [("other", 1.0), ("a", 3.0), ("b", 3.0), ("c", 3.5), ("d", 3.5)]
 
 
+def test_a_delay_counts_from_when_it_was_decided() -> None:
+    """So messages stay in order, however long each took from then until it was held."""
+    held = Held()
+    start = held.clock.now
+    for decided, began, delay, name in ((0.0, 0.5, 2.0, "a"), (0.2, 0.6, 1.9, "b")):
+        held.clock.now = start + began
+        assert held.scheduler.hold(delay, 1, 0, partial(held.note, name), since=start + decided)
+    held.let_go(lambda: len(held.sent) == 2)
+    assert [name for name, _ in held.sent] == ["a", "b"]
+    held.scheduler.close()
+
+
 def test_a_limited_number_of_messages_waits() -> None:
     """And a limited number of bytes; what was sent makes room again."""
     held = Held(most=3, most_bytes=100)

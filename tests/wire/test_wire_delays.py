@@ -53,6 +53,19 @@ def test_a_delayed_message_comes_later_and_in_order(tmp_path: Path) -> None:
         assert set(delayed["delay"].tolist()) == {0.2}
 
 
+def test_messages_of_a_key_leave_a_link_of_limited_rate_in_order(tmp_path: Path) -> None:
+    """Although each takes hardly longer on the link than the wire needs to hear it."""
+    plan = plan_of(READY, link("robot", "base", {**PERFECT, "rate": 1e6, "queue": 10_000_000}))
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as robot, wire.program("base") as base:
+        ready(wire, robot, base)
+        got = reader(base, "x")
+        wait_until(lambda: is_declared(wire, "base", "subscriber", "x"), "the reader is known")
+        for n in range(3000):
+            robot.put("x", f"{n:020}", congestion_control=BLOCK)
+        wait_until(lambda: len(got) == 3000, "all come")
+        assert [int(sample.payload.to_string()) for sample in got] == [*range(3000)]
+
+
 def test_messages_of_an_ordered_link_do_not_overtake_each_other(tmp_path: Path) -> None:
     """Although their delays differ by more than the time between them; without `ordered` some do."""
     varying = {**PERFECT, "delay": {"model": "normal", "mean": 0.1, "standard_deviation": 0.05}}

@@ -97,14 +97,14 @@ class Wire:
         got = self.outcome.got.setdefault((link.name, key), [])
         for _ in range(self._count):
             world().sleep(self._scheduler.random.expovariate(1.0 / self._pause))
-            heard = world().time()
-            n, fate, delay, _ = decide(heard, 8)
+            heard, since = world().time(), world().monotonic()
+            n, fate, delay, _ = decide(since, 8)
             row = journal.records.record(
                 heard, n, -1, delay, code, 0, 8, link.number, Kind.PUT, fate or WireFate.DELIVERED | HELD
             )
             if not fate:
-                task = partial(self._arrive, got, n)
-                queue.send(delay, waiting_bytes(8, key), row, task, patient=True, order=state.order("put", key))
+                task, order = partial(self._arrive, got, n), state.order("put", key)
+                queue.send(delay, waiting_bytes(8, key), row, task, patient=True, order=order, since=since)
 
     def _arrive(self, got: list[int], n: int) -> None:
         self.read()

@@ -210,7 +210,7 @@ class PublicationRelay:
         refused = WireFate.REFUSED
 
         def take(sample: zenoh.Sample) -> None:
-            heard = now()
+            heard, since = now(), clock()
             key = str(sample.key_expr)
             ready = ways_of.get(key)
             ways, code = way_to(ways_of, key, sample.key_expr) if ready is None else ready
@@ -228,7 +228,7 @@ class PublicationRelay:
                 record(heard, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, unlinked)
             for way in ways:
                 way.used = ready is not None
-                n, fate, delay, again = way.decide(heard, size)
+                n, fate, delay, again = way.decide(since, size)
                 if heard > self._until and not fate:
                     fate, delay, again = underway, 0.0, False
                 send_queue = way.send_queue
@@ -253,7 +253,7 @@ class PublicationRelay:
                     message = way.message(sample, 2 if again else 1, publisher)
                     if not at_once:
                         room = waiting_bytes(size, key)
-                        send_queue.send(delay, room, row, message, patient=way.patient, order=way.order)
+                        send_queue.send(delay, room, row, message, patient=way.patient, order=way.order, since=since)
                         continue
                     begun = clock()
                     message()

@@ -247,7 +247,7 @@ class QueryRelay:
         self, kind: Kind, asked: _Asked, way: tuple[str, str], key: str, expression: zenoh.KeyExpr, message: _Message
     ) -> None:
         """Let the link between two sides decide on a message, record it, and send it when it is due."""
-        now, size = world().time(), message.size
+        now, since, size = world().time(), world().monotonic(), message.size
         with self._lock:
             sender, sequence = self._read(message.attachment, message.source)
         code = self._journal.words.key_code(key, way[0])
@@ -257,7 +257,7 @@ class QueryRelay:
             return
         n, fate, delay, again = -1, int(WireFate.TOO_MANY_KEYS), 0.0, False
         if code:
-            n, fate, delay, again = self._decided(state, kind.stream, key, expression, now, size)
+            n, fate, delay, again = self._decided(state, kind.stream, key, expression, since, size)
         mark = int(kind) | AGAIN if again else int(kind)
         row = self._journal.records.record(
             now, n, sequence, delay, code, sender, size, state.link.number, mark, fate or HELD
@@ -281,7 +281,9 @@ class QueryRelay:
         # Replies wait for room: one query may have many.
         order = state.order(kind.stream, key)
         room = waiting_bytes(size, key)
-        self._send_queues[way[1]].send(delay, room, row, send, patient=kind == Kind.REPLY, order=order, lost=lost)
+        self._send_queues[way[1]].send(
+            delay, room, row, send, patient=kind == Kind.REPLY, order=order, lost=lost, since=since
+        )
 
     def _wait_in_vain(self, asked: _Asked) -> None:
         """Let an asker wait for its query, or for a reply, that is lost: nothing tells it so."""

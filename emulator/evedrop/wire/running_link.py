@@ -222,16 +222,22 @@ class Scheduler:
         self._thread.start()
 
     def hold(
-        self, delay: float, size: int, row: int, send: Callable[[], object], order: KeyOrder | None = None
+        self,
+        delay: float,
+        size: int,
+        row: int,
+        send: Callable[[], object],
+        order: KeyOrder | None = None,
+        since: float | None = None,
     ) -> bool:
         """Send a message of some bytes after some seconds, or later to keep an order; returns whether there is room for it.
 
-        row: its row in the journal.
+        row: its row in the journal; since: when the delay begins, in seconds of the monotonic clock; None: now.
         """
         with self._changed:
             if self._ended or len(self._heap) >= self._most or self._bytes + size > self._most_bytes:
                 return False
-            due = self._clock.monotonic() + delay
+            due = (self._clock.monotonic() if since is None else since) + delay
             held = _Held(due if order is None else order.send_at(due), next(self._serial), size, row, send)
             heapq.heappush(self._heap, held)
             self._bytes += size
@@ -289,7 +295,7 @@ Decision = tuple[int, int, float, bool]
 _Stream = tuple[str, str]
 """Kind and key, as in `numbered_as`."""
 Lane = Callable[[float, int], Decision]
-"""Decides on the next message of a key, from the present time in seconds and the message's bytes."""
+"""Decides on the next message of a key, from the present time in seconds of the monotonic clock and the message's bytes."""
 
 
 @final
@@ -311,7 +317,9 @@ class RunningLink:
         self._links_of_keys: tuple[tuple[Change, ...], PerKeyLinks] | None = None  # the latest, which new keys share
         self._orders: dict[_Stream, KeyOrder] = {}
         self._lock = world().lock()
-        self._free = 0.0  # when the queue will have sent all its messages
+        self._rate = 0.0
+        self._free = 0.0  # when the queue will be empty, on the monotonic clock, as are all its times
+        self._latest = 0.0  # when the latest message leaves it: no earlier, whatever the rate becomes
         self._set(link.settings)
 
     def change(self, settings: Mapping[str, Any]) -> None:
@@ -354,7 +362,7 @@ class RunningLink:
                 del self._orders[stream]
 
     def _decide(self, stream: _Stream) -> Lane:
-        lock, largest, clock = self._lock, self._largest, world().monotonic
+        lock, largest = self._lock, self._largest
         with lock:
             fates = self._fates_of(stream)
             after = fates.next
@@ -377,7 +385,7 @@ class RunningLink:
             if self.cut:
                 return at, _CUT, 0.0, False
             if order is not None and code == 0:
-                delay = order.delay(delay, clock())
+                delay = order.delay(delay, now)
             return at, code, delay if code == 0 else 0.0, again
 
         return decide
@@ -420,13 +428,20 @@ class RunningLink:
 
     def _set(self, settings: Mapping[str, Any]) -> None:
         self._settings = settings
-        self._rate = float(settings.get("rate") or 0.0)
+        rate, now = float(settings.get("rate") or 0.0), world().monotonic()
+        if self._free > now:  # its bytes wait on, but they pass at the new rate
+            self._free = now + (self._free - now) * self._rate / rate if rate else now
+        self._rate = rate
         self._queue = float(settings.get("queue") or 0.0)
 
     def _wait(self, now: float, size: int) -> float | None:
-        """Seconds until the link has sent a message; None if its queue is full. The queue is never too small for one message."""
+        """Seconds until the link has sent a message; None if its queue is full. The queue is never too small for one message.
+
+        Messages leave the queue in order: one that came before a change of the rate keeps its time.
+        """
         wait = max(0.0, self._free - now)
         if wait > 0 and wait * self._rate + size > self._queue:
             return None
         self._free = max(self._free, now) + size / self._rate
-        return wait + size / self._rate
+        self._latest = max(self._latest, self._free)
+        return self._latest - now

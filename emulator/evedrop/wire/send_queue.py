@@ -95,18 +95,19 @@ class SendQueue:
         patient: bool,
         order: KeyOrder | None = None,
         lost: Callable[[], None] | None = None,
+        since: float | None = None,
     ) -> None:
         """Send a message, by a task, after some seconds. Its row in the journal is `HELD`.
 
         size: as `waiting_bytes`; patient: whether to wait for room; order: that it must keep; lost: is called if there is no
-        room.
+        room; since: as for `Scheduler.hold`.
 
         A message for which there is no room becomes `HELD_UP` if it is delayed, or else `CONGESTED`; one whose task raises an
         error becomes `REFUSED`.
         """
         if not delay and order is None:
             self._hand(size, row, task, patient, lost)
-        elif not self._delays.hold(delay, size, row, lambda: self._hand(size, row, task, patient, lost), order):
+        elif not self._delays.hold(delay, size, row, lambda: self._hand(size, row, task, patient, lost), order, since):
             self._records.amend(row, WireFate.UNDERWAY if self._ending else WireFate.HELD_UP)
             if lost is not None:
                 lost()
