@@ -12,10 +12,21 @@ from zenoh.ext import CacheConfig, MissDetectionConfig, RecoveryConfig
 from zenoh.ext import declare_advanced_publisher as advanced_publisher
 from zenoh.ext import declare_advanced_subscriber as advanced_subscriber
 
-from evedrop.wire.plan import LOST_HISTORY_SECONDS
+from evedrop.wire.plan import LOST_HISTORY_SECONDS, Side
 from evedrop.wire.records import Kind, WireFate
 from tests.conftest import wait_until
-from tests.wire.wire_at_work import DEAD, PERFECT, WireAtWork, at_work, both_ways, is_declared, link, plan_of
+from tests.wire.wire_at_work import (
+    ANYWHERE,
+    DEAD,
+    LOSSY,
+    PERFECT,
+    WireAtWork,
+    at_work,
+    both_ways,
+    is_declared,
+    link,
+    plan_of,
+)
 
 COMPLETE = zenoh.QueryTarget.ALL_COMPLETE
 ALL = zenoh.QueryTarget.ALL
@@ -318,3 +329,36 @@ def test_delayed_and_doubled_queries_are_answered(tmp_path: Path, settings: dict
     ):
         offer(server, "map", b"x")
         assert wait_until(lambda: answers(asker, "map"), "it answers") == [b"x"]
+
+
+def test_a_side_with_overlapping_keys_asks_each_query_once(tmp_path: Path) -> None:
+    """A query that several of its key expressions hear belongs to the first of them, also one for many keys."""
+    overlapping = Side("robot", (ANYWHERE,), keys=("map/**", "map/scan/**"))
+    plan = plan_of(link("robot", "base"), link("base", "robot"), sides={"robot": overlapping})
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as asker, wire.program("base") as server:
+        offer(server, "map/scan/1", b"x")
+        wait_until(lambda: answers(asker, "map/scan/1"), "the queryable is there")
+        before = len(kinds(wire))
+        for key in ("map/scan/1", "map/**", "map/scan/*"):
+            assert answers(asker, key, consolidation=zenoh.ConsolidationMode.NONE) == [b"x"]
+        assert kinds(wire)[before:] == [(Kind.QUERY, 0), (Kind.REPLY, 0)] * 3
+
+
+def test_the_end_of_the_time_for_replies_is_no_message(tmp_path: Path) -> None:
+    """The asker gets Zenoh's error, whatever the link back does; in the journal, the next reply is the first."""
+    held: list[zenoh.Query] = []
+    with (
+        at_work(both_ways(back=LOSSY, query_seconds=WAIT), tmp_path) as wire,
+        wire.program("robot") as asker,
+        wire.program("base") as server,
+    ):
+        server.declare_queryable("map", held.append)
+        offer(server, "ready", b"x")
+        wait_until(lambda: answers(asker, "ready"), "the queryables are there")
+        before = len(kinds(wire))
+        for n in range(5):
+            replies = [*asker.get("map", timeout=60.0)]
+            assert [reply.err.payload.to_bytes() for reply in replies if reply.err is not None] == [b"Timeout"]
+            assert len(held) == n + 1
+        assert kinds(wire)[before:] == [(Kind.QUERY, 0)] * 5
+        held.clear()

@@ -10,7 +10,8 @@ Source: docs/wire/semantics.md, queries.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, final
 
 import zenoh
@@ -30,6 +31,7 @@ from evedrop.wire.watchdog import Duty
 
 _REMOTE = zenoh.Locality.REMOTE
 _MOST_WAITING = 100_000
+_ROUTING = 0  # the identifier of Zenoh's routing, which no queryable has
 
 
 @final
@@ -49,6 +51,10 @@ class _Asked:
         """For how many seconds from now on its asker waits for something that is lost."""
         left = max(0.0, self._over - world().monotonic())
         return left if published_key(self.key) is None else min(left, LOST_HISTORY_SECONDS)
+
+    def tell(self, error: zenoh.ReplyError) -> None:
+        """Tell its asker of an error that no program sent: it is no message, and no link decides on it."""
+        self._send_queue.follow(partial(self.query.reply_err, error.payload, encoding=error.encoding))
 
     def hold(self) -> None:
         """One thing more to wait for."""
@@ -92,12 +98,19 @@ class QueryRelay:
         self._heard: Queue[tuple[str, str | None, zenoh.Query] | None] = world().queue()
         self.duty = Duty("among the queries")
         self._thread = world().thread(self._run, name="queries")
-        self._queryables = [
-            (name, side.session.declare_queryable(expression, self._taker(name, None), allowed_origin=_REMOTE))
-            for name, side in sides.items()
-            if any(state.link.source == name for state in self._states)
-            for expression in expressions_of(side.side, plan.links)
-        ]
+        self._queryables: list[tuple[str, Any]] = []
+        for name, side in sides.items():
+            if any(state.link.source == name for state in self._states):
+                self._declare(name, [zenoh.KeyExpr(text) for text in expressions_of(side.side, plan.links)])
+
+    def _declare(self, name: str, expressions: Sequence[zenoh.KeyExpr]) -> None:
+        """Offer the queryables for everything at a side, under its key expressions."""
+        for at, expression in enumerate(expressions):
+            earlier = tuple(other for other in expressions[:at] if other.intersects(expression))
+            queryable = self._sides[name].session.declare_queryable(
+                expression, self._taker(name, None, earlier), allowed_origin=_REMOTE
+            )
+            self._queryables.append((name, queryable))
 
     def start(self) -> None:
         """Begin to take queries."""
@@ -155,9 +168,15 @@ class QueryRelay:
         with self._lock:
             return frozenset(self._mirrored[side])
 
-    def _taker(self, name: str, key: str | None) -> Any:
+    def _taker(self, name: str, key: str | None, earlier: Sequence[zenoh.KeyExpr] = ()) -> Any:
+        """What takes the queries of a queryable. earlier: expressions of others for everything; a query belongs to the first."""
+
+        def take(query: zenoh.Query) -> None:
+            if not any(expression.intersects(query.key_expr) for expression in earlier):
+                self._heard.put((name, key, query))
+
         # On the thread that Zenoh calls it on: the queries of a program stay in order.
-        return world().zenoh.handlers.Callback(lambda query: self._heard.put((name, key, query)), indirect=False)
+        return world().zenoh.handlers.Callback(take, indirect=False)
 
     def _run(self) -> None:
         while (heard := self._heard.get()) is not None:
@@ -214,6 +233,9 @@ class QueryRelay:
         """Bring a reply back over the link from the side that it comes from."""
         answer, error, query = reply.ok, reply.err, asked.query
         if error is not None:
+            if _nobody_sent(reply.replier_id, error):
+                asked.tell(error)
+                return
             self._cross(
                 Kind.REPLY,
                 asked,
@@ -340,6 +362,11 @@ class _Message:
     ) -> None:
         self.send, self.attachment, self.source = send, attachment, source
         self.size = sum(len(part) for part in (payload, attachment) if part is not None)
+
+
+def _nobody_sent(replier: zenoh.EntityGlobalId | None, error: zenoh.ReplyError) -> bool:
+    """Whether an error is that of a querier, or of Zenoh's routing, whose time for replies is over."""
+    return (replier is None or replier.eid == _ROUTING) and error.payload.to_bytes() == b"Timeout"
 
 
 def _matching(querier: zenoh.Querier) -> bool:
