@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +29,14 @@ SETTINGS = {
 }
 
 
-def plan_of(settings: Mapping[str, Any], seed: int = 7) -> WirePlan:
+def plan_of(settings: Mapping[str, Any], seed: int = 7, lossless: Sequence[str] = ()) -> WirePlan:
     """A wire with a link `scan` and one that loses nothing."""
     sides = {"robot": {"listen": "tcp/127.0.0.1:0"}, "base": {"listen": "tcp/127.0.0.1:0"}}
     links = [
         {"name": "scan", "from": "robot", "to": "base", "keys": "*/scan/**", **settings},
         {"name": "rest", "from": "robot", "to": "base", "quality": 1.0},
     ]
-    return wire_of({"seed": seed, "side": sides, "link": links})
+    return wire_of({"seed": seed, "side": sides, "link": links, "lossless": [*lossless]})
 
 
 def carried(
@@ -55,8 +55,9 @@ def carried(
     with WireJournal(folder, plan) as journal:
         for key, count in counts.items():
             fates = KeyFates(plan.links[0], key, "put", plan.seed)
+            lossless = key in plan.lossless
             for n in range(count):
-                fate, delay, again = fates.next()
+                fate, delay, again = (WireFate.DELIVERED, 0.0, False) if lossless else fates.next()
                 fate = (hidden or {}).get(n, WireFate(fate))
                 kind = Kind.PUT | (AGAIN if again and fate == WireFate.DELIVERED else 0)
                 row = (
@@ -213,3 +214,16 @@ def test_messages_that_were_heard_at_one_moment_have_no_distance(evedrop: Evedro
     done = evedrop("links", "fit", "runs", "--link", "scan", "--json")
     assert (done.status, done.err) == (0, "")
     assert json.loads(done.out)["slot_seconds"] is None
+
+
+def test_lossless_messages_are_no_survivals(tmp_path: Path) -> None:
+    """No model decided on them; but `--gaps` counts what was lost of them before the wire."""
+    plan = plan_of(SETTINGS, lossless=["robot/scan/stop"])
+    carried(tmp_path / "mixed", plan, {"robot/scan/a": 200, "robot/scan/stop": 300})
+    carried(tmp_path / "alone", plan, {"robot/scan/a": 200})
+    mixed, alone = (journal_recording(tmp_path / name, "scan") for name in ("mixed", "alone"))
+    assert mixed.series.outcomes.tolist() == alone.series.outcomes.tolist()
+    assert mixed.delays.tolist() == alone.delays.tolist()
+    assert "300 messages are lossless in wire.toml: left out" in mixed.notes
+    with pytest.raises(TraceError, match="only messages that no model decides on"):
+        journal_recording(tmp_path / "mixed", "scan", "robot/scan/stop")

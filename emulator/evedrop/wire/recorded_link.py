@@ -29,7 +29,7 @@ from evedrop.scenario.recordings.message_recording import (
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import JOURNAL_FOLDER, journal_tables
-from evedrop.wire.plan import WireLink, numbered_as
+from evedrop.wire.plan import WirePlan, numbered_as
 from evedrop.wire.records import REASONS, Kind, WireFate
 
 _COLUMNS = ["time", "link", "key", "source", "sequence", "reason", "delay", "n", "kind", "again"]
@@ -73,17 +73,20 @@ class _LinkRows:
         name = f"{self._folder}, link {self._link}" + (f", {self._keys}" if self._keys is not None else "")
         if not self._rows.num_rows:
             self._no("has no message on this link and key")
-        recording = self._before(name, longest) if gaps else self._emulated(name)
         plan = self._planned()
-        if plan is None:
+        recording = self._before(name, longest) if gaps else self._emulated(name, plan)
+        link = None if plan is None else next((link for link in plan.links if link.name == self._link), None)
+        if link is None:
             return replace(recording, notes=tuple(self._notes), keys=self._keys or "**")
         return replace(
-            recording, notes=tuple(self._notes), source=plan.source, target=plan.target, keys=self._keys or plan.keys
+            recording, notes=tuple(self._notes), source=link.source, target=link.target, keys=self._keys or link.keys
         )
 
-    def _emulated(self, name: str) -> MessageRecording:
+    def _emulated(self, name: str, plan: WirePlan | None) -> MessageRecording:
         """What the link's models did."""
         rows = self._rows.filter(pc.is_valid(self._rows["n"]))
+        if plan is not None and plan.lossless:
+            rows = self._lossy(rows, plan)
         if not rows.num_rows:
             self._no("has only messages that no model decides on")
         streams, n = self._streams(rows, key=numbered_as, kind=_stream_of), _numbers(rows["n"])
@@ -160,6 +163,15 @@ class _LinkRows:
             self._no(f'has no messages on a link "{link}"; it has {shown}')
         return self._no(f"has several links; expected --link and one of {shown}")
 
+    def _lossy(self, rows: pa.Table, plan: WirePlan) -> pa.Table:
+        """The rows on which the link's models decide: the others are never lost, whatever the models are."""
+        keys = rows["key"].cast(pa.string())
+        never_lost = [key for key in pc.unique(keys).to_pylist() if plan.is_lossless(zenoh.KeyExpr(key))]
+        lossy = rows.filter(pc.invert(pc.is_in(keys, pa.array(never_lost, pa.string()))))
+        if left_out := rows.num_rows - lossy.num_rows:
+            self._notes.append(f"{left_out} messages are lossless in wire.toml: left out")
+        return lossy
+
     def _has_key(self, rows: pa.Table, key: str) -> pa.Array:
         """Which rows have a key that the expression takes."""
         try:
@@ -194,11 +206,10 @@ class _LinkRows:
         if changes > 1:
             self._notes.append(f"the link had {changes} settings one after the other: fitted as one")
 
-    def _planned(self) -> WireLink | None:
-        """The link in the wire's file; None if it is not there."""
+    def _planned(self) -> WirePlan | None:
+        """The wire's file; None if it is not there."""
         with suppress(UsageError):
-            plan = load_wire(self._folder / "wire.toml")
-            return next((link for link in plan.links if link.name == self._link), None)
+            return load_wire(self._folder / "wire.toml")
         return None
 
     def _no(self, problem: str, cause: Exception | None = None) -> NoReturn:
