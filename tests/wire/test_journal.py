@@ -525,6 +525,7 @@ def test_a_table_of_records_gives_them_back() -> None:
     records["time"], records["delay"], records["size"] = 1000.0 + at, at / 8.0, at * 2**20
     records["n"], records["sequence"] = at - 1, 2 * at - 1
     records["link"], records["key"] = np.where(at % 3 == 2, UNLINKED, at % 3), at % 4
+    records["kind"][records["fate"] != WireFate.DELIVERED] &= ~np.uint8(AGAIN)  # which comes to nothing
     words = Words(["scan", "command"], {1: "scan/1", 2: "scan/2", 3: "stop"}, {})
     table = table_of(records, words)
     result = records_of(table, {"scan": 0, "command": 1}, {"scan/1": 1, "scan/2": 2, "stop": 3})

@@ -88,7 +88,7 @@ class Kind(IntEnum):
 
 
 AGAIN = 0x80
-"""Added to the kind in the record of a message that was delivered twice."""
+"""Added to the kind in the record of a message that was delivered twice, if it was delivered at all."""
 
 HELD = 0x80
 """Added to the fate in the record of a message that will be delivered, until Zenoh has taken it."""
@@ -279,9 +279,15 @@ def table_of(records: Records, words: Words) -> pa.Table:
         pa.DictionaryArray.from_arrays(
             pa.array((records["kind"] & ~np.uint8(AGAIN)).astype(np.int8)), pa.array(list(_KINDS))
         ),
-        pa.array((records["kind"] & AGAIN) != 0),
+        pa.array(delivered_again(records)),
     )
     return pa.Table.from_arrays(columns, schema=PARQUET)
+
+
+def delivered_again(records: Records) -> NDArray[np.bool_]:
+    """Whether each message was delivered, and twice."""
+    again: NDArray[np.bool_] = ((records["kind"] & AGAIN) != 0) & (records["fate"] == WireFate.DELIVERED)
+    return again
 
 
 def _words(codes: NDArray[np.uint32], words: Mapping[int, str], kind: str) -> pa.DictionaryArray:

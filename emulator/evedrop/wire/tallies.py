@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
 from evedrop.results.wire_summary import WireLinkSummary
-from evedrop.wire.records import AGAIN, Records, WireFate
+from evedrop.wire.records import Records, WireFate, delivered_again
 
 _SAMPLE = 2**17  # delays of a link that are kept; of more, every second, fourth and so on
 _MOST_RANGES = 2048
@@ -136,7 +136,7 @@ class LinkTally:
         """Add messages to all but `streams`."""
         self.heard += len(records)
         self.bytes += int(records["size"].sum(dtype=np.int64))
-        self.again += int(np.count_nonzero(records["kind"] & AGAIN))
+        self.again += int(np.count_nonzero(delivered_again(records)))
         self.fates += np.bincount(records["fate"], minlength=256)
         delays = records["delay"][records["fate"] == WireFate.DELIVERED]
         taken = delays[self._skip :: self._step].copy()
@@ -153,6 +153,8 @@ class LinkTally:
         """Messages that were added have another fate."""
         self.fates -= np.bincount(records["fate"], minlength=256)
         self.fates[fate] += len(records)
+        if fate is not WireFate.DELIVERED:
+            self.again -= int(np.count_nonzero(delivered_again(records)))
 
     @property
     def delivered(self) -> int:
