@@ -94,6 +94,54 @@ def test_a_link_with_another_model_is_flagged(name: str) -> None:
     assert link_summary_of(changed, name, tally_of(right, name)).within_interval is False
 
 
+def test_the_packets_that_a_full_queue_refuses_do_not_count() -> None:
+    """The interval is that of the independent packets that reached the loss model."""
+    right = linked(3, [{"at": 0, "link": "coins", "set": {"rate": 0.2, "queue": 1}}])
+    tally = tally_of(right, "coins")
+    met = right.slots * right.trials - tally.lost["overflow"]
+    assert met < 0.25 * right.slots * right.trials
+    summary = link_summary_of(right, "coins", tally)
+    assert summary.rate == 1 - tally.lost["lost"] / met
+    assert summary.interval == pytest.approx(interval(summary.rate, 0.9, 0.09 / met), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["pattern", "bursts"])
+def test_no_rate_where_a_full_queue_picks_the_packets_of_a_model_with_a_memory(name: str) -> None:
+    """Every other packet may be one that the pattern lets through."""
+    right = linked(3, [{"at": 0, "link": name, "set": {"rate": 0.5, "queue": 1}}])
+    summary = link_summary_of(right, name, tally_of(right, name))
+    assert summary.lost_by["overflow"] > 0
+    assert (summary.rate, summary.expected_rate, summary.interval, summary.within_interval) == (None,) * 4
+
+
+def test_no_rate_where_a_link_with_a_full_queue_is_cut() -> None:
+    """A packet that the queue refuses during a cut is counted as refused."""
+    right = linked(3, [{"at": 10, "cut": "narrow"}, {"at": 390, "heal": "narrow"}])
+    assert link_summary_of(right, "narrow", tally_of(right, "narrow")).rate is None
+
+
+def test_a_chain_goes_on_while_other_settings_change() -> None:
+    """Its slots are correlated across the changes, so that the interval stays as wide as without them."""
+    plain = linked(3)
+    events = [{"from": k, "to": k + 2, "link": "bursts", "set": {"corrupt": 0.1}} for k in range(2, 398, 4)]
+    changed = linked(3, events)
+    summaries = [link_summary_of(right, "bursts", tally_of(right, "bursts")) for right in (plain, changed)]
+    assert summaries[1].lost_by["corrupted"] > 0
+    assert summaries[0].rate == summaries[1].rate
+    assert summaries[0].interval == summaries[1].interval
+
+
+def test_a_chain_goes_on_during_a_cut() -> None:
+    """The variance of the rate against a sum over all pairs of slots."""
+    right = linked(3, [{"from": k, "to": k + 2, "cut": "bursts"} for k in range(2, 398, 4)])
+    summary = link_summary_of(right, "bursts", tally_of(right, "bursts"))
+    mean, fading = 0.3 / 0.32, 1 - 0.02 - 0.3
+    up = np.array([k for k in range(400) if k < 2 or k % 4 < 2 or k >= 398])
+    variance = mean * (1 - mean) * (fading ** np.abs(up[:, None] - up)).mean() / right.trials
+    assert summary.rate is not None
+    assert summary.interval == pytest.approx(interval(summary.rate, mean, variance), rel=1e-9)
+
+
 def test_every_loss_has_a_reason_in_a_run_cut_short() -> None:
     """Late packets that the receiver has not taken when the run ends are under way."""
     lossy = linked(3)

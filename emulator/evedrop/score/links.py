@@ -23,6 +23,7 @@ from evedrop.model.detection import Chart, chart_for
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.links import loss_of
 from evedrop.model.links.chain import Chain
+from evedrop.model.links.counts import Thinned
 from evedrop.model.links.loss_model import LossModel
 from evedrop.model.metrics.built_in import LinkAccount
 from evedrop.model.metrics.standard_error import standard_error
@@ -43,7 +44,8 @@ def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSumm
     """A link's account, and how its losses and delays compare with those of its models."""
     schedule = scenario.schedule(receiver)
     pieces = _pieces(schedule, tally.done)
-    met = sum(len(slots) for slots, _ in pieces) * tally.trials - tally.lost.get("overflow", 0)
+    slots = sum(len(part.slots) for _, parts in pieces for part in parts)
+    met = slots * tally.trials
     account = LinkAccount.of(tally)
     # In a run cut short, late packets that were still to come are lost, although the router does not report them.
     lost = {**tally.lost, "underway": account.lost - sum(tally.lost.values()) + tally.lost.get("underway", 0)}
@@ -60,22 +62,27 @@ def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSumm
     )
     if tally.offered != tally.done * tally.trials:
         return summary  # trials were cut short at different slots, in which different models may have applied
-    if tally.unsent:
-        # A scheme's packets may depend on the past: for a loss model with a memory they are not a fair sample.
-        if len(pieces) != 1 or len(pieces[0][0]) < tally.done or not _independent(pieces[0][1]):
+    unmet = tally.unsent + tally.lost.get("overflow", 0)
+    if unmet:
+        # A scheme's packets may depend on the past, and a full queue refuses some of them in a regular order: for a loss model
+        # with a memory, or one that changes, the rest is not a fair sample. Nor is it known how many belong to slots of a cut.
+        if len(pieces) != 1 or slots < tally.done or not _independent(pieces[0][0]):
             return summary
-        met -= tally.unsent
+        met -= unmet
     if met <= 0:
         return summary
     rate = 1.0 - tally.lost.get("lost", 0) / met
-    slots = sum(len(piece) for piece, _ in pieces)
     expected = (
-        sum_in_order(float(loss.quality_at(part).sum()) for piece, loss in pieces for part in parts_of(piece)) / slots
+        sum_in_order(
+            float(loss.quality_at(some).sum())
+            for loss, parts in pieces
+            for part in parts
+            for some in parts_of(part.slots)
+        )
+        / slots
     )
-    variance = (
-        sum_in_order(loss.rate_variance(piece) * len(piece) ** 2 for piece, loss in pieces) / slots**2 / tally.trials
-    )
-    variance *= slots * tally.trials / met if tally.unsent else 1.0
+    variance = sum_in_order(loss.count_variance(parts) for loss, parts in pieces) / slots**2 / tally.trials
+    variance *= slots * tally.trials / met
     low, high = interval(rate, expected, variance)
     within = low - _ROUNDING <= expected <= high + _ROUNDING
     return replace(summary, rate=rate, expected_rate=expected, interval=(low, high), within_interval=bool(within))
@@ -105,15 +112,24 @@ def interval(rate: float, expected: float, variance: float) -> tuple[float, floa
     return low, high
 
 
-def _pieces(schedule: LinkSchedule, done: int) -> list[tuple[range, LossModel]]:
-    """The slots below `done` in which the link was not cut, in pieces, each with its loss model."""
+def _pieces(schedule: LinkSchedule, done: int) -> list[tuple[LossModel, list[Thinned]]]:
+    """The loss models of the slots below `done`, each with the parts of its slots in which the link was not cut.
+
+    A model keeps its memory until another one replaces it, whatever else of the link changes.
+    """
     marks = stretches(schedule)
     ends = [*(start for start, _, _ in marks[1:]), done]
-    return [
-        (range(start, min(end, done)), loss_of(settings["loss"]))
-        for (start, settings, cut), end in zip(marks, ends, strict=True)
-        if not cut and start < min(end, done)
-    ]
+    pieces: list[tuple[LossModel, list[Thinned]]] = []
+    before = None
+    for (start, settings, cut), end in zip(marks, ends, strict=True):
+        if settings["loss"] != before:
+            before = settings["loss"]
+            pieces.append((loss_of(before), []))
+        parts = pieces[-1][1]
+        if not cut and start < min(end, done):
+            joined = parts.pop().slots.start if parts and parts[-1].slots.stop == start else start
+            parts.append(Thinned(range(joined, min(end, done))))
+    return [(loss, parts) for loss, parts in pieces if parts]
 
 
 def _mean_burst(tally: Tally) -> float | None:
@@ -124,10 +140,9 @@ def _mean_burst(tally: Tally) -> float | None:
     return float(tally.bursts @ np.arange(1, len(tally.bursts) + 1)) / count
 
 
-def _expected_burst(pieces: list[tuple[range, LossModel]]) -> float | None:
+def _expected_burst(pieces: list[tuple[LossModel, list[Thinned]]]) -> float | None:
     """Mean number of consecutive losses by the model: P(lost) over P(lost after a packet that was not lost)."""
-    models = {id(loss): loss for _, loss in pieces}
-    chain: Chain | None = next(iter(models.values())).chain if len(pieces) == 1 else None
+    chain: Chain | None = pieces[0][0].chain if [len(parts) for _, parts in pieces] == [1] else None
     if chain is None:
         return None
     lost = 1.0 - chain.quality

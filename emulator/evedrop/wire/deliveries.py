@@ -20,10 +20,7 @@ import numpy as np
 
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.links import loss_of
-from evedrop.model.links.chain import Chain
-from evedrop.model.links.counts import Counted, Spectrum
-from evedrop.model.links.loss_model import LossModel, count_variance
-from evedrop.model.process import Floats
+from evedrop.model.links.counts import Counted, Spectrum, Thinned
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule
 from evedrop.model.slot.link_distribution import stretches
 
@@ -36,7 +33,6 @@ _FARTHEST = (
 _SMOOTHED = 1.5  # points of the grid, where it is coarser than the counts
 _MARGIN = 16  # points
 _MOST_PARTS, _POWERS = 2048, 16  # ranges of different streams, and how many of them the powers of a chain cost
-_AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -77,8 +73,8 @@ class KeyDeliveries:
         self.mean = self.variance = 0.0
         for parts in self._groups:
             loss = loss_of(parts[0].spec)
-            self.mean += sum_in_order(part.passes * _delivered(loss, part.slots) for part in parts)
-            self.variance += _variance(loss, parts)
+            self.mean += sum_in_order(part.passes * loss.count_mean(part.slots) for part in parts)
+            self.variance += loss.count_variance([Thinned(part.slots, part.passes) for part in parts])
         if sampled is not None:  # a sample of a known range: the range varies as a whole, and the sample within it
             fraction = sampled / sum(len(part.slots) for part in self.parts)
             self.mean = min(self.mean * fraction, sampled)  # the product is rounded
@@ -156,58 +152,3 @@ def _parts(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Itera
             slots = range(max(some.start, start), min(some.stop, stop))
             if slots:
                 yield _Part(model, new["loss"], slots, 1.0 - new.get("corrupt", 0.0))
-
-
-def _delivered(loss: LossModel, slots: range) -> float:
-    """The mean number of these messages that are not lost."""
-    if loss.chain is not None:
-        return len(slots) * loss.quality
-    pieces = (slots[i : i + _AT_ONCE] for i in range(0, len(slots), _AT_ONCE))
-    return sum_in_order(float(loss.quality_at(piece).sum()) for piece in pieces)
-
-
-def _variance(loss: LossModel, parts: Sequence[_Part]) -> float:
-    if loss.chain is not None:
-        return _variance_of_chain(loss.chain, parts)
-    each = [
-        part.passes**2 * loss.rate_variance(part.slots) * len(part.slots) ** 2
-        + part.passes * (1.0 - part.passes) * _delivered(loss, part.slots)
-        for part in parts
-    ]
-    return sum_in_order(each) if loss.memoryless else sum_in_order(map(math.sqrt, each)) ** 2
-
-
-def _variance_of_chain(chain: Chain, parts: Sequence[_Part]) -> float:
-    """The variance for parts of one chain, which continues between them.
-
-    w is the row Σ passes_i E[(γ_i − mean); state at the present message] over the messages i so far, so that the covariance of
-    all of them with the message is w · (quality − mean). Its entries sum to 0; so the chain's stationary part can be left out.
-    """
-    mean = float(chain.stationary @ chain.quality)
-    centred = chain.quality - mean
-    fading = chain.transitions - chain.stationary
-    sums: dict[int, tuple[Floats, Floats]] = {}
-    w, at, total = np.zeros(len(centred)), parts[0].slots.start, 0.0
-    for part in parts:
-        count, passes = len(part.slots), part.passes
-        if count not in sums:
-            sums[count] = _power_and_sum(fading, count)
-        power, partial = sums[count]
-        w = w @ np.linalg.matrix_power(fading, part.slots.start - at)
-        own = passes**2 * count_variance(chain.transitions, chain.stationary, chain.quality, count)
-        total += own + passes * (1.0 - passes) * count * mean + 2.0 * passes * float(w @ partial @ centred)
-        w = w @ power + passes * ((chain.stationary * centred) @ partial @ fading)
-        at = part.slots.stop
-    return total
-
-
-def _power_and_sum(matrix: Floats, count: int) -> tuple[Floats, Floats]:
-    """The power `count` of a matrix, and the sum of its powers below that one, by doubling."""
-    power, partial = np.eye(len(matrix)), np.zeros_like(matrix)
-    for bit in f"{count:b}":
-        partial = partial + power @ partial
-        power = power @ power
-        if bit == "1":
-            partial = partial + power
-            power = power @ matrix
-    return power, partial

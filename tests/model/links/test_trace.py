@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from evedrop.model.links import loss_of
-from evedrop.model.links.loss_model import Fate, count_variance
+from evedrop.model.links.chain import count_variance
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.links.markov import stationary
 from evedrop.model.links.trace import MOST_OUTCOMES, RecordedLoss
 from evedrop.model.process import Floats

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evedrop.model.links.counts import Counted, Spectrum
+from evedrop.model.links.counts import Counted, Spectrum, Thinned
 from evedrop.model.process import Floats
 
 _MOST_STATES = 8  # of a chain whose packets are counted: the work grows with the cube
@@ -55,3 +55,66 @@ class Chain:
             at = slots.stop
         spectrum: Spectrum = row.sum(axis=1)
         return spectrum
+
+    def count_variance(self, parts: Sequence[Thinned]) -> float:
+        """Variance of the number of packets of these ascending parts that get through; the chain continues between them.
+
+        w is the row Σ passes_i E[(γ_i − mean); state at the present packet] over the packets i so far, so that the covariance of
+        all of them with the packet is w · (quality − mean). Its entries sum to 0; so the chain's stationary part can be left out.
+        """
+        mean = float(self.stationary @ self.quality)
+        centred = self.quality - mean
+        fading = self.transitions - self.stationary
+        sums: dict[int, tuple[Floats, Floats]] = {}
+        w, at, total = np.zeros(len(centred)), parts[0].slots.start, 0.0
+        for slots, passes in parts:
+            count = len(slots)
+            if count not in sums:
+                sums[count] = _power_and_sum(fading, count)
+            power, partial = sums[count]
+            w = w @ np.linalg.matrix_power(fading, slots.start - at)
+            own = passes**2 * count_variance(self.transitions, self.stationary, self.quality, count)
+            total += own + passes * (1.0 - passes) * count * mean + 2.0 * passes * float(w @ partial @ centred)
+            w = w @ power + passes * ((self.stationary * centred) @ partial @ fading)
+            at = slots.stop
+        return total
+
+
+def count_variance(transitions: Floats, stationary: Floats, quality: Floats, slots: int) -> float:
+    """Variance of the number of packets that a chain in its stationary distribution delivers in `slots` slots.
+
+    transitions (states, states), stationary (states,), quality (states,): as in `Chain`; slots ≥ 1. Exact, by doubling: the
+    number of matrix products grows with the logarithm of the slots.
+    """
+    mean = float(stationary @ quality)
+    centred = quality - mean
+    # Without the stationary part the chain's powers decay, and no large numbers are subtracted from each other.
+    fading = transitions - stationary
+    own = np.eye(len(stationary))
+    power, partial, total = own - np.outer(np.ones(len(stationary)), stationary), np.zeros_like(own), np.zeros_like(own)
+    count = 0
+    for bit in f"{slots:b}":
+        # power = Tⁿ, partial = Σ_{j<n} T^j, total = Σ_{j<n} (n−j) T^j, of the chain without its stationary part
+        total = total + count * partial + power @ total
+        partial = partial + power @ partial
+        power = power @ power
+        count *= 2
+        if bit == "1":
+            partial = partial + power
+            total = total + partial
+            power = power @ fading
+            count += 1
+    together = float((stationary * centred) @ (2.0 * total @ centred)) - slots * float(stationary @ (centred * centred))
+    return max(0.0, together) + slots * float(stationary @ (quality * (1.0 - quality)))
+
+
+def _power_and_sum(matrix: Floats, count: int) -> tuple[Floats, Floats]:
+    """The power `count` of a matrix, and the sum of its powers below that one, by doubling."""
+    power, partial = np.eye(len(matrix)), np.zeros_like(matrix)
+    for bit in f"{count:b}":
+        partial = partial + power @ partial
+        power = power @ power
+        if bit == "1":
+            partial = partial + power
+            power = power @ matrix
+    return power, partial

@@ -22,3 +22,11 @@ class Counted(NamedTuple):
     slots: range
     w: Spectrum
     """The factor of each of them that is not lost."""
+
+
+class Thinned(NamedTuple):
+    """Consecutive packets that count, for the variance of their number."""
+
+    slots: range
+    passes: float = 1.0
+    """Probability that one of them that is not lost gets through."""

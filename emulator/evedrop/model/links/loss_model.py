@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from functools import reduce
-from math import prod
+from math import prod, sqrt
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -18,8 +18,8 @@ import numpy as np
 
 from evedrop.model.checks import probability_mistakes
 from evedrop.model.kernels.elementary import sum_in_order
-from evedrop.model.links.chain import Chain
-from evedrop.model.links.counts import Counted, Spectrum
+from evedrop.model.links.chain import Chain, count_variance
+from evedrop.model.links.counts import Counted, Spectrum, Thinned
 from evedrop.model.links.way import Way
 from evedrop.model.process import Floats, parts_of
 from evedrop.model.receiver import Codes, Flags
@@ -102,6 +102,25 @@ class LossModel(ABC):
         qualities = (self.quality_at(part) for part in parts_of(slots))
         return sum_in_order(float((quality * (1.0 - quality)).sum()) for quality in qualities) / count**2
 
+    def count_mean(self, slots: range) -> float:
+        """Mean number of packets of these slots that are delivered."""
+        if self.chain is not None:
+            return len(slots) * self.quality
+        return sum_in_order(float(self.quality_at(part).sum()) for part in parts_of(slots))
+
+    def count_variance(self, parts: Sequence[Thinned]) -> float:
+        """Variance, over trials, of the number of packets that get through; parts: in ascending order.
+
+        Exact for a chain, for losses without a memory, and for a single part; otherwise an upper bound.
+        """
+        if self.chain is not None:
+            return self.chain.count_variance(parts)
+        each = [
+            passes**2 * self.rate_variance(slots) * len(slots) ** 2 + passes * (1.0 - passes) * self.count_mean(slots)
+            for slots, passes in parts
+        ]
+        return sum_in_order(each) if self.memoryless else sum_in_order(map(sqrt, each)) ** 2
+
     def count_spectrum(self, parts: Sequence[Counted]) -> Spectrum | None:
         """The distribution, over trials, of the number of packets that get through; None if it is not known, or too much work.
 
@@ -139,34 +158,6 @@ class LossModel(ABC):
         first: the first of the slots, which follow those of the previous call. A model replaces its memory and never changes it
         in place, so that a shallow copy of the model can continue from the same point.
         """
-
-
-def count_variance(transitions: Floats, stationary: Floats, quality: Floats, slots: int) -> float:
-    """Variance of the number of packets that a chain in its stationary distribution delivers in `slots` slots.
-
-    transitions (states, states), stationary (states,), quality (states,): as in `Chain`; slots ≥ 1. Exact, by doubling: the
-    number of matrix products grows with the logarithm of the slots.
-    """
-    mean = float(stationary @ quality)
-    centred = quality - mean
-    # Without the stationary part the chain's powers decay, and no large numbers are subtracted from each other.
-    fading = transitions - stationary
-    own = np.eye(len(stationary))
-    power, partial, total = own - np.outer(np.ones(len(stationary)), stationary), np.zeros_like(own), np.zeros_like(own)
-    count = 0
-    for bit in f"{slots:b}":
-        # power = Tⁿ, partial = Σ_{j<n} T^j, total = Σ_{j<n} (n−j) T^j, of the chain without its stationary part
-        total = total + count * partial + power @ total
-        partial = partial + power @ partial
-        power = power @ power
-        count *= 2
-        if bit == "1":
-            partial = partial + power
-            total = total + partial
-            power = power @ fading
-            count += 1
-    together = float((stationary * centred) @ (2.0 * total @ centred)) - slots * float(stationary @ (centred * centred))
-    return max(0.0, together) + slots * float(stationary @ (quality * (1.0 - quality)))
 
 
 class Bernoulli(LossModel):
