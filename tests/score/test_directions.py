@@ -15,8 +15,10 @@ from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.theory.covariances import theoretical_covariances
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
+from evedrop.scenario.theory import expectations_of
+from evedrop.score.directions import directions_of
 from evedrop.score.summary import Summary
-from evedrop.score.sums import DirectionTally
+from evedrop.score.sums import DirectionTally, Tally, merged
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from tests.builders import mistakes_in_good
@@ -142,9 +144,32 @@ def test_trials_and_slots_in_parts_have_the_same_bits() -> None:
         for first, end in ((0, 7), (7, 8), (8, 40)):
             part.add_slots(first, x[first:end, :, trials], x_hat[first:end, :, trials])
         parts.append(part)
-    merged = DirectionTally.merged(parts)
-    np.testing.assert_array_equal(merged.window_errors, whole.window_errors)
-    assert merged.done == 40
+    together = DirectionTally.merged(parts)
+    np.testing.assert_array_equal(together.window_errors, whole.window_errors)
+    assert together.done == 40
+
+
+def test_trials_that_were_cut_short_count_by_their_slots() -> None:
+    """One half of the trials has a fifth of the slots: means are those of all slots, and nothing is said of the scatter."""
+    scenario = load("partial-encryption", {"slots": 150, "trials": 40})
+    expected = expectations_of(scenario)
+    v = scenario.process.directions_as_arrays["position"]
+    random = np.random.default_rng(7)
+    parts = []
+    for slots, trials in ((30, 20), (150, 20)):
+        tally = Tally(150, trials)
+        tally.directions["position"] = DirectionTally(v, 150, trials)
+        tally.directions["position"].add_slots(0, *random.standard_normal((2, slots, len(v), trials)))
+        parts.append(tally)
+    (first, second, whole) = (
+        directions_of({"legitimate": tally}, expected)["legitimate"]["position"] for tally in (*parts, merged(parts))
+    )
+    assert whole.mean_squared_error == pytest.approx((first.mean_squared_error + 5 * second.mean_squared_error) / 6)
+    assert first.expected is not None
+    assert second.expected is not None
+    assert whole.expected == pytest.approx((first.expected + 5 * second.expected) / 6, rel=1e-12)
+    assert (whole.standard_error, whole.z) == (None, None)
+    assert first.standard_error is not None
 
 
 @pytest.mark.parametrize(

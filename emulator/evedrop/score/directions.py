@@ -28,7 +28,7 @@ def directions_of(
     legitimate = tallies[LEGITIMATE]
     for receiver, tally in tallies.items():
         for name, errors in tally.directions.items():
-            if not errors.done:
+            if not errors.reached.any():
                 continue
             summary = _measured(errors, expected[receiver], rare_events_of(expected[receiver], tally))
             if receiver != LEGITIMATE:
@@ -40,10 +40,13 @@ def directions_of(
 
 def _measured(errors: DirectionTally, expected: Expectation, rare: RareEvents | None) -> DirectionSummary:
     """The error, and what theory knows of it; rare: the receiver's rare events."""
-    means = errors.window_errors.sum(axis=0) / errors.done
-    mean, series = float(np.mean(means)), None if expected.of_model else expected.along(errors.v, errors.done)
+    sums, offered = errors.window_errors.sum(axis=0), int(errors.reached.sum())
+    # Trials that were cut short at different slots do not have the same expectation.
+    means = sums / errors.done if errors.done * len(sums) == offered else None
+    series = None if expected.of_model else expected.along(errors.v, int(errors.reached.max()))
+    mean = float(sums.sum()) / offered
+    theory = None if series is None else float(np.append(0.0, np.cumsum(series))[errors.reached].sum()) / offered
     scatter = None if expected.infinite_variance else standard_error(means)
-    theory = None if series is None else float(np.mean(series))
     growth = None if expected.of_model else expected.growth
     z = z_of_error(means, theory, expected, errors.done, rare)
     return DirectionSummary(mean, scatter, theory, z, None if growth is None else growth.along(errors.v))

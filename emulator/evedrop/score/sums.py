@@ -195,16 +195,21 @@ class DirectionTally:
         self.v, self.slots = v, slots
         self.window_errors = np.zeros((WINDOWS + 1, trials))
         """As that of `Tally`."""
-        self.done = 0
-        """The number of slots so far; 0 in a mode without estimates."""
+        self.reached: NDArray[np.int64] = np.zeros(trials, np.int64)
+        """The number of slots so far, of every trial, (R,); 0 in a mode without estimates."""
+
+    @property
+    def done(self) -> int:
+        """Slots that all trials have reached."""
+        return int(self.reached.min(initial=self.slots))
 
     def add_slots(self, first: int, x: Floats, x_hat: Floats) -> None:
         """Add the slots from `first` on, from x and x̂, (c, n, R) each."""
-        self.done += len(x)
+        self.reached += len(x)
         error = np.zeros((len(x), x.shape[2]))
         for i, weight in enumerate(self.v.tolist()):
             error += weight * (x[:, i] - x_hat[:, i])
-        windows = window_of(np.arange(first, self.done), self.slots)
+        windows = window_of(np.arange(first, first + len(x)), self.slots)
         for window in dict.fromkeys(windows.tolist()):
             self.window_errors[window] = added_in_order(self.window_errors[window], (error * error)[windows == window])
 
@@ -213,7 +218,7 @@ class DirectionTally:
         """The sums of disjoint sets of trials, in their order."""
         whole = cls(parts[0].v, parts[0].slots, 0)
         whole.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
-        whole.done = min(part.done for part in parts)
+        whole.reached = np.concatenate([part.reached for part in parts])
         return whole
 
 
