@@ -208,6 +208,31 @@ def test_a_metric_that_is_not_known_trial_by_trial_has_none(monkeypatch: pytest.
     assert tally.of_trials("used") is None
 
 
+@pytest.mark.parametrize("kept_by_trial", [True, False])
+def test_trials_that_were_cut_short_count_by_their_slots(kept_by_trial: bool) -> None:
+    """A metric that is 2 in every slot is 2, whatever slots the trials have."""
+
+    class Two(MeanMetric):
+        by_trial = kept_by_trial
+
+        @staticmethod
+        def values(slots: ScoredSlots) -> Floats:
+            twos = np.full_like(slots.error, 2.0)
+            return twos if kept_by_trial else twos.sum(axis=1, keepdims=True)
+
+    parts = []
+    for slots, trials in ((3, 2), (30, 5), (0, 4)):
+        tally = Two.tally(trials)
+        one = np.ones(slots)
+        tally.add(ScoredSlots(0, np.ones((slots, trials)), np.zeros((slots, trials), np.uint8), one, one))
+        parts.append(tally)
+    whole = type(parts[0]).merged(parts)
+    assert whole.value == 2.0
+    assert whole.of_trials is None
+    assert (parts[0].of_trials is not None) is kept_by_trial
+    assert parts[2].value is None
+
+
 def test_a_summary_of_an_older_version_can_be_read(recorded: Results) -> None:
     """Its receivers have no standard errors."""
     text = json.loads(json.dumps(recorded.summary))

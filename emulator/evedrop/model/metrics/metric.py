@@ -180,9 +180,9 @@ class MeanTally(MetricTally):
 
     def __init__(self, values: Callable[[ScoredSlots], Floats], trials: int, by_trial: bool) -> None:
         """values: gives the value in every slot, (c, R) if by_trial, otherwise its sum over trials, (c, 1)."""
-        self._values, self._trials, self._by_trial = values, trials, by_trial
+        self._values, self._by_trial = values, by_trial
         self._sums = np.zeros(trials if by_trial else 1)
-        self._slots = 0
+        self._slots: NDArray[np.int64] = np.zeros(trials, np.int64)
 
     def add(self, slots: ScoredSlots) -> None:
         """Add the next slots."""
@@ -193,21 +193,21 @@ class MeanTally(MetricTally):
     @classmethod
     def merged(cls, parts: Sequence[MeanTally]) -> MeanTally:
         """The sums of disjoint sets of trials, in their order."""
-        whole = cls(parts[0]._values, sum(part._trials for part in parts), parts[0]._by_trial)
+        whole = cls(parts[0]._values, 0, parts[0]._by_trial)
         sums = [part._sums for part in parts]
         whole._sums = np.concatenate(sums) if whole._by_trial else np.sum(sums, axis=0)
-        whole._slots = min(part._slots for part in parts)
+        whole._slots = np.concatenate([part._slots for part in parts])
         return whole
 
     @property
-    def of_trials(self) -> Floats:
-        """The mean over the slots, for each trial, (R,); (1,), summed over trials, unless by_trial."""
-        return self._sums / self._slots
+    def of_trials(self) -> Floats | None:
+        """The mean over its slots, for each trial, (R,); None unless by_trial, and without slots in every trial."""
+        return self._sums / self._slots if self._by_trial and self._slots.all() else None
 
     @property
     def value(self) -> float | None:
         """The mean over slots and trials; None without slots."""
-        return float(self.of_trials.sum()) / self._trials if self._slots else None
+        return float(self._sums.sum()) / int(self._slots.sum()) if self._slots.any() else None
 
 
 class MeanMetric(Metric):
