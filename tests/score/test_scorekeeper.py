@@ -43,7 +43,7 @@ def test_a_summary_does_not_take_more_memory_the_longer_the_run() -> None:
         for tally in run_tally.tallies.values():
             tally.done = tally.offered = done
             for direction in tally.directions.values():
-                direction.done = done
+                direction.reached[:] = done
         summary_of(scenario, run_tally, digests, RunOutcome(1.0, f"slot {done}"))
 
     summarise(100)  # which imports what a summary needs

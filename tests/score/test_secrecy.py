@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -315,6 +316,32 @@ def test_an_error_without_a_known_bound_must_not_grow() -> None:
     assert judged(legitimate, other, use_innovation=1.0).perfect is Claim.HELD
 
 
+def test_an_error_that_approaches_its_limit_from_above_is_within_its_bound() -> None:
+    """It may be as large as theory expects in the last windows of the run."""
+    settling = Process(np.eye(1), np.eye(1) * 1e-5, np.eye(1) * 100.0)
+    link = distribution_of(LinkSchedule({"loss": good(0.8)}))
+    ours = Expectation(settling, link, lambda quality: Outcomes.legitimate(quality, 0.1))
+    theirs = Expectation(settling, link, lambda quality: Outcomes.eavesdropper(quality, 0.1, 1.0, 1.0))
+    by_slot = ours.traces(SLOTS)
+    means = np.bincount(window_of(np.arange(1, SLOTS), SLOTS), by_slot[1:]) / np.bincount(
+        window_of(np.arange(1, SLOTS), SLOTS)
+    )
+    assert means[-1] > 1.5 * ours.limit
+    other = tally(around(np.linspace(1.0, 9.0, WINDOWS)))
+    for factor, verdict in ((1.0, Claim.HELD), (2.0, Claim.FAILED)):
+        result = secrecy((tally(around(factor * means)), ours), ("eve", other, theirs))
+        assert result.perfect_by_theory
+        assert result.perfect is verdict
+
+
+def test_the_limit_of_a_mere_model_bounds_no_error_of_a_run() -> None:
+    """The legitimate error must then not grow, and may be larger than the model has it."""
+    other = tally(around(np.linspace(1.0, 9.0, WINDOWS)))
+    ours, theirs = (replace(expectation(good(0.9), 0.5, uses), of_model=True) for uses in (None, (1.0, 1.0)))
+    for levels, verdict in ((0.5, Claim.HELD), (np.linspace(0.1, 0.9, WINDOWS), Claim.UNDECIDED)):
+        assert secrecy((tally(around(levels)), ours), ("eve", other, theirs)).perfect is verdict
+
+
 def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
     """Without a closed form, the genie is a bound: secrecy that holds against the genie holds; otherwise it is left open."""
     legitimate, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
@@ -355,6 +382,20 @@ def test_rounding_on_a_perfect_link_is_no_failure() -> None:
     )
     misled = expectation(good(0.5), 0.5, (1.0, 1.0))
     assert secrecy((legitimate, perfect), ("eve", other, misled)).perfect is Claim.HELD
+
+
+@pytest.mark.parametrize("slots", [SLOTS, 5])
+@pytest.mark.parametrize("levels", [(0.0, 0.0), (1e-28, 3e-28)])
+def test_errors_that_are_both_rounding_are_equal(slots: int, levels: tuple[float, float]) -> None:
+    """Their ratio means nothing; that of an error to one of rounding is infinite."""
+    perfect = expectation(good(1.0), 0.5), expectation(good(1.0), 0.5, (1.0, 1.0))
+    ours, theirs = (tally(around(level), done=slots, slots=slots) for level in levels)
+    result = secrecy((ours, perfect[0]), ("eve", theirs, perfect[1]))
+    assert result.ratio == 1.0
+    assert result.compared is not None
+    assert result.compared.after_start.ratio == 1.0
+    larger = tally(around(1.0), done=slots, slots=slots)
+    assert math.isinf(secrecy((ours, perfect[0]), ("eve", larger, perfect[1])).ratio)
 
 
 def test_one_slot_proves_nothing() -> None:

@@ -44,8 +44,8 @@ def _measured(errors: DirectionTally, expected: Expectation, rare: RareEvents | 
     # Trials that were cut short at different slots do not have the same expectation.
     means = sums / errors.done if errors.done * len(sums) == offered else None
     series = None if expected.of_model else expected.along(errors.v, int(errors.reached.max()))
-    mean = float(sums.sum()) / offered
-    theory = None if series is None else float(np.append(0.0, np.cumsum(series))[errors.reached].sum()) / offered
+    mean, begun = float(sums.sum()) / offered, errors.reached[errors.reached > 0]
+    theory = None if series is None else float(np.cumsum(series, out=series)[begun - 1].sum()) / offered
     scatter = None if expected.infinite_variance else standard_error(means)
     growth = None if expected.of_model else expected.growth
     z = z_of_error(means, theory, expected, errors.done, rare)
@@ -69,7 +69,7 @@ def _judged(
         means, other = (window_means(each) for each in errors)
         relative, _ = relative_verdict(other - means, test, errors[0].slots)
         if promised is not False:
-            series = expected[0].along(errors[0].v, errors[0].slots)
+            series = None if expected[0].of_model else expected[0].along(errors[0].v, errors[0].slots)
             bound = math.inf if series is None or legitimate.unbounded else float(np.max(series))
             perfect = perfect_verdict(other, means, bound, test)
     return replace(summary, relative=relative.value, perfect=perfect.value, perfect_by_theory=promised)

@@ -26,6 +26,7 @@ from evedrop.score.summary import RARE_FRACTION, LeakSummary, SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_bounds, window_means, window_of
 from evedrop.score.verdict import Compared, Verdict, verdict_on
 
+_QUARTER = WINDOWS // 4  # of the slots, in windows
 _ROUNDING = 1e-12  # relative to the eavesdropper's error: over a perfect link the legitimate error is 0
 
 
@@ -205,15 +206,14 @@ def perfect_verdict(eavesdropper: Floats, legitimate: Floats, bound: float, test
 
     bound: not finite if none is known. Then the legitimate error must not grow; if it does, it may still be bounded.
     """
-    quarter = WINDOWS // 4
     if np.isnan(eavesdropper).any():
         return Claim.UNDECIDED
     growth, legitimate_growth = (
-        test(error[-quarter:].mean(axis=0) - error[:quarter].mean(axis=0)) for error in (eavesdropper, legitimate)
+        test(error[-_QUARTER:].mean(axis=0) - error[:_QUARTER].mean(axis=0)) for error in (eavesdropper, legitimate)
     )
     highest = bound + _ROUNDING * float(np.mean(eavesdropper))
     has_bound = math.isfinite(bound)
-    excess = test(legitimate[-quarter:].mean(axis=0) - highest) if has_bound else _NOTHING
+    excess = test(legitimate[-_QUARTER:].mean(axis=0) - highest) if has_bound else _NOTHING
     if rejected({0: growth.below, 1: excess.above}):
         return Claim.FAILED
     stays = has_bound or legitimate_growth.above > ERROR_RATE
@@ -243,6 +243,7 @@ def secrecy(
     # A limit too large to be computed neither promises nor denies anything.
     perfect_by_theory = perfect_by_theory if both_known and not math.isnan(legitimate_bound + theirs.limit) else None
     complete = legitimate.done == legitimate.slots
+    bound = _latest_bound(legitimate_theory, legitimate.slots) if complete else math.inf
     # What theory promises does not depend on how soon a run was interrupted, but must not take long then.
     slots = legitimate.slots if complete else min(legitimate.slots, max(legitimate.done, _PROMISED_SLOTS))
     legitimate_is_bounded = math.isfinite(legitimate_bound) or not legitimate_theory.has_limit
@@ -272,9 +273,7 @@ def secrecy(
     elif perfect_by_theory is False:
         perfect = Claim.FAILED
     else:
-        perfect = (
-            perfect_verdict(other_means, legitimate_means, legitimate_bound, test) if complete else Claim.UNDECIDED
-        )
+        perfect = perfect_verdict(other_means, legitimate_means, bound, test) if complete else Claim.UNDECIDED
     ratio, scatter, ratio_slots = ratio_of((legitimate, legitimate_theory), other)
     scatter = None if heavy else scatter
     is_rounding = legitimate.done > 0 and other_theory.is_rounding(other.error / max(other.offered, 1), other.done)
@@ -307,7 +306,7 @@ def secrecy(
         unknown=_unknown(other_theory),
         ratio_error=scatter,
         leak=None if other.leak is None else other.leak.summary,
-        has_bound=math.isfinite(legitimate_bound),
+        has_bound=math.isfinite(bound),
         ratio_slots=ratio_slots,
         missing=missing,
         compared=compared,
@@ -390,7 +389,8 @@ def ratio_of(
     """The ratio of two mean errors, the eavesdropper's over the legitimate one, its standard error, and its slots.
 
     Over the second half of the run, so that the start, in which few packets decide, does not count; over all slots of a run
-    that was cut short or is not longer than its first half. inf if the legitimate error is only rounding; NaN without slots.
+    that was cut short or is not longer than its first half. inf if only the legitimate error is mere rounding, 1 if both are;
+    NaN without slots.
     """
     legitimate, theory = of_legitimate
     if not legitimate.done:
@@ -403,8 +403,10 @@ def ratio_of(
     over, under = float(np.mean(theirs)), float(np.mean(ours))
     alike = legitimate.alike and other.alike
     slots = (first, legitimate.done - 1)
-    if not under or theory.is_rounding(under / (slots[1] + 1 - first), legitimate.done):
-        return math.inf, None, slots
+    count = slots[1] + 1 - first
+    if not under or theory.is_rounding(under / count, legitimate.done):
+        equal = not over or theory.is_rounding(over / count, legitimate.done)
+        return 1.0 if equal else math.inf, None, slots
     return over / under, ratio_error(theirs, ours) if alike else None, slots
 
 
@@ -431,6 +433,16 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
     if math.isnan(lost) or 0.0 < lost * trials < RARE:
         heaviest = np.maximum(heaviest, _window_averages(TheoreticalCovariance(theory.process, NOBODY), slots))
     return np.asarray(means.mean(axis=1, keepdims=True) - math.log(ERROR_RATE) / trials * heaviest)
+
+
+def _latest_bound(theory: Expectation, slots: int) -> float:
+    """What theory expects of the mean error in the last quarter of the slots at most, and forever after it; inf if unknown.
+
+    The limit may be approached from above. Of a mere model of what moves the states, it bounds no error of a run.
+    """
+    if not theory.known or theory.of_model or not math.isfinite(theory.limit):
+        return math.inf
+    return max(theory.limit, *map(float, _expected_averages(theory.alike, slots)[-_QUARTER:, 0]))
 
 
 @lru_cache(maxsize=64)
