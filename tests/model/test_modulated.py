@@ -261,11 +261,11 @@ def test_blocks_of_slots_are_what_slot_by_slot_gives(
 
 
 def late(process: Process, link: LinkDistribution, outcomes_at: Callable[[float], Outcomes], slots: int) -> Floats:
-    """The same with late packets, two segments and an outage: each slot from what is settled, (slots,).
+    """The same with late packets, several segments and an outage: each slot from what is settled, (slots,).
 
     A packet of slot j counts in slot k with the probability that it has arrived by then.
     """
-    window, f = link.window, misled_covariances(process, slots)
+    window, f, starts = link.window, misled_covariances(process, slots), [segment.start for segment in link.segments]
     traces: list[float] = []
 
     def after(states: list[Floats] | None, j: int, k: int) -> list[Floats]:
@@ -276,7 +276,7 @@ def late(process: Process, link: LinkDistribution, outcomes_at: Callable[[float]
         pi = segment.chain.stationary
         if states is None:
             return [p * odd.initial * process.initial_covariance for p, odd in zip(pi, odds, strict=True)]
-        fresh = j == segment.start
+        fresh = j in starts and not segment.continues
         weights = [pi[s] * np.ones(len(states)) if fresh else segment.chain.transitions[:, s] for s in range(len(pi))]
         return [
             odd.propagated * process.A @ sum(T * E for T, E in zip(weights[s], states, strict=True)) @ process.A.T
@@ -309,6 +309,7 @@ def test_blocks_of_slots_with_late_packets_are_what_slot_by_slot_gives(process: 
     segments = (
         Segment(0, bursts(0.05, 0.3, 0.02, 0.7), 0.9, arrived),
         Segment(270, bursts(0.2, 0.4), 1.0, np.array([0.5, 0.5, 1.0, 1.0])),
+        Segment(290, bursts(0.2, 0.4), 0.5, arrived, continues=True),
     )
     link = LinkDistribution(segments, ((530, 532, True),))
     whole = ModulatedCovariance(process, link, outcomes_at).next_traces(slots)

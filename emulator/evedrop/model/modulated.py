@@ -131,7 +131,7 @@ class ModulatedCovariance:
                 quality = np.zeros_like(quality)
             if k == start > 0 and not keeps and self._before is not None and self._settled is not None:
                 self._settled = self._before[None] * segment.chain.stationary[:, None, None]
-        fresh = self._k == segment.start
+        fresh = k == segment.start and not segment.continues
         remaining = self._remaining.next() if self._remaining is not None and k > 0 else None
         slot = _Slot(k, segment, fresh, quality, self._before, remaining)
         self._before, self._k = sigma, k + 1
@@ -219,7 +219,7 @@ class _Slot:
     k: int
     segment: Segment
     fresh: bool
-    """Whether a segment begins here; its chain starts in its stationary distribution."""
+    """Whether the chain starts here, in its stationary distribution."""
     quality: Floats
     before: Floats | None
     """Σ_{k−1}."""
@@ -429,7 +429,8 @@ def _slot_distributions_of(
     for segment, stop in zip(link.segments, starts, strict=True):
         some = slice(segment.start, min(stop, slots))
         transitions[some], stationary[some] = segment.chain.transitions, segment.chain.stationary
-        transitions[some][:1] = segment.chain.stationary
+        if not segment.continues:
+            transitions[some][:1] = segment.chain.stationary
         quality[some] = segment.quality(range(some.start, max(some.start, some.stop)))
     odds = SlotOdds.of(outcomes_at).at(quality)
     if slots_at is not None:

@@ -12,7 +12,7 @@ import pytest
 from evedrop.model.delays import delay_of
 from evedrop.model.links import loss_of
 from evedrop.model.links.loss_model import Fate
-from evedrop.model.modulated import ModulatedCovariance, limit_of
+from evedrop.model.modulated import ModulatedCovariance, limit_of, modulated_streaks
 from evedrop.model.process import Process
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
 from evedrop.model.slot.link_distribution import distribution_of, stretches
@@ -121,6 +121,27 @@ def test_a_chain_with_delays_is_a_chain_of_two_ends() -> None:
     )
     changed = LinkSchedule(PLAIN, 0, (Change(20, alike), Change(30, PLAIN)))
     np.testing.assert_allclose(traces(changed), traces(LinkSchedule(PLAIN)), rtol=1e-12)
+
+
+def test_a_change_that_leaves_the_losses_alone_leaves_their_chain_alone() -> None:
+    """A cut of one slot ends no burst; the same chain with another parameter starts anew. Slot by slot, state by state."""
+    bursts = {"loss": {"model": "gilbert-elliott", "p": 0.02, "r": 0.05}}
+    other = {"loss": {"model": "gilbert-elliott", "p": 0.04, "r": 0.1}}
+    changes = (Change(20, cut=True), Change(21, cut=False), Change(30, {**bursts, "corrupt": 0.1}), Change(40, other))
+    link = distribution_of(LinkSchedule(bursts, 0, changes))
+    assert link is not None
+    pi, good = np.array([5.0, 2.0]) / 7.0, np.array([1.0, 0.0])
+    states, expected = np.zeros(2), []
+    for k in range(SLOTS):
+        T = np.array([[0.98, 0.02], [0.05, 0.95]]) if k < 40 else np.array([[0.96, 0.04], [0.1, 0.9]])
+        before = pi * states.sum() if k == 40 else states @ T
+        arrives = good * (0.0 if k == 20 else 0.9 if 30 <= k < 40 else 1.0)
+        states = (1.0 - arrives) * (before + 0.3 * pi if k else 2.0 * pi)
+        expected.append(float(states.sum()))
+    np.testing.assert_allclose(ModulatedCovariance(WALK, link, Outcomes.plain).next_traces(SLOTS), expected, rtol=1e-12)
+    streaks = modulated_streaks(WALK, link, Outcomes.plain, SLOTS, sum(expected))
+    assert streaks is not None
+    assert streaks.carried.sum() == pytest.approx(sum(expected), rel=2e-9)
 
 
 def test_slots_may_be_asked_for_in_any_pieces() -> None:

@@ -33,6 +33,8 @@ class Segment:
     """Probability that a packet that gets through has arrived 0, 1, … slots later, (window + 1,)."""
     quality_at: Callable[[range], Floats] | None = None
     """For losses that differ from slot to slot: probability that a packet is not lost, (c,)."""
+    continues: bool = False
+    """Whether the chain goes on from the segment before; otherwise it starts in its stationary distribution."""
 
     def quality(self, slots: range) -> Floats:
         """Probability that a packet gets through in each slot and state, (c, states)."""
@@ -100,12 +102,13 @@ def distribution_of(schedule: LinkSchedule) -> LinkDistribution | None:
     It does not cover losses with a memory that is not a chain, losses that never settle, queues, delays that are not
     independent draws, and receivers that are away while packets are under way.
     """
-    segments = []
+    segments, loss = [], None
     for start, settings, cut in stretches(schedule):
         segment = _segment(start, settings, cut, schedule.window)
         if segment is None:
             return None
-        segments.append(segment)
+        segments.append(replace(segment, continues=settings["loss"] == loss))
+        loss = settings["loss"]
     late = any(segment.arrived[0] < segment.arrived[-1] for segment in segments)
     if late and schedule.outages:
         return None
