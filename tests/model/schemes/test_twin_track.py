@@ -165,3 +165,5 @@ def test_the_floor_grows_where_the_powers_of_the_process_do() -> None:
         assert without_bound is grows
     drifting = Process(np.array([[1.0, 1.0], [0.0, 1.0]]), np.eye(2), np.eye(2))
     assert TwinTrack(drifting).error_floor(2)[1]
+    for A in ([[2.5]], [[1.5, 1.0], [1.0, 1.5]]):  # their powers leave double precision before slot 1024
+        assert TwinTrack(Process(np.array(A), np.eye(len(A)), np.eye(len(A)))).error_floor(2)[1]

@@ -126,7 +126,7 @@ class TwinTrack(Scheme):
         """
         with np.errstate(over="ignore", invalid="ignore"):
             soon, late = (np.abs(np.linalg.matrix_power(self.process.A, power)).max() for power in (_SOON, _LATE))
-        return twin_track_bound(self.process, slots), bool(not late <= _GROWN * soon)
+        return twin_track_bound(self.process, slots), bool(not (np.isfinite(soon) and late <= _GROWN * soon))
 
     def outcomes(self, mu: float) -> Outcomes:
         """A state with every packet, and x_0 without any."""
