@@ -239,29 +239,17 @@ def test_sums_of_many_trials_are_those_of_numpy(trials: int) -> None:
 @QUICK
 @given(RANDOM, st.integers(0, 3), st.one_of(st.integers(1, 8), st.just(21)), st.integers(0, 9))
 def test_triangular_factors_are_the_same(random: np.random.Generator, count: int, n: int, more: int) -> None:
-    """Any matrices with at least as many columns as rows; where numpy's code fails, so does C."""
+    """Any matrices with at least as many columns as rows."""
     M = numbers(random, count, n, n + more)
-    try:
-        expected = reference.triangular_factors(M)
-    except ZeroDivisionError:
-        with pytest.raises(ZeroDivisionError):
-            compiled.triangular_factors(M)
-    else:
-        same(compiled.triangular_factors(M), expected)
+    same(compiled.triangular_factors(M), reference.triangular_factors(M))
 
 
 @QUICK
 @given(RANDOM, st.integers(1, 6), st.integers(0, 9))
 def test_factors_of_consecutive_slots_are_the_same(random: np.random.Generator, n: int, count: int) -> None:
-    """Each is carried on from the one before; where a square is too small, both say so."""
+    """Each is carried on from the one before, also where squares are too small for a double."""
     A, G, carried = (random.standard_normal((n, n)) * 10.0 ** random.integers(-160, 3) for _ in range(3))
-    try:
-        reference.carried_factors(A, G, carried, count)
-    except ZeroDivisionError:
-        with pytest.raises(ZeroDivisionError):
-            compiled.carried_factors(A, G, carried, count)
-    else:
-        twins("carried_factors", A, G, carried, count)
+    twins("carried_factors", A, G, carried, count)
 
 
 def entries(random: np.random.Generator, *shape: int) -> Floats:

@@ -123,6 +123,16 @@ def test_triangular_factor_is_lapacks(n: int) -> None:
         assert np.allclose(L, np.linalg.cholesky(M @ M.T), rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("small", [1e-140, 1e-147, 3e-162, 1e-170, 1e-300, 5e-324])
+def test_triangular_factor_of_a_row_whose_squares_underflow(small: float) -> None:
+    """The rotation stays a rotation: the other rows, of size 1, keep their products."""
+    M = np.array([[3.0 * small, 0.0, 4.0 * small, 0.0], [0.2, 0.5, -0.9, 1.1]])
+    L = np.array(triangular_factor(M.tolist()))
+    assert L[0] == pytest.approx([5.0 * small, 0.0], rel=1e-14, abs=0.0)
+    assert L[1, 0] == pytest.approx((3.0 * 0.2 - 4.0 * 0.9) / 5.0, rel=1e-14)
+    assert L[1] @ L[1] == pytest.approx(M[1] @ M[1], rel=1e-14)
+
+
 def test_triangular_factor_leaves_its_argument_alone() -> None:
     """The rows that are given are not changed."""
     rows = [[1.0, 2.0], [3.0, 4.0]]

@@ -298,8 +298,6 @@ def carried_factors(A: Floats, G: Floats, carried: Floats, count: int) -> Floats
 
 
 def _check_factor(failed: int, n: int) -> None:
-    if failed > 0:
-        raise ZeroDivisionError("the square of an entry is too small for a double")
     if failed:
         raise MemoryError(f"no memory for the factors of {n} states")
 

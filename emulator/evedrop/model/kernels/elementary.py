@@ -196,6 +196,9 @@ def semidefinite_factor(M: Floats) -> Floats:
     return np.array(rows)
 
 
+_SMALL, _SCALE = 2.0**-485, 2.0**600  # below the first, squares lose digits to underflow
+
+
 def triangular_factor(rows: Rows) -> Rows:
     """Lower triangular L with L Lᵀ = M Mᵀ and a non-negative diagonal, for M (n, m) with m ≥ n, by Givens rotations.
 
@@ -214,7 +217,11 @@ def triangular_factor(rows: Rows) -> Rows:
                 continue
             a = pivot_row[i]
             r = math.sqrt(a * a + b * b)
-            cosine, sine = a / r, b / r
+            scale = _SCALE if r < _SMALL else 1.0
+            if scale != 1.0:
+                a, b = a * scale, b * scale
+                r = math.sqrt(a * a + b * b)
+            cosine, sine, r = a / r, b / r, r / scale
             pivot_row[i], pivot_row[j] = r, 0.0
             for row in work[i + 1 :]:
                 left, right = row[i], row[j]

@@ -388,20 +388,14 @@ def gather(flags: Flags, x: Floats) -> Floats:
 
 
 def triangular_factors(M: Floats) -> Floats:
-    """Lower triangular L (c, n, n) with L Lᵀ = M Mᵀ and a non-negative diagonal, for each of M (c, n, m), m ≥ n.
-
-    Raises ZeroDivisionError where the square of an entry is too small for a double.
-    """
+    """Lower triangular L (c, n, n) with L Lᵀ = M Mᵀ and a non-negative diagonal, for each of M (c, n, m), m ≥ n."""
     expect_wide(M)
     count, n, _ = M.shape
     return np.array([elementary.triangular_factor(matrix.tolist()) for matrix in M]).reshape(count, n, n)
 
 
 def carried_factors(A: Floats, G: Floats, carried: Floats, count: int) -> Floats:
-    """A L of `count` consecutive slots, (count, n, n): L is the triangular factor of [A L before, G], first of [carried, G].
-
-    Raises ZeroDivisionError as `triangular_factors` does.
-    """
+    """A L of `count` consecutive slots, (count, n, n): L is the triangular factor of [A L before, G], first of [carried, G]."""
     n = len(A)
     expect_all((A, (n, n)), (G, (n, n)), (carried, (n, n)))
     factors = np.empty((count, *carried.shape))

@@ -2,6 +2,8 @@
 
 #ifndef ACTIONS
 #define ACTIONS
+#define SMALL 0x1p-485 /* below it squares lose digits to underflow */
+#define SCALE 0x1p600
 enum { STATE = 1, INNOVATION = 2 }; /* `Action` of model/receiver.py */
 #define CACHED 2048                 /* numbers of a covariance's rows that stay in the nearest cache */
 #define GROUP 4                     /* rows or columns computed at once, so that a loaded number serves several sums */
@@ -175,12 +177,14 @@ static int NAME(triangularise, SET)(int64_t n, int64_t m, double *M) {
       double *restrict other = work + j * n;
       double b = other[i];
       if (b == 0.0) continue;
-      double a = pivot[i], r = sqrt(a * a + b * b), cosine = a / r, sine = b / r;
-      if (r == 0.0) { /* b is not 0, but its square is */
-        free(work);
-        return 1;
+      double a = pivot[i], r = sqrt(a * a + b * b), scale = r < SMALL ? SCALE : 1.0;
+      if (scale != 1.0) {
+        a *= scale;
+        b *= scale;
+        r = sqrt(a * a + b * b);
       }
-      pivot[i] = r;
+      double cosine = a / r, sine = b / r;
+      pivot[i] = r / scale;
       other[i] = 0.0;
       for (int64_t q = i + 1; q < n; q++) {
         double left = pivot[q], right = other[q];

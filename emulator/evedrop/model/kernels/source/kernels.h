@@ -73,7 +73,7 @@ void kernels_scatter(int64_t slots, int64_t n, int64_t trials, const uint8_t *fl
 void kernels_gather(int64_t slots, int64_t n, int64_t trials, const uint8_t *flags, const double *x, double *out);
 
 /* Each of M (count, n, m), m >= n, turned by Givens rotations until it is lower triangular with a non-negative diagonal, in place.
-   Returns 0, -1 where memory is short, and 1 where a rotation would divide by 0 because a square is too small for a double. */
+   Returns 0, or -1 where memory is short. */
 int kernels_triangularise(int64_t count, int64_t n, int64_t m, double *M);
 
 /* A L after each of `slots` slots, out (slots, n, n), where L is the triangular factor of [carried, G], and carried the A L before;
