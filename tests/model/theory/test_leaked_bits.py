@@ -49,6 +49,25 @@ def test_the_bits_of_an_innovation(model: Model) -> None:
         carried = rationals.congruent(model.A, sigma)
 
 
+def test_the_bits_of_a_strongly_unstable_process() -> None:
+    """Beyond the slots where Σ_k leaves double precision, each state's are those of a process of its own; none is NaN."""
+    bits = [
+        LeakedBits(Process(np.array(A), np.eye(len(A)), np.eye(len(A)))).next(900)
+        for A in ([[2.4, 0.0], [0.0, 0.5]], [[2.4]], [[0.5]])
+    ]
+    assert np.allclose(bits[0], bits[1] + bits[2], rtol=1e-9, atol=0.0)
+
+
+def test_the_bits_of_a_process_with_states_that_die_out() -> None:
+    """States that noise never reaches hide less and less of the noise of those that it moves, and then nothing of it."""
+    A = np.array([[0.5, 0.1, 0.0], [0.1, 0.4, 0.0], [0.2, 0.1, 0.9]])
+    noise = np.diag([0.0, 0.0, 1.0])
+    bits = LeakedBits(Process(A, noise, np.eye(3), singular_noise=True)).next(3000)
+    alone = LeakedBits(Process(A[2:, 2:], noise[2:, 2:], np.eye(1))).next(3000)
+    assert np.isfinite(bits).all()
+    assert np.allclose(bits[100:], alone[100:], rtol=1e-9, atol=0.0)
+
+
 def joint_covariance(process: Process, heard: list[int]) -> tuple[Matrix, Matrix, Matrix]:
     """The covariance of the path (x_0, w_0, …), that of the innovation packets of these slots, and that of path and packets."""
     n, last = process.n, max(heard)

@@ -339,12 +339,12 @@ def _fixed_point(F: Floats, source: Floats) -> Floats:
         return np.asarray(solve_discrete_lyapunov(F, source))
 
 
-def block_length(A: Floats) -> int:
+def block_length(A: Floats, largest: float = _LARGEST_POWER) -> int:
     """The number of powers of A, (n, n), to compute at once: 256, or fewer if their entries would become too large."""
     power, length = A, 1
     while length < _BLOCK:
         power = power @ power
-        if not np.abs(power).max() < _LARGEST_POWER:
+        if not np.abs(power).max() < largest:
             break
         length *= 2
     return length

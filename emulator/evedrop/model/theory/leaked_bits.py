@@ -26,6 +26,7 @@ from evedrop.model.theory.covariances import block_length
 _AS_GOOD_AS_INFINITE = (
     1e60  # a standard deviation of the state relative to the noise's, with which a packet reveals nothing
 )
+_LARGEST_GROWTH = 1e80  # within a block: the square of such a standard deviation that grows by it is still a double
 
 
 @final
@@ -67,7 +68,7 @@ def _next_block(dynamics: bytes, factor: bytes, n: int, start: bytes) -> tuple[F
     """
     A, noise, carried = (np.frombuffer(matrix).reshape(n, n) for matrix in (dynamics, factor, start))
     largest = _AS_GOOD_AS_INFINITE * float(np.abs(noise).max()) or math.inf
-    more = kernels.carried_factors(A, noise, carried, block_length(A))
+    more = kernels.carried_factors(A, noise, carried, block_length(A, _LARGEST_GROWTH))
     block = _bits(np.concatenate([carried[None], more[:-1]]), noise)
     block.flags.writeable = False
     # A column that is scaled down still means a variance that is as good as infinite.
@@ -105,5 +106,7 @@ def _solved(L: Floats, q: Floats) -> Floats:
     """L⁻¹ q of every slot, (c, n), from L lower triangular, (c, n, n)."""
     y = np.zeros(L.shape[:2])
     for i in range(len(q)):
-        y[:, i] = (q[i] - (L[:, i, :i] * y[:, :i]).sum(axis=1)) / L[:, i, i]
+        rest = q[i] - (L[:, i, :i] * y[:, :i]).sum(axis=1)
+        # Both are 0 in a direction that has no variance, because noise does not reach it, and what it began with has decayed.
+        np.divide(rest, L[:, i, i], out=y[:, i], where=rest != 0.0)
     return y
