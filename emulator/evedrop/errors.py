@@ -47,6 +47,10 @@ class UsageError(EvedropError):
     exit_status = 2
 
 
+class FolderTaken(UsageError):
+    """Another run has begun in a results folder that was empty."""
+
+
 class ScenarioError(UsageError):
     """A scenario with mistakes: `mistakes` lists them, one line each, up to `MOST_MISTAKES`."""
 

@@ -61,6 +61,14 @@ def test_the_most_coded_packets() -> None:
     assert most_coded(DRIFTING, 0.8, LEGITIMATE_RATES) == most_coded(STABLE, 0.8, (0.8, 0.0)) == math.inf
 
 
+def test_a_phase_after_each_acknowledgement_needs_no_coded_packet() -> None:
+    """However long the next acknowledgement takes, when the error grows faster than they come."""
+    process = Process(np.array([[2.1]]), np.eye(1), np.eye(1))
+    assert growth_by_phases(process, 0, 0.8, LEGITIMATE_RATES) == pytest.approx(4.41 * 0.02 / (1.0 - 4.41 * 0.18))
+    assert growth_by_phases(process, 1, 0.8, LEGITIMATE_RATES) == math.inf
+    assert most_coded(process, 0.8, LEGITIMATE_RATES) == 0.0
+
+
 def test_the_error_grows_with_the_code_of_the_project_too() -> None:
     """A forged reference, then coded packets that all arrive: 1.44-fold a slot in the end, whatever is acknowledged."""
     slots = 40

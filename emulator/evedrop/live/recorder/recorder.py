@@ -63,6 +63,7 @@ def record(brief: Brief[RecorderPart], report: EndPrinter, serve: str | None = N
         new_folder(run.folder.now)
         with Session(brief, meanwhile=stop.check):
             pass
+        new_folder(run.folder.now)  # another run may have begun there while this one waited for its router
     viewer = None if web_address is None else _serve(web_address, run.folder.now)
     with end.noted(), run.folder.open():
         with end.noted():  # whatever ended the run, the digests that have come get their rows

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import final
 
-from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError, UnwrittenResults
+from evedrop.errors import EvedropError, FolderTaken, Interrupted, NoAnswer, RunError, UnwrittenResults
 from evedrop.live.protocol.last_word import protocol_breaker
 from evedrop.names import RELAY, ROUTER
 from evedrop.results.summary_file import unwritten
@@ -55,9 +55,14 @@ class RunEnd:
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Note why the block fails, if it does, and go on: no error may cost the results."""
+        """Note why the block fails, if it does, and go on: no error may cost the results.
+
+        Raises FolderTaken: the results there are another run's.
+        """
         try:
             yield
+        except FolderTaken:
+            raise
         except OSError as error:
             self.saved = False
             self.fail(self.how if self.status == RunError.exit_status else unwritten(error))

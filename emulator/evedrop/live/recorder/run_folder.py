@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import final
 
-from evedrop.errors import NoAnswer, UnwrittenResults
+from evedrop.errors import FolderTaken, NoAnswer, UnwrittenResults
 from evedrop.live.recorder.run_end import RunEnd
 from evedrop.live.recorder.run_score import RunScore
 from evedrop.results.ending import note_end
@@ -46,11 +46,18 @@ class RunFolder:
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Write the scenario, and have a writer of rows during the block. Raises OSError if the folder does not exist."""
+        """Write the scenario, and have a writer of rows during the block.
+
+        Raises OSError if the folder does not exist, FolderTaken, with nothing written, if it has the rows of another run.
+        """
         scenario = self._score.scenario
         self._held = HeldFolder(self._place)
-        write_resolved(self.now, scenario)
-        with ResultsWriter.of(self.now, scenario, self._dump_shard) as self._writer:
+        try:
+            writer = ResultsWriter.of(self.now, scenario, self._dump_shard)
+        except FileExistsError as error:
+            raise FolderTaken(f"{self._place} is the results folder of another run; give another folder") from error
+        with writer as self._writer:
+            write_resolved(self.now, scenario)
             yield
 
     def amend(self, scenario: Scenario) -> None:
