@@ -78,6 +78,20 @@ def test_the_error_is_white_and_uniform_whatever_the_state_is() -> None:
     assert np.allclose(np.diag(expected), quantiser.steps(3) ** 2 / 12.0)
 
 
+@pytest.mark.parametrize(
+    ("width", "bits", "warned"), [(2.0, 8, True), (4.0, 8, True), (4.0, 4, False), (6.0, 16, False)]
+)
+def test_a_range_that_states_exceed_is_a_warning(width: float, bits: int, warned: bool) -> None:
+    """Where the cut levels add more than a hundredth to the quantiser's own error, which is all that theory knows of."""
+    process = Process(np.array([[0.9]]), np.array([[0.19]]), np.eye(1))
+    warnings = QuantisedSchedule(process, 1.5, bits, width).warnings()
+    assert bool(warnings) is warned
+    quantiser = DitheredQuantiser(process, bits, width, stream_key(ROOT, "dither"), Batch(1, 400_000))
+    x = np.random.default_rng(3).standard_normal((1, 400_000))
+    error = float(((quantiser.read(0, quantiser.levels(0, x)) - x) ** 2).mean())
+    assert (error > 1.02 * width**2 / (3.0 * 4.0**bits)) is warned
+
+
 def test_masked_levels_say_nothing() -> None:
     """The masked value of any level is uniform (p > 1e-4); the pad is undone exactly, in any order of slots."""
     pad = LevelPad(2, 4, MASK, Batch(6, 8000))

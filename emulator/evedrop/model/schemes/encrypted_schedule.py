@@ -118,6 +118,13 @@ class EncryptedSchedule(Scheme):
 
 
 _WIDEST = 100.0  # standard deviations
+_NEGLECTED = 1e-9  # of a state's variance
+
+
+def _overload(r: float) -> float:
+    """The mean square by which a standard normal variable exceeds ±r: 2(1 + r²)Φ(−r) − 2rφ(r)."""
+    density = math.exp(-0.5 * r * r) / math.sqrt(2.0 * math.pi)
+    return (1.0 + r * r) * math.erfc(r / math.sqrt(2.0)) - 2.0 * r * density
 
 
 @final
@@ -218,6 +225,18 @@ class QuantisedSchedule(Scheme):
             *number_mistakes(given, "threshold", 1.0, MOST_SLOTS),
             *whole_number_mistakes(given, "bits", 1, MOST_BITS),
             *number_mistakes(given, "standard_deviations", 1.0, _WIDEST),
+        ]
+
+    def warnings(self) -> list[str]:
+        """Where theory neglects too much: states beyond the quantiser's range."""
+        error, r = self.quantisation.fraction, self._standard_deviations
+        overload = _overload(r)
+        if overload <= max(_NEGLECTED, 0.01 * error):
+            return []
+        return [
+            f"encoding.standard_deviations is {r:g}: a state exceeds the quantiser's range with a probability of up to "
+            f"{math.erfc(r / math.sqrt(2.0)):.2g} a slot, which adds {overload / error:.3g} times the quantiser's own error; "
+            "theory neglects it, so measured errors are larger than expected; 6 or more prevents that"
         ]
 
     @property
