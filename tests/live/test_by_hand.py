@@ -324,6 +324,19 @@ def test_without_a_router_everybody_says_so(evedrop: Evedrop) -> None:
     assert list((evedrop.folder / "results").iterdir()) == []
 
 
+def test_a_folder_that_another_run_takes_meanwhile_is_left_to_it(evedrop: Evedrop) -> None:
+    """A recorder that waits for its router looks at its folder again before it writes there."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    briefs = written(evedrop, "--listen", endpoint, "--wait", "30")
+    recorder = begun(evedrop, "recorder", briefs["recorder"])
+    taken = evedrop.folder / "results" / "scenario.toml"
+    wait_until(taken.parent.is_dir, "a recorder that waits")
+    taken.write_text("of another run")
+    with Router(evedrop, briefs["router"], endpoint):
+        told(recorder.end(), 2, "results is not empty")
+    assert {path.name: path.read_text() for path in taken.parent.iterdir()} == {taken.name: "of another run"}
+
+
 @pytest.mark.thorough
 def test_the_results_are_where_the_recorder_is_told(evedrop: Evedrop) -> None:
     """Relative to where it is started; --out has the last word; a folder with something in it is refused."""
