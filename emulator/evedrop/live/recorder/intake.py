@@ -48,10 +48,9 @@ class Intake:
         if not self._is_due(source, message, steering):
             return None
         if source == ROUTER:
-            for name, account in self.joiner.add_journal(message).items():
-                self._run_tally.tallies[name].count(account)
+            self.joiner.add_journal(message)
         elif source == CONTROLLER:
-            self._run_tally.solve_times.add_seconds(self.joiner.add_decisions(message).tolist())
+            self.joiner.add_decisions(message)
         elif source != SENSOR and is_leaving(message):
             self._leave(source, message, steering)
         elif source != SENSOR:
@@ -64,7 +63,15 @@ class Intake:
         slots = self.joiner.take_slots()
         if slots is not None:
             self._verifier.joined(slots)
+        self._count()
         return slots
+
+    def _count(self) -> None:
+        """Count the links' accounts and the decisions of the slots that are complete: other processes may be ahead of them."""
+        for accounts in self.joiner.take_accounts():
+            for name, account in accounts.items():
+                self._run_tally.tallies[name].count(account)
+        self._run_tally.solve_times.add_seconds(self.joiner.take_seconds())
 
     def _is_due(self, source: str, message: Reader, steering: Steering) -> bool:
         slot = message.integer("k")

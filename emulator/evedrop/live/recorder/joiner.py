@@ -34,6 +34,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.score.slots import Slots
 
 Kind = TypeVar("Kind", bound=Record)
+Count = TypeVar("Count")
 
 
 @final
@@ -58,6 +59,7 @@ class Joiner:
         self._truth = _Queue(SensorSlots)
         self._links = {name: _Queue(LinkSlots) for name in windows}
         self._reports = {name: _Queue(ReceiverSlots) for name in windows}
+        self._accounts, self._seconds = _Counts[Mapping[str, Account]](), _Counts[float]()
         self._done = 0
         self.digests = {name: DigestLog() for name in windows}
         """Receiver or controller → first slot of a block → its digests, (R, 16)."""
@@ -100,12 +102,15 @@ class Joiner:
         """Whether this many slots have been returned and, if there is a controller, it has reported them, too."""
         return self._done == slots and (self._period is None or self._decided == slots)
 
-    def add_decisions(self, telemetry: Reader) -> Floats:
-        """Take the controller's telemetry; returns the seconds that each decision took."""
-        message = read_decisions(telemetry, self._decided, self._extent, self._blocks[CONTROLLER], self._period or 1)
+    def add_decisions(self, telemetry: Reader) -> None:
+        """Take the controller's telemetry."""
+        period = self._period or 1
+        message = read_decisions(telemetry, self._decided, self._extent, self._blocks[CONTROLLER], period)
+        first = -(-self._decided // period) * period
+        for number, seconds in enumerate(message.seconds.tolist()):
+            self._seconds.add(first + number * period + 1, seconds)
         self._decided += message.count
         self.digests[CONTROLLER].add(message.digests)
-        return message.seconds
 
     def add_truth(self, telemetry: Reader) -> None:
         """Take the sensor's telemetry."""
@@ -124,12 +129,20 @@ class Joiner:
         for block in sorted(message.trace_sums):
             self.trace_sums[name] = self.trace_sums.get(name, 0.0) + message.trace_sums[block]
 
-    def add_journal(self, journal: Reader) -> Mapping[str, Account]:
-        """Take the router's journal; returns the accounts in it."""
+    def add_journal(self, journal: Reader) -> None:
+        """Take the router's journal."""
         message = read_journal(journal, self.journaled, self._windows, self._extent)
         for name, account in message.links.items():
             self._links[name].add(account.slots)
-        return message.links
+        self._accounts.add(self.journaled, message.links)
+
+    def take_accounts(self) -> list[Mapping[str, Account]]:
+        """The next accounts of the links all of whose slots have been returned."""
+        return self._accounts.take(self._done)
+
+    def take_seconds(self) -> list[float]:
+        """The seconds of the next decisions whose first slot has been returned."""
+        return self._seconds.take(self._done)
 
     def take_slots(self) -> Slots | None:
         """The next slots that all processes have reported, or None."""
@@ -177,6 +190,24 @@ class _Queue(Generic[Kind]):
             parts.append(record)
             count -= record.count
         return self._kind.joined(parts)
+
+
+class _Counts(Generic[Count]):
+    """What is counted once its slots have been returned."""
+
+    def __init__(self) -> None:
+        self._counts: deque[tuple[int, Count]] = deque()
+
+    def add(self, end: int, count: Count) -> None:
+        """Add the next count, of slots below `end`."""
+        self._counts.append((end, count))
+
+    def take(self, done: int) -> list[Count]:
+        """Remove those whose slots are all below `done`."""
+        taken = []
+        while self._counts and self._counts[0][0] <= done:
+            taken.append(self._counts.popleft()[1])
+        return taken
 
 
 @final
