@@ -10,11 +10,12 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -24,6 +25,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
+from evedrop.results import crash_proof_tables
 from evedrop.results.crash_proof_tables import goes_on, last_round, parquet_batches
 from evedrop.results.ending import note_end
 from evedrop.results.folder import UNFINISHED
@@ -489,3 +491,36 @@ def test_reading_a_parquet_file_in_batches_keeps_one_row_group(tmp_path: Path) -
         most, rows = max(most, pa.total_allocated_bytes() - before), rows + batch.num_rows
     assert rows == 40 * group
     assert most < 4 * numbers.nbytes
+
+
+def test_rows_follow_no_batch_that_was_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is full between two rounds, when a table is so large that it is written at once, and has room again later."""
+    write, full = crash_proof_tables.write_all, [False]
+
+    def write_some(file: BinaryIO, data: bytes) -> None:
+        if full[0]:
+            file.write(data[: len(data) // 2])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(file, data)
+
+    monkeypatch.setattr(crash_proof_tables, "write_all", write_some)
+    with pytest.raises(OSError, match="an earlier part"), ResultsWriter(tmp_path, NAMES, 2) as writer:  # noqa: PT012
+        for first, count in ((0, 100), (100, 200_000)):
+            full[0] = first > 0
+            with pytest.raises(OSError, match="space") if full[0] else nullcontext():
+                writer.slot_rows(first, NAMES[0], sums(count), np.ones(count))
+            full[0] = False
+            writer.write_rows(f"slot {first + count}")
+    assert Results(tmp_path, {}).slots.num_rows == 100
+
+
+def test_a_table_that_cannot_be_read_stays_a_stream(tmp_path: Path) -> None:
+    """Its file `unfinished` has all that there is; a Parquet file would lack rows that the run counted."""
+    with suppress(OSError), ResultsWriter(tmp_path, NAMES, 2) as writer:
+        for first in (0, 100):
+            writer.slot_rows(first, NAMES[0], sums(100), np.ones(100))
+            writer.write_rows(f"slot {first + 100}")
+        (stream,) = (tmp_path / UNFINISHED).glob("slots-*")
+        os.truncate(stream, stream.stat().st_size - 100)
+    assert stream.exists()
+    assert not (tmp_path / "slots.parquet").exists()

@@ -11,6 +11,7 @@ Source: docs/results.md, while a run goes on.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -366,12 +367,19 @@ def finish(folder: Path) -> None:
 
 
 def _write_parquet(folder: Path, name: str, reader: pa.RecordBatchStreamReader, rows: int) -> None:
-    """Turn the first rows of a stream into the Parquet file of a table. Raises OSError or an error of Arrow."""
+    """Turn the first rows of a stream into the Parquet file of a table. Raises OSError or an error of Arrow.
+
+    It is an error if the stream has fewer rows.
+    """
     unfinished = folder / UNFINISHED / f"{name}.parquet"
+    left = rows
     try:
         with parquet_writer(unfinished, reader.schema) as writer:
             for group in _groups(_batches_in(reader, rows)):
                 writer.write_table(pa.Table.from_batches(group, reader.schema).combine_chunks())
+                left -= sum(batch.num_rows for batch in group)
+        if left:
+            raise OSError(errno.EIO, f"{left} of {rows} rows of {name} cannot be read")
     except (OSError, pa.ArrowException):
         world().disk.remove(unfinished, missing_ok=True)
         raise

@@ -6,7 +6,8 @@ Source: docs/results.md.
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -192,30 +193,37 @@ class ResultsWriter:
 
     def _round(self, before: Callable[[], None] = lambda: None) -> None:
         """Write all rows; before: called when they are written, and do not count yet: they do in the next round if it fails."""
-        if self._broken:  # rows after an incomplete batch could not be read
-            raise OSError(errno.EIO, "an earlier part could not be written")
-        self._broken = True  # until the round succeeds
-        if self._taken is not None:
-            self._taken.write()
 
         def whole() -> None:
             self._broken = False  # all batches are whole, even if what comes before they count fails
             before()
             self._broken = True
 
-        self._unfinished.round(self._at, self._slots, self._streams, whole)
-        self._broken = False
+        with self._unbroken():
+            if self._taken is not None:
+                self._taken.write()
+            self._unfinished.round(self._at, self._slots, self._streams, whole)
         self._on_disk, self._bytes = self._on_disk + self._bytes, 0
         for stream in self._outdated:
             stream.close()
             world().disk.remove(self._held.now / UNFINISHED / stream.file)
         self._outdated = []
 
+    @contextmanager
+    def _unbroken(self) -> Iterator[None]:
+        """If the block fails, nothing more is written: rows after an incomplete batch could not be read."""
+        if self._broken:
+            raise OSError(errno.EIO, "an earlier part could not be written")
+        self._broken = True
+        yield
+        self._broken = False
+
     def _add(self, table: str, columns: Sequence[NDArray[Any]]) -> None:
         stream = self._streams[table]
         self._bytes += stream.add(columns)
         if stream.held_bytes >= BATCH_BYTES:  # these rows count only from the next round on
-            stream.write()
+            with self._unbroken():
+                stream.write()
 
     def slot_rows(
         self,
