@@ -289,13 +289,21 @@ def keep(folder: Path) -> TableRound:
     return latest
 
 
-def batches_of(folder: Path, name: str) -> Iterator[pa.RecordBatch]:
-    """The rows of a table in a stream, batch by batch; none if there is no such stream, fewer if it is damaged."""
-    file, rows = last_round(folder).tables.get(name, ("", 0))
-    if not file:
-        return
-    with contextlib.suppress(OSError, pa.ArrowException), _stream_in(folder, file) as reader:
-        yield from _batches_in(reader, rows)
+@contextlib.contextmanager
+def stream_of(folder: Path, name: str) -> Iterator[tuple[pa.Schema, Iterator[pa.RecordBatch]] | None]:
+    """The schema of a table in a stream, and its rows, batch by batch: fewer if it is damaged.
+
+    None if there is no such stream: then the table is a Parquet file, or there is none. Schema and rows are of one file, even
+    if its table becomes a Parquet file meanwhile.
+    """
+    whole = (folder / f"{name}.parquet").exists()
+    file, rows = ("", 0) if whole else last_round(folder).tables.get(name, ("", 0))
+    with contextlib.ExitStack() as opened:
+        reader = None
+        if file:
+            with contextlib.suppress(OSError, pa.ArrowException):
+                reader = opened.enter_context(_stream_in(folder, file))
+        yield None if reader is None else (reader.schema, _batches_in(reader, rows))
 
 
 @contextlib.contextmanager
@@ -316,24 +324,14 @@ def _batches_in(reader: pa.RecordBatchStreamReader, rows: int) -> Iterator[pa.Re
 
 def schema_of(folder: Path, name: str) -> pa.Schema | None:
     """The schema of a table in a stream; None if there is no such stream."""
-    file, _ = last_round(folder).tables.get(name, ("", 0))
-    if not file:
-        return None
-    try:
-        with _stream_in(folder, file) as reader:
-            return reader.schema
-    except (OSError, pa.ArrowException):
-        return None
+    with stream_of(folder, name) as stream:
+        return None if stream is None else stream[0]
 
 
 def parquet_or_stream(folder: Path, name: str, rows: int = _GROUP_ROWS) -> Iterator[pa.RecordBatch]:
     """The rows of a table, `rows` at a time if it is a Parquet file; none if there is no such table or it is damaged."""
-    path = folder / f"{name}.parquet"
-    if path.exists():
-        with contextlib.suppress(OSError, pa.ArrowException):
-            yield from parquet_batches(path, rows)
-    else:
-        yield from batches_of(folder, name)
+    with stream_of(folder, name) as stream, contextlib.suppress(OSError, pa.ArrowException):
+        yield from parquet_batches(folder / f"{name}.parquet", rows) if stream is None else stream[1]
 
 
 def parquet_batches(path: Path, rows: int, columns: Sequence[str] | None = None) -> Iterator[pa.RecordBatch]:

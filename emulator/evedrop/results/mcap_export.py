@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from evedrop.errors import UsageError
-from evedrop.results.crash_proof_tables import batches_of, parquet_batches
+from evedrop.results.crash_proof_tables import parquet_batches, stream_of
 from evedrop.results.reading import Results
 from evedrop.scenario.progress_events import RunEvent
 from evedrop.scenario.recorded import recorded
@@ -182,10 +182,12 @@ class _Tables:
     def _batches(self, name: str, columns: list[str] | None = None) -> Iterator[pa.RecordBatch]:
         """The rows of a table in batches, from its Parquet file, or from the stream of a run in progress or killed."""
         path = self._folder / f"{name}.parquet"
-        if not path.exists():
-            for batch in batches_of(self._folder, name):
-                yield from self._parts(batch if columns is None else batch.select(columns))
-            return
+        with stream_of(self._folder, name) as stream:
+            if stream is not None:
+                for batch in stream[1]:
+                    yield from self._parts(batch if columns is None else batch.select(columns))
+            if stream is not None or not path.exists():
+                return
         try:
             with opened(path):  # reading a pipe would block
                 pass

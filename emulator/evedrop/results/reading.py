@@ -20,13 +20,13 @@ from evedrop.model.digest import DIGEST_BYTES
 from evedrop.model.streams import MOST_SLOTS
 from evedrop.results.crash_proof_tables import (
     TableRound,
-    batches_of,
     goes_on,
     is_unfinished,
     last_round,
     metrics_path,
     parquet_batches,
     schema_of,
+    stream_of,
 )
 from evedrop.results.summary_file import plain
 from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, inputs_schema_in, trials_schema
@@ -84,7 +84,14 @@ class Results:
                 f"by itself, such as {place / 'shards' / '1'}"
             )
         if not path.exists() and is_unfinished(place):
-            return cls(place, _cut_short(place))
+            try:
+                unfinished = _cut_short(place)
+            except UsageError:
+                if not path.exists():
+                    raise
+            else:
+                if not path.exists():  # or the run has ended meanwhile, and what was found is not all of one moment
+                    return cls(place, unfinished)
         return cls(place, _read_summary(path))
 
     @property
@@ -110,16 +117,17 @@ class Results:
 
     def _table(self, name: str, expected: pa.Schema | None = None) -> pa.Table:
         path = self.folder / f"{name}.parquet"
-        schema = None if path.exists() else schema_of(self.folder, name)
         try:
-            if schema is None:
-                _refuse_pipe(path)
-                # By its path: threads of Arrow that read a Python file may abort the interpreter at its end (Python 3.11).
-                # Not by `read_table`, which takes four times as long for a small one.
-                parquet = pq.ParquetFile(path)
-                table = parquet.read(use_threads=parquet.metadata.num_rows > _ROWS_WORTH_THREADS)
-            else:
-                table = pa.Table.from_batches(batches_of(self.folder, name), schema)
+            with stream_of(self.folder, name) as stream:
+                if stream is None:
+                    _refuse_pipe(path)
+                    # By its path: threads of Arrow that read a Python file may abort the interpreter at its end (Python 3.11).
+                    # Not by `read_table`, which takes four times as long for a small one.
+                    parquet = pq.ParquetFile(path)
+                    table = parquet.read(use_threads=parquet.metadata.num_rows > _ROWS_WORTH_THREADS)
+                else:
+                    schema, batches = stream
+                    table = pa.Table.from_batches(batches, schema)
             columns = table.column_names  # which are read only here, and need not be text
             table.validate(full=True)  # a damaged column of words may name words that are not there
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
@@ -141,12 +149,14 @@ class Results:
         """
         path = self.folder / f"{name}.parquet"
         try:
-            if path.exists():
-                _refuse_pipe(path)
-                table = pq.read_table(path, columns=list(columns), filters=where)
-            else:
-                whole = pa.Table.from_batches(batches_of(self.folder, name), schema_of(self.folder, name))
-                table = (whole if where is None else whole.filter(where)).select(columns)
+            with stream_of(self.folder, name) as stream:
+                if stream is None:
+                    _refuse_pipe(path)
+                    table = pq.read_table(path, columns=list(columns), filters=where)
+                else:
+                    schema, batches = stream
+                    whole = pa.Table.from_batches(batches, schema)
+                    table = (whole if where is None else whole.filter(where)).select(columns)
             table.validate(full=True)
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
@@ -159,14 +169,10 @@ class Results:
         """
         path = self.folder / f"{name}.parquet"
         try:
-            if path.exists():
-                _refuse_pipe(path)
-                for batch in parquet_batches(path, _PIECE_ROWS, list(columns)):
-                    yield _validated(batch, columns)
-            elif schema_of(self.folder, name) is None:
-                raise FileNotFoundError("there is no such file")
-            else:
-                for batch in batches_of(self.folder, name):
+            with stream_of(self.folder, name) as stream:
+                if stream is None:
+                    _refuse_pipe(path)
+                for batch in parquet_batches(path, _PIECE_ROWS, list(columns)) if stream is None else stream[1]:
                     yield _validated(batch, columns)
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
@@ -190,8 +196,8 @@ class Results:
     def inputs(self) -> pa.Table | None:
         """A row per slot and recorded trial of a closed loop; None without a controller."""
         path = self.folder / "inputs.parquet"
+        schema = schema_of(self.folder, "inputs")
         written = path.exists()
-        schema = None if written else schema_of(self.folder, "inputs")
         # Metrics of before the first slot have no controller, although a run that was killed soon after has rows.
         if self.summary.get("controller") is None and schema is None and not written:
             return None
