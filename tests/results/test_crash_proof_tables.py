@@ -13,9 +13,9 @@ from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from dataclasses import fields, replace
 from functools import cache
+from io import FileIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -40,6 +40,7 @@ from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums
 from evedrop.show.view.scene_slots import replay
+from evedrop.system.disk import write_all
 from tests.conftest import Evedrop, Live, wait_until
 from tests.disks import simulated
 from tests.examples import examples, mostly_long
@@ -495,9 +496,9 @@ def test_reading_a_parquet_file_in_batches_keeps_one_row_group(tmp_path: Path) -
 
 def test_rows_follow_no_batch_that_was_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The disk is full between two rounds, when a table is so large that it is written at once, and has room again later."""
-    write, full = crash_proof_tables.write_all, [False]
+    write, full = write_all, [False]
 
-    def write_some(file: BinaryIO, data: bytes) -> None:
+    def write_some(file: FileIO, data: bytes) -> None:
         if full[0]:
             file.write(data[: len(data) // 2])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
