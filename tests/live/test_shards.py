@@ -8,6 +8,7 @@ import signal
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ import pytest
 from evedrop import load_results, montecarlo, run
 from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.gathering import shards_of
-from evedrop.live.launch.shards import OneProgress
+from evedrop.live.launch.shards import OneProgress, _made_one, _ShardsState
 from evedrop.results.crash_proof_tables import last_round
 from evedrop.results.reading import Results, age_of_metrics
 from evedrop.scenario.loading import load
@@ -385,6 +386,14 @@ def test_shards_that_cannot_be_made_one_are_kept(tmp_path: Path, monkeypatch: py
         run("eavesdroppers", out=tmp_path / "run", trials=2, shards=2, slots=20, expect=[])
     for number in (1, 2):
         assert load_results(tmp_path / "run" / "shards" / str(number)).summary["slots"] == 20
+
+
+def test_shards_whose_metric_fails_are_no_complete_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It fails when the shards are merged, as the summary says; the run ends with that failure, as one without shards does."""
+    failed = SimpleNamespace(ended="the metric distance of an installed package failed", failed_expectations=0)
+    monkeypatch.setattr("evedrop.live.launch.gathering.gather", lambda *_: failed)
+    with pytest.raises(RunError, match="the metric distance"):
+        _made_one(load("eavesdroppers"), tmp_path, [], _ShardsState(), 0.0)
 
 
 def test_the_trial_to_watch_is_run_without_shards(evedrop: Evedrop) -> None:

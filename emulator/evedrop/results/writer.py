@@ -139,11 +139,13 @@ class ResultsWriter:
         if failure is not None and error is None:
             raise failure
 
-    def checkpoint(self, at: str, metrics: Callable[[], Summary], before: Callable[[], None] = lambda: None) -> None:
+    def checkpoint(
+        self, at: str, metrics: Callable[[], Summary | None], before: Callable[[], None] = lambda: None
+    ) -> None:
         """Write rows to disk if some seconds have passed since the last round, or if many are held back.
 
-        at: how far the run came, in words; metrics: returns the summary so far, called more rarely if it takes long;
-        before: called before metrics. Raises OSError if the disk is full or the folder is gone.
+        at: how far the run came, in words; metrics: returns the summary so far, or None if there is none now, called more rarely
+        if it takes long; before: called before metrics. Raises OSError if the disk is full or the folder is gone.
         """
         self._at = at
         began = world().monotonic()
@@ -156,7 +158,7 @@ class ResultsWriter:
             before()
         if first:  # rows without metrics could not be looked at, if the run were killed now
             earliest = metrics()
-            self._round(lambda: self.write_metrics(earliest))
+            self._round(lambda: self._write_known(earliest))
             self._metrics_before = True
         else:
             self._round()
@@ -164,7 +166,7 @@ class ResultsWriter:
         if due:
             self._metrics_due = self._round_due
         if due and not first:  # the first metrics import the theory, so their time says nothing about the next
-            self.write_metrics(metrics())
+            self._write_known(metrics())
             now = world().monotonic()
             self._metrics_due = now + max(_ROUND_SECONDS, _METRICS_PAUSE * (now - began))
 
@@ -178,6 +180,10 @@ class ResultsWriter:
         self._at = at
         self._round()
         self.write_metrics(metrics)
+
+    def _write_known(self, metrics: Summary | None) -> None:
+        if metrics is not None:
+            self.write_metrics(metrics)
 
     def write_metrics(self, metrics: Summary) -> None:
         """Write the summary so far, of a run that has not ended."""

@@ -223,4 +223,6 @@ def _made_one(
         raise RunError(how)
     if state.failures:
         raise Interrupted.with_results(folder)
+    if summary.ended != how:  # a metric failed
+        raise RunError(summary.ended)
     return 1 if summary.failed_expectations else 0

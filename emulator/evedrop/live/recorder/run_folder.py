@@ -38,6 +38,7 @@ class RunFolder:
         self._writer: ResultsWriter
         self._digest_rows = DigestRows(score.joiner.digests, score.scenario.first_trial)
         self._final: Summary | None = None
+        self._begun = score.scenario  # whose classes have answered: the operator may change a link
 
     @property
     def now(self) -> Path:
@@ -84,8 +85,7 @@ class RunFolder:
     def save(self) -> None:
         """Save the results so far, from time to time. Raises RunError if they cannot be written."""
         try:
-            with suppress(NoAnswer):  # reported at the end; rows are written before the summary is computed
-                self._writer.checkpoint(self._at, self._so_far, lambda: self._digest_rows.write(self._writer))
+            self._writer.checkpoint(self._at, self._so_far, lambda: self._digest_rows.write(self._writer))
         except OSError as error:
             raise UnwrittenResults(unwritten(error)) from error
 
@@ -105,18 +105,18 @@ class RunFolder:
     def complete(self, end: RunEnd) -> None:
         """Write the summary, and note what it says against the run, or why it cannot be written.
 
-        If not all rows are on disk, the summary has the last metrics whose rows are.
+        If not all rows are on disk, or a class does not answer, the summary has the last metrics whose rows are.
         """
         try:
-            if end.saved:
-                summary = self._final or self._score.summary(self.now, end.how, end.accused)
+            if end.saved and self._final is None:
+                with suppress(NoAnswer):  # noted when the run was to be settled
+                    self._final = self._score.summary(self.now, end.how, end.accused)
+                self._dump_shard()
+            if end.saved and self._final is not None:
+                end.judge(self._final)
+                write_summary(self.now, replace(self._final, ended=end.how))
             else:
-                summary = note_end(self.now, self._score.scenario, end.how)
-            end.judge(summary)
-            if end.saved:
-                if self._final is None:
-                    self._dump_shard()
-                write_summary(self.now, replace(summary, ended=end.how))
+                end.judge(note_end(self.now, self._begun, end.how))
         except OSError as error:
             end.fail(unwritten(error))
 
@@ -125,9 +125,11 @@ class RunFolder:
         """How far the run has come, in words."""
         return f"slot {self._score.joiner.done}"
 
-    def _so_far(self) -> Summary:
+    def _so_far(self) -> Summary | None:
         self._score.course.end()
-        return self._score.summary(self.now, "")
+        with suppress(NoAnswer):  # reported at the end
+            return self._score.summary(self.now, "")
+        return None
 
     def _dump_shard(self) -> None:
         if self._shard:
