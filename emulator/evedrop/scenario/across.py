@@ -37,6 +37,7 @@ from evedrop.scenario.receivers import CHANGEABLE, OTHER_MODEL, LinkTable, chang
 from evedrop.scenario.table import Table, sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import expectations_of
+from evedrop.scenario.timeline import numbered_acts
 from evedrop.scenario.words import as_toml, listed
 
 Numbered = tuple[int, Act]
@@ -82,16 +83,10 @@ def _own(path: str, kind: type[EventKind], ask: Callable[[], Iterator[str]]) -> 
         return [f"{path}.{kind.kind}: cannot be checked: {kind.__name__} raised {place_of(error)}"]
 
 
-def _acts(scenario: Scenario) -> list[Numbered]:
-    """All acts, each with the number of its event, in order of slots."""
-    acts = ((i, act) for i, event in enumerate(scenario.event) for act in event.acts())
-    return sorted(acts, key=lambda numbered: numbered[1].at)
-
-
 def away_in(scenario: Scenario, name: str, slot: int) -> str | None:
     """Say that a receiver is down or paused in a slot, and by which event; None if it is present."""
     away = None
-    for i, act in _acts(scenario):
+    for i, act in numbered_acts(scenario.event):
         if act.at <= slot and name in act.names and act.effect.present is not None:
             away = None if act.effect.present else (i, act.at, act.effect.reason)
     return None if away is None else f"{name} is {_said(away[2])} (event.{away[0]}, from slot {away[1]} on)"
@@ -133,7 +128,7 @@ def _change_mistakes(path: str, name: str, changes: Mapping[str, Any], scenario:
 
 def _order_mistakes(scenario: Scenario) -> Iterator[str]:
     """Events that end a cut or an outage that has not begun, or that begin one while another of its kind lasts."""
-    acts = _acts(scenario)
+    acts = numbered_acts(scenario.event)
     for name in scenario.receivers:
         yield from _order_mistakes_of(name, [(i, act) for i, act in acts if name in act.names])
 

@@ -47,13 +47,16 @@ class Timeline:
 
     def _spans(self, attacked: str) -> list[tuple[int, int]]:
         spans: list[tuple[int, int]] = []
+        began: int | None = None
         for act in self.acts:
-            if act.effect.attacked == attacked:
-                if act.effect.on:
-                    spans.append((act.at, NEVER))
-                else:
-                    spans[-1] = (spans[-1][0], act.at)
-        return spans
+            if act.effect.attacked != attacked:
+                continue
+            if act.effect.on:
+                began = act.at if began is None else began
+            elif began is not None:
+                spans.append((began, act.at))
+                began = None
+        return spans if began is None else [*spans, (began, NEVER)]
 
     @classmethod
     def of(cls, events: Iterable[EventKind], receivers: Sequence[str], changed: Changed) -> Timeline:
@@ -66,9 +69,18 @@ class Timeline:
         )
 
 
+def numbered_acts(events: Iterable[EventKind]) -> list[tuple[int, Act]]:
+    """The acts of events, each with the number of its event, in order of slots.
+
+    In one slot, what an event does after its beginning, such as to end, comes before the beginnings of events.
+    """
+    acts = [(event.first, i, act) for i, event in enumerate(events) for act in event.acts()]
+    return [(i, act) for _, i, act in sorted(acts, key=lambda placed: (placed[2].at, placed[0] == placed[2].at))]
+
+
 def acts_of(events: Iterable[EventKind]) -> tuple[Act, ...]:
-    """The acts of events, in order of slots."""
-    return tuple(sorted((act for event in events for act in event.acts()), key=lambda act: act.at))
+    """The acts of events, in the order of `numbered_acts`."""
+    return tuple(act for _, act in numbered_acts(events))
 
 
 def _changes(name: str, acts: Sequence[Act], changed: Changed) -> Iterator[Change]:
@@ -77,14 +89,19 @@ def _changes(name: str, acts: Sequence[Act], changed: Changed) -> Iterator[Chang
         if name not in act.names:
             continue
         if act.effect.changes_settings:
-            entries = {} if act.effect.entries is None else _over(entries, act.effect.entries)
+            entries = entries_after(entries, act.effect.entries)
             yield Change(act.at, settings=changed(name, entries))
         if act.effect.cuts is not None:
             yield Change(act.at, cut=act.effect.cuts)
 
 
-def _over(entries: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Entries with some changed; a quality removes an earlier loss, and a loss an earlier quality."""
+def entries_after(entries: Mapping[str, Any], changes: Mapping[str, Any] | None) -> dict[str, Any]:
+    """All changed entries of a link after further changes; None undoes all of them.
+
+    A quality removes an earlier loss, and a loss an earlier quality.
+    """
+    if changes is None:
+        return {}
     dropped = {"quality": "loss", "loss": "quality"}
     gone = {dropped[name] for name in changes if name in dropped}
     return {**{name: value for name, value in entries.items() if name not in gone}, **changes}

@@ -236,6 +236,32 @@ def test_a_restart_keeps_the_state_that_it_says() -> None:
         assert away.keeps_state
 
 
+ACKNOWLEDGED: dict[str, Any] = {
+    "encoding": {"scheme": "acknowledged"},
+    "eavesdroppers": {"eve": {"strategy": "reference", "link": {"quality": 0.9}}},
+    "acknowledgements": {"link": {"quality": 0.9}, "attack": "all"},
+}
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_one_event_may_begin_where_another_ends(turn: int) -> None:
+    """In either order in the file: the end comes first."""
+
+    def both(**event: Any) -> list[dict[str, Any]]:
+        return [{"from": 10, "to": 20, **event}, {"from": 20, "to": 30, **event}][::turn]
+
+    assert right(*both(jam="acknowledgements"), **ACKNOWLEDGED).timeline.jams == [(10, 20), (20, 30)]
+    cuts = right(*both(cut="eve")).timeline.changes["eve"]
+    assert [(change.at, change.cut) for change in cuts] == [(10, True), (20, False), (20, True), (30, False)]
+    settings = right(*both(link="eve", set={"corrupt": 0.5})).timeline.changes["eve"]
+    assert [(change.at, "corrupt" in (change.settings or {})) for change in settings] == [
+        (10, True),
+        (20, False),
+        (20, True),
+        (30, False),
+    ]
+
+
 def test_events_survive_being_written_and_read() -> None:
     """A checked scenario, dumped as tables, is the same scenario."""
     scenario = right({"from": 20, "to": 25, "cut": "eve"}, {"at": 30, "link": "eve", "set": {"quality": 0.5}})
@@ -255,11 +281,7 @@ def test_events_survive_being_written_and_read() -> None:
         (
             {"from": 10, "to": 20, "jam": "acknowledgements"},
             "eve",
-            {
-                "encoding": {"scheme": "acknowledged"},
-                "eavesdroppers": {"eve": {"strategy": "reference", "link": {"quality": 0.9}}},
-                "acknowledgements": {"link": {"quality": 0.9}, "attack": "all"},
-            },
+            ACKNOWLEDGED,
         ),
     ],
 )
