@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 import tomli_w
 
 from evedrop.results.resolved_scenario import resolved
-from evedrop.scenario.loading import parse
+from evedrop.scenario.loading import checked, parse
 from evedrop.scenario.tables import Scenario
-from tests.builders import GOOD, mistakes_in_good, places_of
+from tests.builders import GOOD, mistakes_in_good, mistakes_of, places_of
 from tests.golden.pages import Golden
 
 POOL = {"strategy": "colluding", "links": [{"quality": 0.6}, {"quality": 0.5}], "reads_as": "smart"}
@@ -136,3 +137,30 @@ def test_all_mistakes_of_links_are_named_at_once() -> None:
     ):
         assert len([line for line in mistakes if line.startswith(path)]) == count, path
     assert len(mistakes) == 9
+
+
+SLOW = """
+from evedrop.extend import DelayModel
+class Slow(DelayModel):
+    parameters = {"value": 2.0, "more": 1.0}
+    optional = frozenset({"more"})
+    lengths = ("value", "more")
+    def __init__(self, value, more=1.0):
+        self.value = value + more
+    def delays(self, first, numbers):
+        return 0.0 * numbers + self.value
+    def arrived(self, lag):
+        return None
+"""
+
+
+def test_lengths_of_an_own_delay_model_may_be_left_out_and_wrong(tmp_path: Path) -> None:
+    """In seconds: what is left out keeps its default, and a text is a mistake of who gives it."""
+    (tmp_path / "slow.py").write_text(SLOW)
+    delay = {"model": "slow:Slow", "value": 1.0, "unit": "seconds"}
+    tables = {**GOOD, "slot_seconds": 0.5, "modules": str(tmp_path)}
+    own = checked({**tables, "legitimate": {"link": {"quality": 0.9, "delay": delay}}}, "own")
+    assert own.schedule("legitimate").settings["delay"] == {"model": "slow:Slow", "value": 2.0}
+    link = {"quality": 0.9, "delay": {**delay, "value": "long"}}
+    (line,) = mistakes_of(checked, {**tables, "legitimate": {"link": link}}, "own")
+    assert line.startswith('legitimate.link.delay.model: is "slow:Slow"; in a dry run: ')

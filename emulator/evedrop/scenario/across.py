@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ from evedrop.scenario.receivers import CHANGEABLE, OTHER_MODEL, LinkTable, chang
 from evedrop.scenario.table import Table, sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import expectations_of
-from evedrop.scenario.timeline import numbered_acts
+from evedrop.scenario.timeline import entries_after, numbered_acts
 from evedrop.scenario.words import as_toml, listed
 
 Numbered = tuple[int, Act]
@@ -60,10 +61,7 @@ def event_mistakes(scenario: Scenario) -> Iterator[str]:
                 hint = ": it is not a receiver" if name in ("sensor", "router", "recorder") else ""
                 yield f"{path}.{event.names_in}: names {as_toml(name)}{hint}; expected {listed(scenario.receivers)}"
         yield from _own(path, type(event), partial(_compared, path, event, surroundings))
-        for act in event.acts():
-            if act.effect.changes_settings and act.effect.entries is not None:
-                for name in act.names:
-                    yield from _change_mistakes(f"{path}.{act.entry}", name, act.effect.entries, scenario)
+    yield from _changes_mistakes(scenario)
     yield from _order_mistakes(scenario)
     kinds = dict.fromkeys(type(event) for event in scenario.event)
     for kind in kinds:
@@ -104,26 +102,67 @@ def _when_mistakes(path: str, event: EventKind, slots: int) -> Iterator[str]:
         yield f"{path}.to: is {event.to}; expected at most {slots}, the end of the run"
 
 
-def _change_mistakes(path: str, name: str, changes: Mapping[str, Any], scenario: Scenario) -> Iterator[str]:
-    """Mistakes in the changed entries of a receiver's link. One link with a new quality or loss model replaces pooled links."""
+def _changes_mistakes(scenario: Scenario) -> Iterator[str]:
+    """Mistakes in the changes of links, each made on top of the earlier ones that are right."""
+    changed: dict[str, Mapping[str, Any]] = {}
+    for i, act in numbered_acts(scenario.event):
+        entries = act.effect.entries
+        for name in act.names if act.effect.changes_settings else ():
+            before = changed.get(name, {})
+            mistakes = (
+                [] if entries is None else [*change_mistakes(f"event.{i}.{act.entry}", name, entries, scenario, before)]
+            )
+            yield from mistakes
+            if not mistakes:
+                changed[name] = entries_after(before, entries)
+
+
+def change_mistakes(
+    path: str,
+    name: str,
+    changes: Mapping[str, Any],
+    scenario: Scenario,
+    before: Mapping[str, Any] = MappingProxyType({}),
+) -> Iterator[str]:
+    """Mistakes in the changed entries of a receiver's link. One link with a new quality or loss model replaces pooled links.
+
+    before: the entries that are changed already.
+    """
+    entries = entries_after(before, {entry: value for entry, value in changes.items() if entry in CHANGEABLE})
     link = scenario.links.get(name)
     if link is None:
         if name not in scenario.eavesdroppers or scenario.eavesdroppers[name].links is None:
             return
-        if not {"quality", "loss"} & set(changes):
+        if not {"quality", "loss"} & set(entries):
             yield f"{path}: {name} has several links; expected a quality or a loss, for the one link that replaces them"
             return
         link = LinkTable(quality=1.0)
     yield from (f"{path}.{line}" for line in unchangeable(changes))
     try:
-        changed = changed_link(link, {entry: value for entry, value in changes.items() if entry in CHANGEABLE})
+        changed = changed_link(link, entries)
     except ValidationError as error:
         yield from (f"{path}.{line}" for line in sentences(error, LinkTable))
         return
-    if changed.in_seconds and scenario.slot_seconds is None:
-        yield f"{path}.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
-    if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
+    if "delay" in changes:
+        yield from (f"{path}.{line}" for line in changed.delay_mistakes(scenario.slot_seconds))
+    if changes.get("rate") is not None and scenario.scheme.may_be_silent:
+        yield f"{path}.rate: {_silent(scenario)}"
+    if _is_tied(name, scenario) and changed.loss_spec["model"] != link.loss_spec["model"]:
         yield f"{path}.{OTHER_MODEL}"
+
+
+def _is_tied(name: str, scenario: Scenario) -> bool:
+    """Whether the losses of a receiver's link are tied to another link's, or another link's to them."""
+    ties = {receiver: link.correlation.to for receiver, link in scenario.links.items() if link.correlation is not None}
+    return name in ties or name in ties.values()
+
+
+def _silent(scenario: Scenario) -> str:
+    """The mistake of a link of limited rate with a scheme that may be silent."""
+    return (
+        f"is given, but the scheme {scenario.encoding.scheme} may stay silent, and a queue counts on a packet in every slot; "
+        "remove the line"
+    )
 
 
 def _order_mistakes(scenario: Scenario) -> Iterator[str]:
@@ -164,11 +203,10 @@ def _order_mistakes_of(name: str, acts: Sequence[Numbered]) -> Iterator[str]:
 
 
 def link_mistakes(scenario: Scenario) -> Iterator[str]:
-    """Mistakes in correlations, and delays in seconds without `slot_seconds`."""
+    """Mistakes in correlations, and in delays in seconds."""
     for name, link in scenario.links.items():
         path = f"{LEGITIMATE}.link" if name == LEGITIMATE else f"eavesdroppers.{name}.link"
-        if link.in_seconds and scenario.slot_seconds is None:
-            yield f"{path}.delay.unit: is seconds; expected slot_seconds = 0.02, the duration of a slot, at the top of the file"
+        yield from (f"{path}.{line}" for line in link.delay_mistakes(scenario.slot_seconds))
         if link.correlation is not None:
             yield from _correlation_mistakes(f"{path}.correlation.with", name, link, link.correlation.to, scenario)
     for name in () if scenario.wire is None else scenario.wire.links:
@@ -183,9 +221,11 @@ def _correlation_mistakes(entry: str, name: str, link: LinkTable, other: str, sc
     if other not in scenario.receivers or other == name:
         others = [receiver for receiver in scenario.receivers if receiver != name]
         yield f"{entry}: is {as_toml(other)}; expected another receiver" + (f": {listed(others)}" if others else "")
-    elif other in links and links[other].correlation is not None:
+    elif other not in links:
+        yield f"{entry}: is {other}, which has several links; expected a receiver with a single link"
+    elif links[other].correlation is not None:
         yield f"{entry}: is {other}, whose own losses are tied to another link's; expected a link without correlation"
-    elif other in links and links[other].loss_spec["model"] != link.loss_spec["model"]:
+    elif links[other].loss_spec["model"] != link.loss_spec["model"]:
         models = f"{links[other].loss_spec['model']} there and {link.loss_spec['model']} here"
         yield f"{entry}: is {other}, but the loss models differ ({models}); expected the same model on both links"
 
@@ -220,10 +260,7 @@ def acknowledgement_mistakes(scenario: Scenario) -> Iterator[str]:
         for receiver, link in scenario.links.items():
             if link.rate is not None:
                 path = receiver if receiver == LEGITIMATE else f"eavesdroppers.{receiver}"
-                yield (
-                    f"{path}.link.rate: is given, but the scheme {encoding.scheme} may stay silent, and a queue counts on a "
-                    "packet in every slot; remove the line"
-                )
+                yield f"{path}.link.rate: {_silent(scenario)}"
 
 
 def scheme_mistakes(scenario: Scenario) -> Iterator[str]:
@@ -316,12 +353,6 @@ def mistakes_across(scenario: Scenario, beyond_horizon: bool) -> list[str]:
         mistakes += compare(scenario)
     if not mistakes:
         mistakes += _application_objections(scenario)
-    if not mistakes:
-        try:
-            _ = scenario.timeline
-        except ValidationError as error:
-            together = "event: several of them together result in an invalid link"
-            mistakes += [f"{together}: {line}" for line in sentences(error, LinkTable)]
     return [*mistakes, *_expectation_mistakes(scenario, sound=not mistakes)]
 
 

@@ -13,7 +13,6 @@ from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from evedrop.model.kernels.elementary import log
 from evedrop.model.links.loss_model import Fate
@@ -21,11 +20,10 @@ from evedrop.model.process import Floats
 from evedrop.model.slot.link import NEVER
 from evedrop.model.streams import Stream, root_of_seed, stream_key, uniforms
 from evedrop.names import LEGITIMATE
+from evedrop.scenario.across import change_mistakes
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.events.event import EventKind, Fault
 from evedrop.scenario.nemesis import NEMESIS, NemesisTable
-from evedrop.scenario.receivers import LinkTable, changed_link
-from evedrop.scenario.table import sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.timeline import acts_of
 from evedrop.scenario.words import as_toml, listed
@@ -69,21 +67,7 @@ def _mistakes(table: NemesisTable, scenario: Scenario) -> Iterator[str]:
             yield f"{NEMESIS}.targets.{i}: is {as_toml(name)}; expected {listed(scenario.receivers)}"
     told = set[str]()
     for name in _targets(table, scenario) if table.set is not None else ():
-        link = scenario.link(name)
-        try:
-            changed = changed_link(link, table.set or {})
-        except ValidationError as error:
-            lines = [f"{NEMESIS}.set.{line}" for line in sentences(error, LinkTable)]
-        else:
-            lines = []
-            if "correlation" in (table.set or {}):
-                lines.append(f"{NEMESIS}.set.correlation: cannot be changed while a run goes on; remove it")
-            if changed.in_seconds and not scenario.slot_seconds:
-                lines.append(
-                    f"{NEMESIS}.set.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
-                )
-            if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
-                lines.append(f"{NEMESIS}.set.loss.model: differs from that of {name}'s link, whose losses are tied")
+        lines = [*change_mistakes(f"{NEMESIS}.set", name, table.set or {}, scenario)]
         yield from (line for line in lines if line not in told)
         told.update(lines)
 

@@ -15,6 +15,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, ConfigDict, Field
 
 from evedrop.model.acknowledgements import ATTACKS, OVERHEARING
+from evedrop.model.checks import is_number
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.links import LOSS_MODELS, loss_of, pooled_spec
@@ -121,15 +122,32 @@ class LinkTable(Table):
         if self.rate is not None:
             made |= {"rate": self.rate, "queue": _QUEUE if self.queue is None else self.queue}
         if self.delay is not None:
-            delay = {name: value for name, value in self.delay.items() if name != "unit"}
-            if self.in_seconds and slot_seconds:
-                for name in DELAY_MODELS[delay["model"]].lengths:
-                    value = delay[name]
-                    delay[name] = (
-                        [delay_ / slot_seconds for delay_ in value] if isinstance(value, list) else value / slot_seconds
-                    )
-            made["delay"] = delay
+            lengths = DELAY_MODELS[self.delay["model"]].lengths if self.in_seconds and slot_seconds else ()
+            made["delay"] = {
+                name: _in_slots(value, slot_seconds or 1.0) if name in lengths else value
+                for name, value in self.delay.items()
+                if name != "unit"
+            }
         return made
+
+    def delay_mistakes(self, slot_seconds: float | None) -> Iterator[str]:
+        """Mistakes in a delay in seconds: no `slot_seconds`, or too many slots."""
+        if not self.in_seconds:
+            return
+        if slot_seconds is None:
+            yield "delay.unit: is seconds; expected slot_seconds = 0.02, the duration of a slot, at the top of the file"
+            return
+        delay = self.settings(slot_seconds)["delay"]
+        in_slots = {name: value for name, value in delay.items() if name != "model"}
+        for entry, sentence in asked(DELAY_MODELS[delay["model"]], in_slots):
+            yield f"delay.{entry}: in slots, it {sentence}"
+
+
+def _in_slots(value: Any, slot_seconds: float) -> Any:
+    """A length of time, or a list of them, in slots; what is no number stays, for the class of a user to refuse."""
+    if isinstance(value, list):
+        return [_in_slots(inner, slot_seconds) for inner in value]
+    return value / slot_seconds if is_number(value) else value
 
 
 CHANGEABLE = tuple(entry for entry in LinkTable.model_fields if entry != "correlation")

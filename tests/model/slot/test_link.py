@@ -253,3 +253,15 @@ def test_an_outage_of_other_slots_loses_nothing() -> None:
     channel = link(course, Batch(20, 2))
     codes = [channel.fates(slots).codes for slots in (range(10), range(10, 12), range(12, 20))]
     assert [sorted(set(part.ravel().tolist())) for part in codes] == [[Fate.DELIVERED], [Fate.DOWN], [Fate.DELIVERED]]
+
+
+def test_the_longest_waits_are_not_short_ones() -> None:
+    """Waits of more slots than 32 bits can count: only the first packet arrives."""
+    channel = link(
+        LinkSchedule({"loss": {"model": "bernoulli", "quality": 1.0}, "rate": 1e-12, "queue": 9}), Batch(5, 1)
+    )
+    with np.errstate(all="raise"):
+        fates = channel.fates(range(5))
+    assert fates.codes.ravel().tolist() == [Fate.DELIVERED, *[Fate.LATE] * 4]
+    assert fates.delays is not None
+    assert fates.delays[1:].min() == 2**32 - 1

@@ -191,6 +191,65 @@ def test_correlation_needs_links_that_lose_alike() -> None:
     }
     (line,) = mistakes_of(right, eavesdroppers=chained)
     assert "is eve, whose own losses are tied to another link's" in line
+    to_pool = {"quality": 0.9, "correlation": {"with": "pool", "strength": 0.5}}
+    (line,) = mistakes_of(right, eavesdroppers={"pool": POOL}, legitimate={"link": to_pool})
+    several = "is pool, which has several links; expected a receiver with a single link"
+    assert line == f"legitimate.link.correlation.with: {several}"
+
+
+@pytest.mark.parametrize("name", ["eve", "legitimate"])
+def test_neither_of_two_tied_links_gets_another_loss_model(name: str) -> None:
+    """By an event, or by a nemesis."""
+    eve = {"strategy": "smart", "link": {"quality": 0.9, "correlation": {"with": "legitimate", "strength": 0.5}}}
+    bursts = {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.5}}
+    event = {"at": 5, "link": name, "set": bursts}
+    (line,) = mistakes_of(right, event, eavesdroppers={"eve": eve})
+    assert line.startswith("event.0.set.loss.model: differs from the first one, but the link's losses are tied")
+    nemesis = {"faults": ["set"], "every": 5, "lasting": 5, "set": bursts, "targets": [name]}
+    (line,) = mistakes_of(right, nemesis=nemesis, eavesdroppers={"eve": eve})
+    assert line.startswith("nemesis.set.loss.model: differs from the first one, but the link's losses are tied")
+
+
+def test_changes_are_checked_on_top_of_earlier_ones() -> None:
+    """Until these are undone, in the order of slots, not of the file."""
+    late = {"link": "eve", "set": {"delay": {"model": "constant", "value": 1.0}}}
+    reorder = {"link": "eve", "set": {"reorder": 0.5}}
+    settings = right({"at": 6, **reorder}, {"at": 5, **late}).timeline.changes["eve"][1].settings
+    assert settings is not None
+    assert settings["delay"]["value"] == 1.0
+    assert settings["reorder"] == 0.5
+    for events in ([{"at": 5, **reorder}, {"at": 6, **late}], [{"at": 9, **reorder}, {"from": 5, "to": 8, **late}]):
+        (line,) = mistakes_of(right, *events)
+        assert line.startswith("event.0.set.reorder: is given without a delay")
+    some, all_ = ({"link": "pool", "set": entries} for entries in ({"corrupt": 0.5}, {"quality": 0.5}))
+    assert right({"at": 5, **all_}, {"at": 6, **some}, eavesdroppers={"pool": POOL})
+    several = "pool has several links; expected a quality or a loss, for the one link that replaces them"
+    assert mistakes_of(right, {"at": 5, **some}, eavesdroppers={"pool": POOL}) == [f"event.0.set: {several}"]
+    nemesis = {"faults": ["set"], "every": 5, "lasting": 5, "set": {"corrupt": 0.5}}
+    assert mistakes_of(right, nemesis=nemesis, eavesdroppers={"pool": POOL}) == [f"nemesis.set: {several}"]
+
+
+def test_a_scheme_that_may_be_silent_gets_no_rate_later_either() -> None:
+    """Whoever limits the link."""
+    silent = {"encoding": {"scheme": "scheduled", "threshold": 3}, "acknowledgements": {"link": {"quality": 1.0}}}
+    tables = {**silent, "eavesdroppers": {"eve": listener("clear-states", 0.9)}}
+    why = "rate: is given, but the scheme scheduled may stay silent"
+    (line,) = mistakes_of(right, {"at": 5, "link": "eve", "set": {"rate": 0.5}}, **tables)
+    assert line.startswith(f"event.0.set.{why}")
+    nemesis = {"faults": ["set"], "every": 5, "lasting": 5, "set": {"rate": 0.5}}
+    (line,) = mistakes_of(right, nemesis=nemesis, **tables)
+    assert line.startswith(f"nemesis.set.{why}")
+
+
+def test_delays_in_seconds_are_bounded_in_slots() -> None:
+    """At first, and where they change."""
+    delay = {"delay": {"model": "constant", "value": 10.0, "unit": "seconds"}}
+    line = "delay.value: in slots, it is 10000000.0; expected a number from 0 to 1000000"
+    link = {"quality": 0.9, **delay}
+    assert mistakes_of(right, slot_seconds=1e-6, legitimate={"link": link}) == [f"legitimate.link.{line}"]
+    event = {"at": 5, "link": "eve", "set": delay}
+    assert mistakes_of(right, event, slot_seconds=1e-6) == [f"event.0.set.{line}"]
+    assert right(event, slot_seconds=1e-5, legitimate={"link": link})
 
 
 def test_what_events_come_to() -> None:
@@ -236,6 +295,7 @@ def test_a_restart_keeps_the_state_that_it_says() -> None:
         assert away.keeps_state
 
 
+POOL = {"strategy": "colluding", "reads_as": "smart", "links": [{"quality": 0.6}, {"quality": 0.5}]}
 ACKNOWLEDGED: dict[str, Any] = {
     "encoding": {"scheme": "acknowledged"},
     "eavesdroppers": {"eve": {"strategy": "reference", "link": {"quality": 0.9}}},

@@ -88,6 +88,8 @@ MOST_RATE = 1e6
 """The highest rate of a link, in packets a slot."""
 MOST_QUEUED = 1_000_000
 """The longest queue of a link, in packets."""
+_LONGEST = float(np.iinfo(np.uint32).max)
+"""The longest delay, in slots, with the queue's; longer delays are cut to it: no run has that many slots."""
 
 
 @dataclass(frozen=True)
@@ -262,6 +264,8 @@ class Link:
             waits, full = self._queue(slots)
             codes = np.where(full[:, None], np.uint8(Fate.OVERFLOW), codes)
             delays = waits[:, None] + (np.zeros(shape) if delays is None else delays)
+        if delays is not None:
+            delays = np.minimum(delays, _LONGEST)
         if self._state.cut:
             codes = np.where(codes == int(Fate.OVERFLOW), codes, np.uint8(Fate.CUT))
         whole = None if delays is None else delays.astype(np.uint32)
