@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from evedrop.cli.options import entries, loaded, output
+from evedrop.cli.options import changes_of, entries, loaded, output
 from evedrop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -43,6 +43,12 @@ def check_resuming(options: argparse.Namespace) -> None:
     """Raise UsageError for `--resume` without a folder."""
     if options.resume and options.out is None:
         raise UsageError("--resume goes on with the study in a folder: give the folder with --out DIR")
+
+
+def default_trials(options: argparse.Namespace, trials: int) -> None:
+    """Set the number of trials, unless an option gives one: `--trials`, or `--set trials=N`."""
+    if "trials" not in changes_of(options):
+        options.trials = trials
 
 
 def keeping(parser: argparse.ArgumentParser) -> None:
@@ -85,7 +91,7 @@ def studied(
     from evedrop.studies.parts import StudyPlace
 
     check_resuming(options)
-    options.trials = 100 if options.trials is None else options.trials
+    default_trials(options, 100)
     plan = plan_of(options)
     scenario = loaded(options)
     total = scenario.trials * scenario.slots

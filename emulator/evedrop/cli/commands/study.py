@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.in_memory import MEMORY, check_resuming, crew, keeping, plan_of, resuming, studied
+from evedrop.cli.in_memory import MEMORY, check_resuming, crew, default_trials, keeping, plan_of, resuming, studied
 from evedrop.cli.options import Command, as_json, changes_of, entries, loaded, output, over_wire, print_so_far, scenario
 from evedrop.cli.tables import tables
 from evedrop.errors import Interrupted, UsageError
@@ -26,7 +26,7 @@ def montecarlo(options: argparse.Namespace) -> int:
     from evedrop.simulate.montecarlo import simulate
 
     check_resuming(options)
-    options.trials = 1000 if options.trials is None else options.trials
+    default_trials(options, 1000)
     plan = plan_of(options)
     scenario = loaded(options, beyond_horizon=options.mode != "exact")
     with results_folder(options.out, options.scenario) as folder:
@@ -56,7 +56,7 @@ def sweep(options: argparse.Namespace) -> int:
     from evedrop.studies.sweep import grid_of, sweep_over
 
     check_resuming(options)
-    options.trials = 1000 if options.trials is None else options.trials
+    default_trials(options, 1000)
     grid = grid_of(options.over)
     plan = plan_of(options)
     with (
@@ -86,15 +86,16 @@ def _over(parser: argparse.ArgumentParser) -> None:
 
 def compare(options: argparse.Namespace) -> int:
     """Compare schemes against adversaries."""
-    from evedrop.cli.api import compare as compare_all
     from evedrop.cli.console import ProgressLine
     from evedrop.cli.report import print_comparison, report_page
     from evedrop.results.folder import results_folder
     from evedrop.results.summary_file import plain
     from evedrop.scenario.loading import value_of
+    from evedrop.studies.compare import compare_all
+    from evedrop.studies.matchups import matchups_of
 
     check_resuming(options)
-    changes = changes_of(options)
+    default_trials(options, 200)
     parameters = {}
     for text in options.parameters:
         key, equals, value = text.partition("=")
@@ -103,21 +104,13 @@ def compare(options: argparse.Namespace) -> int:
                 f"--with {text}: expected SCHEME.PARAMETER=VALUE, such as innovation.state_probability=0.7"
             )
         parameters[key] = value_of(value)
+    plan = plan_of(options)
+    matchups = matchups_of(loaded(options), _names(options.schemes), _names(options.adversaries), parameters)
     with (
         results_folder(options.out, f"compare-{Path(options.scenario).name}") as folder,
         ProgressLine(None, "trial-slots", options.json) as line,
     ):
-        comparison = compare_all(
-            options.scenario,
-            schemes=_names(options.schemes),
-            adversaries=_names(options.adversaries),
-            parameters=parameters,
-            out=folder,
-            resume=options.resume,
-            plan=plan_of(options),
-            on_event=line.on_event,
-            **{"trials": 200, **changes},
-        )
+        comparison = compare_all(matchups, folder, line.on_event, plan, resume=options.resume)
     if options.json:
         print_json(plain(comparison.as_dict()))
     else:

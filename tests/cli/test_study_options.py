@@ -1,0 +1,58 @@
+"""The options that `montecarlo`, `sweep`, `compare`, `cost` and `learned` share: the number of trials, and changed entries."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.conftest import Evedrop
+
+SMALL = ("--set", "slots=12", "--set", "expect=[]")
+STUDIES = {
+    "montecarlo": ("montecarlo", "eavesdroppers", *SMALL, "--out", "out"),
+    "sweep": ("sweep", "eavesdroppers", *SMALL, "--out", "out", "--over", "seed=1,2"),
+    "compare": ("compare", "eavesdroppers", *SMALL, "--out", "out", "--schemes", "plain", "--adversaries", "naive"),
+    "cost": ("cost", "microgrid", "--set", "slots=12"),
+    "learned": ("learned", "learning", *SMALL),
+}
+
+
+@pytest.mark.parametrize("command", STUDIES)
+def test_a_changed_entry_sets_the_trials(command: str, evedrop: Evedrop) -> None:
+    """`--set trials=3` is heeded as `--trials 3` is."""
+    words = STUDIES[command]
+    by_set = evedrop(*words, "--set", "trials=3", "--json")
+    by_option = evedrop(*words, "--trials", "3", "--out", "other", "--json")
+    assert (by_set.status, by_set.err) == (0, "")
+    found, expected = (json.loads(done.out) for done in (by_set, by_option))
+    for each in (found, expected):
+        if command == "montecarlo":
+            assert each.pop("trials") == 3
+            each.pop("wall_seconds"), each.pop("slots_per_second"), each.pop("surprising")
+    assert found == expected
+
+
+def test_what_a_comparison_changes_is_the_scenario(evedrop: Evedrop) -> None:
+    """A name that is no entry of a scenario is refused, also one that the function of Python takes; nothing is removed."""
+    assert evedrop(*STUDIES["compare"], "--trials", "2").status == 0
+    kept = sorted(path.name for path in (evedrop.folder / "out").iterdir())
+    for change in ("overwrite=true", "resume=true", "workers=1", "schemes=3"):
+        done = evedrop(*STUDIES["compare"], "--trials", "2", "--set", change)
+        assert done.status == 2
+        assert f"{change.partition('=')[0]}: is not an entry of this table" in done.err
+    assert sorted(path.name for path in (evedrop.folder / "out").iterdir()) == kept
+
+
+def test_a_comparison_warns_as_a_run_does(evedrop: Evedrop) -> None:
+    """Of a legitimate estimator without bound."""
+    unbounded = (
+        "--set",
+        "process.A=[[1.5]]",
+        "--set",
+        "process.Q=[[1.0]]",
+        "--set",
+        "process.initial_covariance=[[1.0]]",
+    )
+    words = (*STUDIES["compare"], *unbounded, "--set", "legitimate.link.quality=0.3", "--trials", "2")
+    assert "grows without bound" in evedrop(*words).err
