@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -18,6 +19,7 @@ import pytest
 from evedrop.cli import main as cli
 from evedrop.errors import RunError
 from evedrop.results.reading import Results
+from evedrop.results.summary_file import write_summary
 from evedrop.scenarios import shipped
 from evedrop.studies import scenario_tests as testing
 from evedrop.studies.junit import junit_of
@@ -190,6 +192,55 @@ def test_a_report_holds_what_xml_cannot() -> None:
     assert case.get("time") == "1.250"
     assert case[0][1].get("value") == f"runs/{text}"
     assert (case[1].tag, case[1].get("message"), case[1].text) == ("error", text, f"{text}\nsecond")
+
+
+@pytest.mark.parametrize(
+    ("ended", "mode"), [("a metric failed", "exact"), ("interrupted", "exact"), ("complete", "live")]
+)
+def test_resumed_tests_keep_only_complete_results_in_memory(ended: str, mode: str, tmp_path: Path) -> None:
+    """The results of a live run, and of one that failed or did not end, say nothing: the test is run again, beside them."""
+    written(tmp_path, one=HOLDS)
+    manner = Manner(in_memory=True, trials=3, out=tmp_path / "out", resume=True)
+    first = testing.carry_out(str(tmp_path / "one.toml"), manner)
+    assert first.folder is not None
+    assert testing.carry_out(str(tmp_path / "one.toml"), manner).folder == first.folder
+    write_summary(first.folder, replace(Results.read(first.folder).typed_summary, ended=ended, mode=mode))
+    again = testing.carry_out(str(tmp_path / "one.toml"), manner)
+    assert (again.outcome, again.folder) == (Outcome.PASSED, tmp_path / "out" / "one-2")
+
+
+TALKS = """
+import numpy as np
+from evedrop.extend import PacketTaker
+
+class Talks(PacketTaker):
+    def uses(self, k):
+        print("a word")
+        return np.full(self.trials, k % 3 == 0)
+
+    @classmethod
+    def use_probabilities(cls, parameters):
+        return 1 / 3, 1 / 3
+"""
+
+
+def test_what_a_class_prints_does_not_disturb_tests_side_by_side(evedrop: Evedrop) -> None:
+    """It goes to standard error."""
+    written(evedrop.folder / "cases", a=HOLDS, b=HOLDS.replace('strategy = "naive"', 'strategy = "own:Talks"'))
+    (evedrop.folder / "cases" / "own.py").write_text(TALKS)
+    done = evedrop.process("test", "cases", "--in-memory", "--trials", "2", "--jobs", "2")
+    assert done.status == 0, done
+    assert [line.split()[0] for line in done.out.splitlines()[:2]] == ["passed", "passed"]
+    assert "a word" in done.err
+
+
+def test_a_process_without_a_result_is_broken(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the others are carried out."""
+    written(evedrop.folder / "cases", a=HOLDS)
+    monkeypatch.setattr(testing, "_WORK", "print('half a {')")
+    done = evedrop("test", "cases", "--in-memory", "--jobs", "2")
+    assert done.status == 3
+    assert "its process ended with status 0 and without a result" in done.out
 
 
 def in_the_second(*words: str, evedrop: Evedrop) -> Live:

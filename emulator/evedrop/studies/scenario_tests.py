@@ -37,6 +37,7 @@ from evedrop.score.summary import Judged, failed
 from evedrop.show.report.writing import has_results, try_report
 from evedrop.simulate.finished_tasks import TASKS
 from evedrop.simulate.montecarlo import Plan, simulate
+from evedrop.simulate.simulation import Mode
 from evedrop.studies.simulated_tests import SeedsToPlay, check_simulated, play_seeds
 from evedrop.system.parents import continue_when_parent_dies
 from evedrop.system.processes import SUSPENDED_SECONDS, SuspensionWatch, kill, wait_for
@@ -161,7 +162,7 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
     try:
         if manner.simulation is not None:
             played = play_seeds(made, scenario, folder, manner.simulation, manner.trials)
-        elif not _has_ended(folder):
+        elif not _is_complete(folder):
             folder = _run(made, folder, manner)
     except Interrupted as error:
         error.resumable = manner.resumable
@@ -185,7 +186,10 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
 
 
 def _folder_for(scenario: str, made: Scenario, manner: Manner) -> Path:
-    """The results folder of a scenario: a new one, or when tests are resumed the one that already has this very scenario."""
+    """The results folder of a scenario: a new one, or when tests are resumed the one with the test of this very scenario.
+
+    That of a live run, or of one that failed, is left as it is.
+    """
     if manner.out is None:
         return claimed(default_folder(scenario))
     wanted = manner.out / Path(scenario).stem
@@ -193,14 +197,19 @@ def _folder_for(scenario: str, made: Scenario, manner: Manner) -> Path:
         text = resolved(made)
         for folder in (wanted, *sorted(manner.out.glob(f"{glob.escape(wanted.name)}-*"))):
             with contextlib.suppress(OSError, ValueError):
-                if (folder / "scenario.toml").read_text(encoding="utf-8") == text:
+                same = (folder / "scenario.toml").read_text(encoding="utf-8") == text
+                if same and ((folder / TASKS).exists() or _is_complete(folder)):
                     return folder
     return claimed(wanted)
 
 
-def _has_ended(folder: Path) -> bool:
-    """Whether a folder has the results of a study that is complete."""
-    return has_results(folder) and not (folder / TASKS).exists()
+def _is_complete(folder: Path) -> bool:
+    """Whether a folder has all results of a test in memory."""
+    try:
+        summary = Results.read(folder).typed_summary
+    except UsageError:
+        return False
+    return (summary.ended, summary.mode) == ("complete", Mode.EXACT.value) and not (folder / TASKS).exists()
 
 
 def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:
@@ -273,6 +282,7 @@ class _Crew:
             stdin=subprocess.PIPE,  # closes when this process is gone
             stdout=subprocess.PIPE,
             encoding="ascii",  # JSON
+            errors="replace",
             start_new_session=True,
         )
         with process:
@@ -283,12 +293,13 @@ class _Crew:
             output = process.stdout.read()
             status = process.wait()
             del self._running[process.pid]
-        if not output:
-            how = f"ended with status {status}"
+        try:
+            entries = json.loads(output)
+        except ValueError:
+            how = f"ended with status {status} and without a result"
             if process.pid in self._suspended:
                 how = f"was suspended for {SUSPENDED_SECONDS:g} s (SIGSTOP)"
             return Finding(scenario, Outcome.BROKEN, 0.0, (f"its process {how}",))
-        entries = json.loads(output)
         places = {name: None if entries[name] is None else Path(entries[name]) for name in ("folder", "report")}
         return Finding(
             **{**entries, **places, "outcome": Outcome(entries["outcome"]), "reasons": (*entries["reasons"],)}
@@ -313,7 +324,12 @@ class _Crew:
 
 
 def work() -> None:
-    """Run one process: carry out the scenario in its argument, and write the result to standard output."""
+    """Run one process: carry out the scenario in its argument, and write the result to standard output.
+
+    All else that is printed, as by a class of the user's own, goes to standard error.
+    """
+    result = os.dup(sys.stdout.fileno())
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     continue_when_parent_dies()
     when_launcher_is_gone(lambda: os.kill(os.getpid(), signal.SIGTERM))
     scenario, manner = json.loads(sys.argv[1])
@@ -323,4 +339,5 @@ def work() -> None:
         tested = carry_out(scenario, Manner(**{**manner, "out": out, "simulation": simulation}))
     except Interrupted as error:
         sys.exit(error.exit_status)
-    sys.stdout.write(json.dumps({**asdict(tested), "outcome": tested.outcome.value}, default=str))
+    with open(result, "w", encoding="ascii") as answer:
+        answer.write(json.dumps({**asdict(tested), "outcome": tested.outcome.value}, default=str))
