@@ -10,6 +10,7 @@ import pytest
 
 from evedrop import load_results, montecarlo, run
 from evedrop.errors import UsageError
+from evedrop.show.view.recording import ViewRecording
 from evedrop.show.view.scene_slots import replay
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
@@ -81,6 +82,29 @@ def test_nothing_recorded_is_said(tmp_path: Path) -> None:
     montecarlo("eavesdroppers", trials=2, slots=10, out=tmp_path / "run", plan=Plan(Mode.COVARIANCE_ONLY))
     with pytest.raises(UsageError, match="no recorded trial"):
         replay(tmp_path / "run")
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_a_recording_that_is_cut_short_is_not_kept(
+    error: type[BaseException], study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C, or any error: it would be shown ever after as that of the whole run."""
+    shutil.copytree(study, tmp_path / "run", ignore=shutil.ignore_patterns("*.rrd"))
+
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(ViewRecording, "note", fail)
+    monkeypatch.setattr(ViewRecording, "conclude", fail)
+    with pytest.raises(error):
+        replay(tmp_path / "run")
+    assert not [*(tmp_path / "run").glob("*.rrd*")]
+
+
+def test_a_folder_that_cannot_be_written_is_told(study: Path, tmp_path: Path) -> None:
+    """In one line, with what to do."""
+    with pytest.raises(UsageError, match=r"cannot be written \(No such file or directory\); make the folder writable"):
+        replay(study, tmp_path / "missing" / "run.rrd")
 
 
 def one_action(table: pa.Table) -> pa.Table:

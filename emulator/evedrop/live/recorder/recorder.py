@@ -75,6 +75,8 @@ def record(brief: Brief[RecorderPart], report: EndPrinter, serve: str | None = N
         run.folder.settle(end)
     run.view.conclude(run.folder.verdict)
     usual_end = run.view.close()
+    with suppress(OSError):
+        run.view.remove_incomplete(run.folder.now / "recording.rrd")
     run.folder.complete(end)
     emit(end.event(run.view.failure))
     if by_hand:

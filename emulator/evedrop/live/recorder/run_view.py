@@ -59,6 +59,14 @@ class RunView:
         """Complete the recording; returns whether this process can end as usual: False if a thread hangs."""
         return self._recording is None or self._recording.close()
 
+    def remove_incomplete(self, path: Path) -> None:
+        """Remove the recording, which is at this path now, if it failed. Raises OSError.
+
+        `evedrop view` makes another one from the tables; it would show this one as that of the whole run.
+        """
+        if self.failure is not None:
+            world().disk.remove(path, missing_ok=True)
+
     @property
     def failure(self) -> str | None:
         """Why there is no recording, or an incomplete one; None if it did not fail."""

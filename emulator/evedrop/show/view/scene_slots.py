@@ -29,6 +29,7 @@ from evedrop.model.slot.link import Change
 from evedrop.model.slot.records import ReceiverSlots, SensorSlots
 from evedrop.model.streams import Batch, root_of_seed
 from evedrop.names import LEGITIMATE
+from evedrop.results.folder import private_replacement
 from evedrop.results.reading import Results
 from evedrop.scenario.application import APPLICATIONS, ControlledPlant
 from evedrop.scenario.closed_loop import controlled_plant, labels, monitor_of
@@ -279,31 +280,47 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     loop_values = loop_values_of(scenario)
     if loop_values is not None and (sensor.u is None or len(sensor.u) != len(x)):
         raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
-    around, ack_fates = (
-        np.array(scenario.process.around),
-        AckFates(scenario, _first_trial_of(results), looked_at.unknown_links),
-    )
-    recording = open_recording(
-        scenario, folder.name, path, words=looked_at.words, unknown_links=looked_at.unknown_links
-    )
-    with closing(recording):
-        for first in range(0, len(x), _CHUNK):
-            rows = slice(first, min(first + _CHUNK, len(x)))
-            deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
-            some = sensor.rows(rows)
-            moved = None if loop_values is None else loop_values.take(some, deviations)
-            shown = {name: peer.rows(rows) for name, peer in peers.items()}
-            sent = None if some.sent is None else some.sent[:, 0]
-            acknowledged = ack_fates.take(first, sent, {name: peer.action for name, peer in shown.items()})
-            recording.add(SceneSlots(first, some.x[:, :, 0], some.nu[:, 0], shown, moved, sent, acknowledged))
-        for event in results.events:
-            recording.note(event.slot, "INFO", event.line)
-        if results.remark is None:
-            recording.conclude(results.typed_summary.verdict)
-    if recording.failure is not None:
-        path.unlink(missing_ok=True)
-        raise UsageError(f"{path} cannot be written ({recording.failure}); make the folder writable")
+    around = np.array(scenario.process.around)
+    ack_fates = AckFates(scenario, _first_trial_of(results), looked_at.unknown_links)
+    try:
+        # One that is cut short would be shown ever after as that of the whole run.
+        with private_replacement(path, lasting=False) as unfinished:
+            recording = open_recording(
+                scenario, folder.name, unfinished, words=looked_at.words, unknown_links=looked_at.unknown_links
+            )
+            with closing(recording):
+                _record(recording, results, sensor, peers, around, loop_values, ack_fates)
+            if recording.failure is not None:
+                raise OSError(recording.failure)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written ({error.strerror or error}); make the folder writable") from error
     return path
+
+
+def _record(
+    recording: ViewRecording,
+    results: Results,
+    sensor: SensorSlots,
+    peers: Mapping[str, PeerSlots],
+    around: Floats,
+    loop_values: LoopValues | None,
+    ack_fates: AckFates,
+) -> None:
+    """Add all slots, events and the verdict; sensor and peers: in absolute values."""
+    count = len(sensor.x)
+    for first in range(0, count, _CHUNK):
+        rows = slice(first, min(first + _CHUNK, count))
+        deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
+        some = sensor.rows(rows)
+        moved = None if loop_values is None else loop_values.take(some, deviations)
+        shown = {name: peer.rows(rows) for name, peer in peers.items()}
+        sent = None if some.sent is None else some.sent[:, 0]
+        acknowledged = ack_fates.take(first, sent, {name: peer.action for name, peer in shown.items()})
+        recording.add(SceneSlots(first, some.x[:, :, 0], some.nu[:, 0], shown, moved, sent, acknowledged))
+    for event in results.events:
+        recording.note(event.slot, "INFO", event.line)
+    if results.remark is None:
+        recording.conclude(results.typed_summary.verdict)
 
 
 def _check_shapes(folder: Path, n: int, x: Floats, peers: Mapping[str, PeerSlots]) -> None:
