@@ -40,6 +40,10 @@ def wrong_summary(summary: Mapping[str, Any], reference: RunReference, done: boo
     unexplained = [name for name, link in summary["links"].items() if link["unexplained"]]
     if unexplained:
         yield f"packets to {', '.join(unexplained)} are unexplained"
+    for name, link in summary["links"].items():
+        in_bursts = sum(length * count for length, count in enumerate(link["bursts"] or (), start=1))
+        if in_bursts > link["lost_by"].get("lost", 0):
+            yield f"bursts of {in_bursts} packets to {name}, of which {link['lost_by']} were lost"
     if done:
         if summary["ended"] != "complete":
             yield f"the run ended well, and its summary says {summary['ended']}"

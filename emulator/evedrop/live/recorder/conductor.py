@@ -224,10 +224,9 @@ class Conductor:
         deadline = self._clock.monotonic() + _ROUTERS_SECONDS
         sent, cut_off = 0.0, -math.inf
         while self._clock.monotonic() < deadline and name not in self.misdelivered:
+            # All tokens vanish with the connection, and return one after the other.
             if not (self._session.linked() and self._present[ROUTER]):
-                cut_off = (
-                    self._clock.monotonic()
-                )  # all tokens vanish with the connection, and return one after the other
+                cut_off = self._clock.monotonic()
             elif name == RELAY and not self._present[name] and self._clock.monotonic() - cut_off > _RETURN_SECONDS:
                 return
             if self._clock.monotonic() - sent > _END_SECONDS:
