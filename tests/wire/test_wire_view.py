@@ -17,6 +17,7 @@ from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WireSummary
 from evedrop.show.view import recording
+from evedrop.wire.journal import WireJournal
 from evedrop.wire.panels import Pace
 from evedrop.wire.plan import WireEvent
 from evedrop.wire.recording import WireView, replay_wire
@@ -316,3 +317,15 @@ def test_a_word_that_is_not_a_view_is_refused(tmp_path: Path) -> None:
     with live_view(robot_plan(), tmp_path, "off", print) as view:
         assert view is None
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_second_wire_in_a_folder_leaves_the_recording_of_the_first(tmp_path: Path) -> None:
+    """It is refused before it writes anything."""
+    path = tmp_path / "wire.rrd"
+    path.write_bytes(b"of the first")
+    with WireJournal(tmp_path / "out", both_ways()), pytest.raises(UsageError, match="another wire"):
+        run_wire(both_ways(), tmp_path / "out", seconds=0.1, view=str(path))
+    assert path.read_bytes() == b"of the first"
+    with pytest.raises(UsageError, match="is not a way to view"):
+        run_wire(both_ways(), tmp_path / "new", seconds=0.1, view="pdf")
+    assert not (tmp_path / "new").exists()

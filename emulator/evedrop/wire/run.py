@@ -55,6 +55,7 @@ def run_wire(
     wire ran, or if the machine lacks threads.
     """
     check_zenoh_runtime()
+    _shown(view)
     if (out / JOURNAL_FOLDER).is_dir():
         make_private(out)
     else:
@@ -68,7 +69,8 @@ def run_wire(
         Watchdog(lambda problem: leave(f"the wire no longer answers: {problem}", RunError.exit_status)) as watchdog,
         world().process.stop_or_leave_on_signals(lambda: leave("interrupted again", Interrupted.exit_status)) as stop,
     ):
-        with live_view(plan, out, view, say) as shown, WireJournal(out, plan) as journal:
+        # The journal first: it refuses a folder that another wire uses, whose recording must stay.
+        with WireJournal(out, plan) as journal, live_view(plan, out, view, say) as shown:
             scorekeeper = WireScorekeeper(plan, journal)
             if shown is not None:
                 shown.follow(journal)
@@ -161,6 +163,11 @@ def _begin_results(out: Path, plan: WirePlan) -> None:
         warn(f"wire.toml cannot be written ({error}); the wire goes on")
 
 
+def _shown(mode: str) -> str:
+    """How a wire with a mode of `live_view` is shown: as `choose` says, or "off". Raises UsageError."""
+    return "off" if mode.endswith(".rrd") else choose(mode)
+
+
 @contextmanager
 def live_view(plan: WirePlan, out: Path, mode: str, say: Callable[[str], None]) -> Iterator[WireView | None]:
     """A view of a wire that starts now, for the time of a `with` block; None for "off".
@@ -170,8 +177,7 @@ def live_view(plan: WirePlan, out: Path, mode: str, say: Callable[[str], None]) 
 
     Raises UsageError for any other mode, and if a viewer cannot be started.
     """
-    to_file = mode.endswith(".rrd")
-    shown = "off" if to_file else choose(mode)
+    to_file, shown = mode.endswith(".rrd"), _shown(mode)
     if shown == "off" and not to_file:
         yield None
         return
