@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
+import pytest
+
+from evedrop.errors import UsageError
 from evedrop.system.waiting import SystemClock
 from evedrop.wire.file import wire_of
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.relay import WireRelay
+from evedrop.wire.run import run_wire
 from evedrop.wire.steering import WireConductor
 from evedrop.wire.timeline import Moment
 from tests.clock import TestClock
@@ -122,3 +128,16 @@ def test_the_clock_of_a_wire_is_that_of_the_machine() -> None:
     with WireConductor(plan_of(), Applied(TestClock()), print) as conductor:  # type: ignore[arg-type]
         assert 0.0 <= conductor.seconds <= time.monotonic() - before
         wait_until(lambda: conductor.seconds > 0.0, "time passes")
+
+
+def test_the_state_of_the_start_is_in_force_before_a_side_opens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Programs may be waiting for the side, and their first messages must meet a cut that an event of time 0 makes."""
+
+    def enter(relay: WireRelay) -> None:
+        raise UsageError(f"cut: {[name for name, state in relay.links.items() if state.cut]}")
+
+    monkeypatch.setattr(WireRelay, "__enter__", enter)
+    with pytest.raises(UsageError, match="cut: \\['robot-base'\\]"):
+        run_wire(plan_of({"at": 0, "cut": "robot-base"}), tmp_path / "out")

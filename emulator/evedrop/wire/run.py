@@ -87,12 +87,16 @@ def run_wire(
                 )
             if journal.history.start > 1:
                 say(continuation(journal.history.start, journal.counts))
+            relay = WireRelay(plan, journal, warn, happened)
+            conductor = WireConductor(
+                plan, relay, happened
+            )  # before the sides open: it applies what is in force at first
             with ExitStack() as stack:
                 with watchdog.doing(Duty("while the sides were opened", ANSWER_SECONDS)):
-                    relay = stack.enter_context(WireRelay(plan, journal, warn, happened))
+                    stack.enter_context(relay)
                 for name, endpoints in relay.endpoints.items():
                     say(f"{name} {' '.join(endpoints)}")
-                conductor = stack.enter_context(WireConductor(plan, relay, happened))
+                stack.enter_context(conductor)
                 stack.enter_context(WireControl(out, relay, conductor, scorekeeper, journal, events))
                 _watch(watchdog, relay, journal)
                 stop.wait(seconds)
