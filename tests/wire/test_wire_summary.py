@@ -166,6 +166,27 @@ def test_a_link_on_many_of_whose_messages_no_model_decides_is_judged_as_a_sample
     assert link.bounds[1] - link.bounds[0] == pytest.approx(2 * 2.576 * standard_deviation, rel=0.03)
 
 
+def test_the_keys_of_a_history_have_the_bounds_of_one_key(tmp_path: Path) -> None:
+    """They share their numbers, and so one chain of bursts; gaps are those of each key."""
+    plan = wire_plan(link=BURSTS)
+    keys = [f"link/@adv/pub/{session}/1/_" for session in ("aa", "bb", "cc")]
+    results = []
+    for name, shared in (("history", keys), ("single", keys[:1])):
+        with WireJournal(tmp_path / name, plan) as journal:
+            keeper, fates = WireScorekeeper(plan, journal), KeyFates(plan.links[0], keys[0], "put", plan.seed)
+            for n in range(3000):
+                code = journal.words.key_code(shared[n % len(shared)])
+                journal.records.record(1.0 * n, n, -1, 0.0, code, 0, 1, 0, Kind.PUT, fates.next()[0])
+                if n % 700 == 0:
+                    journal.flush()
+            journal.flush()
+            results.append(keeper.links()["link"])
+    history, single = results
+    assert history.bounds == single.bounds
+    assert (history.rate, history.expected_rate) == (single.rate, single.expected_rate)
+    assert history.gap_messages < single.gap_messages
+
+
 def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
     """Lossless keys, messages that no link takes, what the wire dropped, and what was amended: all in one identity."""
     plan = WirePlan(

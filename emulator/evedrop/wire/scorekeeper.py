@@ -34,7 +34,7 @@ from evedrop.system.output import warn
 from evedrop.system.world import world
 from evedrop.wire.deliveries import KeyDeliveries, bounds
 from evedrop.wire.journal import JournalOnDisk, WireJournal
-from evedrop.wire.plan import WireLink, WirePlan
+from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import REASONS, UNLINKED, Kind, Records, WireFate
 from evedrop.wire.tables import WireExpectTable
 from evedrop.wire.tallies import WIRE_METRICS, LinkTally, StreamTally
@@ -54,6 +54,10 @@ class WireScorekeeper:
         self._links = {link.number: LinkTally() for link in plan.links}
         self._unlinked = LinkTally()
         self._lossless: dict[int, bool] = {}
+        self._histories: dict[
+            str, int
+        ] = {}  # key that numbers a history → the first key of it, which counts its numbers
+        self._history_of: dict[int, int | None] = {}
         self._lock = world().lock()
         journal.listeners.append(self.add)
         journal.amendment_listeners.append(self.amend)
@@ -69,17 +73,23 @@ class WireScorekeeper:
             for (code,), start, stop in _groups(streams[:1]):
                 self._tally(code).add(records[start:stop])
             times, numbers, fates = (records[name].tolist() for name in ("time", "n", "fate"))
+            numbered_together: dict[tuple[int, int, int], list[Records]] = {}
             for (code, key, kind), start, stop in _groups(streams):
                 if code == UNLINKED or not key:
                     continue  # a key that is not kept has no numbers
                 streams_of = self._links[code].streams
                 stream = streams_of.get((key, kind)) or streams_of.setdefault((key, kind), StreamTally())
-                decided = not self._is_lossless(key)
+                decided, history = not self._is_lossless(key), self._history(key)
+                if decided and history is not None:
+                    numbered_together.setdefault((code, history, kind), []).append(records[start:stop])
+                    decided = False
                 if stop - start > _FEW:
                     stream.add(records[start:stop], decided)
                 else:
                     for at in range(start, stop):
                         stream.add_one(times[at], numbers[at], fates[at], decided)
+            for (code, key, kind), parts in numbered_together.items():
+                self._links[code].streams.setdefault((key, kind), StreamTally()).add_decided(np.concatenate(parts))
 
     def amend(self, records: Records, fate: WireFate) -> None:
         """Count records of the journal that were added with another fate."""
@@ -96,6 +106,14 @@ class WireScorekeeper:
         if key not in self._lossless:
             self._lossless[key] = self._plan.is_lossless(zenoh.KeyExpr(self._journal.key_of(key)))
         return self._lossless[key]
+
+    def _history(self, key: int) -> int | None:
+        """The key that counts the numbers of a key that shares them with others; None if it has numbers of its own."""
+        if key not in self._history_of:
+            text = self._journal.key_of(key)
+            numbered = numbered_as(text)
+            self._history_of[key] = None if numbered == text else self._histories.setdefault(numbered, key)
+        return self._history_of[key]
 
     def links(self) -> dict[str, WireLinkSummary]:
         """Link → what became of its messages so far."""

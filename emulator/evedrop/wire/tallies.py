@@ -71,13 +71,10 @@ class StreamTally:
         self._since = time if delivered else since
 
     def add(self, records: Records, decided: bool) -> None:
-        """Add messages in the order in which they were heard. decided: whether the link's models decide on this key at all."""
-        fates, times = records["fate"], records["time"]
+        """Add messages in the order in which they were heard. decided: whether to count their numbers as well."""
         if decided:
-            tried = _TRIED[fates] & (records["n"] >= 0)
-            self.tried += int(tried.sum())
-            self.passed += int(_PASSED[fates[tried]].sum())
-            self._add_numbers(np.sort(records["n"][tried]))
+            self.add_decided(records)
+        fates, times = records["fate"], records["time"]
         places = np.flatnonzero(fates == WireFate.DELIVERED)
         since = float(times[0]) if self._since is None else self._since
         runs = np.diff(places, prepend=-1) - 1
@@ -93,6 +90,13 @@ class StreamTally:
         if self._missing:
             self.longest = max(self.longest, self._missing)
             self.silence = max(self.silence, float(times[-1]) - self._since)
+
+    def add_decided(self, records: Records) -> None:
+        """Count messages on which the link's models decide, in any order: those of all keys that share their numbers."""
+        tried = _TRIED[records["fate"]] & (records["n"] >= 0)
+        self.tried += int(tried.sum())
+        self.passed += int(_PASSED[records["fate"][tried]].sum())
+        self._add_numbers(np.sort(records["n"][tried]))
 
     def _add_numbers(self, numbers: NDArray[np.int64]) -> None:
         if not len(numbers):
