@@ -382,6 +382,23 @@ def test_one_mistake(text: str, place: str | None, golden: Golden) -> None:
     golden("wire", mistakes)
 
 
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("largest = 0\n" + BASE, "largest"),
+        ("held_bytes = 0\n" + BASE, "held_bytes"),
+        (BASE.replace("[side.base]", "[side.base]\nkeys = []"), "side.base.keys"),
+        (BASE.replace("[side.base]", '[side.base]\nusers = { ada = "a\\nb:c" }'), "side.base.users.ada"),
+        (BASE.replace("[side.base]", '[side.base]\nusers = { "a\\tb" = "c" }'), "side.base.users.a\tb"),
+        (f"{BASE}ordered = true\ndelay = {{ model = 'constant', value = 1 }}\n"
+         "[[event]]\nat = 1\nlink = 'robot-base'\nset = { reorder = 0.5 }", "event.0.set.reorder"),
+    ],
+)  # fmt: skip
+def test_a_value_with_which_a_wire_would_not_work(text: str, place: str) -> None:
+    """Nothing would cross, a user's line would become two, or messages would overtake each other although they must not."""
+    assert places_of(mistakes_of(of, text)) == [place]
+
+
 def test_a_correlated_link_keeps_its_model() -> None:
     """Its uniform numbers are the other link's, and each model uses them in its own way."""
     mistakes = mistakes_of(

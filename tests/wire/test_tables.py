@@ -52,6 +52,22 @@ def test_a_bound_is_a_number_that_a_metric_can_reach(bound: Any) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ({"metric": "scan.delivery", "above": "20 ms"}, 'expect.0.above: is "20 ms", but scan.delivery is no time'),
+        ({"metric": "scan.gap_messages", "below": "3 s"}, 'expect.0.below: is "3 s", but scan.gap_messages is no time'),
+        ({"metric": "scan.heard", "below": 0}, "expect.0.below: is 0, and no value is below it"),
+        ({"metric": "scan.delivery", "above": 1.0}, "expect.0.above: is 1, and no value is above it"),
+        ({"metric": "scan.heard", "above": 5, "below": 5}, "expect.0.above: is 5, not less than below"),
+    ],
+)
+def test_bounds_that_nothing_meets_are_refused(table: dict[str, Any], sentence: str) -> None:
+    """And lengths of time for what is not one; each with the entry that is wrong."""
+    (mistake,) = mistakes_of(expecting, **table)
+    assert mistake.startswith(sentence)
+
+
 def test_a_link_stands_alone() -> None:
     """Each other entry is named, and no others; None is as good as an entry that is not there."""
     sentences = mistakes_of(expecting, link="scan", metric="scan.heard", quantile=0.5, above=1)

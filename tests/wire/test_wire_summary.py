@@ -526,7 +526,8 @@ def test_a_metric_of_a_link_is_one_line_of_the_registry(tmp_path: Path, monkeypa
 
     class Bytes:
         name = "bytes"
-        has_quantile = False
+        has_quantile = is_time = False
+        most = math.inf
 
         def value(self, link: WireLinkSummary, tally: LinkTally, quantile: float | None) -> float | None:
             assert (tally.heard, quantile) == (link.heard, None)

@@ -32,6 +32,7 @@ from evedrop.system.hints import near
 from evedrop.wire.plan import Side, WireEvent, WireLink, WirePlan
 from evedrop.wire.tables import (
     ENCRYPTED,
+    IN_ORDER,
     NOTHING_LOST,
     EndpointPlace,
     SideTable,
@@ -218,8 +219,13 @@ def _event_table(event: WireEvent) -> dict[str, Any]:
     return table | {name: value for name, value in given.items() if value is not None}
 
 
-LinkNow = tuple[Mapping[str, Any], bool]
-"""A link's settings, and whether its losses are tied to another link's."""
+class LinkNow(NamedTuple):
+    """What a change of a link depends on."""
+
+    settings: Mapping[str, Any]
+    correlated: bool
+    """Whether its losses are tied to another link's."""
+    ordered: bool
 
 
 def mistakes_across(file: WireFile, sides: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
@@ -230,7 +236,7 @@ def mistakes_across(file: WireFile, sides: Mapping[str, Mapping[str, Any]]) -> I
     yield from _name_mistakes(file.link)
     yield from _correlation_mistakes(names, file.link)
     links = {
-        name: (link.wire_settings(), link.correlation is not None)
+        name: LinkNow(link.wire_settings(), link.correlation is not None, link.ordered)
         for name, link in zip(names, file.link, strict=True)
         if link.name is not None or {link.source, link.target} <= {*file.side}  # otherwise the name is mistaken, too
     }
@@ -305,15 +311,18 @@ def link_names(links: Iterable[tuple[Any, Any, Any]]) -> list[str]:
     return names
 
 
-def change_mistakes(settings: Mapping[str, Any], correlated: bool, changes: Mapping[str, Any]) -> Iterator[str]:
-    """Mistakes in changed entries of a link with these settings. correlated: whether its losses are tied to another link's."""
+def change_mistakes(link: LinkNow, changes: Mapping[str, Any]) -> Iterator[str]:
+    """Mistakes in changed entries of a link."""
     yield from unchangeable(changes)
+    settings = link.settings
     try:
         made = changed_settings(settings, {entry: changes[entry] for entry in changes if entry in CHANGEABLE}, settings)
     except ValidationError as error:
         yield from sentences(error, WireSettingsTable)
         return
-    if correlated and made.get("loss", settings["loss"])["model"] != settings["loss"]["model"]:
+    if link.ordered and made.get("reorder"):
+        yield f"reorder: {IN_ORDER}"
+    if link.correlated and made.get("loss", settings["loss"])["model"] != settings["loss"]["model"]:
         yield OTHER_MODEL
 
 
@@ -414,7 +423,7 @@ def event_mistakes(event: WireEventTable, sides: Sequence[str], links: Mapping[s
         if link is not None and link not in links:
             yield f"{entry}: {unknown(link, [*links], 'link')}"
     if event.link is not None and event.set is not None and event.link in links:
-        yield from (f"set.{line}" for line in change_mistakes(*links[event.link], event.set))
+        yield from (f"set.{line}" for line in change_mistakes(links[event.link], event.set))
 
 
 def wire_lines(plan: WirePlan) -> Iterator[str]:

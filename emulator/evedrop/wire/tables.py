@@ -9,6 +9,7 @@ Source: docs/wire/file.md, the file and sides; docs/wire/results.md, expectation
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, Self
 
@@ -181,9 +182,9 @@ class WireExpectTable(Table):
         if self.metric is None:
             yield "metric", 'is missing; expected metric = "scan.delivery" with below or above, or link = "scan"'
             return
-        if self.below is None and self.above is None:
-            yield "below", "is missing, and so is above; add one of them, or both"
-        if WIRE_METRICS[self.metric.rpartition(".")[2]].has_quantile == (self.quantile is None):
+        metric = WIRE_METRICS[self.metric.rpartition(".")[2]]
+        yield from self._bound_mistakes(metric.most)
+        if metric.has_quantile == (self.quantile is None):
             names = [name for name, kind in WIRE_METRICS.items() if kind.has_quantile]
             sentence = (
                 f"is missing; a {listed(names)} needs one"
@@ -191,6 +192,28 @@ class WireExpectTable(Table):
                 else f"is set, but only a {listed(names)} has quantiles"
             )
             yield "quantile", f"{sentence}; expected quantile = 0.99 with {listed([f'LINK.{kind}' for kind in names])}"
+
+    def _bound_mistakes(self, most: float) -> Iterator[Mistake]:
+        """Bounds that no value from 0 to `most` meets, or none of which is there."""
+        if self.below is None and self.above is None:
+            yield "below", "is missing, and so is above; add one of them, or both"
+        if self.below == 0.0:
+            yield "below", "is 0, and no value is below it; expected a number above 0"
+        if self.above is not None and self.above >= most:
+            yield "above", f"is {self.above:.10g}, and no value is above it; expected a number below {most:g}"
+        if self.above is not None and self.below is not None and self.above >= self.below:
+            yield "above", f"is {self.above:.10g}, not less than below; expected a number below {self.below:.10g}"
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _times_bound_times(cls, entries: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
+        """Refuse a length of time as a bound of a metric that is not in seconds."""
+        table = check(entries)
+        if table.metric is not None and not WIRE_METRICS[table.metric.rpartition(".")[2]].is_time:
+            why = f"but {table.metric} is no time; expected a number"
+            texts = [(name, entries.get(name)) for name in _BOUNDS]
+            refuse((name, f"is {as_toml(text)}, {why}") for name, text in texts if isinstance(text, str))
+        return table
 
     @property
     def subject(self) -> str:
@@ -274,7 +297,13 @@ def _listed(value: Any) -> Any:
 def _user(name: str) -> str:
     if not name or ":" in name:
         raise expected("a user name without a colon")
-    return name
+    return _in_a_line(name)
+
+
+def _in_a_line(text: str) -> str:
+    if any(unicodedata.category(character) == "Cc" for character in text):
+        raise expected("text without control characters")  # Zenoh reads a line for each user
+    return text
 
 
 KeyExpression = Annotated[str, Field(strict=True), AfterValidator(_key_expression)]
@@ -345,6 +374,10 @@ class WireSettingsTable(LinkTable):
         return made
 
 
+IN_ORDER = "is given together with ordered = true; expected one of them"
+"""The end of a message about `reorder` on a link on which no message overtakes another."""
+
+
 class WireLinkTable(WireSettingsTable):
     """`[[link]]`: one direction between two sides."""
 
@@ -359,7 +392,7 @@ class WireLinkTable(WireSettingsTable):
         """Those of the settings, and messages that are to overtake others, on a link on which none does."""
         yield from super().mistakes()
         if self.ordered and self.reorder:
-            yield "reorder", "is given together with ordered = true; expected one of them"
+            yield "reorder", IN_ORDER
 
 
 class TlsTable(Table):
@@ -377,10 +410,14 @@ class SideTable(Table):
     connect: Annotated[Endpoints, Field(default_factory=list, examples=["tcp/127.0.0.1:7447"])]
     tls: Annotated[TlsTable | None, Field(examples=[{"certificate": "robot.pem", "key": "robot.key"}])] = None
     users: Annotated[
-        dict[Annotated[str, AfterValidator(_user)], Annotated[str, Field(strict=True, min_length=1)]] | None,
+        dict[
+            Annotated[str, AfterValidator(_user)],
+            Annotated[str, Field(strict=True, min_length=1), AfterValidator(_in_a_line)],
+        ]
+        | None,
         Field(examples=[{"ada": "a long password"}]),
     ] = None
-    keys: Annotated[KeyExpressions, Field(default_factory=lambda: ["**"])]
+    keys: Annotated[KeyExpressions, Field(default_factory=lambda: ["**"], min_length=1)]
     peers: Annotated[bool, Field(strict=True)] = False
 
     def mistakes(self) -> Iterator[Mistake]:
@@ -459,10 +496,10 @@ class WireFile(Table):
     event: Annotated[list[WireEventTable], Field(default_factory=list)]
     expect: Annotated[list[WireExpectTable], Field(default_factory=list)]
     lossless: Annotated[KeyExpressions, Field(default_factory=list)]
-    largest: Annotated[Size, Field(examples=["64 MB"])] = 2**30
+    largest: Annotated[Size, Field(ge=1, examples=["64 MB"])] = 2**30
     query_seconds: Annotated[Seconds, Field(examples=["10 s"])] = 10.0
     held_messages: Annotated[int, Field(strict=True, ge=1, le=10_000_000, examples=[100_000])] = 100_000
-    held_bytes: Annotated[Size, Field(examples=["1 GB"])] = 2**30
+    held_bytes: Annotated[Size, Field(ge=1, examples=["1 GB"])] = 2**30
 
 
 _NEEDS = {"rate": "queue", "queue": "rate", "reorder": "delay"}

@@ -8,6 +8,7 @@ Source: docs/wire/results.md, the summary and expectations.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple, final
 
@@ -184,13 +185,21 @@ class WireMetric(NamedTuple):
     """Of a link, with the quantile of its table, by default the median; None if no message gives one: its expectation failed."""
     has_quantile: bool = False
     """Whether its table has `quantile`."""
+    is_time: bool = False
+    """Whether it is in seconds."""
+    most: float = math.inf
+    """The largest value that it can have; the least is 0."""
 
 
 WIRE_METRICS: Mapping[str, WireMetric] = {
     "heard": WireMetric(lambda link, _tally, _quantile: link.heard),
-    "delivery": WireMetric(lambda link, _tally, _quantile: link.delivered / link.heard if link.heard else None),
-    "latency": WireMetric(lambda _link, tally, quantile: tally.delay_quantile(quantile or 0.5), has_quantile=True),
+    "delivery": WireMetric(
+        lambda link, _tally, _quantile: link.delivered / link.heard if link.heard else None, most=1.0
+    ),
+    "latency": WireMetric(
+        lambda _link, tally, quantile: tally.delay_quantile(quantile or 0.5), has_quantile=True, is_time=True
+    ),
     "gap_messages": WireMetric(lambda link, _tally, _quantile: link.gap_messages if link.heard else None),
-    "gap_seconds": WireMetric(lambda link, _tally, _quantile: link.gap_seconds if link.heard else None),
+    "gap_seconds": WireMetric(lambda link, _tally, _quantile: link.gap_seconds if link.heard else None, is_time=True),
 }
 """Name, as in `metric = "LINK.name"` → the metric, in the order of docs/wire/results.md."""

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from evedrop.errors import ScenarioError
 from evedrop.model.checks import as_toml
 from evedrop.scenario.table import sentences
-from evedrop.wire.file import event_mistakes, unknown, wire_event
+from evedrop.wire.file import LinkNow, event_mistakes, unknown, wire_event
 from evedrop.wire.plan import WireEvent, WirePlan
 from evedrop.wire.tables import WireEventTable
 
@@ -68,12 +68,11 @@ def with_change(plan: WirePlan, table: Mapping[str, Any], time: float) -> tuple[
     table: as `[[event]]` without a time. Raises ScenarioError with every mistake, worded as for the events of a file.
     """
     now = moment_at(plan, time).settings
-    tied = {link.name for link in plan.links if link.correlation is not None}
     try:
         checked = WireEventTable.model_validate({"at": time, **table})
     except ValidationError as error:
         raise ScenarioError("event", sentences(error, WireEventTable)) from None
-    links = {name: (settings, name in tied) for name, settings in now.items()}
+    links = {link.name: LinkNow(now[link.name], link.correlation is not None, link.ordered) for link in plan.links}
     if mistakes := list(event_mistakes(checked, [*plan.sides], links)):
         raise ScenarioError("event", mistakes)
     event = wire_event(checked, now, {link.name: link.settings for link in plan.links})
