@@ -19,11 +19,11 @@ from typing import Any
 import pytest
 
 from evedrop.cli.api import montecarlo
-from evedrop.errors import Interrupted, UsageError
+from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.simulate import finished_tasks
-from evedrop.simulate.finished_tasks import FinishedTasks
+from evedrop.simulate.finished_tasks import FinishedTasks, study_of
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import tasks_of
@@ -36,6 +36,7 @@ STUDY = (
     *("--record-trials", "2100", "--workers", "1", "--set", "expect=[]"),
 )
 """Three tasks."""
+SMALL: dict[str, Any] = {"trials": 20, "slots": 20}
 _TIMES = re.compile(
     r'"(wall_seconds|slots_per_second)": [^,\n]*|[0-9,]+ trial-slots/s|<td>[0-9.]+ s</td>|[0-9-]+ [0-9:]+ UTC'
 )
@@ -143,7 +144,7 @@ def test_an_interrupted_study_ends_like_a_whole_one(
 KILLED = """
 import os, signal, sys
 from evedrop.cli.main import main
-from evedrop.simulate.finished_tasks import FinishedTasks
+from evedrop.simulate.finished_tasks import FinishedTasks, study_of
 keep = FinishedTasks.keep
 def then(finished, *given):
     keep(finished, *given)
@@ -292,6 +293,74 @@ def test_python_resumes_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert cut == whole
     with pytest.raises(UsageError, match="give the folder as out"):
         montecarlo("eavesdroppers", resume=True, **case)
+
+
+def interrupted_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Press Ctrl-C before any slot."""
+
+    @contextlib.contextmanager
+    def told() -> Iterator[threading.Event]:
+        stop = threading.Event()
+        stop.set()
+        yield stop
+
+    monkeypatch.setattr("evedrop.simulate.montecarlo.stop_on_signals", told)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_study_that_keeps_nothing_leaves_its_folder_as_it_was(
+    there: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder that was there stays, which may be the current one."""
+    monkeypatch.chdir(tmp_path)
+    interrupted_at_once(monkeypatch)
+    with pytest.raises(Interrupted, match="nothing was kept"):
+        montecarlo("eavesdroppers", out="." if there else "run", trials=20, slots=20, plan=Plan(workers=1))
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_resumed_study_that_keeps_nothing_leaves_what_was_in_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files of the user, and what the study needs to go on, are still there."""
+    study = study_of("montecarlo", {"mode": "exact", "rare": False}, [load("eavesdroppers", SMALL)])
+    with finished_tasks.finished_tasks(tmp_path / "run", study, resume=False):
+        pass
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    with monkeypatch.context() as patched:
+        interrupted_at_once(patched)
+        with pytest.raises(Interrupted, match="nothing was kept"):
+            montecarlo("eavesdroppers", out=tmp_path / "run", resume=True, plan=Plan(workers=1), **SMALL)
+    assert (tmp_path / "run" / "notes.txt").read_text() == "mine"
+    montecarlo("eavesdroppers", out=tmp_path / "run", resume=True, plan=Plan(workers=1), **SMALL)
+    assert (tmp_path / "run" / "summary.json").exists()
+
+
+def test_a_folder_that_is_removed_ends_the_study_with_its_own_message(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not with the traceback of an attempt to name it."""
+    keep: Callable[..., None] = FinishedTasks.keep
+
+    def then(finished: FinishedTasks, *given: Any) -> None:
+        keep(finished, *given)
+        shutil.rmtree(tmp_path / "run", ignore_errors=True)
+
+    monkeypatch.setattr(FinishedTasks, "keep", then)
+    with pytest.raises(RunError, match="was removed while the run went on"):
+        montecarlo("eavesdroppers", out=tmp_path / "run", plan=Plan(workers=1), trials=4700, slots=8)
+
+
+def test_a_class_of_any_scenario_is_part_of_the_study(tmp_path: Path) -> None:
+    """Results of another version of it must not be mixed with those of this one."""
+    plain = load("eavesdroppers", SMALL)
+    own = plain.eavesdroppers["smart"].model_copy(update={"strategy": "a_module_of_mine:Mine"})
+    other = plain.model_copy(update={"modules": str(tmp_path), "eavesdroppers": {"smart": own}})
+    studies = []
+    for text in ("class Mine: pass\n", "class Mine: x = 1\n"):
+        (tmp_path / "a_module_of_mine.py").write_text(text)
+        studies.append(study_of("sweep", {}, [plain, other]))
+    assert studies[0] != studies[1]
 
 
 @pytest.mark.thorough

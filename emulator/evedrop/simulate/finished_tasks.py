@@ -26,6 +26,7 @@ import pyarrow as pa
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.results.crash_proof_tables import goes_on
 from evedrop.results.folder import (
+    STATES,
     UNFINISHED,
     HeldFolder,
     disk_errors,
@@ -34,7 +35,7 @@ from evedrop.results.folder import (
     private_replacement,
     write_private,
 )
-from evedrop.results.resolved_scenario import made_with
+from evedrop.results.resolved_scenario import DISTURBANCES, made_with
 from evedrop.results.shard_score import NotData, packed, unpacked
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.tasks import R, Task
@@ -61,17 +62,19 @@ Study = Mapping[str, Any]
 def study_of(kind: str, options: Mapping[str, Any], scenarios: Sequence[Scenario]) -> Study:
     """What a study computes; kind: the command; options: those that change results, beside the scenarios, at least one."""
     secrets = dict.fromkeys(scenario.secret_file for scenario in scenarios if scenario.secret_file is not None)
-    first = scenarios[0].model_dump(mode="json", exclude_none=True)
+    tables = [scenario.model_dump(mode="json", exclude_none=True) for scenario in scenarios]
     every = sha256()
-    for scenario in scenarios:
-        every.update(_json(scenario.model_dump(mode="json", exclude_none=True)))
+    made: dict[str, Any] = {}
+    for table in tables:
+        every.update(_json(table))
+        made |= made_with(table)
     study = {
         "study": kind,
         **options,
-        "scenario": first,
+        "scenario": tables[0],
         "scenarios": every.hexdigest(),
         "secrets": [sha256(Path(scenario).read_bytes()).hexdigest() for scenario in secrets],
-        "made_with": made_with(first),
+        "made_with": made,
     }
     plain: Study = json.loads(json.dumps(study, default=str))
     return plain
@@ -91,6 +94,7 @@ def finished_tasks(folder: Path, study: Study, resume: bool) -> Iterator[Finishe
     Raises UsageError if the folder cannot be used, has another study, has nothing to resume, or another process works in it.
     """
     began = resume and folder.is_dir() and any(folder.iterdir())
+    had_folder = folder.exists()
     if began:
         _check(folder, study)
     else:
@@ -98,14 +102,15 @@ def finished_tasks(folder: Path, study: Study, resume: bool) -> Iterator[Finishe
         with disk_errors(folder):
             make_private(folder / TASKS)
             write_private(folder / TASKS / _STUDY, json.dumps(study, ensure_ascii=False, indent=1) + "\n")
-    tasks = FinishedTasks(folder / TASKS, study)
+    tasks = FinishedTasks(folder / TASKS, study, resumed=began, had_folder=had_folder)
     try:
         if began:
             _clear(folder)
         yield tasks
     except EvedropError as error:
         if tasks.count:
-            error.resumable = str(tasks.results_folder)
+            with contextlib.suppress(OSError):  # the folder was removed meanwhile
+                error.resumable = str(tasks.results_folder)
         raise
     finally:
         tasks.close()
@@ -163,8 +168,9 @@ def _clear(folder: Path) -> None:
 class FinishedTasks:
     """The finished tasks of one study. Holds a lock on their folder."""
 
-    def __init__(self, place: Path, study: Study) -> None:
-        """place: the folder. Raises UsageError if another process holds the lock."""
+    def __init__(self, place: Path, study: Study, *, resumed: bool, had_folder: bool) -> None:
+        """place: the folder; had_folder: whether the results folder was there before. Raises UsageError if it is locked."""
+        self._resumed, self._had_folder = resumed, had_folder
         self._held = HeldFolder(place)
         self._study = sha256(_json(study)).digest()
         self._digests: dict[tuple[Any, ...], tuple[object, str]] = {}
@@ -246,9 +252,19 @@ class FinishedTasks:
         self._files = set()
 
     def remove_unless_any(self) -> None:
-        """Remove the results folder, which has nothing else, unless a task is kept."""
-        if not self._files:
-            shutil.rmtree(self.results_folder)
+        """Unless a task is kept, leave the results folder as the study found it, but for the results of a resumed one."""
+        if self._files:
+            return
+        with contextlib.suppress(OSError):
+            folder = self.results_folder
+            _clear(folder)
+            if self._resumed:
+                return
+            for name in (DISTURBANCES, STATES, "scenario.toml"):
+                (folder / name).unlink(missing_ok=True)
+            shutil.rmtree(self._held.now)
+            if not self._had_folder:
+                folder.rmdir()
 
     def interrupted(self, before: str) -> Interrupted:
         """The end of a study that has no results yet; before: what would have been the first."""
