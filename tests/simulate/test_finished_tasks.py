@@ -21,6 +21,7 @@ import pytest
 from evedrop.cli.api import montecarlo
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.results.reading import Results
+from evedrop.results.shard_score import packed, unpacked
 from evedrop.scenario.loading import load
 from evedrop.simulate import finished_tasks
 from evedrop.simulate.finished_tasks import FinishedTasks, study_of
@@ -293,6 +294,14 @@ def test_python_resumes_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert cut == whole
     with pytest.raises(UsageError, match="give the folder as out"):
         montecarlo("eavesdroppers", resume=True, **case)
+
+
+@pytest.mark.parametrize("trials", [501, 1])
+def test_a_block_of_a_single_trial_can_be_read_again(trials: int) -> None:
+    """The last block of a study, or the only one."""
+    (task,) = tasks_of(load("eavesdroppers", {"trials": trials, "slots": 10}), Mode.EXACT, 1)
+    result = packed(task.carry_out(lambda _: None, lambda: False))
+    assert packed(unpacked(result, task.example())) == result
 
 
 def interrupted_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
