@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.model.links import LOSS_MODELS, loss_of
+from evedrop.model.links import LOSS_MODELS, loss_of, pooled_spec
 from evedrop.model.links.loss_model import Fate
 from evedrop.model.streams import Stream, root_of_seed, stream_key, uniforms
 
@@ -72,3 +72,32 @@ def test_one_rate_is_within_its_interval(name: str) -> None:
     rates = (loss.fates(0, u) == Fate.DELIVERED).mean(axis=0)
     off = np.abs(rates - loss.quality_at(range(SLOTS)).mean()) / math.sqrt(loss.rate_variance(range(SLOTS)))
     assert (off < 2.0).mean() == pytest.approx(0.954, abs=0.03)
+
+
+POOLED: dict[str, tuple[str, ...]] = {
+    "independent": ("bernoulli", "bernoulli"),
+    "patterns": ("pattern", "trace"),
+    "some certain": ("bernoulli", "pattern"),
+    "moving": ("bernoulli", "no shadow"),
+    "chains": ("bursts", "four states"),
+    "chain and pattern": ("soft bursts", "pattern"),
+    "slow ones": ("slow", "random trace"),
+}
+NO_SHADOW = {**RADIO, "receiver": [[0, -300.0, 20.0], [400, 100.0, 20.0]]}
+
+
+@pytest.mark.parametrize("name", POOLED)
+def test_pooled_links(name: str) -> None:
+    """A packet gets through unless all lose it: in the mean slot by slot; the rates scatter as said, or at most so."""
+    loss = loss_of(pooled_spec([{**SPECS, "no shadow": NO_SHADOW}[each] for each in POOLED[name]]))
+    u = uniforms(Stream(KEY, range(TRIALS), loss.uniforms_per_slot).words(range(SLOTS))).transpose(0, 2, 1)
+    delivered = loss.fates(0, u) == Fate.DELIVERED
+    quality, rates = loss.quality_at(range(SLOTS)), delivered.mean(axis=0)
+    off = np.abs(delivered.mean(axis=1) - quality)
+    assert (off <= 5.5 * np.sqrt(quality * (1.0 - quality) / TRIALS) + 1e-12).all()
+    variance = loss.rate_variance(range(SLOTS))
+    exact = loss.memoryless or loss.chain is not None
+    assert exact is (name not in {"chain and pattern", "slow ones"})
+    assert rates.var() <= 1.2 * variance + 1e-15
+    if exact:
+        assert rates.var() >= 0.8 * variance - 1e-15

@@ -274,3 +274,13 @@ def test_a_trial_alone(spec: dict[str, Any]) -> None:
         alone, own = loss_of(spec), u[:, :, trial : trial + 1]
         pieces = [alone.fates(start, own[start:stop]) for start, stop in ((0, 1), (1, 300), (300, 301), (301, 700))]
         assert np.array_equal(np.concatenate(pieces)[:, 0], together[:, trial])
+
+
+@pytest.mark.parametrize(("p", "r", "quality"), [(0.0, 0.5, 0.9), (0.5, 0.0, 0.2)])
+def test_a_state_that_is_never_met_does_not_count(p: float, r: float, quality: float) -> None:
+    """A link of Gilbert and Elliott that stays in one state loses independently, and so has a limit of the error."""
+    chain = loss_of({"model": "gilbert-elliott", "p": p, "r": r, "good": 0.1, "bad": 0.8}).chain
+    assert chain is not None
+    assert chain.independent
+    assert chain.quality == pytest.approx([quality])
+    np.testing.assert_array_equal(chain.transitions, [[1.0]])

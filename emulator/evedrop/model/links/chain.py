@@ -27,6 +27,12 @@ class Chain:
     quality: Floats
     """Probability that a packet is delivered in each state, (states,)."""
 
+    @classmethod
+    def recurrent(cls, transitions: Floats, stationary: Floats, quality: Floats) -> Chain:
+        """The chain without its transient states, in which it never is."""
+        met = stationary > 0.0
+        return cls(transitions[met][:, met], stationary[met], quality[met])
+
     @property
     def independent(self) -> bool:
         """Whether the fates of all packets are independent and identically distributed: a single state, as in the paper."""

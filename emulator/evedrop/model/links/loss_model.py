@@ -209,10 +209,26 @@ class Pooled(LossModel):
     @property
     def quality(self) -> float:
         """1 − Π (1 − quality)."""
-        lost = 1.0
+        return 1.0 - prod(1.0 - model.quality for model in self._models)
+
+    def quality_at(self, slots: range) -> Floats:
+        """The same for each of these slots."""
+        lost = np.ones(len(slots))
         for model in self._models:
-            lost *= 1.0 - model.quality
+            lost *= 1.0 - model.quality_at(slots)
         return 1.0 - lost
+
+    def rate_variance(self, slots: range) -> float:
+        """An upper bound where the losses have a memory and are no chain: that of fates that vary together."""
+        if self.chain is not None or self.memoryless:
+            return super().rate_variance(slots)
+        qualities = (self.quality_at(part) for part in parts_of(slots))
+        return (sum_in_order(float(np.sqrt(each * (1.0 - each)).sum()) for each in qualities) / len(slots)) ** 2
+
+    @property
+    def memoryless(self) -> bool:
+        """Whether all of the links are."""
+        return all(model.memoryless for model in self._models)
 
     @property
     def chain(self) -> Chain | None:

@@ -57,10 +57,10 @@ class GilbertElliott(LossModel):
 
     @property
     def chain(self) -> Chain:
-        """Good and bad."""
+        """Good and bad; a single state if it never leaves that."""
         bad = self._stationary_bad
         transitions = np.array([[1.0 - self._p, self._p], [self._r, 1.0 - self._r]])
-        return Chain(transitions, np.array([1.0 - bad, bad]), np.array([1.0 - self._good, 1.0 - self._bad]))
+        return Chain.recurrent(transitions, np.array([1.0 - bad, bad]), np.array([1.0 - self._good, 1.0 - self._bad]))
 
     def fates(self, first: int, uniforms: Floats) -> Codes:  # noqa: ARG002 - the state says where we are
         """From the state of every slot and a second uniform number."""
@@ -151,9 +151,8 @@ class Markov(LossModel):
 
     @property
     def chain(self) -> Chain:
-        """The given chain without its transient states, in which it never is."""
-        met = self._stationary > 0.0
-        return Chain(self._transitions[met][:, met], self._stationary[met], 1.0 - self._loss[met])
+        """The given chain without its transient states."""
+        return Chain.recurrent(self._transitions, self._stationary, 1.0 - self._loss)
 
     def fates(self, first: int, uniforms: Floats) -> Codes:  # noqa: ARG002 - the state says where we are
         """From the state of every slot and a second uniform number."""
