@@ -54,6 +54,18 @@ def test_it_settles_where_the_riccati_equation_has_it(of: Plant) -> None:
     assert (mistakes_of(*entries) == []) == (len(C) == 2)
 
 
+def test_it_settles_in_any_units() -> None:
+    """A state of variance 1e6 hides none of 1e-7; and states that die out do not keep it from settling."""
+    of = plant(np.eye(2), np.diag([1e4, 1e-4]), np.diag([1e6, 1e-10]))
+    process = Process(np.diag([0.9, 1.0]), np.eye(2), np.diag([1e6, 1e-6]))
+    step = settled(process, of)
+    for i, (a, q, r) in enumerate(((0.9, 1e6, 1e4), (1.0, 1e-10, 1e-4))):
+        ((predicted,),) = solve_discrete_are([[a]], [[1.0]], [[q]], [[r]])
+        assert step.gain[i, i] == pytest.approx(predicted / (predicted + r), rel=1e-7)
+    dying = Process(np.diag([0.9, 0.98]), np.eye(2), np.eye(2))
+    assert settled(dying, plant(np.eye(2), np.eye(2), np.diag([1.0, 0.0]))).covariance[1, 1] < 1e-10
+
+
 def test_it_is_the_kalman_filter_slot_by_slot() -> None:
     """With inputs and disturbances known: estimates, covariances, and errors that are as large as it says."""
     batch = Batch(60, 4000)

@@ -48,6 +48,16 @@ def assignment(A: np.ndarray, of: Plant, period: int = 1, rate: float = 0.0, lim
     return Assignment(process, of, period, 1.0, *weights, np.full(m, limit), {})
 
 
+def test_the_gain_does_not_depend_on_the_units_of_states() -> None:
+    """Two inputs that drive one state each are two regulators, also where the weights are 1e16 apart."""
+    A, weights = np.diag([0.5, 1.0]), np.array([1e8, 1e-8])
+    both = replace(assignment(A, plant(np.eye(2))), state_weights=weights, input_weights=np.ones(2))
+    for i in range(2):
+        a, q = A[i, i], weights[i]
+        ((X,),) = solve_discrete_are([[a]], [[1.0]], [[q]], [[1.0]])
+        assert gain(both)[i, i] == pytest.approx(X * a / (1.0 + X), rel=1e-8)
+
+
 @pytest.mark.parametrize("period", [1, 7])
 @pytest.mark.parametrize("rate", [0.0, 0.5])
 @pytest.mark.parametrize("seed", range(3))

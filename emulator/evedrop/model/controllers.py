@@ -28,7 +28,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from evedrop.model.checks import expect_shapes
-from evedrop.model.kernels.elementary import inverse
+from evedrop.model.kernels.elementary import has_settled, inverse
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Limits, Process, product
 from evedrop.model.receiver import Flags
@@ -169,7 +169,7 @@ def _riccati(F: Floats, G: Floats, H: Floats) -> Floats:
         H, F = H + more, product(FW, F)
         if not np.isfinite(H).all():
             break
-        if np.abs(more).max() <= _SETTLED * np.abs(H).max():
+        if has_settled(more, np.diag(H), _SETTLED):
             return 0.5 * (H + _transposed(H))
     raise ValueError("the Riccati equation has no solution")
 

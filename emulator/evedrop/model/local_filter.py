@@ -13,12 +13,13 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from evedrop.model.kernels.elementary import cholesky, inverse, semidefinite_factor
+from evedrop.model.kernels.elementary import cholesky, has_settled, inverse, semidefinite_factor
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.streams import Ahead, Batch, BlockReader
 
-_SETTLED = 1e-14
+_SETTLED = 1e-14  # relative to the largest entry
+_SETTLED_EACH = 1e-12  # relative to the states' own variances, at the start or now: states may have units of any size
 _LONGEST = 200_000  # slots after which a filter is regarded as not settling
 _LONGEST_OF_MANY = 4_000  # the same for a filter with many states or measurements, whose slots take longer
 _SOME = 4
@@ -52,7 +53,7 @@ class Steps:
     def __init__(self, process: Process, plant: Plant) -> None:
         self._A, self._W = process.A, plant.noise
         self._C, self._V = _measured(plant)
-        self._predicted = process.initial_covariance
+        self._predicted, self._initial = process.initial_covariance, np.diag(process.initial_covariance)
         self._last: FilterStep | None = None
         self.settled = False
 
@@ -77,7 +78,9 @@ class Steps:
             0.5 * (S + S.T),
             0.5 * (predicted + predicted.T),
         )
-        self.settled = bool(np.abs(predicted - P).max() <= _SETTLED * np.abs(predicted).max())
+        change, variances = predicted - P, np.maximum(np.diag(predicted), self._initial)
+        self.settled = bool(np.abs(change).max() <= _SETTLED * np.abs(predicted).max())
+        self.settled = self.settled and has_settled(change, variances, _SETTLED_EACH)
         self._predicted, self._last = predicted, step
         return step
 

@@ -297,6 +297,12 @@ def test_wrong_parameters_of_a_policy_are_found(name: str, given: dict[str, floa
     assert POLICIES[name].mistakes(POLICIES[name].parameters) == []
 
 
+def test_stationary_covariances_do_not_depend_on_units() -> None:
+    """1 / (1 − f²) for each part of its own, whatever the other's size."""
+    X = stationary(np.diag([0.1, 0.999]), np.diag([1e20, 1e-20]))
+    assert np.diag(X) == pytest.approx([1e20 / 0.99, 1e-20 / (1.0 - 0.999**2)], rel=1e-10)
+
+
 def test_what_has_no_stationary_distribution_is_refused() -> None:
     """A source that grows, slowly or fast, and a z that cannot have the covariance of y."""
     for factor in (1.0, 1e200):

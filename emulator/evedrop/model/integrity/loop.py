@@ -12,6 +12,7 @@ from typing import final
 
 import numpy as np
 
+from evedrop.model.kernels.elementary import has_settled
 from evedrop.model.process import Floats, product
 
 _DOUBLINGS = 60
@@ -103,7 +104,7 @@ def stationary(F: Floats, noise: Floats) -> Floats:
         X, F = X + more, product(F, F)
         if not np.isfinite(X).all():
             break
-        if np.abs(more).max() <= _SETTLED * np.abs(X).max():
+        if has_settled(more, np.diag(X), _SETTLED):
             return X
     raise ValueError("there is no stationary distribution")
 

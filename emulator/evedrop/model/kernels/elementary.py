@@ -233,6 +233,12 @@ def triangular_factor(rows: Rows) -> Rows:
     return [row[:n] for row in work]
 
 
+def has_settled(change: Floats, variances: Floats, within: float) -> bool:
+    """Whether entry i, j of a change of a covariance, (n, n), is within this fraction of √(v_i v_j), v (n,), in any units."""
+    deviations = np.sqrt(np.abs(variances))
+    return bool(np.all(np.abs(change) <= within * deviations[:, None] * deviations))
+
+
 def inverse(M: Floats) -> Floats:
     """Inverse of a nonsingular matrix (n, n), by elimination with row pivots.
 
