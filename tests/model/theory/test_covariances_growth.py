@@ -55,6 +55,19 @@ def test_a_direction_is_not_an_eigenvector() -> None:
     assert result.along(np.array([-1.0, 0.7])) is False
 
 
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
+def test_whether_a_state_is_observed_does_not_depend_on_units(unit: float) -> None:
+    """A weak coupling in odd units is a strong one in others: the first state shows the second, or it does not."""
+    units = np.array([1.0, unit])
+    for coupling, seen in ((0.5, True), (0.0, False)):
+        A = np.array([[0.9, coupling], [0.0, 1.1]]) * units[:, None] / units
+        process = Process(A, np.diag(units**2), np.diag(units**2))
+        for mu_d in (0.5, 1.0):
+            basis = ClearStatesForm(process, np.array([False, True]), mu_d, 1.0, 10).growing
+            assert basis.shape[1] == (0 if seen else 1)
+            assert seen or abs(basis[1, 0]) == pytest.approx(1.0)
+
+
 def test_what_is_not_observed_grows() -> None:
     """Exactly over a perfect link; behind a lossy one only growth, and what the state itself does not do, are certain."""
     process = Process(np.array([[1.1, 0.3, 0.0], [0.0, 1.2, 0.0], [0.0, 0.0, 0.5]]), np.eye(3), np.eye(3))

@@ -589,12 +589,17 @@ class ClearStatesForm(ClosedForm):
     @cached_property
     def growing(self) -> Floats:
         """An orthonormal basis of the directions in which the error grows without bound, (n, m)."""
-        A, n, clear = self.process.A, self.process.n, np.eye(self.process.n)[~self.hidden]
+        # In units of the states' own deviations at the start, so that ranks do not depend on the units that the user chose.
+        units, axes = np.sqrt(np.diag(self.process.initial_covariance)), np.eye(self.process.n)
+        A = self.process.A * units / units[:, None]
         if self.mu_d == 0.0:
             # After slot 0, e_k = A^k e_0, and e_0 is in the encrypted states.
-            return unstable_part(A, _invariant_hull(A, np.eye(n)[:, self.hidden]), 1.0 + MARGINAL)
-        unseen = _orthogonal_to(_invariant_hull(A.T, clear.T))
-        return unstable_part(A, unseen, 1.0 - MARGINAL if self.mu_d == 1.0 else 1.0 + MARGINAL)
+            growing = unstable_part(A, _invariant_hull(A, axes[:, self.hidden]), 1.0 + MARGINAL)
+        else:
+            unseen = _orthogonal_to(_invariant_hull(A.T, axes[:, ~self.hidden]))
+            growing = unstable_part(A, unseen, 1.0 - MARGINAL if self.mu_d == 1.0 else 1.0 + MARGINAL)
+        basis: Floats = np.linalg.qr(units[:, None] * growing)[0]
+        return basis
 
     @property
     def growth(self) -> Growth:
