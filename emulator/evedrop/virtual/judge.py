@@ -283,7 +283,8 @@ def _of_hold(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
             held = message.at if held is None else held
         elif message.key == f"control/{SENSOR}" and message.said.startswith("go"):
             held = None
-    if held is not None and run.ended > held + READY_SECONDS + _GIVES_UP_SECONDS:
+    patience = max(READY_SECONDS, case.scenario.longest_outage)
+    if held is not None and run.ended > held + patience + _GIVES_UP_SECONDS:
         yield f"the run is held for {run.ended - held:.1f} s, and goes on to wait"
 
 

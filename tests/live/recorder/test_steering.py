@@ -7,10 +7,12 @@ from typing import Any
 
 import pytest
 
+from evedrop.errors import RunError
 from evedrop.live.network.operator import Answer, Order, read_answer
 from evedrop.live.protocol.commands import ControlCommand, Go, Hold, LinkChange
 from evedrop.live.protocol.launcher_events import ProcessRequest
 from evedrop.live.protocol.requests import REQUESTS
+from evedrop.live.recorder import steering
 from evedrop.live.recorder.steering import Steering
 from evedrop.model.slot.link import Change
 from evedrop.scenario.loading import checked
@@ -45,6 +47,7 @@ class RecordingConductor:
 
     absent: set[str] = field(default_factory=set)
     away: set[str] = field(default_factory=set)
+    missing: list[str] = field(default_factory=list)
     sent: list[Sent] = field(default_factory=list)
 
     def send_to(self, name: str, command: ControlCommand) -> None:
@@ -64,11 +67,11 @@ class RecordingConductor:
 class Run:
     """A steered run in a test's hands."""
 
-    def __init__(self, *events: dict[str, Any], paused: bool = False) -> None:
+    def __init__(self, *events: dict[str, Any], paused: bool = False, longest_outage: float = 30.0) -> None:
         self.conductor = RecordingConductor()
         self.saved: list[Scenario] = []
         self.progress: list[ProgressEvent] = []
-        scenario = checked({**TABLES, "event": list(events)}, "test")
+        scenario = checked({**TABLES, "event": list(events), "longest_outage": longest_outage}, "test")
         self.steering = Steering(
             scenario,
             self.conductor,  # type: ignore[arg-type]
@@ -96,6 +99,17 @@ class Run:
     def events(self) -> list[tuple[int, str, str]]:
         """What was done."""
         return [(event.slot, event.event, event.by) for event in self.steering.events]
+
+
+class TestClock:
+    """The time of the world in a test's hands."""
+
+    __test__ = False
+    now = 0.0
+
+    def monotonic(self) -> float:
+        """The time."""
+        return self.now
 
 
 SET = {"link": "legitimate", "set": {"quality": 0.2}}
@@ -395,3 +409,27 @@ def test_a_restarted_router_receives_all_changes() -> None:
     run.holds(17)
     first = Change(5, {"loss": {"model": "bernoulli", "quality": 0.5}})
     assert run.steering.changes == {"legitimate": (first, Change(17, SETTINGS))}
+
+
+@pytest.mark.parametrize(("longest_outage", "patience"), [(1.0, 30.0), (90.0, 90.0)])
+def test_a_hold_lasts_as_long_as_an_outage_may(
+    monkeypatch: pytest.MonkeyPatch, longest_outage: float, patience: float
+) -> None:
+    """Time in which a process is missing or the recorder is suspended does not count: nobody reported less for that."""
+    clock = TestClock()
+    monkeypatch.setattr(steering, "world", lambda: clock)
+    run = Run(longest_outage=longest_outage)
+    run.steering.held(5)
+
+    def wait(seconds: float, step: float = 0.5) -> None:
+        for _ in range(int(seconds / step)):
+            clock.now += step
+            run.steering.carry_on(4, lambda: {"smart": 4})
+
+    run.conductor.missing = ["smart"]
+    wait(200.0)
+    run.conductor.missing = []
+    wait(100.0, step=50.0)
+    wait(patience - 3.0)
+    with pytest.raises(RunError, match=f"^{patience:.0f} s after the run was held before slot 5, smart did not report"):
+        wait(3.0)

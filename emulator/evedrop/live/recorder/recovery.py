@@ -24,7 +24,7 @@ from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again, ProcessStatus
 from evedrop.live.protocol.keys import writer_of
 from evedrop.live.recorder.conductor import Conductor
-from evedrop.live.recorder.steering import Steering
+from evedrop.live.recorder.steering import STEP_SECONDS, Steering
 from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.scenario.progress_events import ConnectionOutage, OnEvent
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
@@ -32,9 +32,6 @@ from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 LEAST_SECONDS = 5.0
 """The least of these: a busy machine may not let a process work for some seconds."""
 _POLL_SECONDS = 0.25
-_STEP_SECONDS = (
-    1.0  # the most that counts between two polls: time in which the recorder itself did not run does not count
-)
 
 
 def patience_of(longest_outage: float, pace: float, batch: int, program: bool = False) -> float:
@@ -92,7 +89,7 @@ class Stall:
             return
         if now - self._polled < _POLL_SECONDS:
             return
-        step, self._polled = min(now - self._polled, _STEP_SECONDS), now
+        step, self._polled = min(now - self._polled, STEP_SECONDS), now
         if missing:
             return
         self._stalled += step
@@ -222,7 +219,7 @@ class Recovery:
         Raises RunError if a process has been missing for too long. Time in which the recorder itself did not run does not count.
         """
         now = self._clock.monotonic()
-        self._conductor.wait_longer(max(0.0, now - self._polled - _STEP_SECONDS))
+        self._conductor.wait_longer(max(0.0, now - self._polled - STEP_SECONDS))
         self._polled = now
         if done > self._done:
             self._go_on(done, now)

@@ -32,6 +32,9 @@ from evedrop.scenario.tables import Scenario
 from evedrop.score.run_tally import RunTally
 from evedrop.system.world import world
 
+STEP_SECONDS = 1.0
+"""The most that counts between two polls: time in which the recorder itself did not run does not count."""
+
 
 @dataclass(frozen=True)
 class OperatorStep:
@@ -75,7 +78,10 @@ class Steering:
         self._left: dict[str, int] = {}
         self._waiting: tuple[Act, ProcessAction] | None = None
         self._confirmed = True
-        self._since = 0.0
+        self._patience = max(READY_SECONDS, scenario.longest_outage)
+        self._waited = 0.0
+        """Seconds that count of a wait for reports at a hold, or for an act."""
+        self._polled = 0.0
         self._orders: deque[Order] = deque()
         self._asked = False
         self._step: OperatorStep | None = None
@@ -94,7 +100,7 @@ class Steering:
             return
         self.at, self._last, self._asked = k, k, False
         self._pending = list(self._due.pop(k, []))
-        self._since = world().monotonic()
+        self.restart_limit()
         if self.paused:  # only a run that began paused is paused here: all later pauses take effect at a hold
             self._pause(k, "pause the run")
 
@@ -185,10 +191,16 @@ class Steering:
         return False
 
     def _fail(self, problem: str) -> None:
-        """Raise RunError if the run has been waiting for too long; problem: the missing condition."""
-        if world().monotonic() - self._since > READY_SECONDS:
+        """Raise RunError if the run has been waiting for too long; problem: the missing condition.
+
+        Time in which a process was missing, or the recorder itself did not run, does not count.
+        """
+        now = world().monotonic()
+        step, self._polled = min(now - self._polled, STEP_SECONDS), now
+        self._waited += 0.0 if self._conductor.missing else step
+        if self._waited > self._patience:
             raise RunError(
-                f"{READY_SECONDS:.0f} s after the run was held before slot {self.at}, {problem}; look at the logs"
+                f"{self._patience:.0f} s after the run was held before slot {self.at}, {problem}; look at the logs"
             )
 
     def _may(self, act: Act) -> bool:
@@ -201,7 +213,8 @@ class Steering:
             self._conductor.absent |= set(act.names)
         action = act.effect.action
         if action is not None:
-            self._waiting, self._confirmed, self._since = (act, action), False, world().monotonic()
+            self._waiting, self._confirmed = (act, action), False
+            self.restart_limit()
             self._on_event(ProcessRequest(action, act.names[0], k, len(self.events)))
 
     def _obey(self, k: int, order: Order) -> None:
@@ -284,8 +297,8 @@ class Steering:
         return {name: tuple(timeline[name]) for name in sorted(self._changed)}
 
     def restart_limit(self) -> None:
-        """Let processes that were cut off have the whole time limit of the hold."""
-        self._since = world().monotonic()
+        """Let processes have the whole time limit of the hold, such as those that were cut off."""
+        self._waited, self._polled = 0.0, world().monotonic()
 
     def remind(self) -> None:
         """Send the last commands again, which may have been lost with a connection.
