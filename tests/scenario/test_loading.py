@@ -41,7 +41,7 @@ from tests.golden.pages import Golden
         ("process.A", [[1.0, 2.0]], "process.A"),
         ("process.A", [[1.0], [1.0, 2.0]], "process.A"),
         ("process.A", [], "process.A"),
-        ("process.A.0.1", float("inf"), "process.A"),
+        ("process.A.0.1", float("inf"), "process.A.0.1"),
         ("process.A.0.1", 10**400, "process.A.0.1"),
         ("process.A.0.1", "x", "process.A.0.1"),
         ("process.Q", [[1e-3]], "process.Q"),

@@ -112,6 +112,26 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"plant__disturbance_values": [[0.0, 1.0], [1.0], [1.0], [1.0]]},
         "plant.disturbance_values",
     ),
+    "an infinite disturbance": (
+        {"plant__disturbance_values": [[0.0, 1.0], [1.0, np.inf], [1.0, 0.0], [1.0, 0.0]]},
+        "plant.disturbance_values.1.1",
+    ),
+    "no number in a matrix": (
+        {"plant__disturbance_matrix": [[1.0, np.nan], [0.0, 0.0]]},
+        "plant.disturbance_matrix.0.1",
+    ),
+    "no number as noise": ({"plant__noise": [[np.nan, 0.0], [0.0, 0.0]]}, "plant.noise.0.0"),
+    "too large disturbances": (
+        {"plant__disturbance_values": [[0.0, 1.0], [1.0, -1e101], [1.0, 0.0], [1.0, 0.0]]},
+        "plant.disturbance_values",
+    ),
+    "too large a start": ({"plant__start": [1e101, 50.0], "plant__state_upper": None}, "plant.start"),
+    "name of a disturbance": ({"plant__disturbances": ["P_solar", "load, kW"]}, "plant.disturbances"),
+    "unit of a disturbance": ({"plant__disturbance_units": ["kW", "[kW]"]}, "plant.disturbance_units"),
+    "disturbances without names": (
+        {"plant__disturbances": None, "plant__disturbance_matrix": None},
+        "plant.disturbances",
+    ),
     "no plant": (
         {"plant": None},
         "plant",

@@ -17,6 +17,8 @@ from evedrop.model.controllers import CONTROLLERS, LONGEST_PERIOD, Assignment
 from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.plant import Plant
 from evedrop.model.process import MOST_STATES, Floats, Process
+from evedrop.model.slot.cores import LARGEST
+from evedrop.scenario.process import row_mistake, word_mistake
 from evedrop.scenario.table import Matrix, Mistake, Number, Table, one_of, parameter_mistakes
 from evedrop.scenario.words import as_toml
 
@@ -73,10 +75,16 @@ class PlantTable(Table):
         rows, disturbances = self.disturbance_values, len(self.disturbances)
         if disturbances and rows is None:
             yield "disturbance_file", 'is missing; expected disturbance_file = "day.csv", or disturbance_values'
-        wrong = next((i for i, row in enumerate(rows or ()) if len(row) != disturbances), None)
-        if rows is not None and wrong is not None:
-            few = f"row {wrong} has {len(rows[wrong])} numbers; expected {disturbances}, one for each of disturbances"
-            yield "disturbance_values", few
+        elif rows is not None and not disturbances:
+            yield "disturbances", 'is missing; expected the names of the disturbances, such as ["P_solar", "P_load"]'
+        elif rows is not None and (sentence := row_mistake(rows, disturbances, "of disturbances")) is not None:
+            yield "disturbance_values", sentence
+        for entry, words in (("disturbances", self.disturbances), ("disturbance_units", self.disturbance_units or [])):
+            if (sentence := word_mistake(words)) is not None:
+                yield entry, sentence
+        large = next((value for value in self.start or () if abs(value) > LARGEST), None)
+        if large is not None:
+            yield "start", f"has {large:g}; expected numbers of up to {LARGEST:g}"
 
 
 def _named_mistakes(

@@ -8,7 +8,7 @@ Source: docs/scenario.md, process; docs/programs.md.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -83,9 +83,8 @@ def source_mistakes(table: ProcessTable, n: int) -> Iterator[Mistake]:
     if table.given and table.states is None:
         yield "states", 'is missing; expected the names of the states in file or message, such as states = ["x", "y"]'
     for entry, words in (("states", table.states or []), ("units", table.units or [])) if table.given else ():
-        wrong = next((word for word in words if not _WORD.fullmatch(word)), None)
-        if wrong is not None:
-            yield entry, f'has {as_toml(wrong)}; expected words for the first line of a CSV file, without [ ] , " and #'
+        if (sentence := word_mistake(words)) is not None:
+            yield entry, sentence
         elif entry == "states" and len({*words}) < len(words):
             yield entry, "has a name twice; expected different names"
     if not table.given and table.theory is not None:
@@ -93,20 +92,29 @@ def source_mistakes(table: ProcessTable, n: int) -> Iterator[Mistake]:
     offsets = None if table.zenoh is None else table.zenoh.offsets
     if offsets is not None and len(offsets) != n:
         yield "zenoh.offsets", f"has {len(offsets)} entries; expected {n}, one for each state"
-    if table.state_values is not None:
-        yield from _row_mistakes(table.state_values, n)
+    if table.state_values is not None and (sentence := row_mistake(table.state_values, n, "state")) is not None:
+        yield "state_values", sentence
 
 
-def _row_mistakes(rows: list[list[float]], n: int) -> Iterator[Mistake]:
-    wrong = next((i for i, row in enumerate(rows) if len(row) != n), None)
+def word_mistake(words: Sequence[str]) -> str | None:
+    """What is wrong with words that the first line of a CSV file cannot have; None if it can have all."""
+    wrong = next((word for word in words if not _WORD.fullmatch(word)), None)
+    if wrong is None:
+        return None
+    return f'has {as_toml(wrong)}; expected words for the first line of a CSV file, without [ ] , " and #'
+
+
+def row_mistake(rows: Sequence[Sequence[float]], count: int, each: str) -> str | None:
+    """What is wrong with rows of this many numbers, one for each of what `each` names; None if nothing is."""
+    wrong = next((i for i, row in enumerate(rows) if len(row) != count), None)
     if wrong is not None:
-        yield "state_values", f"row {wrong} has {len(rows[wrong])} numbers; expected {n}, one for each state"
-        return
-    values = np.array(rows, np.float64).reshape(-1, n)
+        return f"row {wrong} has {len(rows[wrong])} numbers; expected {count}, one for each {each}"
+    values = np.array(rows, np.float64).reshape(-1, count)
     large = np.argwhere(~(np.abs(values) <= LARGEST))
-    if large.size:
-        i, j = large[0]
-        yield "state_values", f"row {i} has {values[i, j]:g}; expected finite numbers of up to {LARGEST:g}"
+    if not large.size:
+        return None
+    i, j = large[0]
+    return f"row {i} has {values[i, j]:g}; expected finite numbers of up to {LARGEST:g}"
 
 
 _MATRICES = ("A", "Q", "initial_covariance")

@@ -87,7 +87,7 @@ def _process_name(name: str) -> str:
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Probability = Annotated[float, Field(strict=True), AfterValidator(_probability)]
 ProcessName = Annotated[str, AfterValidator(_process_name)]
-Matrix = list[list[Annotated[float, Field(strict=True)]]]
+Matrix = list[list[Number]]
 Mistake = tuple[str, str]
 """A mistake in a table: the entry and a description."""
 
