@@ -247,6 +247,18 @@ def test_delays_are_found_again(name: str, delays: Any, spec: dict[str, float], 
     assert {entry: best.spec[entry] for entry in spec} == pytest.approx(spec, abs=bound + 1e-12)
 
 
+@pytest.mark.parametrize(("count", "lost"), [(60_000, 1), (60_000, 2), (20_000, 1)])
+def test_a_link_that_loses_almost_nothing_keeps_its_losses(tmp_path: Path, count: int, lost: int) -> None:
+    """With four digits, in the link as in the table; gaps are as long as they were."""
+    outcomes = np.ones(count, np.uint8)
+    outcomes[np.linspace(1000, count - 1000, lost).astype(int)] = 0
+    fitted = fit(save(tmp_path, outcomes))
+    quality = fitted.link["loss"]["quality"]
+    assert 1.0 - quality == pytest.approx(lost / count, rel=1e-3)
+    assert fitted.gaps.fitted == pytest.approx(count / lost)
+    assert f"quality = {quality:.10g} (" in fitted.chosen.text
+
+
 def test_delays_beside_outcomes(tmp_path: Path) -> None:
     """A column `delay` is taken by itself, another one by its name; lost packets have none; the line has both models."""
     outcomes = recorded(BERNOULLI, 1000)

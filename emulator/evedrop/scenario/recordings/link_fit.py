@@ -222,13 +222,18 @@ class Candidate:
     """One model with its most likely parameters."""
 
     name: str
-    spec: Mapping[str, Any]
-    """The model as a scenario describes it: `model`, and the parameters."""
+    exact: Mapping[str, Any]
+    """`model`, and the parameters, not rounded."""
     log_likelihood: float
     parameters: int
     """The number of parameters that were estimated."""
     intervals: Mapping[str, Interval] = field(default_factory=dict)
     """95 % confidence intervals, for parameters that have a simple one."""
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """The model as a scenario describes it: `model`, and the parameters, rounded."""
+        return {name: value if name == "model" else _rounded(name, value) for name, value in self.exact.items()}
 
     def bic(self, count: int) -> float:
         """Schwarz's criterion for `count` observations; smaller is better."""
@@ -238,7 +243,7 @@ class Candidate:
         """The candidate as JSON values."""
         return {
             "name": self.name,
-            "spec": dict(self.spec),
+            "spec": self.spec,
             "log_likelihood": self.log_likelihood if math.isfinite(self.log_likelihood) else None,
             "bic": self.bic(count) if math.isfinite(self.log_likelihood) else None,
             "intervals": {name: list(interval) for name, interval in self.intervals.items()},
@@ -250,10 +255,8 @@ class Candidate:
         parts = []
         for name, value in self.spec.items():
             if name != "model":
-                interval = self.intervals.get(name)
-                parts.append(
-                    f"{name} = {value:.4g}" + (f" ({interval[0]:.4g} … {interval[1]:.4g})" if interval else "")
-                )
+                bounds = [f"{_rounded(name, bound):.10g}" for bound in self.intervals.get(name, ())]
+                parts.append(f"{name} = {value:.10g}" + (f" ({' … '.join(bounds)})" if bounds else ""))
         return ", ".join(parts)
 
 
@@ -278,17 +281,25 @@ def rounded(value: float) -> float:
     return float(f"{value:.4g}")
 
 
+def _rounded(parameter: str, value: float) -> float:
+    """The same for a parameter of a model; of a quality close to 1, the rest to 1, the loss, has four digits."""
+    loss = 1.0 - value
+    if parameter != "quality" or not 0.0 < loss < 0.1:
+        return rounded(value)
+    return round(value, 3 - math.floor(math.log10(loss)))
+
+
 def delay_candidates(delays: Floats) -> list[Candidate]:
     """Models for delays in slots, (packets,): constant if all are equal, otherwise normal, or Pareto if none is 0."""
     count, least, mean = len(delays), float(delays.min()), float(delays.mean())
     if least == float(delays.max()):
-        return [Candidate("constant", {"model": "constant", "value": rounded(least)}, 0.0, 1)]
+        return [Candidate("constant", {"model": "constant", "value": least}, 0.0, 1)]
     standard_deviation = float(delays.std())
     spread = -0.5 * count * (math.log(2.0 * math.pi * standard_deviation * standard_deviation) + 1.0)
     candidates = [
         Candidate(
             "normal",
-            {"model": "normal", "mean": rounded(mean), "standard_deviation": rounded(standard_deviation)},
+            {"model": "normal", "mean": mean, "standard_deviation": standard_deviation},
             spread,
             2,
             {
@@ -304,7 +315,7 @@ def delay_candidates(delays: Floats) -> list[Candidate]:
         candidates.append(
             Candidate(
                 "pareto",
-                {"model": "pareto", "least": rounded(least), "shape": rounded(shape)},
+                {"model": "pareto", "least": least, "shape": shape},
                 likelihood,
                 2,
                 {"shape": normal_interval(shape, shape / math.sqrt(count))},
@@ -320,7 +331,7 @@ def bernoulli(outcomes: Outcomes) -> Candidate:
     likelihood = hits * math.log(quality) + (count - hits) * math.log1p(-quality)
     return Candidate(
         "bernoulli",
-        {"model": "bernoulli", "quality": rounded(quality)},
+        {"model": "bernoulli", "quality": quality},
         likelihood,
         1,
         {"quality": wilson(hits, count)},
@@ -338,7 +349,7 @@ def gilbert(outcomes: Outcomes) -> Candidate:
     model = TwoStates(min(p, 1.0), min(r, 1.0), 0.0, 1.0)
     return Candidate(
         "gilbert",
-        {"model": "gilbert-elliott", "p": rounded(model.p), "r": rounded(model.r)},
+        {"model": "gilbert-elliott", "p": model.p, "r": model.r},
         model.log_likelihood_of_states(outcomes == 0),
         2,
         {"p": wilson(worse, max(1, from_good)), "r": wilson(better, max(1, from_bad))},
@@ -348,8 +359,8 @@ def gilbert(outcomes: Outcomes) -> Candidate:
 def gilbert_elliott(outcomes: Outcomes) -> Candidate:
     """Gilbert and Elliott's model with all four parameters, by expectation-maximisation."""
     model, likelihood = most_likely(outcomes, _starts(outcomes))
-    spec = {"model": "gilbert-elliott", "p": rounded(model.p), "r": rounded(model.r)}
-    spec |= {"good": rounded(model.good), "bad": rounded(model.bad)}
+    spec = {"model": "gilbert-elliott", "p": model.p, "r": model.r}
+    spec |= {"good": model.good, "bad": model.bad}
     return Candidate("gilbert-elliott", spec, likelihood, 4)
 
 
@@ -497,7 +508,7 @@ class Fit:
     def link(self) -> dict[str, Any]:
         """The link as a scenario describes it."""
         delay = self.chosen_delay
-        return {"loss": dict(self.chosen.spec)} | ({} if delay is None else {"delay": dict(delay.spec)})
+        return {"loss": self.chosen.spec} | ({} if delay is None else {"delay": delay.spec})
 
     @property
     def toml(self) -> str:
@@ -599,7 +610,7 @@ def _check(name: str, outcomes: Outcomes) -> None:
 
 def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> RunLengths:
     lengths = lengths_of(outcomes == 0 if lost else outcomes == 1)
-    distribution = RunLengthDistribution.of(chosen.spec, lost)
+    distribution = RunLengthDistribution.of(chosen.exact, lost)
     return RunLengths(
         len(lengths),
         float(lengths.mean()) if len(lengths) else None,
