@@ -123,7 +123,7 @@ def _without_classes(tables: dict[str, Any]) -> set[str]:
 
     Returns the receivers whose loss model was replaced. What is not valid stays, for the check of the tables.
     """
-    unknown = set()
+    unknown, plain = set(), set()
     encoding, legitimate, others = (tables.get(name) for name in ("encoding", LEGITIMATE, "eavesdroppers"))
     if isinstance(encoding, dict) and _is_foreign(SCHEMES, encoding.get("scheme")):
         tables["encoding"] = {"scheme": _ANY_SCHEME}
@@ -142,12 +142,39 @@ def _without_classes(tables: dict[str, Any]) -> set[str]:
             table.update({**strategy, **kept})
         links = table.get("links")
         for link in [table.get("link"), *(links if isinstance(links, list) else [])]:
-            if isinstance(link, dict) and foreign(link) and _plain_link(link):
-                unknown.add(name)
+            if isinstance(link, dict) and foreign(link):
+                plain.add(name)
+                if _plain_link(link):
+                    unknown.add(name)
     events = tables.get("event")
     if isinstance(events, list):
-        tables["event"] = [event for event in events if not foreign(event)]
+        tables["event"] = _plain_events(events, plain)
     return unknown
+
+
+def _plain_events(events: list[Any], plain: set[str]) -> list[Any]:
+    """The events without own classes; of changes of links that lack something, those of losses.
+
+    plain: the receivers of such links. Links whose changes are left out are such links, too.
+    """
+    lacking = plain.union(*(_links_in(event) for event in events if foreign(event)))
+    kept = []
+    for event in events:
+        if foreign(event):
+            continue
+        if isinstance(event, dict) and isinstance(event.get("set"), dict) and not lacking.isdisjoint(_links_in(event)):
+            changes = {entry: value for entry, value in event["set"].items() if entry in _PLAIN_LINK}
+            if changes:
+                kept.append({**event, "set": changes})
+        else:
+            kept.append(event)
+    return kept
+
+
+def _links_in(event: Any) -> set[str]:
+    """The receivers whose links a table of an event changes, as far as it is valid."""
+    names = event.get("link") if isinstance(event, dict) else None
+    return {name for name in (names if isinstance(names, list) else [names]) if isinstance(name, str)}
 
 
 def _plain_link(link: dict[str, Any]) -> bool:
