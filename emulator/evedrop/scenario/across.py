@@ -56,10 +56,7 @@ def event_mistakes(scenario: Scenario) -> Iterator[str]:
     for i, event in enumerate(scenario.event):
         path = f"event.{i}"
         yield from _when_mistakes(path, event, scenario.slots)
-        for name in event.names:
-            if name not in scenario.receivers:
-                hint = ": it is not a receiver" if name in ("sensor", "router", "recorder") else ""
-                yield f"{path}.{event.names_in}: names {as_toml(name)}{hint}; expected {listed(scenario.receivers)}"
+        yield from _name_mistakes(path, event, scenario.receivers)
         yield from _own(path, type(event), partial(_compared, path, event, surroundings))
     yield from _changes_mistakes(scenario)
     yield from _order_mistakes(scenario)
@@ -67,6 +64,16 @@ def event_mistakes(scenario: Scenario) -> Iterator[str]:
     for kind in kinds:
         events = [(i, event) for i, event in enumerate(scenario.event) if type(event) is kind]
         yield from _own(f"event.{events[0][0]}", kind, partial(kind.in_turn, events))
+
+
+def _name_mistakes(path: str, event: EventKind, receivers: Sequence[str]) -> Iterator[str]:
+    """Names in an event, and in the acts of an event of a package, that are not receivers."""
+    entries = dict.fromkeys((name, str(event.names_in)) for name in event.names)
+    entries |= dict.fromkeys((name, act.entry) for act in event.acts() for name in act.names if name not in event.names)
+    for name, entry in entries:
+        if name not in receivers:
+            hint = ": it is not a receiver" if name in ("sensor", "router", "recorder") else ""
+            yield f"{path}.{entry}: names {as_toml(name)}{hint}; expected {listed(receivers)}"
 
 
 def _compared(path: str, event: EventKind, surroundings: Surroundings) -> Iterator[str]:
@@ -100,6 +107,8 @@ def _when_mistakes(path: str, event: EventKind, slots: int) -> Iterator[str]:
         yield f"{path}.{entry}: is {event.first}, but the last slot is {slots - 1}; expected a slot of the run"
     if event.to is not None and event.to > slots:
         yield f"{path}.to: is {event.to}; expected at most {slots}, the end of the run"
+    elif (late := max(act.at for act in event.acts())) > max(slots, event.first):
+        yield f"{path}.{event.kind}: has an act at slot {late}; expected at most {slots}, the end of the run"
 
 
 def _changes_mistakes(scenario: Scenario) -> Iterator[str]:

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from evedrop.model.slot.link import NEVER
 from evedrop.scenario.events import EVENTS
-from evedrop.scenario.events.event import EventKind
+from evedrop.scenario.events.event import Act, EventKind, Jamming
+from evedrop.scenario.timeline import Timeline
 from tests.builders import digests_of
 from tests.conftest import Evedrop
 from tests.packages import install
@@ -91,6 +93,28 @@ FAILING = {
     "no acts": (BEGIN, "        return None\n", "acts() gave none; expected an Act, or several"),
     "other acts": (BEGIN, "        yield 3\n", "acts() gave 3; expected an Act with an effect"),
     "no receiver": ('    names_in = "dim"\n', "", "it names no receiver; expected one, or several"),
+    "before the run": ("self.first + 1", "-5", "acts() gave an act at -5; expected a slot, 0 to "),
+    "no slot": ("self.first + 1", "self.first + 0.5", "acts() gave an act at 20.5; expected a slot"),
+    "beyond the run": (
+        "self.first + 1",
+        "self.first + 41",
+        "event.0.dim: has an act at slot 61; expected at most 60, the end of the run",
+    ),
+    "no receivers": (
+        "self.kind, self.names",
+        "self.kind, ('nobody',)",
+        'event.0.dim: names "nobody"; expected legitimate or',
+    ),
+    "a text of names": (
+        "self.kind, self.names",
+        "self.kind, 'smart'",
+        "acts() gave an act with the names 'smart'; expected a tuple of receivers",
+    ),
+    "no entries": (
+        "LinkSettings(None)",
+        "LinkSettings(5)",
+        "acts() gave an act that changes 5; expected a dict of entries",
+    ),
     "mistakes raise": (
         "    def acts",
         "    def mistakes(self):\n        raise ValueError('no')\n\n    def acts",
@@ -123,6 +147,13 @@ def test_an_event_that_fails_is_a_mistake_of_who_uses_it(evedrop: Evedrop, case:
     assert done.status == 2
     assert message in done.err
     assert "Traceback" not in done.err
+
+
+def test_an_attack_that_only_ends_is_none() -> None:
+    """An own class may end what nothing began."""
+    end = Act(5, "dim", (), "over", Jamming(on=False))
+    begin = Act(7, "dim", (), "again", Jamming(on=True))
+    assert Timeline((end, begin), {}, {}).jams == [(7, NEVER)]
 
 
 def test_an_event_that_names_nobody_is_a_mistake(evedrop: Evedrop) -> None:

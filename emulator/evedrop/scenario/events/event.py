@@ -271,12 +271,18 @@ class EventKind(When):
 
 
 def _expect_acts(acts: Sequence[object]) -> None:
-    """Raise NoAnswer unless these are acts, at least one, and each names as many receivers as its effect needs."""
+    """Raise NoAnswer unless these are acts, at least one, each at a slot, with as many names as its effect needs."""
     if not acts:
         raise NoAnswer("acts() gave none; expected an Act, or several")
     for act in acts:
         if not isinstance(act, Act) or not isinstance(act.effect, Effect):
             raise NoAnswer(f"acts() gave {act!r:.60}; expected an Act with an effect")
+        if type(act.at) is not int or not 0 <= act.at <= MOST_SLOTS:
+            raise NoAnswer(f"acts() gave an act at {act.at!r:.60}; expected a slot, 0 to {MOST_SLOTS}")
+        if isinstance(act.names, str) or not all(isinstance(name, str) for name in act.names):
+            raise NoAnswer(f"acts() gave an act with the names {act.names!r:.60}; expected a tuple of receivers")
+        if not isinstance(act.effect.entries, Mapping | None):
+            raise NoAnswer(f"acts() gave an act that changes {act.effect.entries!r:.60}; expected a dict of entries")
         if not act.names and act.effect.needs_receivers:
             raise NoAnswer("it names no receiver; expected one, or several")
         if len(act.names) != 1 and act.effect.one_receiver:
