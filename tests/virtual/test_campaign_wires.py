@@ -284,11 +284,11 @@ def test_the_history_of_a_lossless_topic_is_lossless() -> None:
 
 @pytest.mark.campaign
 def test_a_wire_whose_zenoh_hangs_ends_by_itself() -> None:
-    """And says where it hangs."""
-    played = replace(PLAIN, starts=1, further=(HUNG,)).play()
-    assert played.misses == ()
-    assert "nothing has moved at the side" in played.run.said
-    assert played.run.status == 3
+    """And says where it hangs. The seed decides whether a question hangs."""
+    several = [replace(PLAIN, seed=seed, starts=1, further=(HUNG,)).play() for seed in range(1, 9)]
+    assert {played.misses for played in several} == {()}
+    hung = [played.run.status for played in several if "nothing has moved at the side" in played.run.said]
+    assert set(hung) == {3}
 
 
 @pytest.mark.campaign

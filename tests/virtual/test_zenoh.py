@@ -34,6 +34,8 @@ from tests.virtual.networks import (
 BLOCK, DROP = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
 PUT, DELETE = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
 END = b"end"
+ROUTING = 0
+"""The number of Zenoh's routing among those who answer."""
 Right = tuple[str, str, str]
 USERS = ("writer", "reader")
 
@@ -1559,6 +1561,7 @@ def test_a_question_can_be_answered_with_an_error(net: Network) -> None:
     [reply] = net.until(lambda: [*asker.get("a/b", timeout=60.0)])
     assert reply.ok is None
     assert reply.err.payload.to_bytes() == b"not now"
+    assert reply.replier_id.eid != ROUTING
 
 
 @behaviour
@@ -1670,6 +1673,7 @@ def test_a_question_ends_when_its_time_is_over(net: Network) -> None:
     assert net.now() - began >= 0.4
     assert {reply.ok for reply in replies} == {None}
     assert {reply.err.payload.to_bytes() for reply in replies} == {b"Timeout"}
+    assert {reply.replier_id is None or reply.replier_id.eid == ROUTING for reply in replies} == {True}
 
 
 @behaviour

@@ -72,11 +72,23 @@ class ReplyError:
 
 
 @dataclass(frozen=True)
+class Replier:
+    """Who sent an answer."""
+
+    eid: int
+
+
+QUERYABLE = Replier(1)
+"""A queryable. Zenoh's routing, which sends nothing here, is number 0."""
+
+
+@dataclass(frozen=True)
 class VirtualReply:
-    """An answer to a question, or an error."""
+    """An answer to a question, or an error; without a replier that of the querier, whose time for answers is over."""
 
     ok: VirtualSample | None
     err: ReplyError | None = None
+    replier_id: Replier | None = QUERYABLE
 
 
 def bytes_of(payload: bytes | str | zenoh.ZBytes | None) -> bytes:

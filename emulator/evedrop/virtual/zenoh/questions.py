@@ -289,4 +289,4 @@ class VirtualQuestions:
 
     def _give_up(self, number: int) -> None:
         if number in self._asked:
-            self._finish(number, VirtualReply(None, ReplyError(zenoh.ZBytes(b"Timeout"))))
+            self._finish(number, VirtualReply(None, ReplyError(zenoh.ZBytes(b"Timeout")), None))
