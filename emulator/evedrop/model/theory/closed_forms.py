@@ -690,8 +690,8 @@ def growth_by_phases(process: Process, coded: float, received: float, acknowledg
     was heard by the receiver, and that it is acknowledged and was not heard.
     """
     between, in_phase = _growths(process, received, acknowledged)
-    if in_phase == 0.0:
-        return 0.0
+    if in_phase == 0.0 or coded == 0.0:
+        return in_phase
     if not (math.isfinite(between) and math.isfinite(in_phase) and math.isfinite(coded)):
         return math.inf
     exponent = coded * math.log(between) + math.log(in_phase)
@@ -705,7 +705,7 @@ def most_coded(process: Process, received: float, acknowledged: tuple[float, flo
         return -1.0
     if in_phase == 0.0 or between <= 1.0:
         return math.inf
-    return math.ceil(-math.log(in_phase) / math.log(between)) - 1.0
+    return max(0.0, math.ceil(-math.log(in_phase) / math.log(between)) - 1.0)
 
 
 def _growths(process: Process, received: float, acknowledged: tuple[float, float]) -> tuple[float, float]:
