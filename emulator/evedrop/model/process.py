@@ -8,7 +8,7 @@ Source: docs/mathematics/model.md, model.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +28,7 @@ Limits = np.ndarray[tuple[int], np.dtype[np.float64]]
 
 MARGINAL = 1e-7
 """An eigenvalue of A within this distance of the unit circle counts as on it: computing a double one has errors of 1e-8."""
+_LAST_BITS = 2.0**-50
 MOST_STATES = 64
 """The most states of a process: some computations before a run take a time that grows with n³ or faster."""
 _SLOTS_AT_ONCE = 1024  # whose factors are passed over
@@ -41,6 +42,28 @@ def product(M: Floats, x: Floats) -> Floats:
         products: Floats = kernels.product(M[None], x[None])[0]
         return products
     return kernels.product(np.broadcast_to(M, (len(x), *M.shape[-2:])), x)
+
+
+def eigenvalues(A: Floats) -> NDArray[np.complex128]:
+    """The eigenvalues of A, (n,): where rounding has split a multiple one, which it does by up to 1e-5 and more, its mean.
+
+    Those that lie no further apart than a change of the last bits of A moves them count as one.
+    """
+    values = np.linalg.eigvals(A).astype(np.complex128)
+    signs, moved = np.random.default_rng(0).choice((-_LAST_BITS, _LAST_BITS), (4, *A.shape)), np.zeros(len(A))
+    for changed in np.linalg.eigvals(A * (1.0 + signs)):
+        moved = np.maximum(moved, np.abs(values[:, None] - changed).min(axis=1))
+    one = np.abs(values[:, None] - values) <= 4.0 * (moved[:, None] + moved)
+    for _ in range(len(A).bit_length()):
+        one = one @ one
+    means: NDArray[np.complex128] = (one @ values) / one.sum(axis=1)
+    return means
+
+
+def modulus_in(A: Floats) -> Callable[[float, float], float]:
+    """A function of the real and the imaginary part of an eigenvalue of A, as computed: its modulus by `eigenvalues`."""
+    values = eigenvalues(A)
+    return lambda real, imaginary: float(np.abs(values[np.abs(values - complex(real, imaginary)).argmin()]))
 
 
 @dataclass(frozen=True)
@@ -71,7 +94,7 @@ class Process:
     @cached_property
     def spectral_radius(self) -> float:
         """ρ(A): largest modulus of an eigenvalue of A."""
-        return float(np.max(np.abs(np.linalg.eigvals(self.A))))
+        return float(np.max(np.abs(eigenvalues(self.A))))
 
     @cached_property
     def _Q_column(self) -> Floats:

@@ -9,7 +9,7 @@ import pytest
 
 from evedrop.model.process import Process
 from evedrop.model.theory.closed_forms import ClearStatesForm
-from evedrop.model.theory.covariances import NOBODY, Outcomes, growth, theoretical_covariances
+from evedrop.model.theory.covariances import NOBODY, Outcomes, growth, radius, stability_bound, theoretical_covariances
 
 TURNED, _ = np.linalg.qr(np.random.default_rng(3).standard_normal((4, 4)))
 MIXED = Process(TURNED @ np.diag([1.3, 1.1, 1.0, 0.6]) @ TURNED.T, np.eye(4), np.eye(4))
@@ -40,6 +40,25 @@ def test_an_error_grows_where_it_is_kept_longer_than_it_shrinks(outcomes: Outcom
     for i, expected in enumerate(grows):
         before, after = (float(P[i, i]) for P in late)
         assert (after > 1.5 * before) is expected
+
+
+@pytest.mark.parametrize(
+    "A", [[[3.0, -3.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[-3.0, -1.0, -1.5], [6.0, 2.0, 2.5], [8.0, 2.0, 4.0]]]
+)
+def test_a_triple_root_is_one_root(A: list[list[float]]) -> None:
+    """Rounding splits 1 into three roots that are 1e-5 apart, some inside the unit circle; the error grows in all directions."""
+    process = Process(np.array(A), np.eye(3), np.eye(3))
+    assert radius(process) == 1.0
+    assert stability_bound(process, 0.5) == 0.0
+    assert growth(process, NOBODY).basis.shape == (3, 3)
+    assert growth(process, Outcomes.plain(0.5)).basis.shape == (3, 0)
+
+
+def test_roots_that_are_near_each_other_are_not_one() -> None:
+    """Where nothing moves them: the eigenvalues of a symmetric A."""
+    process = Process(np.array([[1.0, 1e-5], [1e-5, 1.0]]), np.eye(2), np.eye(2))
+    assert process.spectral_radius == pytest.approx(1.00001, abs=1e-12)
+    assert growth(process, NOBODY).basis.shape == (2, 1)
 
 
 def test_a_direction_is_not_an_eigenvector() -> None:

@@ -15,7 +15,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from evedrop.model.process import MARGINAL, Floats, Process
+from evedrop.model.process import MARGINAL, Floats, Process, modulus_in
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 
 _BLOCK = 256  # slots computed from one starting point: long enough to hide Python's overhead, quick to set up (3 ms)
@@ -419,7 +419,9 @@ def unstable_part(A: Floats, within: Floats, least: float) -> Floats:
 
     if not within.shape[1]:
         return within
-    _, Z, count = schur(within.T @ A @ within, sort=lambda real, imaginary: math.hypot(real, imaginary) >= least)
+    M = within.T @ A @ within
+    modulus = modulus_in(M)
+    _, Z, count = schur(M, sort=lambda real, imaginary: modulus(real, imaginary) >= least)
     part: Floats = within @ Z[:, :count]
     return part
 

@@ -19,7 +19,7 @@ import numpy as np
 from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.kernels.mixtures import Leak
-from evedrop.model.process import MARGINAL, Floats, Process, StateFactors, product
+from evedrop.model.process import MARGINAL, Floats, Process, StateFactors, modulus_in, product
 from evedrop.model.schedule import PACKETS, NoiseDistribution
 from evedrop.model.staircase import Staircase
 from evedrop.model.streams import Ahead
@@ -70,7 +70,8 @@ def _remaining_limit(A: Floats, Q: Floats, noise: Floats) -> Floats:
     """The same if noise reaches all states; noise: a factor of Q."""
     from scipy.linalg import schur  # noqa: PLC0415 - slow to import
 
-    T, Z, stable = schur(A.T, sort=lambda real, imaginary: math.hypot(real, imaginary) < 1.0 - MARGINAL)
+    modulus = modulus_in(A.T)
+    T, Z, stable = schur(A.T, sort=lambda real, imaginary: modulus(real, imaginary) < 1.0 - MARGINAL)
     if stable == 0:
         return Q
     dynamics = T[:stable, :stable].T
