@@ -10,7 +10,12 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.system import files
+from evedrop.system.world import world
 from evedrop.wire.history import WireHistory
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.run import _begin_results
+from tests.conftest import wait_until
+from tests.wire.wire_plans import wire_plan
 
 LOSS = {"model": "bernoulli", "quality": 1.0}
 
@@ -36,6 +41,34 @@ def test_a_change_that_cannot_be_written_is_in_force(tmp_path: Path, monkeypatch
     with pytest.raises(OSError, match="No space"):
         history.note("a way past the wire", 3.0, bypass=True)
     assert [event.line for event in history.events] == ["a way past the wire"]
+
+
+def test_a_change_is_soon_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A power cut after it leaves it, as the later records of the link need it; without a change, nothing is synced."""
+    plan = wire_plan()
+    with WireJournal(tmp_path, plan) as journal:
+        synced: list[Path] = []
+        monkeypatch.setattr(type(world().disk), "sync", lambda _, path: synced.append(path))
+        journal.change("scan", {"loss": LOSS}, {})
+        wait_until(lambda: synced, "the journal's thread has synced it")
+        journal.history.sync()
+        assert synced == [tmp_path / "journal" / "history.jsonl"]
+
+
+def test_the_file_of_an_earlier_start_stays_if_it_cannot_be_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without wire.toml, whole, no command reads the folder."""
+    _begin_results(tmp_path, wire_plan())
+    before = (tmp_path / "wire.toml").read_text()
+
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(type(world().disk), "sync", refuse)
+    _begin_results(tmp_path, wire_plan(scan={"loss": {**LOSS, "quality": 0.5}}))
+    assert (tmp_path / "wire.toml").read_text() == before
+    assert "wire.toml cannot be written" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,7 @@ class WireHistory:
     _settings: dict[str, list[_Settings]] = field(default_factory=dict)
     _of_new_keys: dict[str, tuple[Change, ...]] = field(default_factory=dict)
     """Link → the changes of all streams that had no message at any of them."""
+    _unsynced: bool = False
     _lock: AbstractContextManager[bool] = field(default_factory=lambda: world().lock(), repr=False, compare=False)
 
     @classmethod
@@ -110,6 +111,13 @@ class WireHistory:
         """Note other settings of a link. since: (key, kind of stream) → the first number that has them. Raises OSError."""
         rows = [[*stream, n] for stream, n in since.items()]
         self._write({"change": link, "time": now, "settings": dict(settings), "since": rows})
+        self._unsynced = True
+
+    def sync(self) -> None:
+        """Have the changes so far on the disk, also after a power cut: later records depend on them. Raises OSError."""
+        if self._unsynced:
+            self._unsynced = False
+            world().disk.sync(self.folder / _FILE)
 
     def note(self, line: str, now: float, bypass: bool = False) -> None:
         """Note an event. Raises OSError."""

@@ -243,6 +243,8 @@ class WireJournal:
             self.flush()
             with contextlib.suppress(OSError):  # only a killed wire needs to have noted it
                 self.place.beat()
+            with self.place.noting_errors():
+                self.history.sync()
             self.place.poll()
             self.records.tend(world().time())
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from evedrop.errors import Interrupted, RunError
 from evedrop.live.network.control_file import remove_control
-from evedrop.results.folder import make_private, new_folder, write_private
+from evedrop.results.folder import make_private, new_folder, replace_private
 from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE
 from evedrop.scenario.receivers import PUT
 from evedrop.show.report.wire import wire_failures
@@ -162,7 +162,7 @@ def _begin_results(out: Path, plan: WirePlan) -> None:
     except OSError as error:
         warn(f"the summary of an earlier start cannot be removed ({error}); the wire goes on")
     try:
-        write_private(out / WIRE_FILE, resolved_wire(plan))
+        replace_private(out / WIRE_FILE, resolved_wire(plan))
     except OSError as error:
         warn(f"wire.toml cannot be written ({error}); the wire goes on")
 
