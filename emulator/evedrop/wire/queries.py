@@ -169,7 +169,7 @@ class QueryRelay:
             return frozenset(self._mirrored[side])
 
     def _taker(self, name: str, key: str | None, earlier: Sequence[zenoh.KeyExpr] = ()) -> Any:
-        """What takes the queries of a queryable. earlier: expressions of others for everything, to which a query belongs first."""
+        """What takes the queries of a queryable, except those of queryables declared `earlier` with these expressions."""
 
         def take(query: zenoh.Query) -> None:
             if not any(expression.intersects(query.key_expr) for expression in earlier):
