@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.links import LOSS_MODELS, loss_of
 from evedrop.model.links.loss_model import Fate
-from evedrop.model.slot.link import Change
+from evedrop.model.slot.link import Change, Link
 from evedrop.model.streams import Stream, normals, root_of_seed, stream_key, uniforms
 from evedrop.wire.running_link import KeyFates, MessageFate, PerKeyLinks
 from tests.examples import examples
@@ -147,6 +147,30 @@ def test_many_messages_before_the_start() -> None:
     whole = of_scan(bursts)
     taken(whole, 70_000)
     assert taken(of_scan(bursts, start=70_000), 50) == taken(whole, 50)
+
+
+@pytest.mark.parametrize(("first", "decided"), [(POOR, 100), (FULL, 40_100)])
+def test_messages_without_memory_are_not_decided_again(
+    first: dict[str, Any], decided: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A key that comes back after very many messages holds up no other one; bursts before a change are the past."""
+    counted: list[int] = []
+    decide = Link._unchanged
+
+    def count(link: Link, slots: range) -> Any:
+        counted.append(len(slots))
+        return decide(link, slots)
+
+    monkeypatch.setattr(Link, "_unchanged", count)
+    changes = (Change(40_000, POOR), Change(60_000, {**POOR, "duplicate": 0.1}))
+    fates = of_scan(first, start=10**9, changes=changes)
+    result = taken(fates, 20)
+    assert sum(counted) <= decided
+    loss = loss_of(POOR["loss"])
+    key = stream_key(root_of_seed(SEED), "wire/link/scan/put/robot/scan")
+    u = uniforms(Stream(key, range(1), loss.uniforms_per_slot).words(range(10**9, 10**9 + 20))).transpose(0, 2, 1)
+    lost = loss.fates(10**9, u)[:, 0] == Fate.LOST
+    assert [code == Fate.LOST for code, _, _ in result] == lost.tolist()
 
 
 @settings(deadline=None, max_examples=examples(40))

@@ -31,7 +31,6 @@ MessageFate = tuple[int, float, bool]
 """`WireFate` code, delay in seconds, and whether a second copy arrives with the first."""
 _FIRST_BLOCK, _LARGEST_BLOCK = 8, 2048  # fates made at once: a key with few messages needs little time and memory
 _LITTLE = 64  # messages after which a key is not new any more
-_PASSED_AT_ONCE = 65_536
 _LATEST = 2**32 - 1  # seconds: more than the longest delay, so that no message is too late
 _BY_TIME = frozenset({"rate", "queue"})
 _MESSAGES = Batch(NEVER, 1)
@@ -126,8 +125,7 @@ class PerKeyLinks:
         short: whether it decides on few messages in all.
         """
         link = (self._short if short else self._long).like(_StreamKeys(self._stream_key, kind, key))
-        for first in range(0, start, _PASSED_AT_ONCE):
-            link.fates(range(first, min(first + _PASSED_AT_ONCE, start)))
+        link.skip(start)
         return link
 
 

@@ -83,6 +83,7 @@ class ReceiverOutage(NamedTuple):
     """Whether it continues from its last belief; otherwise from the prior of the slot in which it went away."""
 
 
+_READ_AT_ONCE = 65_536  # slots
 _SETTINGS = frozenset({"loss", "delay", "reorder", "duplicate", "corrupt", "rate", "queue"})
 MOST_RATE = 1e6
 """The highest rate of a link, in packets a slot."""
@@ -242,6 +243,18 @@ class Link:
                     self._apply(change)
             parts.append(self._unchanged(range(start, stop)))
         return parts[0] if len(parts) == 1 else _joined(parts)
+
+    def skip(self, stop: int) -> None:
+        """Go on with slot `stop`, as if all earlier ones had been read: few are, unless later losses depend on them."""
+        starts = sorted({0, *(change.at for change in self._changes if 0 < change.at < stop)})
+        for start, end in pairwise([*starts, stop]):
+            for change in self._changes:
+                if change.at == start:
+                    self._apply(change)
+            if self._state.loss.memoryless and not self._state.settings.get("rate"):
+                continue
+            for first in range(start, end, _READ_AT_ONCE):
+                self._unchanged(range(first, min(first + _READ_AT_ONCE, end)))
 
     def _apply(self, change: Change) -> None:
         if change.settings is not None:
