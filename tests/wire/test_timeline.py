@@ -137,3 +137,15 @@ def test_the_loss_model_of_correlated_links_cannot_change() -> None:
     assert len(mistakes_of(with_change, plan, {"link": "back", "set": other}, 2.0)) == 1
     assert with_change(plan, {"link": "robot-base", "set": other}, 2.0)[1].startswith("link robot-base: loss = ")
     assert with_change(plan, {"link": "back", "set": {"quality": 0.4}}, 2.0)[1].startswith("link back: loss = ")
+
+
+def test_an_operator_changes_a_wire_that_has_run_for_weeks() -> None:
+    """For longer than a file can say when something happens."""
+    weeks = 3e6
+    plan, message = with_change(plan_of(), {"cut": "scan"}, weeks)
+    assert message == "cut scan"
+    assert [moment_at(plan, time).cut for time in (weeks - 1.0, weeks)] == [frozenset(), {"scan"}]
+    plan, _ = with_change(plan, {"link": "scan", "set": {"quality": 0.25}}, weeks + 1.0)
+    assert quality(plan, weeks + 1.0) == 0.25
+    plan, _ = with_cut_ended(plan, "scan", weeks + 2.0)
+    assert moment_at(plan, weeks + 2.0).cut == frozenset()

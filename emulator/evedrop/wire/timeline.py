@@ -69,13 +69,13 @@ def with_change(plan: WirePlan, table: Mapping[str, Any], time: float) -> tuple[
     """
     now = moment_at(plan, time).settings
     try:
-        checked = WireEventTable.model_validate({"at": time, **table})
+        checked = WireEventTable.model_validate({"at": 0.0, **table})  # a wire may run for longer than a file can say
     except ValidationError as error:
         raise ScenarioError("event", sentences(error, WireEventTable)) from None
     links = {link.name: LinkNow(now[link.name], link.correlation is not None, link.ordered) for link in plan.links}
     if mistakes := list(event_mistakes(checked, [*plan.sides], links)):
         raise ScenarioError("event", mistakes)
-    event = wire_event(checked, now, {link.name: link.settings for link in plan.links})
+    event = replace(wire_event(checked, now, {link.name: link.settings for link in plan.links}), start=time)
     return replace(plan, events=(*plan.events, event)), _begun(event)
 
 
