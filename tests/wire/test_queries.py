@@ -13,6 +13,7 @@ from zenoh.ext import declare_advanced_publisher as advanced_publisher
 from zenoh.ext import declare_advanced_subscriber as advanced_subscriber
 
 from evedrop.wire.plan import LOST_HISTORY_SECONDS, Side
+from evedrop.wire.queries import QueryRelay
 from evedrop.wire.records import Kind, WireFate
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import (
@@ -362,3 +363,18 @@ def test_the_end_of_the_time_for_replies_is_no_message(tmp_path: Path) -> None:
             assert len(held) == n + 1
         assert kinds(wire)[before:] == [(Kind.QUERY, 0)] * 5
         held.clear()
+
+
+def test_a_query_was_heard_when_it_came(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Although the queries before it kept the wire busy: the journal has that time, and its delay counts from it."""
+    slow = {**PERFECT, "delay": {"model": "constant", "value": 1.5}}
+    with at_work(both_ways(slow), tmp_path) as wire, wire.program("robot") as asker, wire.program("base") as server:
+        offer(server, "map", b"x")
+        wait_until(lambda: answers(asker, "map"), "the queryable is there")
+        ask = QueryRelay._ask
+        monkeypatch.setattr(QueryRelay, "_ask", lambda relay, asked: (time.sleep(1.0), ask(relay, asked)))
+        begun, came = time.time(), time.monotonic()
+        assert answers(asker, "map") == [b"x"]
+        assert time.monotonic() - came < 2.3
+        (query,) = [row for row in wire.rows if row["kind"] == Kind.QUERY and row["time"] >= begun]
+        assert query["time"] - begun < 0.8

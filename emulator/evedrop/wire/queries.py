@@ -34,15 +34,25 @@ _MOST_WAITING = 100_000
 _ROUTING = 0  # the identifier of Zenoh's routing, which no queryable has
 
 
+_Times = tuple[float, float]
+"""The same moment in seconds since 1970, and in seconds of the monotonic clock."""
+
+
+def _now() -> _Times:
+    return world().time(), world().monotonic()
+
+
 @final
 class _Asked:
     """A query that was heard, until all its replies have arrived: then the asker is told that there are no more."""
 
-    def __init__(self, query: zenoh.Query, side: str, send_queue: SendQueue, query_seconds: float) -> None:
-        """send_queue: of the side at which it was asked."""
-        self.query, self.side, self._send_queue = query, side, send_queue
+    def __init__(
+        self, query: zenoh.Query, side: str, heard: _Times, send_queue: SendQueue, query_seconds: float
+    ) -> None:
+        """heard: when; send_queue: of the side at which it was asked."""
+        self.query, self.side, self.heard, self._send_queue = query, side, heard, send_queue
         self.key = str(query.key_expr)
-        self._over = world().monotonic() + reply_seconds(self.key, query_seconds)
+        self._over = heard[1] + reply_seconds(self.key, query_seconds)
         self._open = 1
         self._lock = world().lock()
 
@@ -95,7 +105,7 @@ class QueryRelay:
         self._lock = world().rlock()
         self._read = SenderReader(journal.words.source_code)
         self._patience = Scheduler(_MOST_WAITING, 0, lambda _: None)
-        self._heard: Queue[tuple[str, str | None, zenoh.Query] | None] = world().queue()
+        self._heard: Queue[tuple[str, str | None, zenoh.Query, _Times] | None] = world().queue()
         self.duty = Duty("among the queries")
         self._thread = world().thread(self._run, name="queries")
         self._queryables: list[tuple[str, Any]] = []
@@ -173,7 +183,7 @@ class QueryRelay:
 
         def take(query: zenoh.Query) -> None:
             if not any(expression.intersects(query.key_expr) for expression in earlier):
-                self._heard.put((name, key, query))
+                self._heard.put((name, key, query, _now()))
 
         # On the thread that Zenoh calls it on: the queries of a program stay in order.
         return world().zenoh.handlers.Callback(take, indirect=False)
@@ -181,8 +191,8 @@ class QueryRelay:
     def _run(self) -> None:
         while (heard := self._heard.get()) is not None:
             self.duty.in_hand = heard
-            name, key, query = heard
-            asked = _Asked(query, name, self._send_queues[name], self._plan.query_seconds)
+            name, key, query, when = heard
+            asked = _Asked(query, name, when, self._send_queues[name], self._plan.query_seconds)
             try:
                 if self._responsible(name, query.key_expr) == key:
                     self._ask(asked)
@@ -208,7 +218,8 @@ class QueryRelay:
             # The matching status knows only queryables that include the key.
             if "*" not in asked.key and not _matching(querier):
                 continue  # nobody there can hear it
-            self._cross(Kind.QUERY, asked, (asked.side, target), asked.key, key, self._question(asked, querier, target))
+            question = self._question(asked, querier, target)
+            self._cross(Kind.QUERY, asked, (asked.side, target), asked.key, key, question, asked.heard)
 
     def _question(self, asked: _Asked, querier: zenoh.Querier, target: str) -> _Message:
         query = asked.query
@@ -243,6 +254,7 @@ class QueryRelay:
                 asked.key,
                 query.key_expr,
                 _Message(lambda: query.reply_err(error.payload, encoding=error.encoding), error.payload),
+                _now(),
             )
             return
         assert answer is not None  # noqa: S101 - a reply without an error
@@ -263,13 +275,20 @@ class QueryRelay:
                 )
 
         message = _Message(send, answer.payload, answer.attachment, answer.source_info)
-        self._cross(Kind.REPLY, asked, (source, asked.side), str(answer.key_expr), answer.key_expr, message)
+        self._cross(Kind.REPLY, asked, (source, asked.side), str(answer.key_expr), answer.key_expr, message, _now())
 
     def _cross(
-        self, kind: Kind, asked: _Asked, way: tuple[str, str], key: str, expression: zenoh.KeyExpr, message: _Message
+        self,
+        kind: Kind,
+        asked: _Asked,
+        way: tuple[str, str],
+        key: str,
+        expression: zenoh.KeyExpr,
+        message: _Message,
+        heard: _Times,
     ) -> None:
-        """Let the link between two sides decide on a message, record it, and send it when it is due."""
-        now, since, size = world().time(), world().monotonic(), message.size
+        """Let the link between two sides decide on a message, record it, and send it when it is due. heard: when."""
+        (now, since), size = heard, message.size
         with self._lock:
             sender, sequence = self._read(message.attachment, message.source)
         code = self._journal.words.key_code(key, way[0])
