@@ -188,7 +188,7 @@ def test_what_is_too_skewed_is_refused() -> None:
 
     def doubt(populations: list[float]) -> str | None:
         errors = np.repeat(np.array(populations)[:, None], 3, axis=1)
-        estimate = SplitMeans(errors, (), 1.0).estimate(100, expected)
+        estimate = SplitMeans(errors, (), np.ones(errors.T.shape)).estimate(100, expected)
         assert (estimate.mean_error is None) == (estimate.doubt is not None)
         assert bool(estimate.slots) == (estimate.doubt is None)
         return estimate.doubt
@@ -199,6 +199,36 @@ def test_what_is_too_skewed_is_refused() -> None:
     assert "leaves double precision" in str(doubt([1.0, math.inf]))
     assert doubt([1.0, 1.01]) is None
     assert doubt([0.0, 0.0]) is None
+
+
+def test_estimates_do_not_depend_on_how_many_trials_are_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The populations are simulated in groups of about 2000 trials, for the memory; their numbers have the same bits."""
+    splitter, sizes = Splitter(heavy(), Mode.COVARIANCE_ONLY, "legitimate", 130), set()
+    simulate = Splitter._simulated
+
+    def counted(of: Splitter, numbers: range, splits: Any) -> SplitMeans:
+        sizes.add(len(numbers))
+        return simulate(of, numbers, splits)
+
+    monkeypatch.setattr(Splitter, "_simulated", counted)
+    groups = splitter.estimated()
+    assert sizes == {8, 15, 2}
+    monkeypatch.setattr("evedrop.simulate.splitting._SIDE_BY_SIDE", 10**6)
+    together = splitter.estimated()
+    assert 32 in sizes
+    assert groups.splits == together.splits != ()
+    np.testing.assert_array_equal(groups.errors, together.errors)
+    assert groups.counting == together.counting
+
+
+def test_a_stop_is_noticed_while_the_floor_is_computed() -> None:
+    """After the first slots, whose progress is told."""
+    told: list[int] = []
+    scenario = load("eavesdroppers", {"slots": 1000})
+    splitter = Splitter(scenario, Mode.COVARIANCE_ONLY, "legitimate", 100, lambda: True, told.append)
+    splitter.estimated()
+    assert len(told) == 1
+    assert told[0] < 8 * 100 * 1000 / 2
 
 
 def test_an_interrupted_study_has_no_estimates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

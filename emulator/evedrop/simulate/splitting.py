@@ -9,7 +9,7 @@ Source: docs/mathematics/verdicts.md, splitting; docs/montecarlo.md, rare events
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -84,6 +84,7 @@ POPULATIONS = 32
 LEAST_TRIALS = 100
 """The least number of trials of a population."""
 _PILOTS = 8  # populations that decide in which slots all others are split
+_SIDE_BY_SIDE = 2000  # trials
 _FIRST_TRIAL = 2**47  # far from the trials of any study, so that both are independent
 _SPLIT_BELOW = 0.5  # of the trials that count
 _WIDEST = 0.1  # of the mean: with a larger standard error the populations are too skewed for it to be true
@@ -98,8 +99,19 @@ class SplitMeans:
     """The estimate of each slot's mean error by each population, (P, slots)."""
     splits: tuple[int, ...]
     """The slots after which trials were copied."""
-    counting: float
-    """The least fraction of trials that counted in a slot, in the mean over populations."""
+    fractions: Floats
+    """The fraction of trials of each population that counted in each slot, (slots, P)."""
+
+    @classmethod
+    def joined(cls, parts: Sequence[SplitMeans]) -> SplitMeans:
+        """The means of several sets of populations that were split after the same slots, in their order."""
+        errors = np.concatenate([part.errors for part in parts])
+        return cls(errors, parts[0].splits, np.concatenate([part.fractions for part in parts], axis=1))
+
+    @property
+    def counting(self) -> float:
+        """The least fraction of trials that counted in a slot, in the mean over populations."""
+        return float(self.fractions.mean(axis=1).min())
 
     @property
     def of_populations(self) -> Floats:
@@ -159,15 +171,25 @@ class Splitter:
         self._key = stream_key(root_of_seed(scenario.seed), f"splitting/{receiver}")
         jammer = None if scenario.acknowledgements is None else scenario.acknowledgements.jammer
         self._others = scenario.eavesdroppers.keys() - {receiver, jammer}
-        pilots = range(_FIRST_TRIAL, _FIRST_TRIAL + _PILOTS * trials)
-        chunks = (chunk.receivers[receiver] for chunk in self._simulation(pilots, OWN).chunks())
-        errors = np.concatenate([self._size(piece) for piece in chunks])
-        self._floor = importance_floor(errors, float(np.trace(scenario.process.process.Q)))
+        scale = float(np.trace(scenario.process.process.Q))
+        floor = []
+        for _, _, sizes in self._chunks(range(_PILOTS), OWN):
+            floor.append(importance_floor(sizes, scale))
+            on_progress(sizes.size)
+            if stopped():
+                break
+        self._floor = np.concatenate(floor)
 
     def estimated(self, populations: int = POPULATIONS) -> SplitMeans:
         """The estimates of some populations, split in the slots in which pilots with other trials had to be split."""
         pilots = self._simulated(range(_PILOTS), None)
-        return self._simulated(range(_PILOTS, _PILOTS + populations), pilots.splits)
+        groups = self._groups(range(_PILOTS, _PILOTS + populations))
+        return SplitMeans.joined([self._simulated(group, pilots.splits) for group in groups])
+
+    def _groups(self, numbers: range) -> Iterator[range]:
+        """Populations in groups that are simulated side by side, so that only the pilots need more memory for more trials."""
+        count = max(1, _SIDE_BY_SIDE // self._trials)
+        return (numbers[i : i + count] for i in range(0, len(numbers), count))
 
     def _size(self, chunk: ReceiverChunk) -> Floats:
         """What makes a trial important, (c, R): the error, and what the receiver reports of it where both scatter."""
@@ -177,16 +199,14 @@ class Splitter:
         """The estimates of the populations with these numbers; splits: after which slots; None: wherever few trials count."""
         count, slots = len(numbers), self._scenario.slots
         size = self._trials
-        first = _FIRST_TRIAL + numbers.start * size
         uniforms = BlockReader(self._key, Batch(slots, count, numbers.start), 1)
         populations, lineage, start = SplitPopulations(count, size), OWN, 0
-        errors, counting, done = np.empty((count, slots)), np.ones(slots), list[int]()
+        errors, fractions, done = np.empty((count, slots)), np.ones((slots, count)), list[int]()
         while start < slots and not self._stopped():
-            simulation = self._simulation(range(first, first + count * size), lineage)
-            for k, error, important in self._slots(simulation, start):
+            for k, error, important in self._slots(numbers, lineage, start):
                 errors[:, k] = populations.means(error.reshape(count, size))
-                fraction = populations.weigh((important + self._floor[k]).reshape(count, size)).mean()
-                counting[k], start = fraction, k + 1
+                fractions[k] = populations.weigh((important + self._floor[k]).reshape(count, size))
+                fraction, start = fractions[k].mean(), k + 1
                 self._on_progress(count * size)
                 if self._stopped():
                     break
@@ -195,18 +215,22 @@ class Splitter:
                     lineage = lineage.split(k + 1, ancestors)
                     done.append(k)
                     break
-        return SplitMeans(errors, tuple(done), float(counting.min()))
+        return SplitMeans(errors, tuple(done), fractions)
 
-    def _simulation(self, trials: range, lineage: Lineage) -> Simulation:
-        return Simulation(self._scenario, trials, self._mode, lineage=lineage, leaving_out=self._others)
-
-    def _slots(self, simulation: Simulation, start: int) -> Iterator[tuple[int, Floats, Floats]]:
-        """Each slot from `start` on, with the errors of its trials, and what makes them important, (R,)."""
+    def _chunks(self, numbers: range, lineage: Lineage) -> Iterator[tuple[int, Floats, Floats]]:
+        """The first slot of each chunk, with the errors of the trials of these populations, and their sizes, (c, R)."""
+        first = _FIRST_TRIAL + numbers.start * self._trials
+        trials = range(first, first + len(numbers) * self._trials)
+        simulation = Simulation(self._scenario, trials, self._mode, lineage=lineage, leaving_out=self._others)
         for chunk in simulation.chunks():
             receiver = chunk.receivers[self._receiver]
-            sizes = self._size(receiver)
-            for row in range(max(0, start - chunk.first), len(receiver.error)):
-                yield chunk.first + row, receiver.error[row], sizes[row]
+            yield chunk.first, receiver.error, self._size(receiver)
+
+    def _slots(self, numbers: range, lineage: Lineage, start: int) -> Iterator[tuple[int, Floats, Floats]]:
+        """Each slot from `start` on, with the errors of its trials, and what makes them important, (R,)."""
+        for first, errors, sizes in self._chunks(numbers, lineage):
+            for row in range(max(0, start - first), len(errors)):
+                yield first + row, errors[row], sizes[row]
 
 
 def rare_estimates(
@@ -230,4 +254,4 @@ def trials_of(scenario: Scenario) -> int:
 
 def work_of(scenario: Scenario) -> int:
     """The trial-slots that the populations of all receivers have."""
-    return len(scenario.receivers) * (_PILOTS + POPULATIONS) * trials_of(scenario) * scenario.slots
+    return len(scenario.receivers) * (2 * _PILOTS + POPULATIONS) * trials_of(scenario) * scenario.slots
