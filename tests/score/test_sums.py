@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.model.process import Floats
-from evedrop.score.sums import LEVELS, SlotHistograms
+from evedrop.score.sums import LEVELS, SlotHistograms, quantile_of
 from tests.examples import examples
 
 SCALE = 2e-3
@@ -126,3 +126,11 @@ def test_beyond_the_bins_only_the_side_is_known() -> None:
     quantiles = histograms.quantiles()
     assert np.isinf(quantiles[0]).all()
     assert (quantiles[1] == 0.0).all()
+
+
+def test_a_quantile_among_infinite_values_is_infinite() -> None:
+    """It is no number only where a value is none; below the infinite ones it is that of finite values."""
+    some = np.array([1.0, math.inf, 2.0, math.inf])
+    assert [quantile_of(some, level) for level in (0.0, 0.25, 0.5, 0.95)] == [1.0, 1.75, math.inf, math.inf]
+    assert quantile_of(np.full(4, math.inf), 0.5) == math.inf
+    assert quantile_of(np.array([1.0, 2.0, 5.0]), 0.75) == 3.5

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -22,7 +23,7 @@ from evedrop.cli.api import compare, cost, learned, montecarlo, sweep
 from evedrop.errors import RunError, UsageError
 from evedrop.results.reading import Results
 from evedrop.scenarios import shipped
-from evedrop.simulate.cluster import Cluster
+from evedrop.simulate.cluster import Cluster, _result
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.tasks import Task
 from evedrop.system.ports import free_port
@@ -274,6 +275,14 @@ def test_a_scheduler_that_is_no_address_is_refused() -> None:
     """A cluster in place of its address: the message has the attribute to give."""
     with pytest.raises(UsageError, match=r"expected the address .* a LocalCluster is its scheduler_address"):
         montecarlo("eavesdroppers", slots=9, trials=5, scheduler=cast(str, object()))
+
+
+def test_an_error_of_a_worker_is_said_by_its_first_line() -> None:
+    """As text."""
+    future: Future[object] = Future()
+    future.set_exception(ValueError("no such file\nmore of it"))
+    with pytest.raises(RunError, match="failed: ValueError: no such file; look at"):
+        _result(future)
 
 
 @pytest.mark.long

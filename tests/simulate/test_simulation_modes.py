@@ -5,6 +5,7 @@ Comparisons with theory are at 4.5 standard errors: a normal mean is beyond with
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,11 @@ from evedrop.scenario.loading import checked, load
 from evedrop.scenario.receivers import LinkTable
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
-from evedrop.simulate.montecarlo import Plan, check_mode
+from evedrop.score.scorekeeper import RunOutcome
+from evedrop.simulate.montecarlo import Merger, Plan, check_mode
 from evedrop.simulate.simulation import Mode, Simulation
-from tests.builders import MICROGRID, process_table, scenario_of
+from evedrop.simulate.trials import tasks_of
+from tests.builders import MICROGRID, listener, process_table, scenario_of
 from tests.conftest import Evedrop
 
 SURE = 4.5
@@ -385,3 +388,20 @@ def test_a_mode_that_cannot_follow_a_long_run_names_the_slots_without_it() -> No
         assert (
             re.search(r"out and give at most [0-9,]+ slots, or remove eve", str(refused.value)) is not None
         ) == beyond
+
+
+def test_squares_beyond_double_precision_are_infinite() -> None:
+    """Without a warning, which fails a test; and so is a quantile between them."""
+    scenario = scenario_of(
+        Process(np.array([[1.5]]), np.eye(1), np.eye(1)),
+        beyond_horizon=True,
+        slots=875,
+        trials=40,
+        eavesdroppers={"deaf": listener("smart", 0.0)},
+    )
+    merger = Merger(scenario, Mode.ERROR_COORDINATES)
+    for task in tasks_of(scenario, Mode.ERROR_COORDINATES, 1):
+        merger.add_batch(task.carry_out(lambda _: None, lambda: False))
+    quantiles = merger.summary(RunOutcome(1.0)).peers["deaf"].error_quantiles
+    assert quantiles is not None
+    assert quantiles["0.95"] == math.inf

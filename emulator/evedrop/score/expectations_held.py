@@ -11,15 +11,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from evedrop.model.links.loss_model import REASONS
 from evedrop.scenario.application import APPLICATIONS, Summary
 from evedrop.scenario.expect import ExpectTable, direction_metric, link_metric
 from evedrop.scenario.tables import Scenario
 from evedrop.score.secrecy import Claim, Secrecy
 from evedrop.score.summary import MODES, DirectionSummary, Judged, JudgedValue, LinkSummary, PeerSummary
-from evedrop.score.sums import Tally
+from evedrop.score.sums import Tally, quantile_of
 from evedrop.score.watched_tally import watch_of
 
 _THEORY = {True: "theory promises it", False: "theory denies it", None: "no theory covers these links"}
@@ -104,7 +102,7 @@ class Evidence:
         if expect.quantile is None:
             return tally.value
         values = tally.of_trials
-        return None if values is None else float(np.quantile(values, expect.quantile))
+        return None if values is None else quantile_of(values, expect.quantile)
 
     def _link(self, expect: ExpectTable) -> tuple[JudgedValue, bool | None]:
         account = self.links[str(expect.link)]

@@ -40,7 +40,7 @@ from evedrop.score.run_tally import RunTally
 from evedrop.score.secrecy import Secrecy, secrecy
 from evedrop.score.slots import Slots
 from evedrop.score.summary import PeerSummary, Summary, SurprisingTrial, Verification
-from evedrop.score.sums import LEVELS, SlotSums, Tally, slot_sums, squared_errors, trial_means
+from evedrop.score.sums import LEVELS, SlotSums, Tally, quantile_of, slot_sums, squared_errors, trial_means
 from evedrop.score.verdict import Verdict, verdict_of
 
 _ENOUGH_TO_SURPRISE = 10  # trials
@@ -310,7 +310,7 @@ def _quantiles(tally: Tally) -> dict[str, float] | None:
     """Quantiles over trials of a trial's mean error; None if the run was cut short."""
     if tally.done != tally.slots:
         return None
-    return {f"{level:g}": float(np.quantile(trial_means(tally), level)) for level in LEVELS}
+    return {f"{level:g}": quantile_of(trial_means(tally), level) for level in LEVELS}
 
 
 def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> SurprisingTrial | None:

@@ -385,6 +385,12 @@ def trial_means(tally: Tally | DirectionTally) -> Floats:
     return means
 
 
+def quantile_of(values: Floats, level: float) -> float:
+    """The quantile of values (R,), the largest of which may be infinite; between two neighbours, in proportion."""
+    above = float(np.quantile(values, level, method="higher"))
+    return float(np.quantile(values, level)) if math.isfinite(above) else above
+
+
 _COUNTED = [one.name for one in fields(ReceiverTally) if one.name != "lost"]
 
 

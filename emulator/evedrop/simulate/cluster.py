@@ -179,8 +179,9 @@ def _result(future: Any) -> Any:
     except RunError as error:
         raise RunError(f"a worker failed: {error}") from error
     except Exception as error:
+        first = next(iter(str(error).splitlines()), "")
         raise RunError(
-            f"a worker of the cluster failed: {type(error).__name__}: {str(error).splitlines()[:1]}; "
+            f"a worker of the cluster failed: {type(error).__name__}: {first}; "
             "look at the worker's log, and whether the scenario's classes and files are there, too"
         ) from error
 

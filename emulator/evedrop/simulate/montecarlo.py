@@ -136,13 +136,16 @@ class Plan:
     """Whether to estimate means that rare events carry by splitting, too."""
 
     def __post_init__(self) -> None:
-        """Raise UsageError for an unknown mode, a number of workers below 1, and an address that is not a text."""
+        """Raise UsageError for an unknown mode, a number of workers below 1, an address that is no text, and the like."""
         modes = [mode.value for mode in Mode]
         refuse_unless(self.mode in modes, "mode", self.mode, listed(modes))
         object.__setattr__(self, "mode", Mode(self.mode))  # which may have been given by its name
         if self.workers is not None:
             number_argument("workers", self.workers, whole=True)
             refuse_unless(self.workers >= 1, "workers", self.workers, "1 or more")
+        number_argument("patience", self.patience)
+        refuse_unless(self.patience > 0.0, "patience", self.patience, "seconds above 0")
+        refuse_unless(isinstance(self.rare, bool), "rare", self.rare, "True or False")
         if self.scheduler is not None and not isinstance(self.scheduler, str):
             raise UsageError(
                 f"scheduler={self.scheduler!r:.60}: expected the address of a Dask scheduler, such as "

@@ -38,7 +38,7 @@ from evedrop.score.leak import revealed_by_packets
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import true_ratios, verdicts
-from evedrop.score.sums import LEVELS, Tally, trial_means
+from evedrop.score.sums import LEVELS, Tally, quantile_of, trial_means
 from evedrop.simulate.chunk import PacketTally
 from evedrop.simulate.finished_tasks import finished_tasks, study_of
 from evedrop.simulate.montecarlo import Merger, Plan, progress_counter
@@ -210,7 +210,7 @@ def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expecta
     return SimulatedError(
         mean,
         error,
-        {f"{level:g}": float(np.quantile(means, level)) for level in LEVELS},
+        {f"{level:g}": quantile_of(means, level) for level in LEVELS},
         heavy,
         theory,
         z_of_error(means, exact, expected, tally.done, rare),

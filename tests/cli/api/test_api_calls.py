@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import gc
 import json
+import math
 import os
 import pickle
 import re
@@ -219,6 +220,13 @@ def test_workers_change_no_digest() -> None:
     assert digests_of(montecarlo(tiny, trials=501, workers=2)) == digests_of(montecarlo(tiny, trials=501, workers=1))
     with pytest.raises(UsageError, match="workers=0: expected 1 or more"):
         montecarlo(tiny, workers=0)
+
+
+@pytest.mark.parametrize("given", [{"rare": "no"}, {"patience": "x"}, {"patience": 0}, {"patience": math.nan}])
+def test_a_plan_of_another_type_is_refused(given: dict[str, Any]) -> None:
+    """By the name of the argument."""
+    with pytest.raises(UsageError, match=f"{next(iter(given))}=.*: expected "):
+        Plan(**given)
 
 
 def test_errors_alone_can_be_followed_for_any_number_of_slots() -> None:
