@@ -28,6 +28,7 @@ from evedrop.model.theory.covariances import (
     lyapunov,
     misled_covariances,
     radius,
+    without_cancellation,
 )
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 from evedrop.model.theory.rare_events import REST, Streaks
@@ -41,6 +42,7 @@ class ModulatedCovariance:
         self, process: Process, link: LinkDistribution, outcomes_at: OutcomesAt, slots_at: SlotOutcomes | None = None
     ) -> None:
         """slots_at: the outcomes of each slot, where they differ; `outcomes_at` is then their mean."""
+        process, _ = without_cancellation(process)
         self._process, self._link = process, link
         self._whole = SlotOdds.of(outcomes_at)
         self._slots_at = slots_at

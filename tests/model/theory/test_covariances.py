@@ -9,7 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.model.process import Floats, Process
+from evedrop.model.links.chain import Chain
+from evedrop.model.modulated import ModulatedCovariance
+from evedrop.model.process import Floats, Process, StateFactors
+from evedrop.model.slot.link_distribution import LinkDistribution
 from evedrop.model.theory.covariances import (
     NOBODY,
     Outcomes,
@@ -350,6 +353,30 @@ def test_misled_error_stays_within_a_factor_of_its_expectation() -> None:
     sigma = np.trace(state_covariances(UNSTABLE, 200), axis1=1, axis2=2)
     ratio = 2.0 * sigma[5:] / expected[5:]
     assert ratio.max() < 1.01 * ratio[:20].max()
+
+
+@pytest.mark.parametrize(
+    "A",
+    [
+        [[3.0, -3.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
+        [[2.5, -1.5, -1.0], [1.5, -0.5, -1.0], [1.0, -1.0, 1.0]],
+        [[2.0, -1.0], [1.0, 0.0]],
+    ],
+)
+def test_a_multiple_root_on_the_unit_circle_in_a_long_run(A: list[list[float]]) -> None:
+    """Whatever the coordinates, to 1e-4 after 14,000 slots: against Σ_k from its factors, where nothing can cancel."""
+    process, slots = Process(np.array(A), np.eye(len(A)), np.eye(len(A))), 14_000
+    carried = StateFactors(process).block(range(slots))
+    expected = (carried**2).sum(axis=(1, 2)) + len(A)
+    assert np.allclose(theoretical_traces(process, NOBODY, slots), expected, rtol=1e-4)
+    covariances = theoretical_covariances(process, NOBODY, 3000)
+    factors = np.concatenate([carried, np.broadcast_to(process.noise_factor, carried.shape)], axis=2)[1:3000]
+    assert np.allclose(covariances[1:], factors @ factors.transpose(0, 2, 1), rtol=1e-5)
+    chain = Chain(np.ones((1, 1)), np.ones(1), np.zeros(1))
+    silent = ModulatedCovariance(process, LinkDistribution.steady(chain), Outcomes.plain)
+    assert np.allclose(silent.next_traces(slots), expected, rtol=1e-4)
+    misled, twice = Outcomes.eavesdropper(0.9, 0.5, 1.0, 1.0), misled_covariances(process, 4000)[-1]
+    assert theoretical_traces(process, misled, 4000)[-1] == pytest.approx(0.5 * np.trace(twice), rel=1e-2)
 
 
 def test_importing_theory_and_design_does_not_import_scipy() -> None:

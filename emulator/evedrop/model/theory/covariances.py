@@ -20,6 +20,7 @@ from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 
 _BLOCK = 256  # slots computed from one starting point: long enough to hide Python's overhead, quick to set up (3 ms)
 _LARGEST_POWER = 1e100  # bound on A's entries within a block, far from overflow
+_CANCELS = 10.0  # the sum of a power's terms, relative to the power: up to 1.3 without multiple eigenvalues
 _ROUNDING = 1e-12
 _FEW_STATES = 9  # n² equations are solved at once, which takes a tenth of SciPy's time; it does the same up to here
 LARGEST_OPERATOR = 512
@@ -93,6 +94,23 @@ NOBODY = Outcomes(predicted=1.0, state=0.0, misled=0.0, decoded=0.0, initial=1.0
 """The outcomes of a receiver without packets: its error covariance is that of the state itself."""
 
 
+def without_cancellation(process: Process) -> tuple[Process, Floats | None]:
+    """The process of Zᵀx and Z, orthogonal, (n, n), if products of powers of A cancel; otherwise the process itself and None.
+
+    They do with a multiple eigenvalue on the unit circle, unless A is triangular: in A^j P A^jᵀ numbers of the size j² |P| then
+    leave a result of the size of P. Zᵀ A Z, the real Schur form, is triangular.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        half = np.linalg.matrix_power(process.A, _BLOCK // 2)
+        if not _CANCELS * np.abs(half @ half).max() < (np.abs(half) @ np.abs(half)).max():
+            return process, None
+    from scipy.linalg import schur  # noqa: PLC0415 - slow to import
+
+    A, Z = schur(process.A)
+    Q, initial = (Z.T @ covariance @ Z for covariance in (process.Q, process.initial_covariance))
+    return Process(A, 0.5 * (Q + Q.T), 0.5 * (initial + initial.T), process.singular_noise), Z
+
+
 def state_covariances(process: Process, slots: int) -> Floats:
     """Σ_k = E[x_k x_kᵀ] for k = 0 … slots−1, (slots, n, n): Σ_0 given, Σ_k = A Σ_{k−1} Aᵀ + Q; inf once it overflows.
 
@@ -149,15 +167,16 @@ class TheoreticalCovariance:
         E_{s+j} = F^j E_s F^jᵀ + p_d Σ_{l<j} F^l Q F^lᵀ + 2 p_i (Σ_{l<j} p_k^l) A^j Σ_s A^jᵀ
                   + 2 p_i Σ_{l<j} F^l (W_{j−l} − Q) F^lᵀ,
 
-    all terms positive semidefinite, so nothing cancels. Values do not depend on how many slots are asked for at a time.
-    From the slot where a value exceeds double precision, every entry is inf. Leaks differ from slot to slot, so their
-    recursion is computed slot by slot.
+    all terms positive semidefinite, so nothing cancels where powers of A do not (`without_cancellation`). Values do not depend
+    on how many slots are asked for at a time. From the slot where a value exceeds double precision, every entry is inf. Leaks
+    differ from slot to slot, so their recursion is computed slot by slot.
 
     Source: Theorem IV.3 (proof, corrected), Theorem V.2 (corrected); docs/mathematics/model.md, expectations.
     """
 
     def __init__(self, process: Process, outcomes: Outcomes) -> None:
         n = process.n
+        process, self._Z = without_cancellation(process)
         self._process = process
         self._outcomes = outcomes
         self._remaining = RemainingCovariances(process) if outcomes.leaked else None
@@ -181,7 +200,11 @@ class TheoreticalCovariance:
             self._next += len(part)
             slots -= len(part)
             parts.append(part)
-        return np.concatenate(parts) if parts else np.empty((0, *self._sigma.shape))
+        covariances = np.concatenate(parts) if parts else np.empty((0, *self._sigma.shape))
+        if self._Z is None:
+            return covariances
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _unbounded_from_overflow(self._Z @ covariances @ self._Z.T)
 
     def next_traces(self, slots: int) -> Floats:
         """The trace of the expectation in the next slots, (slots,)."""

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from evedrop.model.process import Floats, Process
-from evedrop.model.theory.covariances import NOBODY, TheoreticalCovariance
+from evedrop.model.theory.covariances import NOBODY, TheoreticalCovariance, without_cancellation
 
 UNIT_ROUNDOFF = 2.0**-53
 TOLERANCE = 0.01
@@ -29,6 +29,7 @@ def horizon(process: Process, slots: int, checked: int = _EACH) -> int | None:
     noise = np.linalg.eigvalsh(process.Q)
     least = noise[noise > _NO_NOISE * noise[-1]][0] if process.singular_noise and noise[-1] > 0.0 else noise[0]
     limit = (TOLERANCE / UNIT_ROUNDOFF) ** 2 * float(least)
+    process, _ = without_cancellation(process)
     states = TheoreticalCovariance(process, NOBODY)
     count = min(slots, max(_AT_LEAST, checked // process.n**2))
     ahead = max(2, checked // (16 * process.n**2))

@@ -18,7 +18,14 @@ import numpy as np
 
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.process import SLOTS_AT_ONCE, Floats, Process, parts_of
-from evedrop.model.theory.covariances import NoiseCovariances, Outcomes, TheoreticalCovariance, block_length, powers_of
+from evedrop.model.theory.covariances import (
+    NoiseCovariances,
+    Outcomes,
+    TheoreticalCovariance,
+    block_length,
+    powers_of,
+    without_cancellation,
+)
 
 LARGEST_RUN = 2**22
 """The most numbers, slots × n², in the covariances of a run for which the streaks of a misled receiver are computed."""
@@ -69,6 +76,7 @@ def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
     """
     if outcomes.leaked or (outcomes.misled and slots * process.n**2 > LARGEST_RUN):
         return None
+    process, _ = without_cancellation(process)
     total = total_of(TheoreticalCovariance(process, outcomes).next_traces, slots)
     if not math.isfinite(total):
         return None
