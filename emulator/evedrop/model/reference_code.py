@@ -257,7 +257,7 @@ class _Known(NamedTuple):
 
 
 class ReferenceReceiver(Receiver):
-    """The exact MMSE reader of packets with references: a Kalman filter of the state x and the reference r.
+    """The exact MMSE reader of packets with references, unless `informed`: a Kalman filter of the state x and the reference r.
 
     From slot to slot x ← A x + w, and r ← L x if the last packet was acknowledged, else L r. It learns which of the two
     happened from the header of the next packet that it hears, and only then repeats the slots since the last one. A packet shows
@@ -323,6 +323,9 @@ class ReferenceReceiver(Receiver):
 
     def informed(self, k: int, x: Floats, belief: Belief) -> Belief:
         """The belief after slot k once that slot's true state x (n, R) is known as well; the reference stays as it was.
+
+        Not optimal: later packets with a reference before slot k that it lacks are discarded. They would tell of the noise since,
+        so an eavesdropper that is told a state may have a smaller error than this one, until a slot from k on is the reference.
 
         As a reference, x_k has the rounding of the sensor's arithmetic, which grows with every later reference made from it.
         """

@@ -20,7 +20,8 @@ from evedrop.model.streams import Batch
 class Reference(PacketReader):
     """Follows the headers as the legitimate estimator does; it needs no knowledge, because the code has no secret.
 
-    Intended only for the schemes `acknowledged`, `open-loop`, `random-code` and `threshold-code`, against which it is optimal.
+    Intended only for the schemes `acknowledged`, `open-loop`, `random-code` and `threshold-code`, against which it is optimal
+    until it is told a state (`ReferenceReceiver.informed`).
 
     Source: docs/mathematics/schemes.md, acknowledged references.
     """
@@ -39,7 +40,7 @@ class Reference(PacketReader):
         return self._reader.prior(first)
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
-        """It can read every packet with a reference to slot k; its previous reference stays valid."""
+        """It can read every packet with a reference to slot k; its previous reference stays valid, and it learns no older one."""
         return self._reader.informed(k, x, belief)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
