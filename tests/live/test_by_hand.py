@@ -375,3 +375,27 @@ def test_when_one_is_killed_nobody_is_left(evedrop: Evedrop) -> None:
         assert name in {"smart", "recorder"} or f"evedrop: {name}: the recorder gave the run up: {why}" in done.err, (
             name
         )
+
+
+@pytest.mark.long
+def test_when_the_recorder_is_killed_nobody_is_left(evedrop: Evedrop) -> None:
+    """Nobody tells the others to end: each notices that its reports are not read, or that its router has left for that."""
+    where = [option.format(port=free_port()) for option in TWO]
+    briefs = written(evedrop, *where, "--wait", "60", "--set", "longest_outage=1.0", slots=10_000_000)
+    running = {name: begun(evedrop, name, path) for name, path in briefs.items()}
+    metrics = evedrop.folder / "results" / "unfinished" / "summary.json"
+    wait_until(metrics.is_file, "a run under way")
+    before = metrics.stat().st_mtime_ns
+    wait_until(lambda: metrics.stat().st_mtime_ns > before, "a run that all have seen")
+    running.pop("recorder").process.kill()
+    ended = {name: live.end() for name, live in running.items()}
+    assert {name: done.status for name, done in ended.items()} == dict.fromkeys(running, 3)
+    assert "router: the recorder has been gone for 1 s" in ended["router"].err
+
+
+def test_a_router_whose_recorder_does_not_come_ends(evedrop: Evedrop) -> None:
+    """After the time that `--wait` gives."""
+    briefs = written(evedrop, "--listen", f"tcp/127.0.0.1:{free_port()}", "--wait", "1")
+    told(
+        begun(evedrop, "router", briefs["router"]).end(), 3, "router: the recorder did not appear within 1 s; start it"
+    )

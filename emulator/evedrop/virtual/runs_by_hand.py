@@ -24,7 +24,7 @@ from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario.tables import Scenario
 from evedrop.system.world import world as here
 from evedrop.virtual.by_hand import CLOCKS, LACKS, SCENARIOS, Brief, ByHand, any_scenario
-from evedrop.virtual.disturbance import KILLED, ROUTERS
+from evedrop.virtual.disturbance import KILLED
 from evedrop.virtual.drawn_hosts import MISTAKES, DrawnHost, DrawnHosts
 from evedrop.virtual.endings import status_of
 from evedrop.virtual.notes import BY_HAND
@@ -159,7 +159,7 @@ class RunByHand(ByHand):
         while any(process.task.alive for process in processes.values()) and here().monotonic() < deadline:
             resumed = resumed or world.machine.program(["resume", str(folder / "results")]) == 0
             here().sleep(_POLL_SECONDS)
-        waiting = [name for name, process in processes.items() if process.task.alive and name not in ROUTERS]
+        waiting = [name for name, process in processes.items() if process.task.alive]
         if self.target == _WITHOUT_RECORDER and waiting:
             raise AssertionError(f"{', '.join(waiting)}: still waiting for a recorder after {_RUN_SECONDS:.0f} s")
         for process in processes.values():

@@ -5,7 +5,8 @@ Zenoh would reconnect a session by itself, but then may deliver one key's messag
 could be out of date. The process keeps one object for each publisher, subscription or other entity that it declares: it reads a
 subscription without a break while another subscriber replaces the subscription's own.
 
-A process that has had no connection for too long ends itself: the recorder cannot tell it to end. While it is on its network it
+A process that has had no connection for too long ends itself: the recorder cannot tell it to end. So does one that was started
+by hand if it is the recorder that is gone. While it is on its network it
 touches a file whose age is a cheap health check, if the environment names one, as the image of docs/containers.md does.
 
 Source: docs/protocol.md, lost connections.
@@ -423,6 +424,44 @@ class ConnectionWatchdog:
         say(sentence)
         sys.stderr.flush()
         LastWord(Cause.NO_CONNECTION, sentence).leave(self._brief.last_word)
+        world().process.exit(RunError.exit_status)
+
+
+_STEP_SECONDS = 0.25
+
+
+@final
+class RecorderWatchdog:
+    """Ends a process that was started by hand if its recorder does not come, or is gone for `flow.longest_outage`.
+
+    Time in which the process was suspended hardly counts: it waits in steps.
+    """
+
+    def __init__(self, brief: AnyBrief, linked: Callable[[], bool]) -> None:
+        """linked: whether the process is on its network, and would see the recorder."""
+        self._brief, self._linked = brief, linked
+        self._over = world().event()
+
+    def start(self, reached: Callable[[], bool], patience: float) -> None:
+        """Begin to watch. reached: whether the recorder is there; patience: how many seconds to wait until it is."""
+        world().thread(self._watch, reached, patience, name="recorder watchdog").start()
+
+    def release(self) -> None:
+        """Stop watching: the recorder has ended the run."""
+        self._over.set()
+
+    def _watch(self, reached: Callable[[], bool], patience: float) -> None:
+        away, limit, why = 0.0, patience, f"did not appear within {patience:g} s; start it, or look at its log"
+        while away <= limit:
+            if self._over.wait(_STEP_SECONDS):
+                return
+            if reached():
+                away, limit = 0.0, self._brief.flow.longest_outage
+                why = f"has been gone for {limit:g} s; look at its log"
+            elif self._linked():
+                away += _STEP_SECONDS
+        say(f"{self._brief.process}: the recorder {why}")
+        sys.stderr.flush()
         world().process.exit(RunError.exit_status)
 
 

@@ -52,7 +52,7 @@ from evedrop.model.receiver import Flags
 from evedrop.model.slot.link import COUNTED_BURSTS, Account, Accountant, Change, LinkSchedule, streams_of
 from evedrop.model.slot.link_core import Arrivals, Late, LinkCore
 from evedrop.model.slot.records import PacketSlots
-from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE, ROUTER
+from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE, RECORDER, ROUTER
 from evedrop.system.threads import Queue
 from evedrop.system.world import world
 
@@ -552,6 +552,8 @@ def relay(brief: Brief[RelayPart]) -> None:
     with _opened_relay(brief, access_control(table, brief.identity is not None)) as session:
         present = session.presence(grant.process for grant in table if grant.token is not None and grant.zid is None)
         session.wait_for_link()
+        # The recorder is present only once it sees everybody else, for whom it waits as long again.
+        session.end_without_recorder(lambda: present[RECORDER], 2.0 * session.patience)
         session.ready()
         session.wait_for(EndRun)
         until_all_left(present)

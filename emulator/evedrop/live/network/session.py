@@ -39,6 +39,7 @@ from evedrop.live.network.connection import (
     Publisher,
     Question,
     Questions,
+    RecorderWatchdog,
     Subscription,
     Watch,
 )
@@ -210,7 +211,9 @@ class Session:
         self._control = self.keys.control(self._process)
         self._by_hand = not brief.ends_with_stdin
         # A router connects to no other process, so it is always on its network.
-        self._heartbeat = HeartbeatFile((lambda: True) if brief.role in ("router", "relay") else self.linked)
+        linked = (lambda: True) if brief.role in ("router", "relay") else self.linked
+        self._heartbeat = HeartbeatFile(linked)
+        self._recorder_watchdog = RecorderWatchdog(brief, linked)
         self.subscribe_with(self._control, self._sort_command)
 
     def __enter__(self) -> Self:
@@ -223,6 +226,7 @@ class Session:
             self._complain(error)
         if self._watchdog is not None:
             self._watchdog.release()
+        self._recorder_watchdog.release()
         self._heartbeat.stop()
         self.connection.close()
 
@@ -345,16 +349,26 @@ class Session:
         publisher = self._reporting
         if publisher is not None:
             self.status.answer(publisher)
+            self.end_without_recorder(lambda: publisher.matched, self.patience)
         if self._replays:
             world().thread(self._send_again, name="sends-again").start()
         self.connection.appear(self.keys.alive(self._process))
         self._heartbeat.start()
+
+    def end_without_recorder(self, reached: Callable[[], bool], patience: float) -> None:
+        """If no launcher would end this process, end it if the recorder is not there, or no longer.
+
+        reached: whether the recorder is there; patience: how many seconds to wait until it is.
+        """
+        if self._by_hand:
+            self._recorder_watchdog.start(reached, patience)
 
     def conclude(self) -> None:
         """Confirm that this process ends on the conductor's command, and report how many messages it has dropped.
 
         The relay, which reports nothing, withdraws its token instead.
         """
+        self._recorder_watchdog.release()
         publisher = self._reporting
         if publisher is not None:
             publisher(EndReport(self.dropped).pack())
