@@ -166,6 +166,7 @@ _OPTIONS = (
     "-T",
     *("-o", "BatchMode=yes"),  # never ask for a password or a key
     *("-o", "ControlMaster=no"),  # a shared connection would outlive the run
+    *("-o", "ControlPath=none"),  # one that exists already asks a silent host as its own options say
     *("-o", "ClearAllForwardings=yes"),
     *("-o", "ForwardAgent=no"),
     *("-o", "ForwardX11=no"),

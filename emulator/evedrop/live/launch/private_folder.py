@@ -10,6 +10,8 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import re
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,7 +21,10 @@ from evedrop.names import ROUTER
 from evedrop.system.world import world
 
 _PREFIX = "evedrop-"
+_TOKEN_BYTES = 8
+_NAME = re.compile(rf"{_PREFIX}[0-9a-f]{{{2 * _TOKEN_BYTES}}}")
 _LOCK = "lock"
+_MODE = 0o700
 _SHORT = Path("/tmp")  # noqa: S108 - the folder in it is as private as one elsewhere
 """Where sockets are if the paths in the folder for temporary files cannot be those of sockets."""
 
@@ -34,7 +39,7 @@ def private_folder(where: Path | None = None) -> Iterator[Path]:
         try:
             where = (where or world().temporary_folder()).absolute()
             _sweep(where)
-            folder = where / f"{_PREFIX}{world().token(8).hex()}"
+            folder = where / f"{_PREFIX}{world().token(_TOKEN_BYTES).hex()}"
             stack.enter_context(world().process.removed_with_it(folder))
         except OSError as error:
             raise _unmade(error) from error
@@ -59,7 +64,7 @@ def socket_folder(private: Path) -> Iterator[Path]:
 def _locked(folder: Path) -> Iterator[None]:
     """Make the folder, and hold the lock in it."""
     try:
-        world().disk.make_folder(folder, 0o700)
+        world().disk.make_folder(folder, _MODE)
         unfinished = folder / f"{_LOCK}.new"
         lock = world().disk.open(unfinished, "wb")
     except OSError as error:
@@ -79,8 +84,10 @@ def _sweep(where: Path) -> None:
     """Remove this user's folders whose launcher is dead."""
     for folder in where.glob(f"{_PREFIX}*"):
         with contextlib.suppress(OSError):
-            if folder.is_symlink() or folder.stat().st_uid != os.getuid():
-                continue
+            status = folder.lstat()
+            private = stat.S_ISDIR(status.st_mode) and status.st_mode & 0o777 == _MODE
+            if not private or status.st_uid != os.getuid() or not _NAME.fullmatch(folder.name):
+                continue  # the user may have made it
             with world().disk.open(folder / _LOCK, "r+b") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 world().disk.remove_tree(folder, ignore_errors=True)
