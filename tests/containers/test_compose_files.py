@@ -143,6 +143,7 @@ def test_docker_compose_accepts_the_files(own: Path) -> None:
         (("two-eavesdroppers", "--wait", "5"), "--wait belongs to briefs"),
         (("two-eavesdroppers", "--set", "shards=1", "--set", "secret_file=secret"), "secret_file = "),
         (("two-eavesdroppers", "--set", "shards=2", "--trials", "2"), "shards = 2"),
+        (("restart",), "slot "),
         (("file/two.toml", "--slots", "7"), "file/two.toml is the scenario itself"),
     ],
 )

@@ -359,6 +359,12 @@ def test_what_is_refused_leaves_no_folder(evedrop: Evedrop) -> None:
     assert not (evedrop.folder / "b").exists()
 
 
+def test_events_that_need_a_launcher_are_refused(evedrop: Evedrop) -> None:
+    """Nobody could kill or pause a process that is started by hand."""
+    told(evedrop("brief", "restart", "--out", "b", "--listen", "tcp/127.0.0.1:7447"), 2, "kill", "use `evedrop run`")
+    assert not (evedrop.folder / "b").exists()
+
+
 @pytest.mark.long
 def test_when_one_is_killed_nobody_is_left(evedrop: Evedrop) -> None:
     """There is no launcher: the recorder tells the others why the run has failed, and they end, whatever they wait for."""

@@ -303,13 +303,14 @@ def write_briefs(
 
     results: the recorder's folder, on its host, relative to its working directory. patience: how many seconds processes
     wait for each other. paused: as in `RecorderTask`. Raises UsageError if the folder is not empty or cannot be
-    written, and for a scenario in shards.
+    written, and for a scenario in shards or one that needs a launcher.
     """
     if scenario.shards > 1:
         raise UsageError(
             f"shards = {scenario.shards}: briefs belong to one run; give --set shards=1, or write the briefs of each shard "
             "separately, with its own --first-trial and --trials"
         )
+    expect_no_launcher_needed(scenario)
     made = briefs_of(
         scenario, endpoints, RecorderTask(results, True, paused=paused), ends_with_stdin=False, patience=patience
     )
@@ -318,6 +319,16 @@ def write_briefs(
         return [brief.write(folder) for brief in made.values()]
     except OSError as error:
         raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error
+
+
+def expect_no_launcher_needed(scenario: Scenario) -> None:
+    """Raise UsageError if only a launcher can carry out an event of the scenario."""
+    for act in scenario.timeline.acts:
+        if act.effect.action is not None:
+            raise UsageError(
+                f"slot {act.at}: {act.text}: nobody can do this to a process that is started by hand or in a container; use "
+                "`evedrop run`, with --hosts FILE for several hosts"
+            )
 
 
 @final

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evedrop.errors import UsageError
+from evedrop.live.launch.briefs import expect_no_launcher_needed
 from evedrop.names import CONTROLLER, LEGITIMATE, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import make_private, write_private
 from evedrop.results.resolved_scenario import input_texts, resolved
@@ -223,6 +224,7 @@ def _check(scenario: Scenario) -> None:
         raise UsageError(f"modules = {scenario.modules}: the image does not contain classes of your own; {remedy}")
     if scenario.secret_file is not None:
         raise UsageError(f"secret_file = {scenario.secret_file}: containers do not have this file; {remedy}")
+    expect_no_launcher_needed(scenario)
     if scenario.process.source == "zenoh":
         raise UsageError(f"process.zenoh: no container can reach the program that gives the states; {remedy}")
 
