@@ -22,8 +22,9 @@ from typing import Any
 
 import pytest
 
-from evedrop.errors import ScenarioError
+from evedrop.errors import ScenarioError, UsageError
 from evedrop.live.launch.hosts_file import load_hosts
+from evedrop.live.launch.launcher import launch
 from evedrop.live.launch.other_hosts import LauncherHeartbeat, StartProcess, greeting_in, line_of, order_in, ssh_command
 from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
@@ -417,3 +418,24 @@ def test_a_host_ends_when_its_launcher_is_silent(evedrop: Evedrop) -> None:
         assert stream is not None
         stream.close()
     assert list(evedrop.temporary.iterdir()) == []
+
+
+def test_a_router_without_certificates_is_warned_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On hosts as on one machine; here nothing is started, for there is no ssh."""
+    (tmp_path / "hosts.toml").write_text(
+        '[router]\nlisten = "tcp/127.0.0.1:7447"\n[hosts.beta]\naddress = "beta.lan"\nprocesses = ["smart"]\n'
+    )
+    scenario = load("restart")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UsageError, match="ssh cannot be started"):
+        launch(
+            scenario,
+            tmp_path / "run",
+            "off",
+            None,
+            lambda _: None,
+            hosts=load_hosts(tmp_path / "hosts.toml", scenario),
+        )
+    assert "tcp/127.0.0.1:7447 is not encrypted" in capsys.readouterr().err

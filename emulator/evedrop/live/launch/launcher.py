@@ -99,6 +99,7 @@ def _on_hosts(
         raise UsageError(
             f"--hosts: the scenario has {scenario.shards} shards, and hosts carry one run; give --set shards=1"
         )
+    warn_if_exposed(hosts.endpoints)
     with ssh_starter(hosts, here, stop, scenario.longest_outage) as start:
         return launch_one(
             scenario,
