@@ -1,11 +1,13 @@
 """The parser of the command line: argparse, with a hint for a mistyped word, no abbreviations, and help in sections.
 
-It uses one private name of argparse, `_option_string_actions`; if a later Python lacks it, options have no hints.
+It uses two private names of argparse. If a later Python lacks `_option_string_actions`, options have no hints; if it lacks
+`_negative_number_matcher`, a list that begins with a minus must be given as `--option=-1,2`.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 import shutil
 import sys
 import textwrap
@@ -100,6 +102,10 @@ def _broken(line: str) -> str:
     )
 
 
+_NEGATIVE = re.compile(r"-\.?\d")
+"""How a negative number, or a list of numbers whose first is negative, begins; no option begins so."""
+
+
 class Parser(argparse.ArgumentParser):
     """A parser of one command, or of all; sections: title → command → description, for the help of all."""
 
@@ -107,6 +113,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*given, **{"formatter_class": _Help, "allow_abbrev": False, **named})
         self.sections: dict[str, dict[str, str]] = {}
         self._commands: Mapping[str, Parser] = {}
+        self._negative_number_matcher = _NEGATIVE
 
     def add_commands(self) -> _SubParsersAction[Parser]:
         """Begin the commands of this parser; each is then added to what this returns."""

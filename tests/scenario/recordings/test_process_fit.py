@@ -75,12 +75,12 @@ def test_the_fit_is_a_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str
         "time [s],x [m],who,y [m]\n"
         + "".join(f"{3 + 0.1 * k},{x},a,{y}\n" for k, (x, y) in enumerate(path_of(1, around=5.0)))
     )
-    assert main(["process", "fit", str(tmp_path / "pose.csv"), "--states", "x,y", "--reference", "5,5"]) == 0
+    assert main(["process", "fit", str(tmp_path / "pose.csv"), "--states", "x,y", "--reference", "-5.5,5"]) == 0
     tables = tomllib.loads(capsys.readouterr().out)
     assert tables["slot_seconds"] == 0.1
     process = tables["process"]
     assert np.allclose(process["A"], A, atol=0.2)
-    assert (process["theory"], process["units"], process["reference"]) == (True, ["m", "m"], [5.0, 5.0])
+    assert (process["theory"], process["units"], process["reference"]) == (True, ["m", "m"], [-5.5, 5.0])
     rest = {"title": "Fitted", "slots": 100, "encoding": {"scheme": "plain"}, "legitimate": {"link": {"quality": 0.9}}}
     assert len(checked({**tables, **rest}, "file").process.state_values or []) == 100
     assert main(["process", "fit", str(tmp_path / "pose.csv"), "--states", "x,y", "--json"]) == 0
