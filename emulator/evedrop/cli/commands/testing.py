@@ -43,7 +43,7 @@ def test(options: argparse.Namespace) -> int:
         resume=options.resume,
         simulation=simulation,
     )
-    started, tested = time.time(), list[Finding]()
+    started, began, tested = time.time(), time.monotonic(), list[Finding]()
     try:
         for finding in results(scenarios, manner, options.jobs):
             tested.append(finding)
@@ -59,7 +59,7 @@ def test(options: argparse.Namespace) -> int:
     printed = ", ".join(
         f"{count} {outcome.word}" for outcome, count in sorted(counts.items(), key=lambda at: at[0].value)
     )
-    tell(f"{printed}, in {time.time() - started:.1f} s", alarm="FAILED")
+    tell(f"{printed}, in {time.monotonic() - began:.1f} s", alarm="FAILED")
     if page is not None:
         tell(f"report: {page}")
     return max(outcome.value for outcome in counts)
