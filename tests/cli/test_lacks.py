@@ -47,6 +47,9 @@ LACKS: list[tuple[BaseException, str]] = [
         "there is not enough memory; ",
     ),
     (SystemError("error return without exception set"), "there is not enough memory; "),
+    (OSError(errno.EMFILE, "Too many open files", "summary.json"), "this process may open no further file; "),
+    (OSError(errno.ENFILE, "Too many open files in system"), "no further file can be opened; "),
+    (PanicException("Failed to init net"), "this process may open no further file; "),
 ]
 STUDY = ("montecarlo", "eavesdroppers", "--trials", "2", "--slots", "5")
 
@@ -71,6 +74,7 @@ def test_a_study_without_resources_is_no_failed_expectation(
     "error",
     [
         RuntimeError("other"),
+        RuntimeError("Failed to init by itself"),
         ImportError("no module named x"),
         OSError(errno.ENOSPC, "No space"),
         SystemError("other"),

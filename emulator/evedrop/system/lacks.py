@@ -26,10 +26,15 @@ _WITHOUT_REASON = ("without exception set", "without setting an exception")
 """What Python says in a SystemError if its own code, or an extension's, found no memory and raised no exception for it."""
 _WITHOUT_THREAD = ("can't start new thread", "can't spawn worker thread", "Failed to launch worker thread")
 """What Python, Zenoh (in a PanicException, which does not derive from Exception) and Arrow say."""
+_WITHOUT_FILE = "Failed to init "
+"""What Zenoh says, in a PanicException, if it can open no file for its threads."""
 _LACKS = {
     errno.EAGAIN: "no further process or thread can be started",
     errno.ENOMEM: "there is not enough memory",
+    errno.EMFILE: "this process may open no further file",
+    errno.ENFILE: "no further file can be opened",
 }
+_NO_FILE = (errno.EMFILE, errno.ENFILE)
 
 
 def lack_of(error: BaseException) -> str | None:
@@ -42,13 +47,13 @@ def lack_of(error: BaseException) -> str | None:
         lack = _LACKS[errno.ENOMEM]
     elif any(words in str(error) for words in _WITHOUT_THREAD):
         lack = _LACKS[errno.EAGAIN]
-    elif isinstance(error, OSError) and error.filename is None and error.errno in _LACKS:
+    elif _WITHOUT_FILE in str(error) and not isinstance(error, Exception):
+        lack = _LACKS[errno.EMFILE]
+    elif isinstance(error, OSError) and error.errno in (_NO_FILE if error.filename is not None else _LACKS):
         lack = _LACKS[error.errno]
     else:
         return None
-    return (
-        f"{lack}; free system resources, or raise the limit (ulimit -v, ulimit -u, or the container's), and try again"
-    )
+    return f"{lack}; free system resources, or raise the limit (ulimit -v, -u or -n, or the container's), and try again"
 
 
 @final

@@ -5,10 +5,13 @@ from __future__ import annotations
 import signal
 import subprocess
 from io import BytesIO
+from queue import Queue
+from typing import IO
 
 import pytest
 
-from evedrop.live.launch.starter import GRACE_SECONDS, ReportedProcess, end_all
+from evedrop.live.launch.starter import GRACE_SECONDS, ForkServer, ReportedProcess, end_all
+from evedrop.system.fork_channels import ProcessHandle, StandardFiles
 from evedrop.system.killable import KILLED_SECONDS
 from evedrop.system.processes import kill, wait_for
 from evedrop.system.signals import SHOW_STACKS
@@ -111,3 +114,41 @@ def test_the_first_report_of_an_end_counts() -> None:
     assert process.poll() == 0
     assert process.wait() == 0
     assert process.closed == 1
+
+
+class Channel:
+    """A channel with a fork server that starts a process, to which the system passes on no descriptor."""
+
+    def __init__(self) -> None:
+        self._reports: Queue[bytes] = Queue()
+
+    def files(self, log: IO[bytes], tells: bool) -> StandardFiles:
+        """None."""
+        raise NotImplementedError
+
+    def send(self, request: bytes, descriptors: tuple[int, int, int]) -> None:
+        """Start a process, which ends at once."""
+        del request, descriptors
+        self._reports.put(b'{"pid": 7}')
+        self._reports.put(b'{"pid": 7, "status": 0}')
+
+    def receive(self) -> tuple[bytes, list[ProcessHandle]]:
+        """The next report, without a handle."""
+        return self._reports.get(), []
+
+    def shut(self) -> None:
+        """There is no further report."""
+        self._reports.put(b"")
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def test_a_launcher_that_may_open_no_further_file_cannot_start_a_process() -> None:
+    """It gets no descriptor of the process; that the process ends then is no surprise, and the server goes on."""
+    server = ForkServer(Channel())
+    for _ in range(2):
+        with pytest.raises(OSError, match="Too many open files"):
+            server.fork(["sensor"], (0, 1, 2), {}, None, 0o077)
+    assert server.alive
+    server.close()

@@ -328,7 +328,10 @@ class ForkServer:
         if "error" in report:
             self._begun.put(OSError(report["error"], os.strerror(report["error"])))
         elif "status" in report:
-            self._forks.pop(report["pid"]).ended(report["status"])
+            if (ended := self._forks.pop(report["pid"], None)) is not None:
+                ended.ended(report["status"])
+        elif not handles:  # the system did not pass it on; the process ends when its standard input does
+            self._begun.put(OSError(errno.EMFILE, os.strerror(errno.EMFILE)))
         else:
             fork = self._forks[report["pid"]] = Fork(report["pid"], *handles)
             self._begun.put(fork)
