@@ -201,7 +201,8 @@ def leave_on_signals() -> None:
         signal.signal(number, leave)
 
     def wait() -> None:
-        os.read(ours, 1)
+        while os.read(ours, 1)[0] not in SIGNALS:  # another signal for which a library or a user's class has a handler
+            pass
         os._exit(INTERRUPTED)
 
     import threading  # noqa: PLC0415 - the handlers come first
