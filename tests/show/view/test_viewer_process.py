@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 from rerun.chunk import RrdReader
 
-from evedrop.errors import UsageError
+from evedrop.errors import Interrupted, UsageError
 from evedrop.show.view import picture, viewer
 from evedrop.show.view.recording import ViewRecording
 from evedrop.show.view.viewer import _LSOF, PortTaken, Viewer, WebAddress, _lsof_says, end, owns, spawn
 from evedrop.system.ports import free_port
-from tests.conftest import LIMIT, wait_until
+from tests.conftest import LIMIT, wait_until, with_mark
 from tests.privileged import CannotRun, skip
 from tests.show.view.simulated_run import Simulated
 
@@ -203,6 +203,21 @@ def test_a_viewer_that_ends_after_it_listened_is_no_stranger(tmp_path: Path, mon
         spawn(port, [str(port)], tmp_path)
     with pytest.raises(UsageError, match="mesa-vulkan-drivers"):
         spawn(port, ["--headless", str(port)], tmp_path)
+
+
+def test_who_waits_for_a_viewer_may_give_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A viewer that does not listen is ended then."""
+    program = tmp_path / "viewer"
+    program.write_text(f"#!{sys.executable}\nimport time\ntime.sleep(600.0)\n")
+    program.chmod(0o700)
+
+    def interrupted() -> None:
+        raise Interrupted
+
+    monkeypatch.setattr(viewer, "executable", lambda: program)
+    with pytest.raises(Interrupted):
+        spawn(free_port(), [], tmp_path, meanwhile=interrupted)
+    assert with_mark(str(program)) == {}
 
 
 @pytest.fixture

@@ -80,6 +80,12 @@ def launch_one(
             task = RecorderTask(folder.absolute(), view != "off", shard, paused)
             briefs = briefs_of(scenario, at, task, patience=patience, ahead=ahead)
             recorder = briefs.pop(RECORDER)
+            # Before all processes: a viewer may take longer to start than they wait for the recorder.
+            viewer = Viewer.start(
+                view, folder / "logs", folder.absolute() / "recording.rrd", meanwhile=lambda: _heed(stop)
+            )
+            if viewer is not None:
+                on_event(ViewOpened(viewer.address, viewer.warning))
             with Children(held, private, scenario.controller is not None, starter) as children:
                 for name in (ROUTER, RELAY):
                     if name in briefs:
@@ -87,10 +93,6 @@ def launch_one(
                         _wait_until_listening(children, name, stop, patience)
                 for brief in briefs.values():
                     children.start(brief)
-                # The other processes start up at the same time as the viewer.
-                viewer = Viewer.start(view, folder / "logs", folder.absolute() / "recording.rrd")
-                if viewer is not None:
-                    on_event(ViewOpened(viewer.address, viewer.warning))
                 children.start(recorder)
                 status = follow_to_end(children, stop, on_event)
                 if viewer is not None:
@@ -127,6 +129,11 @@ def _endpoints(given: RouterEndpoints | None, private: Path) -> Iterator[RouterE
         yield socket_endpoints(folder)
 
 
+def _heed(stop: ThreadEvent) -> None:
+    if stop.is_set():
+        raise Interrupted
+
+
 def _wait_until_listening(children: Children, router: str, stop: ThreadEvent, patience: float) -> None:
     """Wait until a router says that it listens: a process that is started earlier might connect to another program there.
 
@@ -135,8 +142,7 @@ def _wait_until_listening(children: Children, router: str, stop: ThreadEvent, pa
     limit = _LONGER * patience
     deadline = world().monotonic() + limit
     while not children.listens(router):
-        if stop.is_set():
-            raise Interrupted
+        _heed(stop)
         event = children.next_event(_POLL_SECONDS)
         if isinstance(event, ProcessExit) and not _meant_us_too(event, stop) and not children.restart_router(event):
             raise RunError(children.failure_report(event, None))

@@ -23,7 +23,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, final
@@ -107,11 +107,12 @@ def spawn(
     stdin: int = subprocess.DEVNULL,
     apart: bool = False,
     environment: Mapping[str, str] | None = None,
+    meanwhile: Callable[[], None] = lambda: None,
 ) -> subprocess.Popen[bytes]:
     """Start Rerun's command with these arguments, only on loopback; returns when it listens on `port`.
 
     arguments: must not name what is to be shown, for another process may have taken the port. apart: with a network of its own,
-    if the system allows it.
+    if the system allows it. meanwhile: called while waiting.
 
     Raises PortTaken if another process listens there, and UsageError if it ends first or is not ready in time: with the driver
     that it lacks, or the last lines of its log.
@@ -128,7 +129,7 @@ def spawn(
             env={**viewer_environment(), "XDG_CONFIG_HOME": str(_CONFIG), **(environment or {})},
         )
         try:
-            if _listens(process, port):
+            if _listens(process, port, meanwhile):
                 return process
         except BaseException:
             _give_up(process)
@@ -176,7 +177,7 @@ def executable() -> Path:
     return bundled if sys.platform == "darwin" and bundled.exists() else folder / "rerun"
 
 
-def _listens(process: subprocess.Popen[bytes], port: int) -> bool:
+def _listens(process: subprocess.Popen[bytes], port: int, meanwhile: Callable[[], None]) -> bool:
     """Whether the process listens on the port in time; false if it ends first. Raises PortTaken if another one listens there."""
     deadline, foreign = time.monotonic() + _START_SECONDS, 0
     # A process that is about to end owns nothing any more a moment before its port is closed, so a single probe proves nothing.
@@ -185,6 +186,7 @@ def _listens(process: subprocess.Popen[bytes], port: int) -> bool:
         if listened_at and (is_apart(process) or owns(process.pid, port)):
             return True
         foreign = foreign + 1 if listened_at else 0
+        meanwhile()
         time.sleep(0.02)
     if foreign == _FOREIGN_PROBES or (process.poll() is not None and _is_listened_at(process, port)):
         raise PortTaken(
@@ -336,12 +338,19 @@ class Viewer:
 
     @classmethod
     def start(
-        cls, mode: str, logs: Path, recording: Path, complete: bool = False, options: Sequence[str] = _WINDOW
+        cls,
+        mode: str,
+        logs: Path,
+        recording: Path,
+        complete: bool = False,
+        options: Sequence[str] = _WINDOW,
+        meanwhile: Callable[[], None] = lambda: None,
     ) -> Viewer | None:
         """Start a viewer and wait until it is ready; None for "off". A window's output goes to viewer.log in the folder `logs`.
 
         mode: "native", "web", "notebook", "off", or "auto". recording: the file to show, from its beginning on and as it grows;
         it need not exist yet. complete: whether the file no longer grows. options: those that a window is started with.
+        meanwhile: called while waiting for a window.
 
         Raises UsageError if it cannot be started.
         """
@@ -355,8 +364,8 @@ class Viewer:
             return cls._page(followed, HOST, HOST, 0, 0, framed=mode == NOTEBOOK)
         for _ in range(_ATTEMPTS - 1):
             with contextlib.suppress(PortTaken):
-                return cls._window(followed, free_port(), logs, options)
-        return cls._window(followed, free_port(), logs, options)
+                return cls._window(followed, free_port(), logs, options, meanwhile)
+        return cls._window(followed, free_port(), logs, options, meanwhile)
 
     @classmethod
     def serve(cls, web_address: WebAddress, recording: Path, complete: bool = False) -> Viewer:
@@ -391,11 +400,15 @@ class Viewer:
         return cls(followed, None, [served, page], f"http://{seen}:{page.port}/?url={data}&{_DARK}")
 
     @classmethod
-    def _window(cls, followed: Followed, port: int, logs: Path, options: Sequence[str]) -> Viewer:
+    def _window(
+        cls, followed: Followed, port: int, logs: Path, options: Sequence[str], meanwhile: Callable[[], None]
+    ) -> Viewer:
         from evedrop.show.view.serving import feed  # noqa: PLC0415 - only with a view
 
         arguments = ["--port", str(port), *options, "-"]
-        process = spawn(port, arguments, logs, stdin=subprocess.PIPE, apart=not _screen_is_remote())
+        process = spawn(
+            port, arguments, logs, stdin=subprocess.PIPE, apart=not _screen_is_remote(), meanwhile=meanwhile
+        )
         assert process.stdin is not None  # noqa: S101 - it is a pipe
         feed(followed, process.stdin)
         return cls(followed, process)
