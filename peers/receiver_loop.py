@@ -178,11 +178,17 @@ def _acknowledged(delivery: Reader, k: int, trials: int) -> bytes:
 
 
 def _save(brief: Brief[ReceiverPart], belief: Belief) -> None:
-    """Save a belief for this process if it is restarted; does nothing if the brief names no state file."""
+    """Save a belief for this process if it is restarted; does nothing if the brief names no state file.
+
+    The file is complete at any moment: the barrier may come again, and this process may be ended then.
+    """
     if brief.part.state_file is None:
         return
-    with world().disk.writer(Path(brief.part.state_file)) as file:
+    path = Path(brief.part.state_file)
+    unfinished = path.with_name(f"{path.name}.new")
+    with world().disk.writer(unfinished) as file:
         np.savez(file, belief.x_hat, belief.P, belief.action, *belief.memory)
+    world().disk.replace(unfinished, path)
 
 
 def _outages_of(brief: Brief[ReceiverPart]) -> dict[int, tuple[int, bool]]:

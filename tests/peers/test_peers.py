@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import msgpack
 import numpy as np
@@ -19,14 +19,16 @@ from evedrop.live.network.process_session import ReplayBuffer
 from evedrop.live.network.reporting import is_due
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
-from evedrop.live.protocol.brief import AnyBrief, Flow, LegitimatePart, SensorPart
+from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, LegitimatePart, ReceiverPart, SensorPart
 from evedrop.live.protocol.commands import EndRun, Start
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.notices import Progress
 from evedrop.model.digest import Blocks, Digests
 from evedrop.model.process import Process
+from evedrop.model.receiver import prior
 from evedrop.peers.eavesdropper import eavesdrop
 from evedrop.peers.legitimate import estimate
+from evedrop.peers.receiver_loop import _save
 from evedrop.peers.sensor import Window, sense
 from evedrop.system.threads import Queue
 from tests.builders import listener, part_of, scenario_of
@@ -404,3 +406,21 @@ def test_a_full_window_always_holds_the_end_of_a_batch(window: int) -> None:
         ends = [0, *(k + 1 for k in range(101) if is_due(brief, k))]
         assert ends[-1] == 101
         assert max(np.diff(ends)) <= window
+
+
+def test_a_belief_that_is_saved_again_is_kept_until_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The barrier may come again; whoever is killed while it saves finds the belief of the first time when it is restarted."""
+    saved = tmp_path / "legitimate.state"
+    brief = cast("Brief[ReceiverPart]", briefs()["legitimate"])
+    brief = replace(brief, part=replace(brief.part, state_file=str(saved)))
+    _save(brief, prior(PROCESS, 3, 0))
+    whole = saved.read_bytes()
+
+    def killed(file: BinaryIO, *_: object) -> None:
+        file.write(whole[:10])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez", killed)
+    with pytest.raises(KeyboardInterrupt):
+        _save(brief, prior(PROCESS, 3, 0))
+    assert saved.read_bytes() == whole
