@@ -322,6 +322,7 @@ OPTIONAL = {
     "singular_noise",
     "longest_outage",
     "largest_message",
+    "largest_report",
     "message",
     "measurement",
     "noise_covariance",

@@ -25,6 +25,7 @@ from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.link import COUNTED_BURSTS, Account, Change
 from evedrop.model.slot.link_core import Arrivals, Late
 from evedrop.model.slot.records import LinkSlots, PacketSlots, ReceiverSlots, SensorSlots
+from evedrop.scenario.loading import load
 from tests.examples import examples
 from tests.live.protocol.made_briefs import briefed
 
@@ -163,6 +164,12 @@ def test_what_waits_is_bounded_by_sender() -> None:
         mailbox.get()
     assert raised.value.at_fault == ("eve",)
     assert len(mailbox) < 10
+
+
+def test_what_may_wait_is_measured_by_reports() -> None:
+    """Not by the largest message, which is a command: a sender could fill the memory before its flood ends the run."""
+    flow = flow_of(load("eavesdroppers"))
+    assert allowance(flow.largest_report, flow.window, flow.batch) < 2**25 < flow.largest_message
 
 
 def test_a_window_in_some_rounds_is_allowed() -> None:

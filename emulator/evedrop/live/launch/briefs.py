@@ -70,8 +70,9 @@ def flow_of(scenario: Scenario, ahead: int = MOST_SLOTS_AHEAD) -> Flow:
     elif scenario.process.source == "zenoh":
         batch = 1  # the program's pace is not known, and its messages should be on disk when it falls silent
     message = _slots_of_message(scenario, batch)
-    largest = max(sizes_of(scenario, batch, message).of_kinds.values())
-    return Flow(window, batch, scenario.longest_outage, largest, message)
+    kinds = sizes_of(scenario, batch, message).of_kinds
+    largest_report = max(kinds["telemetry"], kinds["journal"])
+    return Flow(window, batch, scenario.longest_outage, max(kinds.values()), largest_report, message)
 
 
 def _slots_of_message(scenario: Scenario, batch: int) -> int:

@@ -116,8 +116,12 @@ _ROUNDS = 4  # of resending all kept messages, before the first one is read
 
 
 def allowance(largest: int, window: int, batch: int) -> int:
-    """How many unread bytes of one sender may wait: reports of a window and two batches, in some rounds, and a reserve."""
-    return _ROUNDS * (window // batch + 3) * (largest + _OVERHEAD_BYTES) + 2**20
+    """How many unread bytes of one sender may wait: reports of a window and two batches, in some rounds, and a reserve.
+
+    largest: bytes of the largest report; each may be in parts of a slot, as in a run that is held again and again.
+    """
+    reports = window // batch + 3
+    return _ROUNDS * reports * (largest + batch * 2 * _OVERHEAD_BYTES) + 2**20
 
 
 @final

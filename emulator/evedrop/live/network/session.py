@@ -188,7 +188,7 @@ class Session:
         """How many seconds to wait for other processes."""
         self.status = StatusReporter()
         """The slot this process is at and what it waits for; to be kept up to date."""
-        self.allowance = allowance(brief.flow.largest_message, brief.flow.window, brief.flow.batch)
+        self.allowance = allowance(brief.flow.largest_report, brief.flow.window, brief.flow.batch)
         """How many unread bytes of one sender may wait."""
         self._room = _WINDOWS * (brief.flow.window + 8)
         self._dropped = Dropped(brief.process, self._mistaken)

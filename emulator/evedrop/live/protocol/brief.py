@@ -484,6 +484,8 @@ class Flow:
     """Seconds for which a process may be cut off before that ends the run."""
     largest_message: Positive = 2**30
     """Bytes of the largest message of the run: larger ones are not accepted."""
+    largest_report: Positive = 2**30
+    """Bytes of the largest message of telemetry or of the journal, which bounds what may wait to be read."""
     message: Positive = 1
     """A message carries the packets of at most this many slots."""
 
