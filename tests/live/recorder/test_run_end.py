@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
 
 from evedrop.errors import RunError, UnwrittenResults
-from evedrop.live.recorder.run_end import RunEnd
+from evedrop.live.recorder import recorder
+from evedrop.live.recorder.run_end import RunEnd, reason_of
 
 
 @pytest.mark.parametrize(("error", "suspects"), [(RunError("why"), ("eve",)), (UnwrittenResults("no space"), ())])
@@ -25,3 +28,29 @@ def test_a_run_with_packets_that_are_unaccounted_for_has_failed(unexplained: int
     end = RunEnd()
     end.judge(Mock(links=links, ended=end.how, failed_expectations=()))
     assert end.status == status
+
+
+@pytest.mark.parametrize("error", [UnwrittenResults("no space"), OSError(28, "No space left on device"), MemoryError()])
+def test_nobody_waits_for_a_recorder_that_failed(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever ends a run by hand, the recorder tells the others that it has given up: no launcher ends them."""
+    told: list[str] = []
+
+    class FailingDirection:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def start(self) -> None:
+            raise error
+
+        def dismiss(self) -> None:
+            pass
+
+    monkeypatch.setattr(recorder, "Session", lambda *_, **__: nullcontext())
+    monkeypatch.setattr(recorder, "Conductor", lambda *_: SimpleNamespace(missing=[], abandon=told.append))
+    monkeypatch.setattr(recorder, "Direction", FailingDirection)
+    course = SimpleNamespace(end=lambda: None)
+    score = SimpleNamespace(scenario=SimpleNamespace(digested=(), relayed=False), course=course)
+    run, brief = SimpleNamespace(score=score), SimpleNamespace(part=SimpleNamespace(recording=False))
+    with pytest.raises(type(error)):
+        recorder._conduct(run, brief, SimpleNamespace(check=None), None, RunEnd(), by_hand=True)  # type: ignore[arg-type]
+    assert told == [reason_of(error)]

@@ -114,8 +114,9 @@ def _conduct(
                 direction.look_after()
                 run.folder.save()
             run.folder.save_rows()  # processes may take long to confirm their end, and this one may be killed meanwhile
-        except EvedropError as error:
-            end.blame(conductor.missing, error)
+        except Exception as error:
+            if isinstance(error, EvedropError):
+                end.blame(conductor.missing, error)
             if by_hand:  # a launcher ends them itself
                 conductor.abandon(reason_of(error))
             raise

@@ -88,6 +88,8 @@ class RunEnd:
         return RunEnded(self.status, self.how, self.suspects, self.accused, view, self.broken_by)
 
 
-def reason_of(error: EvedropError) -> str:
+def reason_of(error: Exception) -> str:
     """Why a run ended with this error, in words."""
-    return "interrupted" if isinstance(error, Interrupted) else str(error)
+    if isinstance(error, Interrupted):
+        return "interrupted"
+    return str(error) if isinstance(error, EvedropError) else f"the recorder failed ({error!r})"
