@@ -313,10 +313,12 @@ class Recovery:
 
         complete: whether these are all slots, so that none was waited for: the outages lasted to the end.
         """
-        now = self._clock.monotonic()
-        self._close(done, now)
+        now, until = self._clock.monotonic(), done if complete else None
         missing = self._missing
         missing = next(({name: missing[name]} for name in (RELAY, ROUTER) if name in missing), missing)
-        until = done if complete else None
-        self.outages += [ConnectionOutage(name, slot, until, now - since) for name, (slot, since) in missing.items()]
-        self._missing = {}
+        opened = {
+            **missing,
+            **self._back,
+        }  # one that was lost again before the run went on has been away since the first time
+        self.outages += [ConnectionOutage(name, slot, until, now - since) for name, (slot, since) in opened.items()]
+        self._missing, self._back = {}, {}
