@@ -19,6 +19,7 @@ from evedrop.scenario.loading import checked
 from evedrop.scenario.progress_events import Held, ProgressEvent
 from evedrop.scenario.tables import Scenario
 from tests.builders import places_of, scalar_tables
+from tests.clock import TestClock
 from tests.golden.pages import Golden
 
 SLOTS = 100
@@ -99,17 +100,6 @@ class Run:
     def events(self) -> list[tuple[int, str, str]]:
         """What was done."""
         return [(event.slot, event.event, event.by) for event in self.steering.events]
-
-
-class TestClock:
-    """The time of the world in a test's hands."""
-
-    __test__ = False
-    now = 0.0
-
-    def monotonic(self) -> float:
-        """The time."""
-        return self.now
 
 
 SET = {"link": "legitimate", "set": {"quality": 0.2}}
