@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
 
 
 @pytest.fixture(scope="module")
@@ -240,3 +243,22 @@ def test_what_a_detector_says_is_compared(tmp_path: Path) -> None:
     pq.write_table(rows.set_column(place, "statistic", raised), changed / "inputs.parquet")
     result = difference(original, Results.read(changed))
     assert result.text.startswith("first difference: slot 31, trial 0, controller: statistic ")
+
+
+def test_a_block_of_a_run_that_ended_early_may_go_beyond_its_slots(runs: dict[str, Results], tmp_path: Path) -> None:
+    """Its receivers were ahead of the slots that all have reported, and had finished a block of which the other has a part."""
+    early = rewritten(
+        runs["whole"], tmp_path / "early", "digests", lambda digests: digests.filter(pc.less(digests["block"], 512))
+    )
+    early = replace(early, summary={**early.summary, "slots": 300, "ended": "interrupted"})
+    for pair in ((early, runs["shorter"]), (runs["shorter"], early)):
+        result = difference(*pair)
+        assert result.same, result.text
+        assert result.text.startswith("no difference in 24 blocks")
+
+
+def test_studies_of_covariances_have_nothing_to_compare(tmp_path: Path) -> None:
+    """They have neither digests nor rows of trials, so they are not called different."""
+    study = montecarlo("eavesdroppers", out=tmp_path / "study", plan=Plan(Mode.COVARIANCE_ONLY), slots=20, trials=4)
+    with pytest.raises(UsageError, match="has neither digests nor recorded trials"):
+        difference(study, study)

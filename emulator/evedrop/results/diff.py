@@ -9,6 +9,7 @@ from itertools import pairwise
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from evedrop.errors import UsageError
 from evedrop.model.digest import BLOCK_SLOTS
 from evedrop.names import CONTROLLER
 from evedrop.results.reading import Results
@@ -26,10 +27,23 @@ class RunDifference:
 
 
 def difference(a: Results, b: Results) -> RunDifference:
-    """Compare all that the receivers received and estimated, trial by trial, for the trials and receivers that both runs have."""
+    """Compare all that the receivers received and estimated, trial by trial, for the trials and receivers that both runs have.
+
+    Raises UsageError if a run has nothing of the kind.
+    """
     blocks_a, blocks_b = _blocks(a), _blocks(b)
+    for run, blocks in ((a, blocks_a), (b, blocks_b)):
+        if not blocks and not len(run.trials):
+            raise UsageError(
+                f"{run.folder} has neither digests nor recorded trials, as a study of covariances only or a run of few slots "
+                "that ended early; give a run that has"
+            )
     ends_a, ends_b = _ends(a, blocks_a), _ends(b, blocks_b)
-    common = [key for key in blocks_a.keys() & blocks_b.keys() if ends_a[key[0], key[2]] == ends_b[key[0], key[2]]]
+    common = [
+        (peer, trial, block)
+        for peer, trial, block in blocks_a.keys() & blocks_b.keys()
+        if (end := ends_a.get((peer, block))) is not None and end == ends_b.get((peer, block))
+    ]
     first = _first(a, b)
     if not common and first is None:
         return _by_rows_alone(a, b)
@@ -81,13 +95,21 @@ def _unequal_digests(a: Results, b: Results) -> list[str]:
 
 
 def _ends(results: Results, blocks: Iterable[tuple[str, int, int]]) -> dict[tuple[str, int], int]:
-    """(Receiver, first slot of a block) → the slot after the block: a multiple of 256, the next block, or the run's end."""
+    """(Receiver, first slot of a block) → the slot after the block: a multiple of 256, the next block, or the run's end.
+
+    Without the last block of a run that ended early, if it may go beyond the run's slots: a receiver may have been ahead of them.
+    """
+    slots, complete = int(results.summary["slots"]), results.remark is None
     starts: dict[str, set[int]] = {}
     for peer, _, block in blocks:
         starts.setdefault(peer, set()).add(block)
     ends = {}
     for peer, of_peer in starts.items():
-        for block, after in pairwise([*sorted(of_peer), int(results.summary["slots"])]):
+        *earlier, last = sorted(of_peer)
+        natural = (last // BLOCK_SLOTS + 1) * BLOCK_SLOTS
+        if complete or natural <= slots:
+            ends[peer, last] = min(natural, slots)
+        for block, after in pairwise([*earlier, last]):
             ends[peer, block] = min((block // BLOCK_SLOTS + 1) * BLOCK_SLOTS, after)
     return ends
 
