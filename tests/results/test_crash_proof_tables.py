@@ -515,6 +515,26 @@ def test_rows_follow_no_batch_that_was_cut(tmp_path: Path, monkeypatch: pytest.M
     assert Results(tmp_path, {}).slots.num_rows == 100
 
 
+def test_a_power_cut_may_take_hundreds_of_rounds(tmp_path: Path) -> None:
+    """A fast run writes many in the seconds that a power cut takes; those before are found, and each table is read once."""
+    kept = 0
+
+    def write(writer: ResultsWriter) -> None:
+        nonlocal kept
+        for first in range(0, 4000, 10):
+            if first == 100:
+                kept = sizes(writer._held.now)["slots-0.arrows"]
+            writer.slot_rows(first, microgrid().receivers[0], sums(10), np.random.default_rng(first).random(10))
+            writer.write_rows(f"slot {first + 10}")
+
+    folder = killed(tmp_path, write)
+    assert last_round(folder).slots == 4000
+    stream = folder / UNFINISHED / "slots-0.arrows"
+    whole = stream.read_bytes()
+    stream.write_bytes(whole[:kept] + bytes(100) + whole[kept + 100 :])
+    assert last_round(folder).slots == 100
+
+
 def test_a_table_that_cannot_be_read_stays_a_stream(tmp_path: Path) -> None:
     """Its file `unfinished` has all that there is; a Parquet file would lack rows that the run counted."""
     with suppress(OSError), ResultsWriter(tmp_path, NAMES, 2) as writer:

@@ -37,7 +37,7 @@ _GROUP_ROWS = 65_536
 _ROUNDS = "rounds"
 _SUMMARY = "summary.json"
 _CHECKED_AT_ONCE = 2**20
-_TAIL_BYTES = 65_536  # more than the longest line of the rounds
+_TAIL_BYTES = 65_536  # of the rounds: more than the longest line
 
 
 @final
@@ -177,35 +177,55 @@ class TableRound:
                 checks[str(name)] = (int(size), int(checksum))
         return cls(str(entry["at"]), int(entry["slots"]), tables, checks)
 
-    def survives(self, folder: Path) -> bool:
-        """Whether a power cut has left all of it in a results folder."""
+    def survives(self, folder: Path, checksums: Mapping[str, Mapping[int, int] | None]) -> bool:
+        """Whether a power cut has left all of it in a results folder; checksums: those of its files, see `_checksums_of`."""
         for name, (size, checksum) in self.checks.items():
-            path = folder / UNFINISHED / self.tables[name][0]
-            try:
-                status = path.stat()
-            except OSError:
+            of_file = checksums[self.tables[name][0]]
+            if of_file is None:
                 if not (folder / f"{name}.parquet").exists():
                     return False
-            else:
-                state = (status.st_ino, status.st_size, status.st_mtime_ns)
-                if _checksum(path, size, state) != checksum:
-                    return False
+            elif of_file.get(size) != checksum:
+                return False
         return True
 
 
+def _checksums_of(folder: Path, rounds: Sequence[TableRound]) -> dict[str, Mapping[int, int] | None]:
+    """File → size that one of these rounds gives → checksum of so many bytes at its beginning; None if there is no such file.
+
+    Each file is read once. A size is left out if the file is shorter.
+    """
+    sizes: dict[str, set[int]] = {}
+    for latest in rounds:
+        for name, (size, _) in latest.checks.items():
+            sizes.setdefault(latest.tables[name][0], set()).add(size)
+    checksums: dict[str, Mapping[int, int] | None] = {}
+    for file, wanted in sizes.items():
+        path = folder / UNFINISHED / file
+        try:
+            status = path.stat()
+        except OSError:
+            checksums[file] = None
+        else:
+            state = (status.st_ino, status.st_size, status.st_mtime_ns)
+            checksums[file] = _checksums(path, tuple(sorted(wanted)), state)
+    return checksums
+
+
 @lru_cache(maxsize=64)
-def _checksum(path: Path, size: int, state: tuple[int, ...]) -> int | None:
-    """The checksum of the first bytes of a file; None if there are fewer. state: something that changes with the file."""
+def _checksums(path: Path, sizes: tuple[int, ...], state: tuple[int, ...]) -> Mapping[int, int]:
+    """Size, in rising order → checksum of so many bytes of a file. state: something that changes with the file."""
     del state
-    check = xxhash.xxh3_64()
-    try:
-        with path.open("rb") as file:
-            while size and (data := file.read(min(size, _CHECKED_AT_ONCE))):
-                size -= len(data)
+    check, done = xxhash.xxh3_64(), 0
+    checksums = {}
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        for size in sizes:
+            while done < size and (data := file.read(min(size - done, _CHECKED_AT_ONCE))):
+                done += len(data)
                 check.update(data)
-    except OSError:
-        return None
-    return None if size else check.intdigest()
+            if done < size:
+                break
+            checksums[size] = check.intdigest()
+    return checksums
 
 
 class Unfinished:
@@ -254,17 +274,27 @@ def last_round(folder: Path) -> TableRound:
     A power cut may leave the line of a round and not its rows, so such a round counts only if its rows are on the disk, unless
     its writer still runs.
     """
-    try:
-        lines = lines_in(folder / UNFINISHED / _ROUNDS, last=_TAIL_BYTES)
-    except OSError:
-        return TableRound()
     runs = goes_on(folder)
-    for line in reversed(lines):
-        with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, OverflowError):
-            latest = TableRound.read(line)
-            if runs or latest.survives(folder):
-                return latest
+    for last in (_TAIL_BYTES, None):  # a power cut may have taken more rounds than there are at the end
+        rounds = _rounds(folder, last)
+        latest = next(rounds if runs else _surviving(folder, [*rounds]), None)
+        if latest is not None:
+            return latest
     return TableRound()
+
+
+def _rounds(folder: Path, last: int | None) -> Iterator[TableRound]:
+    """The rounds that were written completely, from the last one on; last: as in `lines_in`."""
+    with contextlib.suppress(OSError):
+        for line in reversed(lines_in(folder / UNFINISHED / _ROUNDS, last)):
+            with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, OverflowError):
+                yield TableRound.read(line)
+
+
+def _surviving(folder: Path, rounds: Sequence[TableRound]) -> Iterator[TableRound]:
+    """Those of some rounds that a power cut has left."""
+    checksums = _checksums_of(folder, rounds)
+    return (each for each in rounds if each.survives(folder, checksums))
 
 
 def write_metrics(folder: Path, text: str) -> None:
