@@ -41,6 +41,7 @@ from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums
 from evedrop.show.view.scene_slots import replay
 from evedrop.system.disk import write_all
+from evedrop.system.files import try_lock
 from tests.conftest import Evedrop, Live, wait_until
 from tests.disks import simulated
 from tests.examples import examples, mostly_long
@@ -533,6 +534,16 @@ def test_a_power_cut_may_take_hundreds_of_rounds(tmp_path: Path) -> None:
     whole = stream.read_bytes()
     stream.write_bytes(whole[:kept] + bytes(100) + whole[kept + 100 :])
     assert last_round(folder).slots == 100
+
+
+def test_a_reader_does_not_keep_a_run_from_its_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever looks just then whether the run goes on has the lock for a moment; later readers must see that it does."""
+    lock, readers = try_lock, [True, True]
+    monkeypatch.setattr(
+        crash_proof_tables, "try_lock", lambda descriptor: not (readers and readers.pop()) and lock(descriptor)
+    )
+    with ResultsWriter(tmp_path, NAMES, 2):
+        assert goes_on(tmp_path)
 
 
 def test_a_table_that_cannot_be_read_stays_a_stream(tmp_path: Path) -> None:

@@ -37,6 +37,8 @@ _GROUP_ROWS = 65_536
 _ROUNDS = "rounds"
 _SUMMARY = "summary.json"
 _CHECKED_AT_ONCE = 2**20
+_LOCK_ATTEMPTS = 50
+_LOCKED_SECONDS = 0.002  # in which a reader that looks whether a run goes on holds the lock
 _TAIL_BYTES = 65_536  # of the rounds: more than the longest line
 
 
@@ -236,7 +238,10 @@ class Unfinished:
         place = folder / UNFINISHED
         make_private(place, exist_ok=False)
         self._descriptor = world().disk.hold(place)
-        try_lock(self._descriptor)  # on a file system without locks, a run in progress looks killed
+        for _ in range(_LOCK_ATTEMPTS):  # on a file system without locks, a run in progress looks killed
+            if try_lock(self._descriptor):
+                break
+            world().sleep(_LOCKED_SECONDS)
         self._rounds = LineFile(place / _ROUNDS)
 
     def round(
