@@ -57,13 +57,15 @@ class ScenarioError(UsageError):
     def __init__(self, source: str, mistakes: list[str], excerpts: Sequence[str] = ()) -> None:
         """excerpts: for each mistake, the line of the file with carets below what is wrong; empty for none."""
         self.source = source
-        self._excerpts = excerpts
         self._all = mistakes
         more = len(mistakes) - MOST_MISTAKES
+        self._excerpts = [*excerpts[:MOST_MISTAKES], ""] if more > 0 else excerpts
         short = [line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}…" for line in mistakes[:MOST_MISTAKES]]
         self.mistakes = short if more <= 0 else [*short, f"and {more} more"]
         count = "1 mistake" if len(mistakes) == 1 else f"{len(mistakes)} mistakes"
-        super().__init__("\n".join([f"{source}: {count}, nothing was started", *(f"  {line}" for line in mistakes)]))
+        super().__init__(
+            "\n".join([f"{source}: {count}, nothing was started", *(f"  {line}" for line in self.mistakes)])
+        )
 
     def numbered(self, line_of: Callable[[str], int | None], excerpt: Callable[[str, int], str]) -> ScenarioError:
         """The same with the line of each mistake's entry.

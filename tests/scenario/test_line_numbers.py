@@ -9,10 +9,11 @@ from typing import Any
 
 import pytest
 
-from evedrop.errors import ScenarioError
+from evedrop.errors import MOST_MISTAKES, ScenarioError
 from evedrop.scenario.line_numbers import excerpt, line_of, lines_of_entries
 from evedrop.scenario.loading import load, parse
 from evedrop.scenarios import shipped
+from tests.builders import BASE
 
 TEXT = '''# a comment with [brackets]
 a = 1
@@ -194,3 +195,23 @@ def test_an_excerpt_marks_the_key_of_an_unknown_entry() -> None:
     """The value of an entry that is not known is not what is wrong."""
     shown, carets = excerpt("legitimate = {quality = 1.4}", 4, "quality", key=True).split("\n")
     assert shown[carets.index("^") : carets.rindex("^") + 1] == "quality"
+
+
+def test_an_excerpt_has_no_end_of_line() -> None:
+    """Of a file that was written on Windows."""
+    assert excerpt("slots = 0\r", 3, "slots") == excerpt("slots = 0", 3, "slots")
+
+
+def test_a_message_has_as_many_mistakes_as_can_be_read() -> None:
+    """A hundred, with the lines of the file, and how many more there are."""
+    events = [f'[[event]]\nat = 1\ncut = "nobody{k}"\n' for k in range(150)]
+    with pytest.raises(ScenarioError) as caught:
+        parse(BASE + "\n".join(events), "many.toml")
+    first, *lines = str(caught.value).split("\n")
+    assert first == "many.toml: 150 mistakes, nothing was started"
+    assert [line.strip() for line in lines] == caught.value.mistakes
+    assert len(lines) == MOST_MISTAKES + 1
+    assert lines[-1] == "  and 50 more"
+    illustrated = caught.value.illustrated.split("\n")
+    assert len(illustrated) == 1 + 3 * MOST_MISTAKES + 1
+    assert illustrated[-1] == "  and 50 more"

@@ -79,6 +79,7 @@ def excerpt(row: str, line: int, name: str = "", *, key: bool = False, column: i
     If the line does not have this entry, the carets are below the header or the first key. column: where a single caret is, from
     0, in place of them. Empty if that is too far right to be shown.
     """
+    row = row.removesuffix("\r")
     statement = row.strip() if row.lstrip().startswith("[") else row.partition("=")[0].strip()
     begin, end = row.find(statement), row.find(statement) + len(statement)
     entry = re.search(rf"(?<![\w-])({re.escape(name)})\s*=\s*{_VALUE}", row) if name else None
