@@ -63,6 +63,7 @@ def expecting(*expectations: dict[str, Any], **changes: Any) -> Scenario:
         ({"metric": "links.smart.lots", "below": 1}, "metric"),
         ({"metric": "links.nobody.lost", "below": 1}, "metric"),
         ({"metric": "links.smart.lost_by.2", "below": 1}, "metric"),
+        ({"metric": "links.smart.lost_by.corupted", "below": 1}, "metric"),
         ({"metric": "smart", "below": 1}, "metric"),
         ({"metric": 3, "below": 1}, "metric"),
         ({"link": "smrt"}, "link"),

@@ -39,7 +39,7 @@ OTHERS: list[dict[str, Any]] = [
     {"metric": "naive.mean_trace_covariance", "slots": [FIRST, 70], "above": 0.0},
     {"metric": "naive.theoretical_trace_covariance", "slots": [FIRST, 70], "above": 0.0},
     {"metric": "links.naive.lost", "above": 0},
-    {"metric": "links.naive.lost_by.nothing", "above": 0},
+    {"metric": "links.naive.lost_by.cut", "above": 0},
     {"link": "naive"},
     {"secrecy": "relative", "against": "naive"},
     {"secrecy": "perfect", "against": "smart"},
@@ -115,9 +115,10 @@ def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
             value, rel=1e-12
         )
     assert expectations["links.naive.lost above 0"]["value"] == results.summary["links"]["naive"]["lost"]
-    unknown = expectations["links.naive.lost_by.nothing above 0"]
-    assert (unknown["value"], unknown["held"]) == (None, None)
-    assert Judged(**unknown).sentence.endswith(": FAILED, the run has no value for it")
+    cut = expectations["links.naive.lost_by.cut above 0"]
+    assert (cut["value"], cut["held"]) == (0, False)
+    unknown = Judged(**{**cut, "value": None, "held": None})
+    assert unknown.sentence.endswith(": FAILED, the run has no value for it")
     perfect = expectations["perfect secrecy against smart promised by theory and shown by the run"]
     assert (perfect["held"], perfect["value"]) == (False, "theory denies it, the run shows that it fails")
     states = np.isin(of_trials(results, "suspicious")["action"], ("state", "misled"))

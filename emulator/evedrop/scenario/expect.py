@@ -6,13 +6,13 @@ Source: docs/scenario.md, expect.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
+from evedrop.model.links.loss_model import REASONS
 from evedrop.model.metrics import expectable_metrics, metrics_of, unloadable_metrics
 from evedrop.model.metrics.built_in import LINK_METRICS
 from evedrop.scenario.application import APPLICATIONS, Application
@@ -23,7 +23,6 @@ from evedrop.system.hints import near
 SECRECY = ("relative", "perfect")
 
 LINKS, DIRECTIONS = "links", "directions"
-_LOST_BY = re.compile(r"lost_by\.[a-z][a-z0-9_-]*")
 _COMPARISONS = ("below", "above", "near", "within", "within_relative")
 _ENTRIES: Mapping[str, tuple[str, ...]] = {
     "metric": (*_COMPARISONS, "slots", "quantile"),
@@ -275,22 +274,21 @@ class Around:
 
     def _metric_mistakes(self, metric: str) -> list[Mistake]:
         link = link_metric(metric)
-        if link is not None and link[0] in self.receivers and _LOST_BY.fullmatch(".".join(link[1])):
-            return []
         metrics = expectable_metrics()
         own = [f"{receiver}.{name}" for receiver in self.receivers for name in metrics_of(receiver) if name in metrics]
         links = [f"{LINKS}.{receiver}.{name}" for receiver in self.receivers for name in LINK_METRICS]
+        reasons = [f"{LINKS}.{receiver}.lost_by.{reason}" for receiver in self.receivers for reason in REASONS]
         first = metric.partition(".")[0]
         if first not in self.receivers and first in APPLICATIONS:
             return self._application_mistakes(metric, first, APPLICATIONS[first])
         name = metric.rpartition(".")[2]
-        if metric not in [*own, *links]:
+        if metric not in [*own, *links, *reasons]:
             broken = unloadable_metrics().get(name)
             if broken is not None:
                 return [("metric", f"is {as_toml(metric)}{broken}")]
             names = f"RECEIVER ({', '.join(self.receivers)}).METRIC ({', '.join(metrics)})"
             of_links = f"{LINKS}.RECEIVER.METRIC ({', '.join(LINK_METRICS)}, lost_by.REASON)"
-            hint = near(metric, [*own, *links])
+            hint = near(metric, reasons if ".lost_by." in metric else [*own, *links])
             return [("metric", f"is {as_toml(metric)}; expected {names} or {of_links}{hint}")]
         why = self.no_theory(first) if link is None and metrics[name].needs_theory else None
         if why is not None:
