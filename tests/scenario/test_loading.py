@@ -241,6 +241,19 @@ def test_any_entry_can_be_set() -> None:
     ]
 
 
+def test_a_quality_replaces_a_loss_only_in_a_link() -> None:
+    """At first and where an event changes it; eavesdroppers may have these names."""
+    eve = GOOD["eavesdroppers"]["smart"]
+    tables = {**GOOD, "eavesdroppers": {"loss": eve, "quality": eve}}
+    tables["event"] = [{"at": 5, "link": "loss", "set": {"quality": 0.5}}]
+    loss = {"model": "pattern", "outcomes": "10"}
+    changes = {"eavesdroppers.quality.link.loss": loss, "event.0.set.loss": loss, "eavesdroppers.loss.window": 2}
+    scenario = parse(tomli_w.dumps(tables), "scenario", changes)
+    assert scenario.receivers == ("legitimate", "loss", "quality")
+    assert scenario.eavesdroppers["quality"].pool.loss == loss
+    assert scenario.timeline.changes["loss"][0].settings == {"loss": loss}
+
+
 @given(st.one_of(st.integers(), st.booleans(), st.floats(allow_nan=False), st.lists(st.integers()), st.text("abc d")))
 def test_values_on_the_command_line_are_toml_or_text(value: Any) -> None:
     """A value that is TOML is read as such, everything else as a string."""

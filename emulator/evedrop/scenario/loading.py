@@ -238,10 +238,10 @@ def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
     """
     names = dotted.split(".")
     inner: Any = tables
-    for name, after in pairwise(names):
+    for i, (name, after) in enumerate(pairwise(names)):
         new: Any = [] if after == "0" else {}
         if isinstance(inner, dict) and name:
-            inner.pop(_SHORT_FORMS.get(name), None)
+            _drop_other_form(inner, names[: i + 1])
             inner = inner.setdefault(name, new)
         elif isinstance(inner, list) and name.isdecimal() and int(name) <= len(inner):
             if int(name) == len(inner):
@@ -251,12 +251,19 @@ def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
             raise _no_such_key(dotted, name, inner)
     last = names[-1]
     if isinstance(inner, dict) and last:
-        inner.pop(_SHORT_FORMS.get(last), None)
+        _drop_other_form(inner, names)
         inner[last] = value
     elif isinstance(inner, list) and last.isdecimal() and int(last) <= len(inner):
         inner[int(last) : int(last) + 1] = [value]
     else:
         raise _no_such_key(dotted, last, inner)
+
+
+def _drop_other_form(table: dict[str, Any], names: list[str]) -> None:
+    """Remove the other form of an entry of a link, or of a change of one, in place; names: the path of the entry."""
+    tables = [name for name in names[:-1] if not name.isdecimal()]
+    if tables and tables[-1] in ("link", "links", "set"):
+        table.pop(_SHORT_FORMS.get(names[-1]), None)
 
 
 def _no_such_key(dotted: str, name: str, inner: Any) -> UsageError:
