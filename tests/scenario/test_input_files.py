@@ -204,3 +204,19 @@ def test_a_model_whose_class_says_so_reads_a_recording(tmp_path: Path, monkeypat
     assert (read_recordings({"loss": loss}), list(loss)) == ([], ["model", "file"])
     monkeypatch.setattr(Pattern, "recorded", "outcomes")
     assert (read_recordings({"loss": loss}), loss) == ([], {"model": "pattern", "outcomes": "101"})
+
+
+def test_a_secret_that_a_change_names_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the current folder; the scenario that is written can be read elsewhere."""
+    (tmp_path / "secret").write_bytes(bytes(range(64)))
+    monkeypatch.chdir(tmp_path)
+    text = parse(BASE, "scenario.toml", {"secret_file": "secret"}).to_toml()
+    monkeypatch.chdir("/")
+    assert parse(text, "again").secret_file == str(tmp_path / "secret")
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(50_000, 64), (1_000_000, 10), (1, 1)])
+def test_there_is_room_for_all_numbers_of_a_table(rows: int, columns: int) -> None:
+    """Written in full, with a comma and a space."""
+    longest = len(f"{-(2.0**-1000) / 3.0!r}, ")
+    assert Limit.of_rows(rows, columns).characters > rows * columns * longest

@@ -190,6 +190,7 @@ def checked(
     if isinstance(tables.get("secret_file"), str):
         try:
             secret_in(tables["secret_file"])
+            tables["secret_file"] = str(Path(tables["secret_file"]).absolute())
         except UsageError as error:
             mistakes.append(str(error))
     if isinstance(tables.get("modules"), str):
@@ -261,9 +262,9 @@ def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
 
 def _drop_other_form(table: dict[str, Any], names: list[str]) -> None:
     """Remove the other form of an entry of a link, or of a change of one, in place; names: the path of the entry."""
-    tables = [name for name in names[:-1] if not name.isdecimal()]
-    if tables and tables[-1] in ("link", "links", "set"):
-        table.pop(_SHORT_FORMS.get(names[-1]), None)
+    tables, other = [name for name in names[:-1] if not name.isdecimal()], _SHORT_FORMS.get(names[-1])
+    if other is not None and tables and tables[-1] in ("link", "links", "set"):
+        table.pop(other, None)
 
 
 def _no_such_key(dotted: str, name: str, inner: Any) -> UsageError:

@@ -39,9 +39,9 @@ class Limit:
     characters: int
 
     @classmethod
-    def of_rows(cls, rows: int) -> Limit:
-        """A limit with room for this many rows of numbers, and for comments and empty lines."""
-        return cls(2 * rows + 10_000, 16 * 2**20 + 1024 * rows)
+    def of_rows(cls, rows: int, columns: int = 1) -> Limit:
+        """A limit with room for this many rows of numbers, for comments and empty lines, and for some other columns."""
+        return cls(2 * rows + 10_000, 16 * 2**20 + max(1024, 32 * columns) * rows)
 
 
 def is_there(path: Path) -> bool:

@@ -70,7 +70,7 @@ def read_disturbances(
             [f"is read for {slots} slots of {len(names)} columns; expected at most {most} slots, or fewer columns"],
         )
     limit = _ROWS_UNASKED if slots is None else max(0, slots)
-    rows = _rows(path, limit)
+    rows = _rows(path, limit, len(names))
     head = next(rows, None)
     if head is None:
         problem = f"is empty; expected a line of names such as {_EXAMPLE}, then a line for every slot"
@@ -110,7 +110,7 @@ def recorded_states(path: Path, names: Sequence[str] | None = None) -> StateReco
 
     Raises DisturbanceError as `read_disturbances` does; times may scatter by a tenth of their mean distance.
     """
-    rows = _rows(path, MOST_NUMBERS)
+    rows = _rows(path, MOST_NUMBERS, 1)
     head = next(rows, None)
     if head is None:
         raise DisturbanceError(
@@ -175,10 +175,10 @@ class _Found:
     mistakes: list[str]
 
 
-def _rows(path: Path, slots: int) -> Iterator[_Row]:
-    """Every line that is neither blank nor a comment, from a file for this number of slots. Raises DisturbanceError."""
+def _rows(path: Path, slots: int, columns: int) -> Iterator[_Row]:
+    """Every line that is neither blank nor a comment, from a file for so many slots and columns. Raises DisturbanceError."""
     try:
-        reader = csv.reader(lines_of(path, Limit.of_rows(slots)), skipinitialspace=True)
+        reader = csv.reader(lines_of(path, Limit.of_rows(slots, columns)), skipinitialspace=True)
         for cells in reader:
             stripped = list(map(str.strip, cells))
             if any(stripped) and not stripped[0].startswith("#"):
