@@ -303,7 +303,13 @@ class Scenario(Table):
         return _builders().load(source, {**table_argument("changes", changes, CHANGES), **dotted(others)})
 
     def replace(self, changes: Mapping[str, Any] | None = None, /, **others: Any) -> Scenario:
-        """The same scenario with changes, given as for `load`; None removes an entry. Raises ScenarioError with every mistake."""
+        """The same scenario with changes, given as for `load`; None removes an entry.
+
+        The faults that a nemesis drew, and matrices that were `"filter"`, stay as they are; `load` with the changes makes new
+        ones.
+
+        Raises ScenarioError with every mistake.
+        """
         return _builders().change(self, {**table_argument("changes", changes, CHANGES), **dotted(others)})
 
     def to_toml(self) -> str:
