@@ -14,9 +14,10 @@ from evedrop.errors import UsageError
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.closed_forms import encrypted_fraction
-from evedrop.results.comparison import Comparison, read_comparison
+from evedrop.results.comparison import Comparison, SimulatedError, Theory, read_comparison
 from evedrop.results.summary_file import plain
 from evedrop.scenario.loading import load
+from evedrop.score.summary import RareEvents
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.comparison import conclusion, verdict
 from evedrop.show.report.comparison_sections import COMPARISON_SECTIONS, ComparisonSource
@@ -228,6 +229,61 @@ def test_trials_alone_do_not_rank_schemes(tmp_path: Path) -> None:
     assert not result.dominant
     assert result.without_limit == ("cipher", "plain")
     assert conclusion(result).startswith("no scheme is known to dominate: theory does not give")
+
+
+def test_a_mean_over_a_run_is_no_price(tmp_path: Path) -> None:
+    """A scheme without a limit in theory has the mean of the run, start included; it is not compared with limits of others.
+
+    From a large start the mean of `random-code` over the run is above the limit of `innovation`, and its long run is below.
+    """
+    start: dict[str, Any] = {
+        "process__initial_covariance": [[1.0, 0.0], [0.0, 0.1]],
+        "process__A": [[0.95, 0.1], [0.0, 0.9]],
+    }
+    result = compare(
+        "bayesian",
+        schemes=["innovation", "random-code"],
+        adversaries=["naive", "constant"],
+        out=tmp_path,
+        expect=[],
+        slots=200,
+        trials=10,
+        **start,
+    )
+    innovation, code = result.schemes.values()
+    assert innovation.price < code.price
+    assert innovation.protection > code.protection
+    assert code.price_range[0] < innovation.price < code.price_range[1]
+    assert code.legitimate.theory is not None
+    assert code.legitimate.theory.bound
+    assert (result.dominant, result.without_limit) == ((), ("random-code",))
+    assert conclusion(result).startswith(
+        "no scheme is known to dominate: theory does not give the legitimate error of rand"
+    )
+
+
+def test_trials_bound_an_error_unless_rare_events_matter() -> None:
+    """Within three standard errors, and not below what theory allows; a lower bound of theory is no limit."""
+    error = SimulatedError(4.0, 0.1, {"0.5": 3.9}, infinite_variance=False, theory=None)
+    assert error.expected == pytest.approx((3.7, 4.3))
+    assert replace(error, theory=Theory(3.9, 3.9, 5.0, bound=True)).expected == pytest.approx((3.9, 4.3))
+    assert replace(error, theory=Theory(3.9, 3.9, 5.0, bound=True)).lasting == (5.0, math.inf)
+    assert replace(error, theory=Theory(3.9, 3.9, 5.0, bound=False)).expected == (3.9, 3.9)
+    assert replace(error, theory=Theory(3.9, 3.9, 5.0, bound=False)).lasting == (5.0, 5.0)
+    assert replace(error, rare_events=RareEvents(0.2, 1e4)).expected == (0.0, math.inf)
+    assert replace(error, standard_error=None).expected == (0.0, math.inf)
+    assert error.lasting == (0.0, math.inf)
+
+
+def test_a_scheme_alone_does_not_dominate(literature: Comparison) -> None:
+    """Nor does one if no adversary counts against it."""
+    alone = replace(literature, schemes={"cipher": literature.schemes["cipher"]})
+    assert alone.dominant == ()
+    assert conclusion(alone).startswith("no scheme dominates: only cipher was compared")
+    plain_, cipher = (literature.schemes[name] for name in ("plain", "cipher"))
+    untouched = replace(literature, schemes={"plain": replace(plain_, cells={}), "cipher": cipher})
+    assert untouched.dominant == ()
+    assert conclusion(untouched).startswith("no scheme is known to dominate: no adversary counts against plain")
 
 
 @pytest.mark.long

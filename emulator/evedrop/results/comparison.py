@@ -20,7 +20,7 @@ from evedrop.errors import UsageError
 from evedrop.results.reading import ByName
 from evedrop.results.summary_file import plain
 from evedrop.score.secrecy import Claim, Secrecy
-from evedrop.score.summary import RareEvents, SecrecySummary
+from evedrop.score.summary import RARE_FRACTION, RareEvents, SecrecySummary
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.system.files import Unreadable, text_of
 
@@ -28,6 +28,10 @@ COMPARISON = "compare.json"
 _MOST_BYTES = 2**26
 _NOT_IN_NAMES, _LONGEST_NAME = re.compile(r"[^a-z0-9_-]"), 32  # of receivers
 _ALIKE = 1e-6  # relative difference of two errors of theory that count as equal: allows for rounding only
+_REACH = 3.0  # standard errors around a mean over trials within which its expectation is taken to be
+
+Range = tuple[float, float]
+"""The least and the largest value that an error may have."""
 
 
 def receiver_name(strategy: str) -> str:
@@ -89,6 +93,25 @@ class SimulatedError:
     def typical(self) -> float:
         """The metric to compare by: the mean over trials, or the median if the variance is infinite."""
         return self.quantiles["0.5"] if self.infinite_variance else self.mean
+
+    @property
+    def expected(self) -> Range:
+        """Where its expectation over the slots of the run is: as in theory, else as trials tell, unless rare events matter."""
+        if self.theory is not None and not self.theory.bound:
+            return self.theory.mean, self.theory.mean
+        least = 0.0 if self.theory is None else self.theory.mean
+        if self.standard_error is None or (self.rare_events and self.rare_events.fraction > RARE_FRACTION):
+            return least, math.inf
+        reach = _REACH * self.standard_error
+        return max(least, self.mean - reach), max(least, self.mean + reach)
+
+    @property
+    def lasting(self) -> Range:
+        """Where its expectation in the long run is, by theory alone."""
+        limit = None if self.theory is None else self.theory.limit
+        if self.theory is None or limit is None or math.isnan(limit):
+            return 0.0, math.inf
+        return limit, math.inf if self.theory.bound else limit
 
 
 @dataclass(frozen=True)
@@ -203,8 +226,7 @@ class SchemeResult:
     @property
     def closest(self) -> Cell | None:
         """The adversary with the least error, except those that learn a true state; None if there is none."""
-        played = [cell for cell in self.cells.values() if cell.eavesdropper is not None and not cell.match.betrayed]
-        return min(played, key=lambda cell: _error(cell.eavesdropper), default=None)
+        return min(self._played, key=lambda cell: _error(cell.eavesdropper), default=None)
 
     @property
     def protection(self) -> float:
@@ -212,25 +234,49 @@ class SchemeResult:
         return math.nan if self.closest is None else _error(self.closest.eavesdropper)
 
     @property
+    def protection_range(self) -> Range:
+        """Where the least of the expected errors of these adversaries is."""
+        ranges = [cell.eavesdropper.expected for cell in self._played if cell.eavesdropper is not None]
+        least, most = (min(ends) for ends in zip(*ranges, strict=True)) if ranges else (0.0, math.inf)
+        return least, most
+
+    @property
     def price(self) -> float:
         """The largest error of the legitimate estimator under any attack: the limit of theory, if it is known."""
-        errors = [self.legitimate, *(cell.legitimate for cell in self.cells.values() if cell.legitimate is not None)]
-        return max(_lasting(error) for error in errors)
+        return max(
+            error.typical if error.lasting[0] < error.lasting[1] else error.lasting[0]
+            for error in self.legitimate_errors
+        )
 
+    @property
+    def price_range(self) -> Range:
+        """Where the largest error of the legitimate estimator in the long run is, under any attack."""
+        least, most = (max(ends) for ends in zip(*(error.lasting for error in self.legitimate_errors), strict=True))
+        return least, most
 
-def _limit(of: SimulatedError) -> float:
-    limit = None if of.theory is None else of.theory.limit
-    return math.nan if limit is None else limit
+    @property
+    def _played(self) -> list[Cell]:
+        return [cell for cell in self.cells.values() if cell.eavesdropper is not None and not cell.match.betrayed]
+
+    @property
+    def legitimate_errors(self) -> list[SimulatedError]:
+        """The errors of the legitimate estimator without an attack, then in the simulation of each adversary."""
+        return [self.legitimate, *(cell.legitimate for cell in self.cells.values() if cell.legitimate is not None)]
+
+    def keeps_up_with(self, other: SchemeResult) -> bool:
+        """Whether it is certain that neither its price nor its protection is worse."""
+        cheap = self.price_range[1] <= other.price_range[0] * (1.0 + _ALIKE)
+        return cheap and self.protection_range[0] >= other.protection_range[1] * (1.0 - _ALIKE)
+
+    def is_beaten_by(self, other: SchemeResult) -> bool:
+        """Whether it is certain that its price or its protection is worse."""
+        dear = self.price_range[0] > other.price_range[1] * (1.0 + _ALIKE)
+        return dear or self.protection_range[1] < other.protection_range[0] * (1.0 - _ALIKE)
 
 
 def _error(of: SimulatedError | None) -> float:
     assert of is not None  # noqa: S101 - the caller has checked it
     return of.typical if of.theory is None or of.theory.bound else of.theory.mean
-
-
-def _lasting(of: SimulatedError) -> float:
-    limit = _limit(of)
-    return of.typical if math.isnan(limit) else limit
 
 
 @dataclass(frozen=True)
@@ -251,21 +297,26 @@ class Comparison:
 
     @property
     def dominant(self) -> tuple[str, ...]:
-        """Schemes that no other beats: none has a smaller legitimate error, or a larger error of the closest adversary."""
-        usable = [scheme for scheme in self.schemes.values() if not math.isnan(scheme.protection)]
-        return tuple(
-            scheme.name
-            for scheme in usable
-            if all(
-                scheme.price <= other.price * (1.0 + _ALIKE) and scheme.protection >= other.protection * (1.0 - _ALIKE)
-                for other in usable
-            )
-        )
+        """Schemes that no other beats: none has a smaller price, or more protection."""
+        return tuple(scheme.name for scheme in self.schemes.values() if self.is_beaten(scheme) is False)
+
+    def is_beaten(self, scheme: SchemeResult) -> bool | None:
+        """Whether another scheme has a smaller price, or more protection; None if that is not certain, or there is no other."""
+        others = [other for other in self.schemes.values() if other is not scheme]
+        if any(map(scheme.is_beaten_by, others)):
+            return True
+        return False if others and all(map(scheme.keeps_up_with, others)) else None
 
     @property
     def without_limit(self) -> tuple[str, ...]:
         """Schemes whose legitimate error in the long run no theory gives, so that `price` has that of the trials."""
-        return tuple(scheme.name for scheme in self.schemes.values() if math.isnan(_limit(scheme.legitimate)))
+        ranges = {scheme.name: scheme.price_range for scheme in self.schemes.values()}
+        return tuple(name for name, (least, most) in ranges.items() if least < most)
+
+    @property
+    def without_protection(self) -> tuple[str, ...]:
+        """Schemes against which no adversary counts."""
+        return tuple(scheme.name for scheme in self.schemes.values() if scheme.closest is None)
 
     def cell(self, scheme: str, adversary: str) -> Cell:
         """The cell of one pair. Raises UnknownName, a KeyError, for a scheme or an adversary that was not compared."""

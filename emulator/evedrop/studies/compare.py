@@ -13,6 +13,7 @@ import itertools
 import math
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ import numpy as np
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.model.metrics.built_in import MeanSquaredError
 from evedrop.model.metrics.standard_error import standard_error
-from evedrop.model.schemes import scheme_of
+from evedrop.model.outcomes import legitimate_outcomes
+from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.names import LEGITIMATE
 from evedrop.results.comparison import Cell, Comparison, Needs, PacketLeak, SchemeResult, SimulatedError, Theory
 from evedrop.results.folder import (
@@ -221,6 +223,8 @@ def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expecta
 def _theory(scenario: Scenario, receiver: str, expected: Expectation) -> Theory | None:
     """The theory of a receiver: its error, or a lower bound for receivers of its kind; None if neither is known."""
     usable = expected if expected.known else expected.bound
+    if usable is None and receiver == LEGITIMATE:
+        usable = _if_given_states(scenario, expected)
     if usable is not None:
         traces = usable.traces(scenario.slots)
         return Theory(float(np.mean(traces)), float(traces[-1]), usable.limit, usable is not expected)
@@ -229,6 +233,18 @@ def _theory(scenario: Scenario, receiver: str, expected: Expectation) -> Theory 
         return None
     floor, grows = bound
     return Theory(float(np.mean(floor)), float(floor[-1]), math.inf if grows else None, True)
+
+
+def _if_given_states(scenario: Scenario, expected: Expectation) -> Expectation | None:
+    """What theory would expect of the legitimate estimator if every packet brought the state; no built-in scheme does better.
+
+    None if it does not know that, and for a scheme of the user's own, which may tell more by being silent.
+    """
+    if SCHEMES.foreign(scenario.encoding.scheme):
+        return None
+    plain = scheme_of(scenario.process.process, {"scheme": "plain"})
+    given = replace(expected, outcomes_at=legitimate_outcomes(plain), closed=None, closed_bound=None, slots_at=None)
+    return given if given.known else None
 
 
 def _write(folder: Path, reproduction: Comparison, played: Sequence[tuple[Group, Merger]]) -> None:

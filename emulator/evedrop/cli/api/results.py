@@ -261,7 +261,7 @@ class ComparisonResults(Comparison, ReportedResults):
         table = TextTable.headed(["scheme"], numbers, ["beaten by another scheme"])
         for scheme in self.schemes.values():
             price, protection = (None if math.isnan(error) else error for error in (scheme.price, scheme.protection))
-            beaten = "–" if protection is None else "no" if scheme.name in self.dominant else "yes"
+            beaten = {True: "yes", False: "no", None: "–"}[self.is_beaten(scheme)]
             table.add(scheme.name, number_text(price, ".3g"), number_text(protection, ".3g"), beaten)
         lines = [conclusion(self), *left_out_schemes(self)]
         return printable(

@@ -40,15 +40,22 @@ def conclusion(comparison: Comparison) -> str:
             f"{', '.join(comparison.dominant)}: {alone}: no other scheme costs the legitimate estimator less in the long run, "
             f"and no other scheme gives the closest adversary a larger error{more}"
         )
-    if comparison.without_limit:
+    if all(map(comparison.is_beaten, comparison.schemes.values())):
         return (
-            f"no scheme is known to dominate: theory does not give the legitimate error of {listed(comparison.without_limit)} in "
-            f"the long run, and errors of trials are too inexact to rank schemes{more}"
+            "no scheme dominates: each one costs the legitimate estimator more in the long run than another scheme, or gives "
+            f"the closest adversary a smaller error{more}"
         )
-    return (
-        "no scheme dominates: each one costs the legitimate estimator more in the long run than another scheme, or gives the "
-        f"closest adversary a smaller error{more}"
-    )
+    if len(comparison.schemes) == 1:
+        return f"no scheme dominates: only {next(iter(comparison.schemes))} was compared{more}"
+    if comparison.without_limit:
+        why = f"theory does not give the legitimate error of {listed(comparison.without_limit)} in the long run, and"
+    elif comparison.without_protection:
+        return (
+            f"no scheme is known to dominate: no adversary counts against {listed(comparison.without_protection)}{more}"
+        )
+    else:
+        why = "theory does not give the errors of all closest adversaries, and"
+    return f"no scheme is known to dominate: {why} errors of trials are too inexact to rank schemes{more}"
 
 
 def comparison_lines(comparison: Comparison) -> Iterator[str]:
@@ -155,7 +162,8 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
         "clear: the fraction of slots whose packet is the state itself; leak: the bits about the path of states that another "
         "packet reveals without the secret"
     )
-    measured = [cell.eavesdropper for scheme in comparison.schemes.values() for cell in scheme.cells.values()]
+    schemes = comparison.schemes.values()
+    measured = [cell.eavesdropper for scheme in schemes for cell in scheme.cells.values()]
     if any(scheme is not None and scheme.infinite_variance for scheme in measured):
         yield (
             "med: the variance over trials is infinite, so the mean says nothing; this is the median trial, which lies far "
@@ -173,5 +181,9 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
             f"{rare_events_words(comparison.trials)} carry a part of expected errors, whose means and standard errors are then "
             f"probably too small: {', '.join(rare)}"
         )
-    if any(scheme is not None and scheme.theory is not None and scheme.theory.bound for scheme in measured):
-        yield "≥: no closed form is known; a lower bound on the expected error of any receiver without the secret"
+    every = [*measured, *(error for scheme in schemes for error in scheme.legitimate_errors)]
+    if any(error is not None and error.theory is not None and error.theory.bound for error in every):
+        yield (
+            "≥: no closed form is known; a lower bound on the expected error, that of an adversary for any receiver without "
+            "the secret"
+        )
