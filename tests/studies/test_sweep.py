@@ -78,6 +78,7 @@ def test_lists_are_read_as_toml(text: str, values: list[object]) -> None:
         ["slots"],
         ["=1,2"],
         ["slots="],
+        ["slots= "],
         ["a=1", "a=2"],
         ["a=5:1:1"],
         ["a=1:5:-1"],
@@ -87,6 +88,7 @@ def test_lists_are_read_as_toml(text: str, values: list[object]) -> None:
         ["a=1:2"],
         ["a=1:2:x"],
         ["a=0:1:1e-9"],
+        ["a=0:1e999999:1e-999999"],
         ["a=0:1:0.001", "b=0:1:0.01"],
     ],
     ids=str,
@@ -98,6 +100,24 @@ def test_what_is_no_grid_is_refused(texts: list[str], golden: Golden) -> None:
     assert str(told.value).startswith("--over")
     assert "\n" not in str(told.value)
     golden("sweep", told.value)
+
+
+@pytest.mark.parametrize("texts", ["seed=0,0", "seed=1,2,1.0", "encoding.state_probability=[0.5],[0.5]"])
+def test_a_repeated_value_is_refused(texts: str, tmp_path: Path) -> None:
+    """Its rows would be taken for those of one point, and the sweep for one that was interrupted."""
+    with pytest.raises(UsageError, match="is given 2 times; give each value once"):
+        sweep_over("eavesdroppers", {}, grid_of([texts]), tmp_path / "out", lambda _: None, Plan())
+    assert not (tmp_path / "out").exists()
+
+
+def test_values_of_different_kinds_are_text_in_the_table(evedrop: Evedrop) -> None:
+    """A number and a list: the table, plot and page are made, and the values read as TOML."""
+    changes = {"slots": 2, "trials": 3, "expect": []}
+    grid = {"encoding.state_probability": [0.5, [0.25, 0.75]]}
+    table = sweep_over("eavesdroppers", changes, grid, evedrop.folder / "out", lambda _: None, Plan(workers=1))
+    assert list(dict.fromkeys(table["encoding.state_probability"].to_pylist())) == ["0.5", "[0.25, 0.75]"]
+    write_report(evedrop.folder / "out")
+    assert "0.5,[0.25, 0.75]" in " ".join(checked(evedrop.folder / "out").texts)
 
 
 GRID = {"encoding.state_probability": [0.3, 0.6, 0.9], "eavesdroppers.smart.link.quality": [0.5, 0.9]}

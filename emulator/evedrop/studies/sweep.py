@@ -8,6 +8,7 @@ import json
 import math
 import re
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -46,7 +47,7 @@ _WHOLE = re.compile(r"[+-]?\d+")
 def grid_of(texts: Sequence[str]) -> dict[str, list[Any]]:
     """The grid that `--over` options describe: KEY=first:last:step, both ends included, or KEY=a,b,c.
 
-    Raises UsageError for anything else, an empty range, or more than 10 000 points.
+    Raises UsageError for anything else, an empty range or list, or more than 10 000 points.
     """
     grid: dict[str, list[Any]] = {}
     for text in texts:
@@ -56,6 +57,8 @@ def grid_of(texts: Sequence[str]) -> dict[str, list[Any]]:
         if key in grid:
             raise UsageError(f"--over {text}: {key} is given twice; give all its values in one option")
         grid[key] = _range(text, values) if _RANGE.fullmatch(values) else _listed(values)
+        if not grid[key]:
+            raise UsageError(f"--over {text}: the list is empty; expected KEY=a,b,c, such as slots=100,200")
     if math.prod(len(values) for values in grid.values()) > MOST_POINTS:
         raise UsageError(f"--over asks for more than {MOST_POINTS} points; take wider steps")
     return grid
@@ -73,11 +76,16 @@ def _range(text: str, values: str) -> list[Any]:
         first, last, step = (Decimal(value.strip()) for value in values.split(":"))
     except (ValueError, InvalidOperation):
         raise UsageError(f"--over {text}: expected three numbers first:last:step, such as 0.1:0.9:0.1") from None
-    if not all(number.is_finite() for number in (first, last, step)) or not step or (last - first) / step < 0:
+    finite = all(number.is_finite() for number in (first, last, step))
+    if not finite or not step or (last > first if step < 0 else last < first):
         raise UsageError(f"--over {text}: the range is empty; expected first:last:step with the step towards last")
-    if (last - first) / step >= MOST_POINTS:
+    try:
+        steps = (last - first) / step
+    except ArithmeticError:  # a step that is too small for Decimal
+        steps = Decimal(MOST_POINTS)
+    if steps >= MOST_POINTS:
         raise UsageError(f"--over {text} asks for more than {MOST_POINTS} values; take a wider step")
-    values_ = [first + i * step for i in range(int((last - first) / step) + 1)]
+    values_ = [first + i * step for i in range(int(steps) + 1)]
     whole = all(_WHOLE.fullmatch(value.strip()) for value in values.split(":"))
     return [int(value) if whole else float(value) for value in values_]
 
@@ -96,8 +104,9 @@ def sweep_over(
 
     resume: go on with the sweep in the folder, which was interrupted.
 
-    Returns the table, with a row for each point and peer. Raises ScenarioError if the scenario of any point has mistakes,
-    before any point is run; Interrupted, or RunError if a worker fails, with the points done so far in the folder.
+    Returns the table, with a row for each point and peer. Raises UsageError if a value is given twice, ScenarioError if the
+    scenario of any point has mistakes, before any point is run; Interrupted, or RunError if a worker fails, with the points
+    done so far in the folder.
     """
     scenarios = _checked(source, changes, grid, plan)
     total = sum(scenario.trials * scenario.slots for _, scenario in scenarios)
@@ -130,7 +139,7 @@ def sweep_over(
                         summary = _summary(scenario, plan, itertools.islice(results, len(its_tasks)))
                         if summary is None:
                             break
-                        rows += _rows(point, scenario, summary)
+                        rows += _rows(_stored(point, grid), scenario, summary)
                         applications |= dict.fromkeys(summary.applications)
                         done += 1
                         if time.monotonic() - written > _WRITE_SECONDS:
@@ -185,7 +194,12 @@ def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> 
 def _checked(
     source: str | Path | Scenario, changes: Mapping[str, Any], grid: Grid, plan: Plan
 ) -> list[tuple[Point, Scenario]]:
-    """Every point with its scenario. Raises ScenarioError with the mistakes of all points."""
+    """Every point with its scenario. Raises UsageError for a repeated value, ScenarioError with the mistakes of all points."""
+    for key, values in grid.items():
+        stored = Counter((_kind(value), _in_table(value)) for value in values)
+        for (_, value), count in stored.items():
+            if count > 1:
+                raise UsageError(f"{key}: the value {value} is given {count} times; give each value once")
     points: list[Point] = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
     checked_points: list[tuple[Point, Scenario]] = []
     mistakes: dict[str, None] = {}
@@ -202,6 +216,25 @@ def _checked(
     return checked_points
 
 
+def _kind(value: Any) -> type | None:
+    """The type of a value's column in the table, float for all numbers; None for what the table has only as text."""
+    return next((kind for kind, of in ((bool, bool), (float, (int, float)), (str, str)) if isinstance(value, of)), None)
+
+
+def _in_table(value: Any) -> Any:
+    """A value as it is in the table: a list or a table as JSON."""
+    return json.dumps(value) if _kind(value) is None else value
+
+
+def _stored(point: Point, grid: Grid) -> Point:
+    """A point as it is in the table, where the values of an entry are of one kind: all of them text if they differ."""
+    mixed = {key for key, values in grid.items() if len(set(map(_kind, values))) > 1}
+    return {
+        key: json.dumps(value) if key in mixed and not isinstance(value, str) else _in_table(value)
+        for key, value in point.items()
+    }
+
+
 def _title(source: str | Path | Scenario) -> str:
     return source.title if isinstance(source, Scenario) else str(source)
 
@@ -212,12 +245,12 @@ def _true_times(filter_: FilterSummary, name: str) -> str | None:
 
 
 def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[str, Any]]:
-    """A row for each peer: the point, the metrics, the verdict."""
+    """A row for each peer: the point as it is stored, the metrics, the verdict."""
     for name, peer in summary.peers.items():
         secrecy = summary.secrecy.get(name)
         verdict = None if secrecy is None else secrecy.verdict
         yield {
-            **{key: json.dumps(value) if isinstance(value, (list, dict)) else value for key, value in point.items()},
+            **point,
             "peer": name,
             "slots": scenario.slots,
             "trials": summary.trials,
