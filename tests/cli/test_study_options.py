@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import pytest
 
@@ -56,3 +57,27 @@ def test_a_comparison_warns_as_a_run_does(evedrop: Evedrop) -> None:
     )
     words = (*STUDIES["compare"], *unbounded, "--set", "legitimate.link.quality=0.3", "--trials", "2")
     assert "grows without bound" in evedrop(*words).err
+
+
+PERFECT = ("--set", 'encoding={scheme="plain"}', "--set", "legitimate.link.quality=1.0", "--set", "expect=[]")
+
+
+def strict(text: str) -> Any:
+    """JSON that has no numbers that JSON lacks."""
+
+    def refuse(name: str) -> None:
+        raise AssertionError(name)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_infinite_numbers_are_strings_in_json(evedrop: Evedrop) -> None:
+    """Over an error of 0 a ratio is infinite; it is computed without a warning."""
+    smart = ("--set", 'eavesdroppers.smart.strategy="naive"', "--set", "eavesdroppers.smart.link.quality=1.0")
+    words = (*PERFECT, *smart, "--slots", "12", "--trials", "3")
+    learned = evedrop("learned", "learning", *words, "--json", "--out", "out")
+    assert (learned.status, learned.err) == (0, "")
+    rows = strict(learned.out)
+    assert rows[0]["ratios"]["learning"]["smart"]["ratio"] == "inf"
+    assert strict((evedrop.folder / "out" / "learned.json").read_text(encoding="utf-8")) == rows
+    assert strict(evedrop("sweep", "learning", *words, "--over", "seed=1,2", "--json").out)

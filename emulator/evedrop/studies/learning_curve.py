@@ -177,6 +177,7 @@ def _added(rows: Floats, total: Floats) -> Floats:
     return total
 
 
+@np.errstate(divide="ignore", invalid="ignore")  # an error, or a parameter, that is 0
 def _row(window: tuple[int, int], parts: list[_Measured]) -> LearningRow:
     error = {name: np.concatenate([part.error[name] for part in parts]) for name in parts[0].error}
     return LearningRow(

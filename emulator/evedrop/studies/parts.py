@@ -12,6 +12,7 @@ from typing import Any, TypeVar, final
 
 from evedrop.errors import Interrupted
 from evedrop.results.folder import disk_errors, replace_private
+from evedrop.results.summary_file import plain
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.finished_tasks import FinishedTasks, finished_tasks, study_of
 from evedrop.simulate.montecarlo import Plan
@@ -72,6 +73,6 @@ def all_results(
 
 
 def write_found(place: StudyPlace | None, name: str, result: object) -> None:
-    """Write what a study found to a file of its results folder, as JSON; nothing without a folder. Raises OSError."""
+    """Write what a study found to a file of its results folder, as strict JSON; nothing without a folder. Raises OSError."""
     if place is not None:
-        replace_private(place.folder / name, json.dumps(result, ensure_ascii=False, indent=1) + "\n")
+        replace_private(place.folder / name, json.dumps(plain(result), ensure_ascii=False, indent=1) + "\n")

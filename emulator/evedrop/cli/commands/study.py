@@ -53,6 +53,7 @@ def sweep(options: argparse.Namespace) -> int:
     from evedrop.cli.console import ProgressLine
     from evedrop.cli.report import print_sweep, report_page
     from evedrop.results.folder import results_folder
+    from evedrop.results.summary_file import plain
     from evedrop.studies.sweep import grid_of, sweep_over
 
     check_resuming(options)
@@ -67,7 +68,7 @@ def sweep(options: argparse.Namespace) -> int:
             options.scenario, changes_of(options), grid, folder, line.on_event, plan, resume=options.resume
         )
     if options.json:
-        print_json(table.to_pylist())
+        print_json(plain(table.to_pylist()))
     else:
         print_sweep(table, tuple(grid), str(folder))
     report_page(folder, options.json)
@@ -138,11 +139,12 @@ def _compares(parser: argparse.ArgumentParser) -> None:
 
 def cost(options: argparse.Namespace) -> int:
     """Compare a scenario's scheme with `plain`, trial by trial."""
+    from evedrop.results.summary_file import plain
     from evedrop.studies.secrecy_cost import secrecy_cost
 
     _, result = studied(options, secrecy_cost)
     if options.json:
-        print_json(asdict(result))
+        print_json(plain(asdict(result)))
     else:
         _print_cost(result)
     return 0
@@ -180,11 +182,12 @@ _ROUNDING = 1e-12  # a standard error that is smaller, over the mean, is roundin
 
 def learned(options: argparse.Namespace) -> int:
     """Print what has been learned after 8, 16, 32, … slots."""
+    from evedrop.results.summary_file import plain
     from evedrop.studies.learning_curve import learning_curve
 
     scenario, rows = studied(options, learning_curve)
     if options.json:
-        print_json([asdict(row) for row in rows])
+        print_json(plain([asdict(row) for row in rows]))
     else:
         _print_learned(rows, scenario.trials)
     return 0
