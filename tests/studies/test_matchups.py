@@ -153,6 +153,15 @@ def test_what_no_scheme_can_use_is_refused() -> None:
         matchups_of(late)
 
 
+def test_a_long_title_is_shortened() -> None:
+    """So that there is room for the scheme and the attack."""
+    scenario = load("acknowledged", {"title": "t" * 200, "expect": []})
+    groups = matchups_of(scenario, ["acknowledged"], ["blocks-all"]).groups
+    titles = [group.scenario.title for group in groups]
+    assert [len(title) for title in titles] == [200, 200]
+    assert titles[1].endswith("t (acknowledged, acknowledgements attacked: all)")
+
+
 def test_the_command_prints_a_table_and_writes_its_folder(evedrop: Evedrop) -> None:
     """Every scheme and pair in the table; compare.json, two pictures and the scenarios in the folder."""
     names = ("--schemes", "innovation,acknowledged", "--adversaries", "smart,reference,blocks-critical")

@@ -76,6 +76,31 @@ def test_a_controller_that_sees_the_truth_pays_nothing() -> None:
     assert {measure for measures in result.differences.values() for measure in measures.values()} == {nothing}
 
 
+@pytest.mark.parametrize(
+    "named",
+    [
+        {"legitimate.link": {"quality": 0.6, "correlation": {"with": "smart", "strength": 0.5}}},
+        {"event": [{"at": 5, "link": "smart", "set": {"quality": 0.5}}]},
+        {"event": [{"from": 5, "to": 9, "cut": ["naive"]}]},
+        {},
+    ],
+    ids=["correlation", "change", "outage", "nothing"],
+)
+@pytest.mark.parametrize("acknowledged", [False, True])
+def test_what_names_an_eavesdropper_is_left_out_with_it(named: dict[str, Any], acknowledged: bool) -> None:
+    """Also an attack on acknowledgements, which `plain` has none of; the cost is that without eavesdroppers."""
+    encoding: dict[str, Any] = {"encoding": {"scheme": "innovation", "state_probability": 0.1}}
+    if acknowledged:
+        encoding = {"encoding": {"scheme": "acknowledged"}, "acknowledgements": {"link": {"quality": 0.9}}}
+    own = {"slots": 130, "trials": 3, "expect": [], **encoding}
+    alone = secrecy_cost(load("microgrid", {**own, **OTHERS}), lambda _: None)
+    if acknowledged:
+        own |= {"acknowledgements": {**encoding["acknowledgements"], "attack": "critical", "jammer": "naive"}}
+        own |= {"eavesdroppers": {name: {"strategy": "naive", "link": {"quality": 0.6}} for name in ("smart", "naive")}}
+    assert (alone.more_than_plain["total_energy"].mean == 0.0) is acknowledged
+    assert secrecy_cost(load("microgrid", {**own, **named}), lambda _: None) == alone
+
+
 @pytest.mark.long
 def test_a_days_cost_is_that_of_the_document() -> None:
     """Twenty whole days at μ_d = 0.1, within five standard errors of the table of docs/microgrid.md, made from a hundred."""

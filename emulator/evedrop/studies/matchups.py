@@ -40,6 +40,7 @@ ATTACKERS: Mapping[str, str] = {
 _FLIP = 0.1
 """The probability with which `flips` flips an acknowledgement, unless the scenario has one."""
 
+_LONGEST_TITLE = 200  # of a scenario
 _ACK_CHANNEL = {"link": {"quality": 1.0}}
 
 Tables = dict[str, Any]
@@ -223,12 +224,21 @@ def _encoding(scenario: Scenario, scheme: str, parameters: Mapping[str, Any]) ->
     }
 
 
+def without_eavesdroppers(scenario: Scenario, encoding: Tables) -> Scenario:
+    """The scenario with another encoding, and without eavesdroppers, their attacks, and events that name one.
+
+    Raises ScenarioError if the encoding cannot be used.
+    """
+    return _scenario(scenario, encoding, "none", ())
+
+
 def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequence[Match]) -> Scenario:
     tables: Tables = scenario.model_dump(mode="json", exclude_none=True)
     scheme = encoding["scheme"]
     under = "" if attack == "none" else f", acknowledgements attacked: {attack}"
+    suffix = f" ({scheme}{under})"
     tables |= {
-        "title": f"{scenario.title} ({scheme}{under})",
+        "title": scenario.title[: _LONGEST_TITLE - len(suffix)] + suffix,
         "encoding": encoding,
         "eavesdroppers": {match.receiver: _eavesdropper(scenario, scheme, str(match.strategy)) for match in matches},
         "event": [

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -19,12 +19,12 @@ from evedrop.errors import UsageError
 from evedrop.model.process import Floats
 from evedrop.scenario.application import APPLICATIONS, ControlledPlant, applications_in
 from evedrop.scenario.closed_loop import controlled_plant
-from evedrop.scenario.loading import checked
 from evedrop.scenario.tables import Scenario
 from evedrop.score.energy import Meter, energy
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Simulation
 from evedrop.simulate.tasks import OnProgress, Stopped, Task
+from evedrop.studies.matchups import without_eavesdroppers
 from evedrop.studies.parts import StudyPlace, all_results, parts_of, write_found
 
 _SIDE_BY_SIDE = 50  # trials
@@ -76,14 +76,15 @@ def secrecy_cost(
     plan: where the trials are carried out, by default here; place: the folder for cost.json; side_by_side: trials that are
     simulated at once.
 
-    Raises UsageError for a scenario without an application that has a power, or with fewer than two trials; RunError if a
-    worker fails, Interrupted on Ctrl-C.
+    Raises UsageError for a scenario without an application that has a power, or with fewer than two trials; ScenarioError if
+    `plain` cannot be used with it; RunError if a worker fails, Interrupted on Ctrl-C.
     """
     loop = controlled_plant(scenario)
     if loop is None or not any(APPLICATIONS[name].has_power for name in scenario.applications):
         raise UsageError(f"{scenario.title}: {_lacking()}")
     if scenario.trials < 2:
         raise UsageError(f"--trials {scenario.trials}: expected 2 or more, so that there is a standard error")
+    _pair(scenario)  # both are checked before a task begins
     tasks = parts_of(_CostTask, scenario, side_by_side)
     with all_results(tasks, plan or Plan(), on_progress, "cost", place) as parts:
         cost = _combined(scenario, loop, parts)
@@ -137,12 +138,7 @@ class _CostTask(Task[_Part]):
 
 def _part_of(scenario: Scenario, trials: range, on_progress: OnProgress, stopped: Stopped) -> _Part:
     meters = [Meter.zero(len(trials)) for _ in range(3)]
-    tables: dict[str, Any] = scenario.model_dump(mode="json", exclude_none=True)
-    alone = {**tables, "eavesdroppers": {}, "expect": []}  # eavesdroppers change nothing
-    ours, plain = (
-        _powers(checked(changed, scenario.title), trials)
-        for changed in (alone, {**alone, "encoding": {"scheme": "plain"}})
-    )
+    ours, plain = (_powers(each, trials) for each in _pair(scenario))
     for (power, truth), (other, other_truth) in zip(ours, plain, strict=True):
         pairs = ((power, other), (power, truth), (other, other_truth))
         meters = [meter.then(*pair) for meter, pair in zip(meters, pairs, strict=True)]
@@ -150,6 +146,14 @@ def _part_of(scenario: Scenario, trials: range, on_progress: OnProgress, stopped
         if stopped():
             return _Part((meters[0], meters[1], meters[2]), complete=False)
     return _Part((meters[0], meters[1], meters[2]), complete=True)
+
+
+def _pair(scenario: Scenario) -> tuple[Scenario, Scenario]:
+    """The scenario with its own scheme, then with `plain`; eavesdroppers change nothing, and are left out."""
+    ours, plain = (
+        without_eavesdroppers(scenario, encoding) for encoding in (scenario.encoding.spec, {"scheme": "plain"})
+    )
+    return ours, plain
 
 
 def _powers(scenario: Scenario, trials: range) -> Iterator[tuple[Floats, Floats]]:
