@@ -109,8 +109,8 @@ def test_a_live_run_shows_what_its_replay_shows(tmp_path: Path) -> None:
     assert blocked
     for rrd in (live, again):
         assert [k for k, word in enumerate(lane(rrd, "packets/4_acknowledged", 41)) if word == "blocked"] == blocked
-        assert [k for k, marks in rows(rrd, "plane/truth/attacks", "Points2D:positions").items() if marks] == blocked
-        texts = rows(rrd, "plane/truth/attacked", "Points2D:labels")
+        assert [k for k, marks in rows(rrd, "plane/Truth/attacks", "Points2D:positions").items() if marks] == blocked
+        texts = rows(rrd, "plane/Truth/attacked", "Points2D:labels")
         assert texts[blocked[0]] == ["acknowledgement blocked by jammer, 1 so far"]
         assert texts[40] == [f"{len(blocked)} acknowledgements blocked by jammer so far"]
         assert not texts[0] or blocked[0] == 0
@@ -124,7 +124,7 @@ def test_a_replay_of_measurements_is_shown_while_it_lasts(tmp_path: Path) -> Non
     path = replay(folder)
     words = lane(path, "packets/3_attack", 260)
     assert words == [" "] * 160 + ["measurements are a recording"] * 100
-    levels, marks = rows(path, "levels/0/truth", "Scalars:scalars"), rows(path, "levels/0/attacks/0", "Scalars:scalars")
+    levels, marks = rows(path, "levels/0/Truth", "Scalars:scalars"), rows(path, "levels/0/Attacks/0", "Scalars:scalars")
     assert marks == {k: levels[k] for k in range(160, 260)}
 
 
@@ -136,7 +136,7 @@ def test_a_link_that_is_cut_is_named(tmp_path: Path) -> None:
     both = "cut off: smart, legitimate"
     words = [" "] * 20 + ["cut off: smart"] * 5 + [both] * 5 + ["cut off: legitimate"] * 10 + [" "] * 10
     assert lane(path, "packets/3_attack", 50) == words
-    shown = rows(path, "plane/truth/attacked", "Points2D:labels")
+    shown = rows(path, "plane/Truth/attacked", "Points2D:labels")
     assert [(shown[k] or [" "])[0] for k in range(50)] == words
     cut = rows(path, "plane/legitimate/cut", "Points2D:labels")
     assert [k for k in range(50) if cut[k]] == [*range(25, 40)]
@@ -159,7 +159,7 @@ def test_a_run_without_attack_shows_none(tmp_path: Path) -> None:
     assert quiet.title == "   acknowledged   pale: yes"
     assert quiet.texts(some_slots(0, 3, [0, 1, 2]), np.arange(3)) == [""] * 3
     path = replay(montecarlo("eavesdroppers", trials=1, slots=50, out=tmp_path / "run").folder)
-    assert rows(path, "plane/truth/attacked", "Points2D:labels") == {}
+    assert rows(path, "plane/Truth/attacked", "Points2D:labels") == {}
     assert not any("acknowledgement" in text[0] for text in rows(path, "events", "TextDocument:text").values())
 
 

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
 from evedrop.show.view.column import laid_out
-from evedrop.show.view.panels.curves import SquaredError, TraceOfP
-from evedrop.show.view.panels.plane import frames, stride
+from evedrop.show.view.panels.curves import SquaredError, StateOverTime, TraceOfP, WhatMovesThePlant
+from evedrop.show.view.panels.panel import ViewPanel
+from evedrop.show.view.panels.plane import StatePlane, frames, stride
+from evedrop.show.view.panels.texts import Legend
 from evedrop.show.view.recording import ViewRecording
-from evedrop.show.view.scene import Scene
+from evedrop.show.view.scene import Moved, Scene
 from tests.conftest import LIMIT
 from tests.examples import mostly_long
 from tests.show.view.read_back import lane, new_events, rows
@@ -155,7 +158,7 @@ def test_lanes_tell_what_happened(run: Simulated, rrd: Path) -> None:
 
 def test_plane_shows_truth_estimates_and_ellipses(run: Simulated, rrd: Path) -> None:
     """The plane holds each point, mirrored, and ellipses whose points are all 2σ from their centre."""
-    truth = rows(rrd, "plane/truth/at", "Points2D:positions")
+    truth = rows(rrd, "plane/Truth/at", "Points2D:positions")
     for k in (0, 1, 200, SLOTS - 1):
         np.testing.assert_allclose(truth[k][0], run.slots.x[k] * [1, -1], rtol=1e-6)
     smart = run.slots.peers["smart"]
@@ -169,7 +172,7 @@ def test_plane_shows_truth_estimates_and_ellipses(run: Simulated, rrd: Path) -> 
 
 def test_trail_passes_through_every_slot(run: Simulated, rrd: Path) -> None:
     """The trail's pieces join up to the whole way."""
-    pieces = rows(rrd, "plane/truth/trail", "LineStrips2D:strips")
+    pieces = rows(rrd, "plane/Truth/trail", "LineStrips2D:strips")
     for k in range(1, SLOTS):
         np.testing.assert_allclose(pieces[k][0], run.slots.x[k - 1 : k + 1] * [1, -1], rtol=1e-6)
 
@@ -197,7 +200,7 @@ def test_chunks_do_not_show(run: Simulated, rrd: Path, tmp_path: Path) -> None:
         ("error/naive", "Scalars:scalars"),
         ("packets/3_suspicious", "StateChange:state"),
         ("plane/smart/trail", "LineStrips2D:strips"),
-        ("plane/frame", "LineStrips2D:strips"),
+        ("plane/Frame", "LineStrips2D:strips"),
         ("events", "TextDocument:text"),
     ):
         assert rows(tmp_path / "other.rrd", entity, component) == rows(rrd, entity, component)
@@ -209,6 +212,44 @@ def test_one_state_is_drawn_over_time(simulated: Callable[..., Simulated], tmp_p
     record(run, tmp_path / "r.rrd")
     shown = rows(tmp_path / "r.rrd", "plane/smart", "Scalars:scalars")
     assert [shown[k][0] for k in range(50)] == run.slots.peers["smart"].x_hat[:, 0].tolist()
+
+
+@pytest.mark.parametrize(("n", "kind"), [(2, StatePlane), (1, StateOverTime)])
+def test_a_receiver_may_have_any_name(n: int, kind: type[ViewPanel], simulated: Callable[..., Simulated]) -> None:
+    """Also that of something else in the panel: nothing is recorded in place of it, or shown together with it."""
+    run = simulated(50, n=n)
+    others = {"naive": "truth", "suspicious": "scale", "smart": "attacks"}
+    named = tuple(replace(shown, name=others.get(shown.name, shown.name)) for shown in run.scene.receivers)
+    panel = kind(replace(run.scene, receivers=named))
+    peers = {others.get(name, name): peer for name, peer in run.slots.peers.items()}
+    paths = [column.path for column in panel.columns(run.slots.changed(peers=peers))]
+    assert len(set(paths)) == len(paths)
+    assert {path.split("/")[1] for path in paths} - {shown.name for shown in named} <= {"Truth", "Frame", "Scale"}
+    happens: Any = [view.view.contents for view in panel.views()][1]
+    assert not any(f"/{name}" in str(path) for name in others.values() for path in happens)
+
+
+def test_each_input_has_a_curve(run: Simulated) -> None:
+    """Also where their names differ in characters that a path cannot have."""
+    panel = WhatMovesThePlant(replace(run.scene, moving=("P (kW)", "P [kW]", "α", "β")))
+    assert len(panel.styles()) == 4
+    moved = Moved(np.arange(4.0 * run.slots.count).reshape(-1, 4))
+    columns = list(panel.columns(run.slots.changed(moved=moved)))
+    assert [column.path for column in columns] == [*panel.styles()]
+    assert len({column.path for column in columns}) == 4
+
+
+def test_of_a_sensor_that_measures_its_estimate_is_shown(simulated: Callable[..., Simulated]) -> None:
+    """The view does not call it the truth, which it does not show."""
+    for n in (1, 2):
+        run = simulated(20, n=n)
+        for of_estimate, word in ((False, "truth"), (True, "sensor's estimate")):
+            scene = replace(run.scene, of_estimate=of_estimate)
+            panels = [Legend(scene), *(kind(scene) for kind in (StatePlane, StateOverTime) if kind.applies(scene))]
+            titles = [str(view.view.name) for panel in panels for view in panel.views()]
+            assert any(title.startswith("What happens") for title in titles) is not of_estimate
+            assert Legend(scene)._entries()[0][0] == word
+            assert any("grey: truth" in title for title in titles) is (n == 1 and not of_estimate)
 
 
 def test_long_runs_have_bounded_frames() -> None:

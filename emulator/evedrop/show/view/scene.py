@@ -17,8 +17,8 @@ from evedrop.model.record import Record, RecordColumn, column
 from evedrop.scenario.application import Panel, Sketch
 from evedrop.show.view.palette import Colour, identities
 
-TRUTH_NAME = "truth"
-"""The name of the true state where receivers' names are those of their estimates."""
+TRUTH_NAME = "Truth"
+"""The part of a path for the true state where receivers' names, which have no capital letters, are those of their estimates."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,16 @@ class Scene:
     """What a slot lasts in the scenario; None if it is a number only."""
     of_estimate: bool = False
     """Whether the sensor measures, so that errors are against the estimate that it sends."""
+
+    @property
+    def compared_with(self) -> str:
+        """What estimates are compared with, in words."""
+        return "sensor's estimate" if self.of_estimate else "truth"
+
+    @property
+    def what_happens(self) -> str:
+        """The title of the view of what estimates are compared with."""
+        return "What the sensor estimates" if self.of_estimate else "What happens"
 
     @property
     def unit(self) -> str:

@@ -31,7 +31,7 @@ from evedrop.model.streams import Batch, root_of_seed
 from evedrop.names import LEGITIMATE
 from evedrop.results.folder import private_replacement
 from evedrop.results.reading import Results
-from evedrop.scenario.application import APPLICATIONS, ControlledPlant
+from evedrop.scenario.application import APPLICATIONS, ControlledPlant, Sketch
 from evedrop.scenario.closed_loop import controlled_plant, labels, monitor_of
 from evedrop.scenario.recorded import recorded
 from evedrop.scenario.stream_keys import StreamKeys
@@ -152,13 +152,22 @@ def driven_scene(scenario: Scenario) -> dict[str, Any]:
         return {}
     drawings = (APPLICATIONS[name].drawing(loop, table) for name, table in scenario.applications.items())
     return {
-        "states": labels(process.states, process.units),
-        "moving": (*loop.disturbance_labels, *labels(plant.inputs, plant.input_units)),
+        "states": tuple(map(drawable, labels(process.states, process.units))),
+        "moving": tuple(map(drawable, (*loop.disturbance_labels, *labels(plant.inputs, plant.input_units)))),
         "panels": tuple(
-            panel for name, table in scenario.applications.items() for panel in APPLICATIONS[name].panels(loop, table)
+            replace(panel, title=drawable(panel.title))
+            for name, table in scenario.applications.items()
+            for panel in APPLICATIONS[name].panels(loop, table)
         ),
-        "drawing": next(filter(None, drawings), None),
+        "drawing": next(map(_drawable, filter(None, drawings)), None),
     }
+
+
+def _drawable(sketch: Sketch) -> Sketch:
+    """The same drawing, in letters of the viewer's font."""
+    levels = (replace(level, name=drawable(level.name)) for level in sketch.levels)
+    flows = (replace(flow, positive=drawable(flow.positive), negative=drawable(flow.negative)) for flow in sketch.flows)
+    return replace(sketch, levels=tuple(levels), flows=tuple(flows))
 
 
 def loop_values_of(scenario: Scenario) -> LoopValues | None:

@@ -161,7 +161,7 @@ def test_a_broken_panel_is_left_out_of_a_recording(
         sys.path.remove(str(tmp_path))
     check_warnings(capfd.readouterr().err, "evedrop: warning: ")
     assert curve(rrd, "error/naive") == before
-    assert len(rows(rrd, "plane/truth/at", "Points2D:positions")) == SLOTS
+    assert len(rows(rrd, "plane/Truth/at", "Points2D:positions")) == SLOTS
     assert sorted(curve(rrd, "sound")) == list(range(SLOTS))
 
 

@@ -126,7 +126,7 @@ def test_the_plane_follows_truth_and_legitimate(simulated: Callable[..., Simulat
         recording = ViewRecording(tmp_path / f"{name}.rrd", replace(run.scene, units=("m", "m")))
         recording.add(slots)
         assert recording.close()
-        frames[name] = rows(tmp_path / f"{name}.rrd", "plane/frame", "LineStrips2D:strips")
+        frames[name] = rows(tmp_path / f"{name}.rrd", "plane/Frame", "LineStrips2D:strips")
     assert frames["near"] == frames["far"]
     labels = rows(tmp_path / "far.rrd", "plane/naive/away", "Points2D:labels")
     assert {k: text for k, text in labels.items() if text} == {k: ["naive: 5,000 m"] for k in range(30, 40)}
@@ -159,7 +159,7 @@ def test_the_plane_shows_a_legitimate_estimate_wherever_it_is(
     recording = ViewRecording(tmp_path / "r.rrd", run.scene)
     recording.add(replace(run.slots, peers=peers))
     assert recording.close()
-    result = rows(tmp_path / "r.rrd", "plane/frame", "LineStrips2D:strips")
+    result = rows(tmp_path / "r.rrd", "plane/Frame", "LineStrips2D:strips")
     for k in range(30, 40):
         corners = np.array(result[k][0])
         for state in (run.slots.x[k], x_hat[k]):

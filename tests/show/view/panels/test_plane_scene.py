@@ -105,6 +105,6 @@ def test_the_plane_of_the_numbers_has_no_labels_of_the_worlds() -> None:
     run: Simulated = simulate(orbit(), 20)
     contents_of: list[Any] = [view.view.contents for view in StatePlane(run.scene).views()]
     plane, _, *worlds = contents_of
-    assert {"- /plane/smart/off", "- /plane/scale", "- /plane/truth/heading"} <= set(plane)
+    assert {"- /plane/smart/off", "- /plane/Scale", "- /plane/Truth/heading"} <= set(plane)
     for shown, contents in zip(run.scene.receivers, worlds, strict=True):
         assert [path for path in contents if str(path).endswith("/off")] == [f"plane/{shown.name}/off"]

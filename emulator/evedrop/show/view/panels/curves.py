@@ -7,7 +7,6 @@ what the scenario's applications describe.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator
 from typing import final
 
@@ -244,12 +243,12 @@ def worlds_over_time(scene: Scene, path: str, axis: rrb.TimeAxis) -> Iterator[Pl
 
     attacked = bool(lane_count(scene))
     if scene.drawing is None:
-        yield PlacedView(view(f"What happens: {label}", TRUTH_NAME, f"{_ATTACKS}/**", legend=attacked), "truth")
+        yield PlacedView(view(f"{scene.what_happens}: {label}", TRUTH_NAME, f"{_ATTACKS}/**", legend=attacked), "truth")
     for shown in scene.receivers:
-        yield PlacedView(view(f"{shown.world_title}   grey: truth", TRUTH_NAME, shown.name), "worlds")
+        yield PlacedView(view(f"{shown.world_title}   grey: {scene.compared_with}", TRUTH_NAME, shown.name), "worlds")
 
 
-_ATTACKS = "attacks"
+_ATTACKS = "Attacks"
 
 
 @final
@@ -307,7 +306,9 @@ class StateOverTime(ViewPanel):
     def styles(self) -> dict[str, rr.AsComponents]:
         """Each estimate in its receiver's colour; the truth grey and wide."""
         styles: dict[str, rr.AsComponents] = {**self._marks.styles()}
-        styles[f"{_STATE_PATH}/{TRUTH_NAME}"] = rr.SeriesLines(names="truth", colors=TRUTH_CURVE, widths=2.5)
+        styles[f"{_STATE_PATH}/{TRUTH_NAME}"] = rr.SeriesLines(
+            names=self.scene.compared_with, colors=TRUTH_CURVE, widths=2.5
+        )
         for name, bright in self.scene.colours.items():
             styles[f"{_STATE_PATH}/{name}"] = rr.SeriesLines(names=name, colors=bright, widths=1.5)
         return styles
@@ -341,7 +342,7 @@ class Levels(ViewPanel):
         """A view for each of the first two states, in the middle."""
         for i in range(min(self.scene.n, _VIEWS)):
             label = self.scene.states[i] if self.scene.states else f"state {i}"
-            title = f"{label}   grey: truth"
+            title = f"{label}   grey: {self.scene.compared_with}"
             yield PlacedView(curves_view(title, f"{_LEVELS_PATH}/{i}", whole_run(self.scene), legend=False), "middle")
         yield from worlds_over_time(self.scene, f"{_LEVELS_PATH}/0", whole_run(self.scene))
 
@@ -349,7 +350,7 @@ class Levels(ViewPanel):
         """Each estimate in its receiver's colour; the truth grey and wide."""
         styles: dict[str, rr.AsComponents] = {**self._marks.styles()}
         for i in range(self.scene.n):
-            styles[f"{_LEVELS_PATH}/{i}/{TRUTH_NAME}"] = line_style("truth", TRUTH_CURVE, 1.8)
+            styles[f"{_LEVELS_PATH}/{i}/{TRUTH_NAME}"] = line_style(self.scene.compared_with, TRUTH_CURVE, 1.8)
             for name, bright in self.scene.colours.items():
                 styles[f"{_LEVELS_PATH}/{i}/{name}"] = line_style(name, bright, 0.9)
         return styles
@@ -387,7 +388,7 @@ class WhatMovesThePlant(ViewPanel):
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Steps, because a value holds for its whole slot."""
         return {
-            _curve(label): line_style(label, PLANT[i % len(PLANT)], 1.4, steps=True)
+            _curve(i): line_style(label, PLANT[i % len(PLANT)], 1.4, steps=True)
             for i, label in enumerate(self.scene.moving)
         }
 
@@ -395,12 +396,12 @@ class WhatMovesThePlant(ViewPanel):
         """A curve for each disturbance and input."""
         at = thinned(self.scene, slots.numbers)
         if slots.moved is not None and len(at):
-            for label, values in zip(self.scene.moving, slots.moved.values.T, strict=True):
-                yield scalars(_curve(label), slots.numbers[at], values[at])
+            for i, values in enumerate(slots.moved.values.T):
+                yield scalars(_curve(i), slots.numbers[at], values[at])
 
 
-def _curve(label: str) -> str:
-    return f"{_PLANT_PATH}/{re.sub(r'[^A-Za-z0-9_-]+', '_', label)}"
+def _curve(i: int) -> str:
+    return f"{_PLANT_PATH}/{i}"
 
 
 @final

@@ -56,7 +56,7 @@ class DrawnPlant(ViewPanel):
         bounds = rrb.VisualBounds2D(x_range=(0.0, width), y_range=(0.0, height))
         yield PlacedView(
             rrb.Spatial2DView(
-                name="What happens",
+                name=self.scene.what_happens,
                 origin=_PATH,
                 background=list(GROUND),
                 visual_bounds=bounds,

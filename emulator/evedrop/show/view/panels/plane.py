@@ -30,8 +30,8 @@ from evedrop.show.view.panels.panel import PlacedView, ViewPanel
 from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots, Shown
 
 _PLANE_PATH = "plane"
-_FRAME = f"{_PLANE_PATH}/frame"
-_HEADING, _SCALE = f"{_PLANE_PATH}/{TRUTH_NAME}/heading", f"{_PLANE_PATH}/scale"
+_FRAME = f"{_PLANE_PATH}/Frame"
+_HEADING, _SCALE = f"{_PLANE_PATH}/{TRUTH_NAME}/heading", f"{_PLANE_PATH}/Scale"
 _ATTACKS, _ATTACKED = f"{_PLANE_PATH}/{TRUTH_NAME}/attacks", f"{_PLANE_PATH}/{TRUTH_NAME}/attacked"
 _TRAIL = 30
 _TRUTH_TRAIL = 130
@@ -73,7 +73,7 @@ class StatePlane(ViewPanel):
         past = dict.fromkeys((_trail(TRUTH_NAME), _ATTACKS), trails[_trail(TRUTH_NAME)])
         yield PlacedView(
             rrb.Spatial2DView(
-                name="What happens",
+                name=self.scene.what_happens,
                 origin=_PLANE_PATH,
                 contents=[_FRAME, f"{_PLANE_PATH}/{TRUTH_NAME}/**", f"{_SCALE}/**"],
                 background=list(GROUND),
@@ -104,6 +104,10 @@ class StatePlane(ViewPanel):
             background=list(GROUND),
             overrides=overrides,  # type: ignore[arg-type]
         )
+
+    @property
+    def _off_words(self) -> str:
+        return "off the sensor's" if self.scene.of_estimate else "off"
 
     def _past(self, slots: int) -> rrb.VisibleTimeRanges:
         # A piece of a trail is recorded at its end, so the oldest piece shown begins a frame earlier.
@@ -173,7 +177,7 @@ class StatePlane(ViewPanel):
             outlines[seen] = np.clip(drawn, low[seen, None], high[seen, None])
             yield Column(_ellipse(shown.name), k[at], rr.LineStrips2D.columns(strips=line_strips(outlines)))
             distances = self._distance.of(slots.x[at], peer.x_hat[at])
-            offs = [f"{self._distance.text(distance)} off" for distance in distances.tolist()]
+            offs = [f"{self._distance.text(distance)} {self._off_words}" for distance in distances.tolist()]
             below = rr.Points2D.columns(positions=labels_below(places[shown.name], low, high), labels=offs)
             yield Column(_off(shown.name), k[at], below)
             if i > 0:

@@ -129,7 +129,7 @@ class Legend(ViewPanel):
         yield from ()
 
     def _entries(self) -> list[tuple[str, Colour]]:
-        return [("truth", TRUTH), *self.scene.colours.items(), *lanes.legend(self.scene)]
+        return [(self.scene.compared_with, TRUTH), *self.scene.colours.items(), *lanes.legend(self.scene)]
 
     def _places(self) -> list[tuple[float, float]]:
         places, at = [], 0.0

@@ -411,7 +411,7 @@ class Household(Application):
             Panel(
                 GUESSES,
                 f"{loop.disturbance_labels[loop.disturbance(house.load)]}, and what each would guess from its estimate",
-                (PanelCurve("truth", TRUTH_CURVE, "steps", 1.4), *guesses),
+                (PanelCurve("Truth", TRUTH_CURVE, "steps", 1.4), *guesses),
                 (-0.1 * most, 1.15 * most),
                 with_beliefs=True,
             ),
@@ -479,7 +479,7 @@ class HouseholdFeed(PanelFeed):
         return {
             f"{ENERGY}/bought": np.stack([slots, bought]),
             f"{ENERGY}/sold": np.stack([slots, sold]),
-            f"{GUESSES}/truth": np.stack([slots, load]),
+            f"{GUESSES}/Truth": np.stack([slots, load]),
             **{f"{GUESSES}/{name}": self._guessed(name, first, estimates[name]) for name in self._guesses},
         }
 
