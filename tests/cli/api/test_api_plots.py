@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,17 +14,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.text import Text
 
-from evedrop import Scenario, montecarlo
+from evedrop import Scenario, load_results, montecarlo
 from evedrop.cli.api import ComparisonResults, RunResults, SweepResults, compare, sweep
 from evedrop.errors import UsageError
 from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.show.report.comparison import conclusion
 from evedrop.show.report.writing import REPORT
 from evedrop.show.view.palette import DROPPED, paper_inks
+from evedrop.show.view.result_pictures import sweep_figure
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from tests.builders import GOOD
@@ -202,6 +206,31 @@ def test_what_cannot_be_drawn_is_refused(results: RunResults) -> None:
     with pytest.raises(UsageError, match="the run has recorded none, and 'errors' needs none"):
         covariances.plot()
     assert len(covariances.plot("errors", slots=range(10)).axes) == 1
+
+
+def test_dollar_signs_are_not_mathematics() -> None:
+    """A title, a state or a unit may have them; matplotlib would refuse what is between two of them."""
+    two = {"process__states": ["$a_$", "b"], "process__units": ["$^$", "m"]}
+    scenario = SCENARIO.replace(title=r"costs $5_ to $7^", slots=5, record_trials=1, **two)
+    montecarlo(scenario, trials=2).plot().savefig(io.BytesIO())
+    compare(scenario, schemes=["innovation"], adversaries=["naive"], trials=2).plot().savefig(io.BytesIO())
+
+
+def test_a_run_without_slots_has_nothing_to_plot(results: RunResults, tmp_path: Path) -> None:
+    """Such as one that was interrupted before its first slot."""
+    shutil.copytree(results.folder, tmp_path / "run")
+    table = tmp_path / "run" / "slots.parquet"
+    pq.write_table(pq.read_table(table).slice(0, 0), table)
+    with pytest.raises(UsageError, match=r"plot: .* has no slots to plot"):
+        load_results(tmp_path / "run").plot("errors")
+
+
+def test_panels_that_a_picture_of_a_sweep_lacks_are_counted() -> None:
+    """It has six at most."""
+    rows = [{"peer": "eve", "slots": 4, "seed": seed, "mean_squared_error": 1.0} for seed in range(8)]
+    figure = sweep_figure(pa.Table.from_pylist(rows), ["slots", "seed"])
+    assert len(figure.axes) == 6
+    assert figure.get_suptitle() == "the first 6 of 8 combinations"
 
 
 @pytest.mark.long

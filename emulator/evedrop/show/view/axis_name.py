@@ -28,4 +28,9 @@ def squared_unit(units: Iterable[str]) -> str:
 
 def as_mathematics(name: str) -> str:
     """The same for matplotlib, with the symbol as mathematics."""
-    return name.replace("μ_d", r"$\mu_d$")
+    return without_mathematics(name).replace("μ_d", r"$\mu_d$")
+
+
+def without_mathematics(text: str) -> str:
+    """A text of the user for matplotlib, which would take what is between two dollar signs as mathematics."""
+    return text.replace("$", r"\$")

@@ -32,7 +32,7 @@ from evedrop.scenario.recorded import recorded, recorded_noise, recorded_strateg
 from evedrop.score.rare_events import recorded_rare_errors, sound_errors
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.view import journal_column, palette
-from evedrop.show.view.axis_name import as_mathematics, axis_name, squared_unit
+from evedrop.show.view.axis_name import as_mathematics, axis_name, squared_unit, without_mathematics
 from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
 from evedrop.show.view.figure_style import drawing, panels
 from evedrop.show.view.lanes import EAVESDROPPER
@@ -76,6 +76,8 @@ def run_figure(
     column = width == "column"
     rows = results.slots
     last = pc.max(rows["slot"]).as_py()
+    if last is None:
+        raise UsageError(f"plot: {results.folder} has no slots to plot; run the scenario again")
     if slots is not None and (not slots or slots.step != 1 or not 0 <= slots[0] <= slots[-1] <= last):
         raise UsageError(f"plot: {slots} are not slots of the run; expected some such as range(0, {last + 1})")
     receivers = rows["peer"].unique().to_pylist()
@@ -86,12 +88,12 @@ def run_figure(
         journal_column.WIDTH if column else _WIDTH, sum(heights), journal_column.STYLE if column else None
     ) as figure:
         if not column:
-            figure.suptitle(str(results.summary["scenario"]), x=0.02, ha="left", fontsize=11)
+            figure.suptitle(without_mathematics(str(results.summary["scenario"])), x=0.02, ha="left", fontsize=11)
         places = figure.subplots(len(names), 1, height_ratios=heights, squeeze=False)[:, 0]
         for name, axes in zip(names, places, strict=True):
             if name == "errors":
                 floor = error_floor(recorded_noise(results.folder), pc.max(rows["trials"]).as_py())
-                y_label = f"squared error{squared_unit(recorded_units(results.folder))}"
+                y_label = f"squared error{without_mathematics(squared_unit(recorded_units(results.folder)))}"
                 if results.summary.get("filter") is not None:
                     y_label += "\nto the sensor's estimate"
                 rare = recorded_rare_errors(results.folder, last + 1, pc.max(rows["trials"]).as_py())
@@ -176,7 +178,8 @@ class _RecordedTrial:
         process = recorded(results.folder).scenario.process
         states = process.states or [f"x[{i}]" for i in range(len(process.A))]
         units = process.units or [""] * len(states)
-        self.states = [f"{state} ({unit})" if unit else state for state, unit in zip(states, units, strict=True)]
+        names = (f"{state} ({unit})" if unit else state for state, unit in zip(states, units, strict=True))
+        self.states = [*map(without_mathematics, names)]
 
     def lanes(self, axes: Axes) -> None:
         """What became of each packet, a lane for each receiver."""
@@ -238,14 +241,14 @@ def draw_sweep(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
 
     Bars at the marks are standard errors.
     """
-    count = len(_others(table.to_pylist(), keys))
+    count = min(_MOST_PANELS, len(_others(table.to_pylist(), keys)))
     with panels(path, count, *_sweep_size(count)) as axes:
         _draw_sweep_on(axes, table, keys)
 
 
 def sweep_figure(table: pa.Table, keys: Sequence[str]) -> ShownFigure:
     """The plot of a sweep as a figure."""
-    count = len(_others(table.to_pylist(), keys))
+    count = min(_MOST_PANELS, len(_others(table.to_pylist(), keys)))
     with drawing(*_sweep_size(count)) as figure:
         _draw_sweep_on(list(figure.subplots(1, count, squeeze=False)[0]), table, keys)
     return figure
@@ -257,8 +260,8 @@ def _sweep_size(count: int) -> tuple[float, float]:
 
 
 def _others(rows: list[dict[str, Any]], keys: Sequence[str]) -> list[tuple[Any, ...]]:
-    """The combinations of values of all entries but the first, a panel for each."""
-    return list(dict.fromkeys(tuple(row[key] for key in keys[1:]) for row in rows))[:_MOST_PANELS]
+    """The combinations of values of all entries but the first, of which the first `_MOST_PANELS` have a panel each."""
+    return list(dict.fromkeys(tuple(row[key] for key in keys[1:]) for row in rows))
 
 
 def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> None:
@@ -267,7 +270,11 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
         [name for name, scheme in all_metrics().items() if scheme.sweep_picture == way] for way in ("marks", "lines")
     )
     inks = paper_inks(dict.fromkeys(row["peer"] for row in rows), strategies)
-    for scheme, values in zip(axes, _others(rows, keys), strict=True):
+    combinations = _others(rows, keys)
+    if len(combinations) > len(axes):
+        words = f"the first {len(axes)} of {len(combinations):,} combinations"
+        axes[0].figure.suptitle(words, x=0.02, ha="left", fontsize=9)
+    for scheme, values in zip(axes, combinations, strict=False):
         for (peer, ink), mark in zip(inks.items(), itertools.cycle(_MARKS), strict=False):
             mine = [row for row in rows if row["peer"] == peer and tuple(row[key] for key in keys[1:]) == values]
             x = _positions([row[keys[0]] for row in mine])
@@ -286,11 +293,12 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
                 label=peer,
             )
             if not numbers:
-                scheme.set_xticks(x, [str(row[keys[0]]) for row in mine])
+                scheme.set_xticks(x, [without_mathematics(str(row[keys[0]])) for row in mine])
                 scheme.set_xlim(-0.5, len(x) - 0.5)
         scheme.set_yscale("log")
         scheme.set_xlabel(as_mathematics(axis_name(keys[0])))
-        scheme.set_title(", ".join(f"{key} = {value}" for key, value in zip(keys[1:], values, strict=True)))
+        title = ", ".join(f"{key} = {value}" for key, value in zip(keys[1:], values, strict=True))
+        scheme.set_title(without_mathematics(title))
     limits = [limit for scheme in axes for limit in scheme.get_ylim()]
     for scheme in axes:
         scheme.set_ylim(min(limits), max(limits))
@@ -431,7 +439,8 @@ def _legend(axes: Axes, comparison: Comparison, left: float) -> None:
         axes.text(place + 0.52, rows + 0.1, meaning, ha="left", va="center", fontsize=8.8)
         place += 1.0 + 0.092 * len(meaning)
     notes = [
-        f"{comparison.title}: {comparison.slots:,} slots, {comparison.trials:,} trial{'s' if comparison.trials > 1 else ''}.",
+        f"{without_mathematics(comparison.title)}: {comparison.slots:,} slots, "
+        f"{comparison.trials:,} trial{'s' if comparison.trials > 1 else ''}.",
         "n×: the adversary's error over the legitimate one. legitimate n×: an attack raises the legitimate error n-fold. "
         "·: not defined." + (f" Bold: dominates ({', '.join(comparison.dominant)})." if comparison.dominant else ""),
     ]
