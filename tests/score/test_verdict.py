@@ -15,7 +15,7 @@ from evedrop.score.after_start import AfterStart, BatchMeans, DistanceTally, _li
 from evedrop.score.scorekeeper import verdicts
 from evedrop.score.secrecy import MeanErrors, _larger, sign_of_mean
 from evedrop.score.sums import WINDOWS
-from evedrop.score.verdict import Compared, SecrecyOutcome, verdict_of, verdict_on, verdict_so_far
+from evedrop.score.verdict import Compared, SecrecyOutcome, times_text, verdict_of, verdict_on, verdict_so_far
 from tests.score.test_verdict_calibration import tally_of
 
 
@@ -34,6 +34,27 @@ def correlated(draw: np.random.Generator, slots: int, memory: float) -> Floats:
         state = memory * state + noise[k]
         states[k] = state
     return np.asarray(states**2)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "interval", "text"),
+    [
+        (17.0, (13.2, 21.8), "17 × [13, 22]"),
+        (1.04, (1.013, 1.07), "1.04 × [1.01, 1.07]"),
+        (1.003, (1.0024, 1.0036), "1.003 × [1.002, 1.01]"),
+        (0.97, (0.941, 0.9987), "0.970 × [0.94, 0.999]"),
+        (1.2, (1.04, 1.4), "1.2 × [1.04, 1.4]"),
+        (1.0, (0.7, 1.3), "1 × [0.7, 1.3]"),
+        (1.0, (1.0, 1.0), "1 × [1, 1]"),
+        (2.0, (0.5, np.inf), "2 × [0.5, ∞]"),
+        (1.04, None, "1 ×"),
+    ],
+)
+def test_an_interval_shows_on_which_side_of_1_it_is(
+    ratio: float, interval: tuple[float, float] | None, text: str
+) -> None:
+    """Its limits are rounded outwards near 1."""
+    assert times_text(ratio, interval) == text
 
 
 @given(cuts=st.sets(st.integers(1, 999), max_size=20))

@@ -6,7 +6,7 @@ Source: docs/metrics.md, verdict.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -49,6 +49,10 @@ def weakest(outcomes: Iterable[SecrecyOutcome]) -> SecrecyOutcome:
     return min(outcomes, key=_ORDER.index)
 
 
+_NEAR, _MOST_PLACES = (
+    0.1,
+    7,
+)  # how near to 1 two digits hide on which side a ratio is; and more decimals than its text has
 _SMALLER = 0.8  # times the legitimate error: less is "more than the estimator", and the rest "as much"
 
 
@@ -173,9 +177,32 @@ def _sortable(ratio: float) -> float:
 
 
 def times_text(ratio: float, interval: tuple[float, float] | None = None) -> str:
-    """A ratio with two digits and its interval, such as "17 × [13, 22]"."""
-    between = "" if interval is None else " [{}, {}]".format(*map(two_digits, interval))
-    return f"{two_digits(ratio)} ×{between}"
+    """A ratio with two digits and its interval, such as "17 × [13, 22]".
+
+    Limits near 1, the ratio of equal errors, are rounded outwards, to as many decimals as show on which side of 1 they are.
+    """
+    if interval is None:
+        return f"{two_digits(ratio)} ×"
+    low, high = interval
+    places = max(_places(low, math.floor), _places(high, math.ceil))
+    between = f"[{_limit(low, math.floor)}, {_limit(high, math.ceil)}]"
+    return f"{f'{ratio:.{places}f}' if places and _near_one(ratio) else two_digits(ratio)} × {between}"
+
+
+def _limit(limit: float, outwards: Callable[[float], int]) -> str:
+    places = _places(limit, outwards)
+    return f"{outwards(limit * 10**places) / 10**places:.{places}f}" if places else two_digits(limit)
+
+
+def _places(limit: float, outwards: Callable[[float], int]) -> int:
+    """The decimals that a limit near 1 needs not to be rounded to 1; 0: two digits suffice."""
+    if not _near_one(limit):
+        return 0
+    return next((places for places in range(2, _MOST_PLACES) if outwards(limit * 10**places) != 10**places), 0)
+
+
+def _near_one(ratio: float) -> bool:
+    return ratio != 1.0 and abs(ratio - 1.0) < _NEAR
 
 
 def distance_text(distance: float, unit: str = "") -> str:
