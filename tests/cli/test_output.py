@@ -164,9 +164,9 @@ def test_json_in_any_encoding_has_the_same_content(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("encoding", "printed"),
     [
-        ("utf-8", "μ_d, Ω ≥ |x − x̂|² ± ½ · 10⁻¹², ü, ₖ, ϕ, \\udcff"),
-        ("latin-1", "mu_d, Omega >= |x - x_hat|² ± ½ · 10^-¹², ü, _k, \\u03d5, \\udcff"),
-        ("ascii", "mu_d, Omega >= |x - x_hat|^2 +/- \\xbd - 10^-12, \\xfc, _k, \\u03d5, \\udcff"),
+        ("utf-8", "μ_d, Ω ≥ |x − x̂|² ± ½ · 10⁻¹², ü, ₖ, ϕ, ✔✓✗, \\udcff"),
+        ("latin-1", "mu_d, Omega >= |x - x_hat|² ± ½ · 10^-¹², ü, _k, \\u03d5, Vvx, \\udcff"),
+        ("ascii", "mu_d, Omega >= |x - x_hat|^2 +/- \\xbd - 10^-12, \\xfc, _k, \\u03d5, Vvx, \\udcff"),
     ],
 )
 def test_a_character_that_the_encoding_lacks_is_spelled(encoding: str, printed: str, tmp_path: Path) -> None:
@@ -176,7 +176,7 @@ def test_a_character_that_the_encoding_lacks_is_spelled(encoding: str, printed: 
         contextlib.redirect_stdout(file),
         standard_streams(),
     ):
-        sys.stdout.write("μ_d, Ω ≥ |x − x̂|² ± ½ · 10⁻¹², ü, ₖ, ϕ, \udcff")
+        sys.stdout.write("μ_d, Ω ≥ |x − x̂|² ± ½ · 10⁻¹², ü, ₖ, ϕ, ✔✓✗, \udcff")
     assert (tmp_path / "said").read_text(encoding=encoding) == printed
 
 

@@ -22,7 +22,8 @@ _SPELLED = "evedrop.spelled"
 _SPELLINGS = {
     "−": "-", "–": "-", "—": "-", "·": "-", "─": "-", "…": "...", "±": "+/-", "×": "x", "÷": "/", "≥": ">=", "≤": "<=",
     "≈": "~", "√": "sqrt ", "∞": "inf", "°": " deg ", "‰": " per mille", "€": "EUR", "′": "'", "’": "'", "‘": "'", "“": '"',
-    "”": '"', "„": '"', "µ": "mu", "\N{COMBINING CIRCUMFLEX ACCENT}": "_hat", "\N{COMBINING TILDE}": "_tilde",
+    "”": '"', "„": '"', "µ": "mu", "✔": "V", "✓": "v", "✗": "x",
+    "\N{COMBINING CIRCUMFLEX ACCENT}": "_hat", "\N{COMBINING TILDE}": "_tilde",
     "\N{COMBINING MACRON}": "_bar",
 }  # fmt: skip
 _GREEK = re.compile("GREEK (SMALL|CAPITAL) LETTER (?:FINAL )?([A-Z]+)$")
