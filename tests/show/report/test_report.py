@@ -32,7 +32,7 @@ from PIL import Image
 
 from evedrop import montecarlo
 from evedrop.errors import UsageError
-from evedrop.model.metrics.text import ShownNumber, estimate, number_text, short_text
+from evedrop.model.metrics.text import ShownNumber, estimate, number_text, percent_text, short_text
 from evedrop.results.reading import Results
 from evedrop.score.synchronisation import LongestSpans, LostSpan, Synchronisation, lost_spans, synchronisation_of
 from evedrop.show.report import closing
@@ -122,6 +122,15 @@ def test_the_numbers_of_a_column_have_the_same_format() -> None:
     assert [short_text(value) for value in (None, math.inf, 0.0123, 57.1, 123.4, 3.42e5)] == [
         *("–", "∞", "0.012", "57", "123", "3.4e5"),
     ]  # fmt: skip
+    assert [short_text(value) for value in (0.0, 0.00999, 99.4, 99.7, 9999.7)] == ["0", "0.01", "99", "100", "1.0e4"]
+    assert estimate(-0.001, 0.2) == "0.0 ± 0.2"
+
+
+def test_a_percentage_is_nothing_or_everything_only_if_it_is() -> None:
+    """One slot of a hundred thousand without synchronisation is not none."""
+    fractions = (0.0, 1e-5, 0.0006, 0.5, 0.9994, 0.99999, 1.0)
+    texts = ["0.0%", "less than 0.1%", "0.1%", "50.0%", "99.9%", "more than 99.9%", "100.0%"]
+    assert [percent_text(fraction) for fraction in fractions] == texts
 
 
 def test_a_z_beyond_four_is_marked() -> None:
@@ -161,7 +170,37 @@ def test_a_page_names_what_does_not_travel_with_it(study: Path, tmp_path: Path) 
     assert downloads(page).keys() == {"scenario.toml", "disturbances.csv"}
     scenario.unlink()
     write_report(tmp_path / "run")
-    assert any("cannot be repeated" in text for text in checked(tmp_path / "run").texts)
+    texts = checked(tmp_path / "run").texts
+    assert any("cannot be repeated" in text for text in texts)
+    assert any("tr Q, the noise of one step, is 0 or unknown" in text for text in texts)
+    assert not any("Fractions of the slots, and spans" in text for text in texts)
+
+
+def test_a_part_of_a_run_is_not_promised_again(study: Path, tmp_path: Path) -> None:
+    """The command runs all of it; one that estimated rare events does so again."""
+    shutil.copytree(study, tmp_path / "run")
+    summary = json.loads((study / "summary.json").read_text())
+    summary["ended"] = "interrupted"
+    rare: dict[str, Any] = {
+        "mean_error": 1.0,
+        "standard_error": 0.1,
+        "z": None,
+        "populations": 8,
+        "trials": 20,
+        "splits": 3,
+    }
+    rare |= {"counting": 0.5, "doubt": None, "slots": {}}
+    entries = [*summary["peers"]["legitimate"].items()]
+    entries.insert([name for name, _ in entries].index("digest"), ("rare_estimate", rare))
+    summary["peers"]["legitimate"] = dict(entries)
+    (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))
+    write_report(tmp_path / "run")
+    texts = checked(tmp_path / "run").texts
+    assert any("the whole run, of which this one is a part" in text for text in texts)
+    assert any("--trials 20 --rare --out again" in text for text in texts)
+    texts = checked(study).texts
+    assert any("the same results to the same bits" in text for text in texts)
+    assert any("--trials 20 --out again" in text for text in texts)
 
 
 def test_a_report_that_cannot_be_written_leaves_everything_as_it_was(

@@ -39,6 +39,7 @@ _SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE, _LAST_PLACE = 0.01, 1e5, -4, -6  # b
 _ROUNDING = 1e-12  # a standard error below this part of the estimate comes from the rounding of equal trials
 _MOST_DIGITS = 8  # significant digits of an estimate
 _LARGE_COUNT, _NEARLY_ALL, _LARGE_SHORT = 1e7, 0.99, 1e4
+_WHOLE = 99.5  # from here on two digits would be the whole number, or have an exponent
 _LEAST_PLAIN, _LARGE_PLAIN = 1e-4, 999_500  # beyond them two digits have an exponent
 
 
@@ -56,8 +57,9 @@ def short_text(value: float | None) -> str:
         return "–"
     if not math.isfinite(value):
         return "∞"
-    if _SMALL_NUMBER <= value < _LARGE_SHORT:
-        return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
+    rounded = float(f"{value:.0f}" if value >= _WHOLE else f"{value:.2g}")
+    if rounded == 0.0 or _SMALL_NUMBER <= rounded < _LARGE_SHORT:
+        return f"{rounded:.0f}" if rounded >= 100 else f"{rounded:.2g}"
     return _scientific(value, 1)
 
 
@@ -88,6 +90,14 @@ def fraction_text(fraction: float) -> str:
     return f"{100 * fraction:.2g} %" if fraction < _NEARLY_ALL else "more than 99 %"
 
 
+def percent_text(fraction: float) -> str:
+    """A fraction as a percentage with one decimal; only nothing is 0.0%, and only everything 100.0%."""
+    text = f"{fraction:.1%}"
+    if text == "100.0%" and fraction < 1.0:
+        return "more than 99.9%"
+    return "less than 0.1%" if text == "0.0%" and fraction > 0.0 else text
+
+
 def estimate(value: float | None, error: float | None, how: str = ".4g") -> ShownNumber:
     """An estimate with its standard error, to the place of that error's first digit: 0.0123 ± 0.0004. how: without an error.
 
@@ -108,7 +118,7 @@ def _estimate(value: float | None, error: float | None, how: str) -> str:
         _LEAST_PLACE if abs(value) < _SMALL_NUMBER else _LAST_PLACE
     ):
         places = max(0, -place)
-        return f"{value:.{places}f} ± {error:.{places}f}"
+        return f"{number_text(value, f'.{places}f')} ± {error:.{places}f}"
     return _scientific_estimate(value, error)
 
 

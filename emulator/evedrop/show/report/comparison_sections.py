@@ -15,7 +15,7 @@ from evedrop.results.comparison import COMPARISON, Cell, Comparison, read_compar
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.comparison import comparison_lines, conclusion, pairs_table, schemes_table, verdict
 from evedrop.show.report.page import facts_table, made
-from evedrop.show.report.travel import circumstances, download, input_files
+from evedrop.show.report.travel import OF_PAGE, circumstances, download, input_files
 from evedrop.show.view import palette
 from evedrop.show.view.palette import hexadecimal
 from evedrop.system.files import Unreadable, text_of
@@ -115,7 +115,7 @@ def _repeat(of: ComparisonSource) -> Iterator[Markup]:
             files.append(download(path.name, text_of(path, _MOST_BYTES)))
             commands.append(f"evedrop montecarlo {shlex.quote(path.name)} --trials {comparison.trials}")
     yield made("details", f"The {len(files)} scenarios", made("block", *files, made("code", "\n".join(commands))))
-    yield facts_table(circumstances(of.folder / COMPARISON), "Date and machine")
+    yield facts_table(circumstances(of.folder / COMPARISON), f"Date of the results; {OF_PAGE}")
 
 
 COMPARISON_SECTIONS: Mapping[str, Callable[[ComparisonSource], Iterator[Markup]]] = {

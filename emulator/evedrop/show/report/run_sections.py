@@ -20,7 +20,7 @@ import pyarrow as pa
 from markupsafe import Markup
 
 from evedrop.errors import UsageError
-from evedrop.model.metrics.text import number_text
+from evedrop.model.metrics.text import number_text, percent_text
 from evedrop.model.process import Floats
 from evedrop.model.receiver import NOTHING, SILENT, Codes, Flags
 from evedrop.results.reading import Results
@@ -33,7 +33,7 @@ from evedrop.show.report import closing
 from evedrop.show.report.chart import POINTS, Curve, GroupCounts, GroupMeans, LogChart
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.text_table import TextTable
-from evedrop.show.report.travel import SCENARIO, circumstances, download, input_files
+from evedrop.show.report.travel import OF_PAGE, SCENARIO, circumstances, download, input_files
 from evedrop.show.view.axis_name import squared_unit
 from evedrop.show.view.error_floor import error_floor, mean_band
 from evedrop.show.view.lanes import EAVESDROPPER, KNOWLEDGE, SPIED, Lane, knowledge_lane
@@ -230,7 +230,7 @@ class RunSource:
 
     @cached_property
     def noise(self) -> float:
-        """The process noise tr Q; 0 if the scenario cannot be read."""
+        """The process noise tr Q; 0 if it is unknown, because the scenario cannot be read."""
         return recorded_noise(self.folder)
 
 
@@ -321,6 +321,9 @@ def _lost_synchronisation(of: RunSource) -> Iterator[Markup]:
     """The spans in which each receiver lost synchronisation, in the first recorded trial."""
     if not of.trial:
         return
+    if not of.noise:
+        yield made("paragraph", "Not shown: tr Q, the noise of one step, is 0 or unknown.")
+        return
     yield made(
         "paragraph",
         f"Trial {of.summary.first_trial}, slot by slot. A receiver is overconfident where its squared error is more than "
@@ -331,7 +334,7 @@ def _lost_synchronisation(of: RunSource) -> Iterator[Markup]:
     for name, recorded in of.trial.items():
         table.add(
             name,
-            *(f"{fraction:.1%}" for fraction in recorded.synchronisation.fractions),
+            *map(percent_text, recorded.synchronisation.fractions),
             f"{recorded.lost.count:,}",
             f"slots {_where(recorded.lost.spans[0])}" if recorded.lost.count else "–",
         )
@@ -353,10 +356,10 @@ def _lanes(name: str, recorded: RecordedTrial) -> Iterator[Markup]:
     spans = recorded.lost.spans
     yield made("heading", name)
     fraction = recorded.synchronisation.fractions[Synchronisation.SYNCHRONISED]
-    label = f"{name}: synchronised in {fraction:.1%} of the slots 0 to {recorded.last:,}"
+    label = f"{name}: synchronised in {percent_text(fraction)} of the slots 0 to {recorded.last:,}"
     yield lane_picture(knowledge_lane(name), recorded.synchronisation.highest, label)
     counted = ", ".join(
-        f"{fraction:.1%} {word}"
+        f"{percent_text(fraction)} {word}"
         for word, fraction in zip(OUTCOMES, recorded.outcome.fractions, strict=True)
         if fraction
     )
@@ -423,15 +426,16 @@ def _repeat(of: RunSource) -> Iterator[Markup]:
     """The scenario to save, the command that repeats the run with it, and when, where and with which versions it was made."""
     summary = of.summary
     if of.scenario_text:
-        yield made(
-            "paragraph",
-            "Save the scenario, and run it in its folder: the same results to the same bits, and a look at them.",
-        )
+        whole = summary.ended == "complete"
+        same = "the same results to the same bits" if whole else "the whole run, of which this one is a part"
+        yield made("paragraph", f"Save the scenario, and run it in its folder: {same}, and a look at them.")
         yield download(SCENARIO, of.scenario_text)
         yield from input_files(of.folder)
         if "secret_file" in of.tables:
             yield made("paragraph", "Its secret is in a file, which does not travel with this page.")
         command = repeating(Path(SCENARIO), summary.trials, summary.mode)
+        if any(peer.rare_estimate is not None for peer in summary.peers.values()):
+            command += " --rare"
         yield made("code", f"{command} --out again\nevedrop view again")
     else:
         yield made("paragraph", f"The run cannot be repeated: its folder has no {SCENARIO} that can be read.")
@@ -445,7 +449,7 @@ def _repeat(of: RunSource) -> Iterator[Markup]:
         **(versions if isinstance(versions, dict) else {}),
         **{f"digest of {name}": peer.digest or "–" for name, peer in summary.peers.items()},
     }
-    yield facts_table(facts, "Seed, machine, versions and digests")
+    yield facts_table(facts, f"Seed, versions and digests of the run; {OF_PAGE}")
     if of.scenario_text and len(of.scenario_text) <= _MOST_TEXT:
         yield made("details", "The scenario with all its entries", made("code", of.scenario_text))
 

@@ -29,7 +29,7 @@ from evedrop.score.verdict import SecrecyOutcome, weakest
 from evedrop.show.report.chart import Curve, LogChart
 from evedrop.show.report.closing import SWEEP_TABLE, sweep_table
 from evedrop.show.report.page import facts_table, made
-from evedrop.show.report.travel import SCENARIO, circumstances, download
+from evedrop.show.report.travel import OF_PAGE, SCENARIO, circumstances, download
 from evedrop.show.view.axis_name import axis_name
 from evedrop.show.view.palette import paper_inks
 from evedrop.system.files import Unreadable, text_of
@@ -117,7 +117,8 @@ def _verdicts(of: SweepSource) -> Iterator[Markup]:
 def _errors(of: SweepSource) -> Iterator[Markup]:
     """The error of every receiver against the first entry, in a chart for each combination of the others."""
     first, *others = of.grid
-    for values in list(dict.fromkeys(tuple(row[key] for key in others) for row in of.rows))[:_MOST_CHARTS]:
+    combinations = list(dict.fromkeys(tuple(row[key] for key in others) for row in of.rows))
+    for values in combinations[:_MOST_CHARTS]:
         rows = [row for row in of.rows if tuple(row[key] for key in others) == values]
         where = ", ".join(f"{key} = {value}" for key, value in zip(others, values, strict=True))
         words = None
@@ -132,6 +133,11 @@ def _errors(of: SweepSource) -> Iterator[Markup]:
         )
         shown = f"Mean error with its 95 % interval; dotted: theory{'; ' if where else ''}{where}"
         yield LogChart(label, _axis(first), shown, curves, words, y_axis="mean error").figure or Markup()
+    if len(combinations) > _MOST_CHARTS:
+        yield made(
+            "paragraph",
+            f"Charts of the first {_MOST_CHARTS} of {len(combinations):,} combinations; all are in the table.",
+        )
 
 
 def _axis(key: str) -> Markup:
@@ -183,7 +189,7 @@ def _repeat(of: SweepSource) -> Iterator[Markup]:
     words += _MODES.get(of.mode, [])
     yield made("code", shlex.join(words))
     facts = {**circumstances(of.folder / SWEEP_TABLE), "python": platform.python_version(), "numpy": np.__version__}
-    yield facts_table({**facts, "evedrop": version("evedrop")}, "Date, machine and versions")
+    yield facts_table({**facts, "evedrop": version("evedrop")}, f"Date of the results; versions, {OF_PAGE}")
 
 
 def _listed(values: Sequence[Any]) -> list[str]:

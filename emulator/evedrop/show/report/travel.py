@@ -19,6 +19,8 @@ from evedrop.show.report.page import made
 from evedrop.system.files import Unreadable, text_of
 
 SCENARIO = "scenario.toml"
+OF_PAGE = "machine, operating system and commit that made this page"
+"""What of `circumstances` need not be that of the results."""
 _MOST_BYTES = 2**20
 _GIT_SECONDS = 5.0
 

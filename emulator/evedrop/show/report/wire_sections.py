@@ -11,13 +11,14 @@ from typing import Any
 from markupsafe import Markup
 
 from evedrop.errors import UsageError
+from evedrop.model.metrics.text import percent_text
 from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, WireSummary
 from evedrop.scenario.words import toml_text
 from evedrop.show.report.chart import Curve, LogChart
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.run_sections import lane_picture
 from evedrop.show.report.text_table import TextTable
-from evedrop.show.report.travel import circumstances, download
+from evedrop.show.report.travel import OF_PAGE, circumstances, download
 from evedrop.show.report.wire import reasons_table, unlinked_sentence, wire_faults, wire_outcome, wire_table, wire_title
 from evedrop.show.report.wire_over_time import LANE, WireOverTime
 from evedrop.show.view.palette import hexadecimal, on_paper, series
@@ -116,7 +117,7 @@ def _over_time(of: WireSource) -> Iterator[Markup]:
     yield made("legend", "Lanes:", LANE.legend({int(code) for link in links.values() for code in link.codes}))
     for name, link in links.items():
         yield made("heading", name)
-        lost = f"{link.lost.sum() / link.heard.sum():.1%} of {int(link.heard.sum()):,} messages were not delivered"
+        lost = f"{percent_text(link.lost.sum() / link.heard.sum())} of {int(link.heard.sum()):,} messages were not delivered"
         yield lane_picture(LANE, link.codes, f"{name}, {of.summary.seconds:,.1f} s: {lost}")
     history = history.coarser
     links = {name: history.links[name] for name in links}
@@ -179,7 +180,7 @@ def _repeat(of: WireSource) -> Iterator[Markup]:
         "time": f"{of.summary.seconds:,.1f} s",
         **of.summary.made_with,
     }
-    yield facts_table(facts, "Seed, machine and versions")
+    yield facts_table(facts, f"Seed and versions of the wire; {OF_PAGE}")
 
 
 WIRE_SECTIONS: Mapping[str, Callable[[WireSource], Iterator[Markup]]] = {
