@@ -25,7 +25,15 @@ import pytest
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.live.launch.hosts_file import load_hosts
 from evedrop.live.launch.launcher import launch
-from evedrop.live.launch.other_hosts import LauncherHeartbeat, StartProcess, greeting_in, line_of, order_in, ssh_command
+from evedrop.live.launch.other_hosts import (
+    LauncherHeartbeat,
+    StartProcess,
+    greeting_in,
+    line_of,
+    order_in,
+    ssh_command,
+    trial_command,
+)
 from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import NetworkTable
@@ -351,6 +359,9 @@ def test_what_ssh_is_given_never_asks_and_has_no_secret(tmp_path: Path) -> None:
     for option in ("BatchMode=yes", "ControlPath=none"):
         assert words[words.index(option) - 1] == "-o"
     assert words[-7:] == ["-l", "lab", "-p", "2222", "--", "beta.lan", "cd '/a b' && exec '/opt/my env/evedrop' host"]
+    trial = trial_command(plan.hosts["beta"], tmp_path / "config")
+    there = "cd '/a b' && exec '/opt/my env/evedrop' --version"
+    assert trial == ["ssh", "-F", str(tmp_path / "config"), "-l", "lab", "-p", "2222", "beta.lan", there]
 
 
 @pytest.mark.parametrize("longest_outage", [1.0, 3.0, 5.0, 7.5, 11.0, 30.0, 100.0])
@@ -410,6 +421,7 @@ def test_a_host_ends_when_its_launcher_is_silent(evedrop: Evedrop) -> None:
     host = evedrop.start(["-m", "evedrop"], ("host",), {"stdin": subprocess.PIPE})
     assert host.stdin is not None
     assert host.stdout is not None
+    assert host.stdout.readline() == "\n", "a login shell may have printed a line without its end"
     assert greeting_in(host.stdout.readline().encode()).evedrop == version("evedrop")
     host.stdin.write(line_of(LauncherHeartbeat(0.2)).decode())
     host.stdin.flush()

@@ -48,12 +48,14 @@ def connect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connect:
     """Begin a connection; the script says these lines, keeps all that it is told, and ends with its standard input."""
     monkeypatch.setenv("PATH", str(tmp_path / "bin"), prepend=":")
 
-    def begin(*lines: str, beat_seconds: float = 30.0, **table: Any) -> SshHost:
+    def begin(*lines: str, beat_seconds: float = 30.0, warning: str = "", **table: Any) -> SshHost:
         (tmp_path / "bin").mkdir()
         (tmp_path / "told").touch()
         (tmp_path / "said").write_text("".join(f"{line}\n" for line in lines))
         script = tmp_path / "bin" / "ssh"
-        script.write_text(f"#!/bin/sh\ncat '{tmp_path}/said'\nexec cat 3>&1 >'{tmp_path}/told'\n")
+        script.write_text(
+            f"#!/bin/sh\nprintf '{warning}' >&2\ncat '{tmp_path}/said'\nexec cat 3>&1 >'{tmp_path}/told'\n"
+        )
         script.chmod(0o700)
         return SshHost("beta", HostTable(address="beta.lan", processes=("smart",), **table), None, 30.0, beat_seconds)
 
@@ -161,6 +163,26 @@ def test_a_host_that_only_talks_is_given_up(connect: Connect) -> None:
     host = connect(*["more"] * MOST_NOISE, GREETING)
     with pytest.raises(UsageError, match=r"^host beta: "):
         ready(host)
+    host.close(time.monotonic() + LIMIT)
+
+
+def test_a_warning_at_the_beginning_is_not_why_a_connection_ended(connect: Connect, tmp_path: Path) -> None:
+    """What ssh says once the program runs is; before that, a warning may be."""
+    host = connect(GREETING, warning="cannot change locale")
+    ready(host)
+    assert isinstance(host._ssh, SystemSsh)
+    host._ssh.kill()
+    wait_until(host._lost.is_set, "the end of the connection")
+    assert host._ending() == "the connection with host beta ended: ssh ended with status -9"
+    host.close(time.monotonic() + LIMIT)
+
+
+def test_a_host_whose_program_does_not_begin_is_not_still_connecting(connect: Connect) -> None:
+    """Its login shell may wait for something."""
+    host = connect("Your password will expire.")
+    wait_until(lambda: host._noisy, "the words of the login shell")
+    with pytest.raises(UsageError, match=r"only its login shell has printed.*; try `ssh beta.lan evedrop --version`"):
+        host.wait_until_ready(time.monotonic(), threading.Event())
     host.close(time.monotonic() + LIMIT)
 
 

@@ -231,9 +231,14 @@ class SshHost:
         longest_outage: seconds for which a process of the run may be cut off. beat_seconds: between two heartbeats.
         """
         self.name, self._table, self._beat_seconds = name, table, beat_seconds
+        self._trial = shlex.join(trial_command(table, config))
         self._sending, self._guard = world().lock(), world().lock()
         self._processes: dict[int, HostedProcess] = {}
         self._version = ""
+        self._said_before = 0
+        """How much ssh and the login shell had written before the program began."""
+        self._noisy = False
+        """Whether anything came before the program began."""
         self._lack: str | None = None
         self._answered, self._lost = world().event(), world().event()
         try:
@@ -316,7 +321,9 @@ class SshHost:
             for line in itertools.islice(answers, MOST_NOISE):  # of the login shell
                 with contextlib.suppress(ValueError):
                     self._version = greeting_in(line).evedrop
+                    self._said_before = len(self._ssh.said)
                     break
+                self._noisy = True
             else:
                 raise ValueError
             self._answered.set()
@@ -360,16 +367,19 @@ class SshHost:
         """What this machine lacks, or the last line that ssh printed, or its exit status."""
         if self._lack is not None:
             return self._lack
-        lines = [line.strip() for line in self._ssh.said.splitlines() if line.strip()]
+        lines = [line.strip() for line in self._ssh.said[self._said_before :].splitlines() if line.strip()]
         status = self._ssh.poll()
         if lines:
             return lines[-1]
-        return "ssh is still connecting" if status is None else f"ssh ended with status {status}"
+        if status is not None:
+            return f"ssh ended with status {status}"
+        if self._answered.is_set():
+            return "ssh has not ended"
+        return "only its login shell has printed" if self._noisy else "ssh is still connecting"
 
     def _remedy(self) -> str:
         """A command that the user can try."""
-        words = [word for word in ssh_words(self._table) if word != "--"]
-        return f"try `ssh {shlex.join(words)} {shlex.join([*self._table.command, '--version'])}`"
+        return f"try `{self._trial}`"
 
 
 def ssh_words(table: HostTable) -> list[str]:
@@ -386,9 +396,26 @@ def ssh_command(table: HostTable, config: Path | None, longest_outage: float) ->
     many without an answer: soon after what is tolerated, and before the processes there count as lost, so that it is named.
     """
     alive = ["-o", f"ServerAliveCountMax={max(1, math.ceil(TOLERATED * longest_outage / _ALIVE_SECONDS))}"]
-    given = [] if config is None else ["-F", str(config)]
+    return ["ssh", *_given(config), *_OPTIONS, *alive, *ssh_words(table), _on_host(table, "host")]
+
+
+def trial_command(table: HostTable, config: Path | None) -> list[str]:
+    """The command that the user can try: it asks in the same way for the version of Evedrop there."""
+    words = [word for word in ssh_words(table) if word != "--"]
+    there = _on_host(table, "--version").removeprefix("exec ")
+    apart = there.split()
+    # ssh joins the words, so they need quotes only if one has any.
+    return ["ssh", *_given(config), *words, *(apart if shlex.join(apart) == there else [there])]
+
+
+def _given(config: Path | None) -> list[str]:
+    return [] if config is None else ["-F", str(config)]
+
+
+def _on_host(table: HostTable, word: str) -> str:
+    """What the shell of a host is given: it calls Evedrop with a word."""
     folder = "" if table.folder is None else f"cd {shlex.quote(table.folder)} && "
-    return ["ssh", *given, *_OPTIONS, *alive, *ssh_words(table), f"{folder}exec {shlex.join([*table.command, 'host'])}"]
+    return f"{folder}exec {shlex.join([*table.command, word])}"
 
 
 @final
@@ -453,7 +480,7 @@ def serve_launcher() -> None:
     with this.raise_on_signals(), private_folder() as private, preloaded_without_recorder() as start:
         host, silence = HostProcesses(private, start, this.send_event), _Silence()
         try:
-            host.answer(Greeting(own_version()))
+            host.greet()
             for line in _lines_of(this):
                 try:
                     order = order_in(line)
@@ -505,7 +532,12 @@ class HostProcesses:
         self._ending = False
         self._processes: dict[int, StartedProcess] = {}
 
-    def answer(self, message: Greeting | Answer) -> None:
+    def greet(self) -> None:
+        """Say that the program runs, on a line of its own: the login shell may have printed one without its end."""
+        with self._sending, contextlib.suppress(OSError):
+            self._send(b"\n" + line_of(Greeting(own_version())))
+
+    def answer(self, message: Answer) -> None:
         """Send a message to the launcher; harmless if it is gone."""
         with self._sending, contextlib.suppress(OSError):
             self._send(line_of(message))
