@@ -49,7 +49,7 @@ def lack_of(error: BaseException) -> str | None:
         lack = _LACKS[errno.EAGAIN]
     elif _WITHOUT_FILE in str(error) and not isinstance(error, Exception):
         lack = _LACKS[errno.EMFILE]
-    elif isinstance(error, OSError) and error.errno in (_NO_FILE if error.filename is not None else _LACKS):
+    elif isinstance(error, OSError) and (error.filename is None or error.errno in _NO_FILE) and error.errno in _LACKS:
         lack = _LACKS[error.errno]
     else:
         return None

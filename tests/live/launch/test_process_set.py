@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO
 
 import pytest
 
 from evedrop.errors import Interrupted
 from evedrop.live.launch import process_set
+from evedrop.live.launch.starter import StartedProcess
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.show.view.viewer import Viewer
@@ -25,7 +26,8 @@ def test_no_process_waits_for_a_viewer(tmp_path: Path, monkeypatch: pytest.Monke
         stop.set()
         meanwhile()
 
-    def never(*_: Any) -> Any:
+    def never(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
+        del role, brief, log, environment
         raise AssertionError("a process was started before the viewer")
 
     monkeypatch.setattr(Viewer, "start", slow)
