@@ -372,7 +372,12 @@ def test_a_query_was_heard_when_it_came(tmp_path: Path, monkeypatch: pytest.Monk
         offer(server, "map", b"x")
         wait_until(lambda: answers(asker, "map"), "the queryable is there")
         ask = QueryRelay._ask
-        monkeypatch.setattr(QueryRelay, "_ask", lambda relay, asked: (time.sleep(1.0), ask(relay, asked)))
+
+        def ask_late(relay: QueryRelay, asked: Any) -> None:
+            time.sleep(1.0)
+            ask(relay, asked)
+
+        monkeypatch.setattr(QueryRelay, "_ask", ask_late)
         begun, came = time.time(), time.monotonic()
         assert answers(asker, "map") == [b"x"]
         assert time.monotonic() - came < 2.3

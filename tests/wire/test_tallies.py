@@ -147,3 +147,17 @@ def test_a_metric_is_a_number_of_the_summary(name: str, value: float) -> None:
 def test_a_latency_is_the_quantile_that_is_asked_for() -> None:
     """By default the median."""
     assert [WIRE_METRICS["latency"].value(link(12), DELAYS, value) for value in (0.9, None)] == [0.9, 0.5]
+
+
+def test_what_was_not_delivered_after_all_has_no_delay() -> None:
+    """The quantiles are those of the messages that were delivered, however many were kept of all."""
+    for count in (10, 400_000):
+        tally, records = LinkTally(), np.zeros(count, RECORD)
+        records["delay"] = np.random.default_rng(5).permutation(np.arange(count) % 10)
+        tally.add(records)
+        assert tally.delay_quantile(0.99) == 9.0
+        for fate in (WireFate.UNDERWAY, WireFate.CONGESTED):
+            tally.amend(records[records["delay"] == (8.0 if fate is WireFate.CONGESTED else 9.0)], fate)
+        assert [tally.delay_quantile(level) for level in (0.1, 0.44, 0.98)] == [0.0, 3.0, 7.0]
+        tally.amend(records[records["delay"] < 8.0], WireFate.UNDERWAY)
+        assert tally.delay_quantile(0.5) is None

@@ -125,6 +125,34 @@ class StreamTally:
 
 
 @final
+class _DelaySample:
+    """Some of many delays, in seconds: all of the first, then every second, fourth and so on."""
+
+    def __init__(self) -> None:
+        self.step = 1
+        """The delays for which each of the sample stands."""
+        self._parts: list[Floats] = []
+        self._count = self._skip = 0
+
+    def add(self, delays: Floats) -> None:
+        """Add further delays."""
+        taken = delays[self._skip :: self.step].copy()
+        self._skip = (self._skip - len(delays)) % self.step
+        self._parts.append(taken)
+        self._count += len(taken)
+        if self._count > _SAMPLE:
+            thinned = self.delays
+            self._skip += self.step * (len(thinned) % 2)
+            self._parts, self.step = [thinned[::2]], 2 * self.step
+            self._count = len(self._parts[0])
+
+    @property
+    def delays(self) -> Floats:
+        """The sample."""
+        return np.concatenate(self._parts) if self._parts else np.zeros(0)
+
+
+@final
 class LinkTally:
     """All messages of one link."""
 
@@ -134,8 +162,8 @@ class LinkTally:
         """Messages by fate; their sum is `heard`."""
         self.streams: dict[tuple[int, int], StreamTally] = {}
         """(code of the key, kind) → its messages."""
-        self._delays: list[Floats] = []
-        self._sampled, self._step, self._skip = 0, 1, 0
+        self._delays = _DelaySample()
+        self._undelivered = _DelaySample()  # those of messages that were not delivered after all
 
     def add(self, records: Records) -> None:
         """Add messages to all but `streams`."""
@@ -143,16 +171,7 @@ class LinkTally:
         self.bytes += int(records["size"].sum(dtype=np.int64))
         self.again += int(np.count_nonzero(delivered_again(records)))
         self.fates += np.bincount(records["fate"], minlength=256)
-        delays = records["delay"][records["fate"] == WireFate.DELIVERED]
-        taken = delays[self._skip :: self._step].copy()
-        self._skip = (self._skip - len(delays)) % self._step
-        self._delays.append(taken)
-        self._sampled += len(taken)
-        if self._sampled > _SAMPLE:
-            thinned = np.concatenate(self._delays)
-            self._skip += self._step * (len(thinned) % 2)
-            self._delays, self._step = [thinned[::2]], 2 * self._step
-            self._sampled = len(self._delays[0])
+        self._delays.add(records["delay"][records["fate"] == WireFate.DELIVERED])
 
     def amend(self, records: Records, fate: WireFate) -> None:
         """Messages that were added have another fate."""
@@ -160,6 +179,7 @@ class LinkTally:
         self.fates[fate] += len(records)
         if fate is not WireFate.DELIVERED:
             self.again -= int(np.count_nonzero(delivered_again(records)))
+            self._undelivered.add(records["delay"][records["fate"] == WireFate.DELIVERED])
 
     @property
     def delivered(self) -> int:
@@ -174,8 +194,20 @@ class LinkTally:
 
     def delay_quantile(self, level: float) -> float | None:
         """A quantile of the time for which delivered messages were held back, in seconds; None if there are none."""
-        delays = np.concatenate(self._delays) if self._delays else np.zeros(0)
+        delays = self._delivered_delays() if self.delivered else np.zeros(0)
         return float(np.quantile(delays, level, method="inverted_cdf")) if len(delays) else None
+
+    def _delivered_delays(self) -> Floats:
+        """The sample without the delays of messages that were not delivered after all."""
+        delays, undelivered = self._delays.delays, self._undelivered.delays
+        if not len(undelivered):
+            return delays
+        values, places = np.unique(np.concatenate([delays, undelivered]), return_inverse=True)
+        counts = np.zeros(len(values), np.int64)
+        np.add.at(counts, places[: len(delays)], self._delays.step)
+        np.subtract.at(counts, places[len(delays) :], self._undelivered.step)
+        remaining: Floats = np.repeat(values, np.maximum(counts, 0) // self._delays.step)
+        return remaining
 
 
 class WireMetric(NamedTuple):
