@@ -134,13 +134,13 @@ class WriteBriefs(ByHand):
     ) -> None:
         """Write what is to be written for a scenario, which is in a folder, and use it until a deadline."""
         if self.target == _CONTAINERS:
-            refused = scenario.shards > 1 or scenario.modules is not None or scenario.process.source == "zenoh"
+            refused = _by_launcher(scenario) or scenario.modules is not None or scenario.process.source == "zenoh"
             if self._written(world, folder, ["--compose"], refused=refused):
                 self._check_containers(world, scenario, folder / "written")
         elif self.target == _REFUSED:
             for options in (*_WRONG_OPTIONS, *([("--listen", _AT)] if scenario.relayed else [])):
                 self._written(world, folder, options, refused=True)
-        elif self._written(world, folder, self._options(scenario), refused=scenario.shards > 1):
+        elif self._written(world, folder, self._options(scenario), refused=_by_launcher(scenario)):
             paths = sorted((folder / "written").glob("*.json"))
             self._start_some(world, {path: json.loads(path.read_text()) for path in paths}, some, deadline)
 
@@ -208,6 +208,11 @@ class WriteBriefs(ByHand):
             path.chmod(0o644 if some.random() < 0.03 else 0o600)
             _start(world, role, path, clock, some.choice((*[_SOON_SECONDS] * 4, _PATIENCE_SECONDS)))
             path.write_text(json.dumps(briefs[path]))
+
+
+def _by_launcher(scenario: Scenario) -> bool:
+    """Whether only a launcher can run a scenario: it is in shards, or processes are killed or suspended."""
+    return scenario.shards > 1 or any(act.effect.action is not None for act in scenario.timeline.acts)
 
 
 def any_scenario(some: random.Random) -> Scenario:
