@@ -18,6 +18,7 @@ import evedrop.cli
 from evedrop.cli.api import montecarlo, sweep
 from evedrop.cli.commands import MODULES, ROLES
 from evedrop.cli.tables import tables
+from evedrop.errors import RunError
 from evedrop.model.metrics.text import estimate, finite_text, number_text
 from evedrop.show.report.text_table import TextTable, csv_text, latex_escaped, latex_text
 from tests.conftest import Evedrop
@@ -241,3 +242,36 @@ def test_python_writes_them_too(tmp_path: Path) -> None:
         rows = list(itertools.islice(csv.reader(path.read_text(encoding="utf-8").splitlines()), 3))
         assert len(rows) == 3
         assert r"\begin{tabular}" in results.to_latex(tmp_path / f"{i}.tex").read_text()
+
+
+def test_a_table_that_cannot_be_written_is_refused_at_the_start(evedrop: Evedrop) -> None:
+    """Before anything is simulated; a file of a results folder that the command makes is written."""
+    small = ("montecarlo", "eavesdroppers", "--trials", "2", "--slots", "9", "--set", "expect=[]")
+    for option in ("--csv", "--latex"):
+        done = evedrop(*small, "--out", "out", option, "nowhere/table")
+        assert (done.status, done.out) == (2, "")
+        assert done.err.startswith(
+            "evedrop: nowhere/table cannot be written (No such file or directory); give another file"
+        )
+    assert not (evedrop.folder / "out").exists()
+    assert evedrop(*small, "--out", "out", "--csv", "out/table.csv", "--latex", "table.tex").status == 0
+    assert (evedrop.folder / "out/table.csv").exists()
+    assert (evedrop.folder / "table.tex").exists()
+
+
+def test_a_table_that_is_not_written_does_not_hide_an_error(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error decides the status, and the other file is written."""
+    (evedrop.folder / "bad.csv").touch()
+    small = ("montecarlo", "eavesdroppers", "--trials", "2", "--slots", "9", "--set", "expect=[]")
+
+    def fail(*_: object) -> None:
+        (evedrop.folder / "bad.csv").unlink()
+        (evedrop.folder / "bad.csv").mkdir()
+        raise RunError("it failed")
+
+    monkeypatch.setattr("evedrop.cli.report.report_page", fail)
+    done = evedrop(*small, "--csv", "bad.csv", "--latex", "table.tex")
+    assert done.status == 3
+    assert "warning: bad.csv cannot be written (Is a directory)" in done.err
+    assert "evedrop: it failed" in done.err
+    assert (evedrop.folder / "table.tex").read_text(encoding="utf-8")

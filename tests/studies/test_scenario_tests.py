@@ -182,6 +182,28 @@ def test_tests_of_one_name_keep_their_results_apart(tmp_path: Path) -> None:
     assert "cannot be written (Not a directory)" in blocked.reasons[0]
 
 
+def test_a_report_that_cannot_be_written_is_refused_at_the_start(
+    evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before anything is run. One that cannot be written at the end does not hide what was found."""
+    written(evedrop.folder, one=HOLDS)
+    words = ("test", "one.toml", "--in-memory", "--trials", "2", "--out", "out", "--junit")
+    done = evedrop(*words, "one.toml/report.xml")
+    assert (done.status, done.out) == (2, "")
+    assert done.err.startswith("evedrop: one.toml/report.xml cannot be written (")
+    assert not (evedrop.folder / "out").exists()
+    report = evedrop.folder / "late.xml"
+
+    def late(*_: object) -> None:
+        report.mkdir()
+
+    monkeypatch.setattr("evedrop.studies.tests_page.write_tests_page", late)
+    done = evedrop(*words, "late.xml")
+    assert done.status == 2
+    assert "1 passed, in " in done.out
+    assert "late.xml cannot be written (Is a directory)" in done.err
+
+
 def test_a_report_holds_what_xml_cannot() -> None:
     """Markup is escaped, and characters that no XML may have are replaced."""
     strange = '<a> & "b" ]]> \x00\x1b[31m \ud800 \U0001f512'

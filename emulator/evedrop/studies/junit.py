@@ -5,21 +5,37 @@ Source: docs/testing.md.
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from evedrop.errors import UsageError
 from evedrop.show.report.page import printable
 from evedrop.studies.scenario_tests import Finding, Outcome
+from evedrop.system.files import check_writable
 
 
-def write_junit(path: Path, tested: Sequence[Finding], started: float) -> None:
-    """Write a report; started: seconds since the epoch. Raises UsageError if it cannot be written."""
+def check_junit(path: Path) -> None:
+    """Raise UsageError if no report can be written there; makes its folder."""
+    with _named(path):
+        check_writable(path)
+
+
+def write_junit(path: Path | None, tested: Sequence[Finding], started: float) -> None:
+    """Write a report if there is a path; started: seconds since the epoch. Raises UsageError if it cannot be written."""
+    if path is not None:
+        with _named(path):
+            path.write_bytes(junit_of(tested, started))
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Make the folder of a report; an error in the block names the report."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(junit_of(tested, started))
+        yield
     except OSError as error:
         raise UsageError(f"{path} cannot be written ({error.strerror}); give another --junit") from error
 

@@ -44,6 +44,17 @@ class Limit:
         return cls(2 * rows + 10_000, 16 * 2**20 + max(1024, 32 * columns) * rows)
 
 
+def check_writable(file: Path) -> None:
+    """Raise OSError if a file cannot be written; it is left as it is. What is no file, such as a pipe, is not tried."""
+    there = file.exists()
+    if there and not file.is_file() and not file.is_dir():
+        return
+    with file.open("ab"):
+        pass
+    if not there:
+        file.unlink()
+
+
 def is_there(path: Path) -> bool:
     """Whether a path exists, even as a broken link; False for an impossible name."""
     try:

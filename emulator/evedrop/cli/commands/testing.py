@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from evedrop.cli.in_memory import check_resuming, resuming, scheduler
 from evedrop.cli.options import Command
 from evedrop.errors import UsageError
-from evedrop.system.output import tell
+from evedrop.system.output import tell, warn
 
 if TYPE_CHECKING:
     from evedrop.studies.simulated_tests import SeedsToPlay
@@ -22,7 +22,7 @@ _PROGRAM = "evedrop.cli.simulated:program"
 
 def test(options: argparse.Namespace) -> int:
     """Run scenarios as tests; returns the worst of their exit statuses."""
-    from evedrop.studies.junit import write_junit
+    from evedrop.studies.junit import check_junit, write_junit
     from evedrop.studies.scenario_tests import Finding, Manner, results, scenarios_of
     from evedrop.studies.tests_page import write_tests_page
 
@@ -35,6 +35,8 @@ def test(options: argparse.Namespace) -> int:
     check_resuming(options)
     simulation = _simulation(options)
     scenarios = scenarios_of(options.places)
+    if options.junit is not None:
+        check_junit(options.junit)
     manner = Manner(
         options.in_memory,
         options.trials,
@@ -51,10 +53,14 @@ def test(options: argparse.Namespace) -> int:
             for line in finding.lines:
                 tell(f"    {line}")
             sys.stdout.flush()
-    finally:
-        if options.junit is not None:
+    except BaseException:
+        write_tests_page(manner.folder, tested, started)
+        try:
             write_junit(options.junit, tested, started)
-        page = write_tests_page(manner.folder, tested, started)
+        except UsageError as error:
+            warn(str(error))
+        raise
+    page = write_tests_page(manner.folder, tested, started)
     counts = Counter(finding.outcome for finding in tested)
     printed = ", ".join(
         f"{count} {outcome.word}" for outcome, count in sorted(counts.items(), key=lambda at: at[0].value)
@@ -62,6 +68,7 @@ def test(options: argparse.Namespace) -> int:
     tell(f"{printed}, in {time.monotonic() - began:.1f} s", alarm="FAILED")
     if page is not None:
         tell(f"report: {page}")
+    write_junit(options.junit, tested, started)
     return max(outcome.value for outcome in counts)
 
 
