@@ -88,6 +88,10 @@ REFUSED = {
         view done --slots 1:2
         view done --picture a.png --times 1:2
         view done --panel scene
+        view done --slot 3
+        view done --table --size 300x300
+        view done --picture done.png --fps 5
+        view done --table --serve nonsense
         """,
     "diff": """
         diff done
@@ -98,13 +102,18 @@ REFUSED = {
         export done
         export nowhere run.mcap
         export done run.bag
+        export done run.csv --period 2
         export done --mcap
         """,
     "test": """
         test full
+        test full vehicle
         test vehicle --jobs 0
         test vehicle --scheduler tcp://127.0.0.1:8786
         test vehicle --resume
+        """,
+    "cost": """
+        cost microgrid --workers 0
         """,
     "status": """
         status
@@ -154,3 +163,16 @@ def test_what_a_command_refuses(command: str, evedrop: Evedrop, golden: Golden) 
         assert "Traceback" not in done.err
         golden(command, f"$ evedrop {line.strip()}", done.err)
     assert everything(evedrop.folder) == before
+
+
+def test_a_sweep_and_a_comparison_are_named(evedrop: Evedrop) -> None:
+    """Where the results folder of a run is expected."""
+    small = ("--trials", "2", "--slots", "5", "--set", "expect=[]")
+    assert evedrop("sweep", "eavesdroppers", "--over", "seed=1,2", *small, "--out", "swept").status == 0
+    schemes = ("--schemes", "plain", "--adversaries", "naive")
+    assert evedrop("compare", "eavesdroppers", *schemes, *small, "--out", "compared").status == 0
+    for folder, study in (("swept", "sweep"), ("compared", "comparison")):
+        for words in (("view", folder), ("diff", folder, folder), ("export", folder, "run.mcap")):
+            done = evedrop(*words)
+            assert (done.status, done.out) == (2, "")
+            assert f"{folder} is the folder of a {study}; give the results folder of a run" in done.err

@@ -104,9 +104,11 @@ MEMORY = (entries, output, memory, resuming)
 
 
 def plan_of(options: argparse.Namespace) -> Plan:
-    """The plan, how and where trials are computed, from the options of `memory` or `crew`."""
+    """The plan, how and where trials are computed, from the options of `memory` or `crew`. Raises UsageError."""
     from evedrop.simulate.montecarlo import Plan
     from evedrop.simulate.simulation import Mode
 
+    if options.workers is not None and options.workers < 1:
+        raise UsageError(f"--workers {options.workers}: expected 1 or more")
     mode = Mode(getattr(options, "mode", Mode.EXACT))
     return Plan(mode, options.workers, options.scheduler, rare=getattr(options, "rare", False))

@@ -78,6 +78,11 @@ class Results:
         path_argument("folder", folder, "the results folder of a run")
         place = Path(folder)
         path = place / "summary.json"
+        for study, file in (("sweep", "sweep.json"), ("comparison", "compare.json")):
+            if not path.exists() and (place / file).exists():
+                raise UsageError(
+                    f"{folder} is the folder of a {study}; give the results folder of a run, or: evedrop report {folder}"
+                )
         if not path.exists() and (place / "shards").is_dir():
             raise UsageError(
                 f"{folder} is of a run in shards that is in progress or was killed; each of its shards is a results folder "

@@ -122,7 +122,7 @@ class Finding:
 
 
 def scenarios_of(places: Sequence[str]) -> list[str]:
-    """The scenarios in files, folders and built-in names, each once. Raises UsageError if none is found."""
+    """The scenarios in files, folders and built-in names, each once. Raises UsageError for a place without one."""
     scenarios: dict[Path, str] = {}
     for place in places:
         paths: Sequence[Path] = [Path(place)]
@@ -131,10 +131,10 @@ def scenarios_of(places: Sequence[str]) -> list[str]:
             continue
         if Path(place).is_dir():
             paths = list(scenarios_in(Path(place)))
+            if not paths:
+                raise UsageError(f"no scenario in {place}; a scenario is a TOML file with [process] and [encoding]")
         for path in paths:
             scenarios.setdefault(path.resolve(), str(path))
-    if not scenarios:
-        raise UsageError(f"no scenario in {', '.join(places)}; a scenario is a TOML file with [process] and [encoding]")
     return list(scenarios.values())
 
 

@@ -32,10 +32,16 @@ _LONGEST = 3600.0  # seconds per slot, as for pace
 
 def export(options: argparse.Namespace) -> int:
     """Write a run as MCAP, a wire's journal as CSV, or the picture or tables of a study; the file's ending decides."""
+    from evedrop.scenario.words import listed
+
     kind = options.file.suffix.lower()
     for option, is_given in (("--panel", options.panel is not None), ("--width", options.width != "page")):
         if is_given and kind not in _PICTURES:
             raise UsageError(f"{option} is for pictures, whose files end in {', '.join(_PICTURES)}; leave it out")
+    if kind not in {_MCAP, *_PICTURES, *_TABLES}:
+        raise UsageError(f"{options.file}: expected a file that ends in {listed([_MCAP, *_PICTURES, *_TABLES])}")
+    if options.period is not None and kind != _MCAP:
+        raise UsageError(f"--period is for MCAP files, which end in {_MCAP}; leave it out")
     if kind in {*_PICTURES, *_TABLES}:
         return _export_study(options, kind)
     from evedrop.results.mcap_export import export_mcap
@@ -54,7 +60,7 @@ def export(options: argparse.Namespace) -> int:
     return 0
 
 
-_PICTURES, _TABLES = (".pdf", ".png", ".svg"), (".csv", ".tex")
+_MCAP, _PICTURES, _TABLES = ".mcap", (".pdf", ".png", ".svg"), (".csv", ".tex")
 _DOTS_PER_INCH = 300
 
 

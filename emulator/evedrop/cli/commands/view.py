@@ -74,9 +74,18 @@ def view(options: argparse.Namespace) -> int:
 
 
 def _check_names(options: argparse.Namespace) -> None:
-    """Raise UsageError for a picture or a video that cannot be made, before anything is drawn."""
-    if options.panel is not None and options.picture is None and options.video is None:
-        raise UsageError("--panel is for a picture or a video; give --picture or --video, too")
+    """Raise UsageError for a picture or a video that cannot be made, or an option of one, before anything is drawn."""
+    picture, video = options.picture is not None, options.video is not None
+    for name, fits, what in (
+        ("panel", picture or video, "a picture or a video; give --picture or --video, too"),
+        ("size", picture or video, "a picture or a video; give --picture or --video, too"),
+        ("slot", picture or video, "a picture; give --picture, too"),
+        ("time", picture or video, "a picture; give --picture, too"),
+        ("fps", video, "a video; give --video, too"),
+        ("serve", not (picture or video or options.table), "a view on the screen; leave it out"),
+    ):
+        if getattr(options, name) is not None and not fits:
+            raise UsageError(f"--{name} is for {what}")
     if options.picture is not None:
         from evedrop.show.view.picture import check_picture_name
 
