@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import http.client
+import threading
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.show.view.serving import RerunPage
+from evedrop.show.view.serving import Followed, RerunPage, Served
 from evedrop.show.view.viewer import end, executable, spawn
 from evedrop.system.ports import free_port
-from tests.conftest import LIMIT
+from tests.conftest import LIMIT, wait_until
 
 PAGE = b"<!doctype html>\n<script src=re_viewer.js></script>\n</html>\n"
 SCRIPT = b"let wasm_bindgen = (function() {\n    WebAssembly.instantiate();\n})({ __proto__: null });\n"
@@ -45,6 +47,39 @@ def served(url: str) -> bytes:
     """The content at an address."""
     with urllib.request.urlopen(url, timeout=LIMIT) as reply:  # noqa: S310 - of loopback
         return bytes(reply.read())
+
+
+def test_a_reader_that_left_has_no_place(tmp_path: Path) -> None:
+    """A browser may load the page of a paused run any number of times."""
+    (tmp_path / "r.rrd").write_bytes(b"abc")
+    followed = Followed(tmp_path / "r.rrd")
+    served_at = Served(followed, "127.0.0.1", 0)
+    try:
+        for _ in range(40):
+            wait_until(lambda: first_bytes(served_at) == b"abc", "the recording")
+    finally:
+        followed.complete()
+        served_at.stop()
+
+
+def first_bytes(served_at: Served) -> bytes:
+    """What a reader gets who leaves at once; nothing without a place."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{served_at.port}{served_at.path}", timeout=LIMIT) as reply:
+            return bytes(reply.read(3))
+    except (OSError, http.client.HTTPException):
+        return b""
+
+
+def test_a_recording_is_found_although_its_folder_was_moved(tmp_path: Path) -> None:
+    """The first reader may come later than that."""
+    followed = Followed(tmp_path / "run" / "r.rrd")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "r.rrd").write_bytes(b"abc")
+    wait_until(lambda: "recording" not in {thread.name for thread in threading.enumerate()}, "opened files")
+    (tmp_path / "run").rename(tmp_path / "moved")
+    followed.complete()
+    assert b"".join(followed.pieces()) == b"abc"
 
 
 def test_the_page_is_what_rerun_serves(rerun: RerunPage, theirs: str) -> None:

@@ -51,6 +51,8 @@ class Followed:
         self._over = threading.Event()
         if complete:
             self._over.set()
+        elif self._begun() is None:
+            threading.Thread(target=self._open_early, name="recording", daemon=True).start()
 
     def complete(self) -> None:
         """Declare the recording complete: `pieces` then stops at its end."""
@@ -58,10 +60,13 @@ class Followed:
             self._opened()
         self._over.set()
 
-    def pieces(self) -> Iterator[bytes]:
-        """The recording so far, in large chunks, then what is added to it, as it comes; waits for more until it is complete."""
+    def pieces(self, left: Callable[[], bool] = lambda: False) -> Iterator[bytes]:
+        """The recording so far, in large chunks, then what is added to it, as it comes; waits for more until it is complete.
+
+        left: whether the reader has left, asked while there is nothing to read.
+        """
         while (files := self._begun()) is None:
-            if self._over.wait(_POLL_SECONDS) and self._begun() is None:
+            if left() or (self._over.wait(_POLL_SECONDS) and self._begun() is None):
                 return
         *parts, (start, _) = files.spans or [(0, 0)]
         for descriptor, (first, end) in zip(files.descriptors, parts, strict=False):
@@ -77,10 +82,15 @@ class Followed:
             if piece:
                 start += len(piece)
                 yield piece
-            elif over:
+            elif over or left():
                 return
             else:
                 self._over.wait(_POLL_SECONDS)
+
+    def _open_early(self) -> None:
+        """Open the files as soon as they exist: a reader may come when their folder has been moved."""
+        while self._files is None and not self._over.wait(_POLL_SECONDS):
+            self._begun()
 
     def _begun(self) -> LiveFiles | None:
         """The files, as soon as something can be read; None before."""
@@ -161,9 +171,18 @@ class _RecordingHandler(QuietHandler):
         self.send_header("Cache-Control", "no-store")
         self.send_header("Transfer-Encoding", "chunked")
         self.end_headers()
-        for piece in self.server.followed.pieces():
+        for piece in self.server.followed.pieces(self._left):
             self.wfile.write(b"%x\r\n%b\r\n" % (len(piece), piece))
         self.wfile.write(b"0\r\n\r\n")
+
+    def _left(self) -> bool:
+        """Whether the reader has closed the connection: its place is then free for another."""
+        try:
+            return not self.connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
 
 
 _LARGEST_TEXT = 2**22
