@@ -6,6 +6,7 @@ import io
 import re
 import sys
 from collections import Counter
+from contextlib import redirect_stdout
 from typing import Any
 
 import pytest
@@ -20,7 +21,7 @@ from evedrop.model.metrics.text import estimate
 from evedrop.scenario.progress_events import RunProgress
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.terminal_tables import fitted
-from evedrop.system.output import YELLOW, say
+from evedrop.system.output import YELLOW, say, standard_streams
 from tests.cli.terminal import Terminal
 
 
@@ -38,6 +39,21 @@ def shown(columns: int, **how: Any) -> list[str]:
     console = Console(file=out, width=columns)
     console.print(fitted(table(), console, **how))
     return [line.rstrip() for line in out.getvalue().splitlines()]
+
+
+def test_columns_are_as_wide_as_their_characters_are_spelled() -> None:
+    """In an encoding that lacks them: every column begins at the same place in all lines."""
+    made = TextTable.headed(["receiver"], ["tr P̂ ≥ …", "z"])
+    made.add("a", estimate(0.123, 0.004), "1.0")
+    made.add("bb", "–", "–20.5")
+    out = io.BytesIO()
+    stream = io.TextIOWrapper(out, encoding="ascii")
+    with redirect_stdout(stream), standard_streams():
+        terminal().show(made)
+    lines = [line for line in out.getvalue().decode().splitlines() if line.strip()]
+    stream.close()
+    assert "tr P_hat >= ..." in lines[1]
+    assert len({len(line) for line in lines}) == 1
 
 
 WIDTHS = [40, 60, 80, 100, 120, 200]

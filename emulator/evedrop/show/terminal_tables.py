@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 from rich.box import SIMPLE_HEAD
@@ -16,17 +17,21 @@ from rich.text import Text
 
 from evedrop.model.metrics.text import ShownNumber
 from evedrop.show.report.text_table import TextTable
+from evedrop.system.output import spelled
 
 _ENDLESS = 10_000  # columns
 _ALARMS = re.compile("FAILED|BROKEN|✗|\\bNO\\b")
 _PARTS_OF_KEYS = re.compile(r"(?<=\w\w[._])(?=\w\w)")
 
 
-def rich_table(table: TextTable, *, tight: bool = False, sections: bool = False, heads: str = "") -> Table:
+def rich_table(
+    table: TextTable, *, tight: bool = False, sections: bool = False, heads: str = "", encoding: str = "utf-8"
+) -> Table:
     """A table for the terminal.
 
     tight: without room at its sides and between columns; sections: with a line above each row whose first cell is not empty;
-    heads: "short" breaks headings at their first space, "broken" between all words, and keys of entries at dots.
+    heads: "short" breaks headings at their first space, "broken" between all words, and keys of entries at dots; encoding: of the
+    terminal, which may have to spell characters, so that they take more room.
     """
     shown = Table(
         title=alarming(table.title) if table.title else None,
@@ -36,12 +41,18 @@ def rich_table(table: TextTable, *, tight: bool = False, sections: bool = False,
         collapse_padding=tight,
     )
     for column in table.columns:
-        heading = column.heading.replace(" ", "\n", {"": 0, "short": 1}.get(heads, -1))
+        heading = spelled(column.heading, encoding).replace(" ", "\n", {"": 0, "short": 1}.get(heads, -1))
         heading = _PARTS_OF_KEYS.sub("\n", heading) if heads == "broken" else heading
         shown.add_column(heading, justify="right" if column.number else "left", no_wrap=not column.wraps)
     for row, following in pairwise([*table.rows, ("",)]):
-        shown.add_row(*map(alarming, row), end_section=sections and bool(following[0]))
+        shown.add_row(*(_cell(cell, encoding) for cell in row), end_section=sections and bool(following[0]))
     return shown
+
+
+def _cell(text: str, encoding: str) -> Text:
+    shown = alarming(text)
+    words = spelled(text, encoding)
+    return shown if words == text else Text(words, "bold red" if shown.spans else "")
 
 
 def alarming(text: str, style: str = "") -> Text:
@@ -59,10 +70,11 @@ def fitted(
     tight, sections, heads: as for `rich_table`.
     """
     forms = ((tight, heads), (True, heads), (True, "short"), (True, "broken"))
-    folded, without = rich_table(table, sections=sections, tight=True, heads="broken"), list[str]()
+    rich = partial(rich_table, sections=sections, encoding=console.encoding)
+    folded, without = rich(table, tight=True, heads="broken"), list[str]()
     for version, left_out in _versions(table):
         for narrow, broken in forms:
-            drawn = rich_table(version, tight=narrow, sections=sections, heads=broken)
+            drawn = rich(version, tight=narrow, heads=broken)
             if _fits(drawn, console):
                 return _noted(drawn, left_out)
         if not table.least or len(left_out) <= len(table.least):

@@ -287,6 +287,14 @@ def _set_errors(stream: io.TextIOWrapper, errors: str | None) -> None:
         stream.reconfigure(errors=errors)
 
 
+def spelled(text: str, encoding: str) -> str:
+    """A text as a stream of this encoding shows it, for who must know its width."""
+    if text.isascii() or codecs.lookup(encoding).name == "utf-8":
+        return text
+    codecs.register_error(_SPELLED, _spelled)
+    return text.encode(encoding, _SPELLED).decode(encoding)
+
+
 def _spelled(error: UnicodeError) -> tuple[str, int]:
     """Replace characters that an encoding lacks; an error handler, see `codecs.register_error`."""
     if not isinstance(error, UnicodeEncodeError):
