@@ -1,7 +1,7 @@
 """The parser of the command line: argparse, with a hint for a mistyped word, no abbreviations, and help in sections.
 
 It uses two private names of argparse. If a later Python lacks `_option_string_actions`, options have no hints; if it lacks
-`_negative_number_matcher`, a list that begins with a minus must be given as `--option=-1,2`.
+`_negative_number_matcher`, a list that begins with a minus must be given as `--reference=-1,2`.
 """
 
 from __future__ import annotations
