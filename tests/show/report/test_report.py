@@ -332,7 +332,7 @@ def test_the_longest_spans_are_listed_in_the_order_of_time() -> None:
     traces[errors == 0.0] = 1.0
     words = {"sent": (same, ["state"]), "action": (same, OUTCOMES[:1])}
     trial.add({**words, "squared_error": errors, "trace_covariance": traces})
-    source: Any = SimpleNamespace(summary=SimpleNamespace(first_trial=0), trial={"smart": trial})
+    source: Any = SimpleNamespace(noise=1.0, summary=SimpleNamespace(first_trial=0), trial={"smart": trial})
     (listed,) = (node for node in RUN_SECTIONS["Lost synchronisation"](source) if "<details>" in node)
     spans_shown = [text.partition(":")[0] for text in Checked(listed).texts if text.startswith("slots ")]
     assert spans_shown == [f"slots {span.first:,} to {span.last:,}" for span in spans if span.slots > 2]
