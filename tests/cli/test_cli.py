@@ -325,12 +325,12 @@ def test_other_errors_of_the_system_are_not_blamed_on_the_output(
     from evedrop.simulate import finished_tasks
 
     def fail(_: object) -> None:
-        raise OSError(errno.EMFILE, "Too many open files")
+        raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(finished_tasks, "new_folder", fail)
     done = evedrop("sweep", "eavesdroppers", "--over", "seed=1,2", "--trials", "2", "--slots", "5", "--out", "x")
     assert (done.status, done.out) == (3, "")
-    assert done.err == "evedrop: [Errno 24] Too many open files; free system resources and try again\n"
+    assert done.err == "evedrop: [Errno 37] No locks available; free system resources and try again\n"
 
 
 @pytest.mark.thorough
