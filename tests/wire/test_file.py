@@ -399,8 +399,9 @@ def test_a_value_with_which_a_wire_would_not_work(text: str, place: str) -> None
     assert places_of(mistakes_of(of, text)) == [place]
 
 
-def test_a_correlated_link_keeps_its_model() -> None:
-    """Its uniform numbers are the other link's, and each model uses them in its own way."""
+@pytest.mark.parametrize("link", ["robot-base", "x"])
+def test_correlated_links_keep_their_model(link: str) -> None:
+    """The uniform numbers of one are the other's, and each model uses them in its own way."""
     mistakes = mistakes_of(
         of,
         f"""{BASE}correlation = {{ with = "x", strength = 0.5 }}
@@ -410,7 +411,7 @@ def test_a_correlated_link_keeps_its_model() -> None:
     to = "robot"
     [[event]]
     at = 1
-    link = "robot-base"
+    link = "{link}"
     set = {{ loss = {{ model = "pattern", outcomes = "10" }} }}
     """,
     )

@@ -224,7 +224,7 @@ class LinkNow(NamedTuple):
 
     settings: Mapping[str, Any]
     correlated: bool
-    """Whether its losses are tied to another link's."""
+    """Whether its losses are tied to another link's, or another's to its own."""
     ordered: bool
 
 
@@ -235,8 +235,9 @@ def mistakes_across(file: WireFile, sides: Mapping[str, Mapping[str, Any]]) -> I
     yield from _side_mistakes([*file.side], file.link)
     yield from _name_mistakes(file.link)
     yield from _correlation_mistakes(names, file.link)
+    tied_to = {link.correlation.to for link in file.link if link.correlation is not None}
     links = {
-        name: LinkNow(link.wire_settings(), link.correlation is not None, link.ordered)
+        name: LinkNow(link.wire_settings(), link.correlation is not None or name in tied_to, link.ordered)
         for name, link in zip(names, file.link, strict=True)
         if link.name is not None or {link.source, link.target} <= {*file.side}  # otherwise the name is mistaken, too
     }

@@ -72,7 +72,11 @@ def with_change(plan: WirePlan, table: Mapping[str, Any], time: float) -> tuple[
         checked = WireEventTable.model_validate({"at": 0.0, **table})  # a wire may run for longer than a file can say
     except ValidationError as error:
         raise ScenarioError("event", sentences(error, WireEventTable)) from None
-    links = {link.name: LinkNow(now[link.name], link.correlation is not None, link.ordered) for link in plan.links}
+    tied_to = {link.correlation[0] for link in plan.links if link.correlation is not None}
+    links = {
+        link.name: LinkNow(now[link.name], link.correlation is not None or link.name in tied_to, link.ordered)
+        for link in plan.links
+    }
     if mistakes := list(event_mistakes(checked, [*plan.sides], links)):
         raise ScenarioError("event", mistakes)
     event = replace(wire_event(checked, now, {link.name: link.settings for link in plan.links}), start=time)
