@@ -305,6 +305,17 @@ def test_probabilities_that_are_not_one_for_each_slot_are_refused(wrong: list[fl
     assert refusal(brief, tmp_path) is None
 
 
+def test_a_process_whose_packets_show_its_noise_is_refused_by_who_reads_leaks(tmp_path: Path) -> None:
+    """A and Q are both singular: there is no posterior of what a packet holds, and no traceback of that."""
+    brief = json.loads(made(briefed())["smart"].text)
+    assert refusal(brief, tmp_path) is None
+    brief["part"] |= {"strategy": "bayesian", "parameters": {}}
+    brief["model"] |= {"A": [[1.0, 0.0], [0.0, 0.0]], "Q": [[1.0, 0.0], [0.0, 0.0]], "singular_noise": True}
+    assert "model cannot be used (ValueError: A is singular to double precision, and so is Q" in str(
+        refusal(brief, tmp_path)
+    )
+
+
 @pytest.mark.parametrize("role", ["router", "sensor", "legitimate", "smart", "recorder"])
 def test_unknown_entries_of_a_part_are_refused(role: str, tmp_path: Path) -> None:
     """As those of the brief itself."""

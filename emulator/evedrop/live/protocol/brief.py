@@ -42,6 +42,7 @@ from evedrop.model.schedule import NoiseDistribution
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import Link, LinkSchedule, streams_of
+from evedrop.model.staircase import Staircase
 from evedrop.model.streams import KEY_BYTES, MOST_SLOTS, Batch
 from evedrop.names import ACKNOWLEDGEMENTS
 from evedrop.system.fields import Finite, NotNegative, Probability, Slot
@@ -327,6 +328,9 @@ class EavesdropperPart:
                 self._expect_parameters(READERS[self.parameters["reads_as"]])
             streams = kind.streams(self.parameters)
         brief.expect_keys(streams)
+        if kind.reads_leaks:
+            with _using("model"):
+                Staircase(brief.model.process)
         with _using("part.noise_covariance"):
             if noise is not None and noise.factors(brief.model.process).block(range(1, 2)).shape[1:] != (n, n):
                 raise ValueError(f"it does not have {n} states, as the model does")
