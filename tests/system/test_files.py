@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.system.files import LineFile, lines_in, whole_file
+from evedrop.system.files import LineFile, check_writable, lines_in, whole_file
 from tests.disks import simulated
 
 
@@ -92,3 +92,15 @@ def test_what_is_not_a_file_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="give"), whole_file(tmp_path / name):
         pytest.fail("it was opened")
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
+
+
+def test_a_file_that_can_be_written_is_left_as_it_is(tmp_path: Path) -> None:
+    """So is a link to one that does not exist yet."""
+    link, file, known = (tmp_path / name for name in ("link", "file", "known"))
+    link.symlink_to(file)
+    known.write_text("text")
+    for path in (link, file, known):
+        check_writable(path)
+    assert (link.is_symlink(), file.exists(), known.read_text()) == (True, False, "text")
+    with pytest.raises(OSError, match="No such file"):
+        check_writable(tmp_path / "nowhere" / "file")

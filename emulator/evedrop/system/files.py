@@ -46,12 +46,14 @@ class Limit:
 
 def check_writable(file: Path) -> None:
     """Raise OSError if a file cannot be written; it is left as it is. What is no file, such as a pipe, is not tried."""
-    there = file.exists()
-    if there and not file.is_file() and not file.is_dir():
+    file = file.resolve()
+    if file.exists() and not file.is_file() and not file.is_dir():
         return
-    with file.open("ab"):
-        pass
-    if not there:
+    try:
+        file.open("xb").close()
+    except FileExistsError:
+        file.open("ab").close()
+    else:
         file.unlink()
 
 

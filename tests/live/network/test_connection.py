@@ -5,10 +5,13 @@ from __future__ import annotations
 import threading
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
+import pytest
 import zenoh
 
-from evedrop.live.network.connection import Connection
+from evedrop.live.network import connection
+from evedrop.live.network.connection import Connection, RecorderWatchdog
 from tests.conftest import wait_until
 
 
@@ -50,3 +53,26 @@ def test_a_session_that_cannot_be_closed_is_replaced_all_the_same() -> None:
     assert first.is_closed()
     connection.close()
     assert second.is_closed()
+
+
+@pytest.mark.parametrize(
+    ("longest", "absent", "ends"), [(0.0, 1, False), (0.0, 2, True), (0.5, 3, False), (0.5, 4, True)]
+)
+def test_a_recorder_is_gone_only_if_it_is_for_long(
+    longest: float, absent: int, ends: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the first step in which it is not there, nobody knows for how much of it it was gone."""
+    monkeypatch.setattr(connection, "_STEP_SECONDS", 0.25)
+    there, ended, over = iter([True, *[False] * absent, True]), list[int](), Mock()
+    over.wait = lambda _: over.set.called
+    monkeypatch.setattr(connection, "world", lambda: Mock(event=lambda: over, process=Mock(exit=ended.append)))
+    watchdog = RecorderWatchdog(Mock(process="smart", flow=Mock(longest_outage=longest)), lambda: True)
+
+    def reached() -> bool:
+        now = next(there, None)
+        if now is None:
+            watchdog.release()
+        return now is not False
+
+    watchdog._watch(reached, 600.0)
+    assert ended == ([3] if ends else [])

@@ -124,24 +124,25 @@ def test_an_outage_that_is_open_at_the_end_lasts_to_the_last_slot_of_a_complete_
     assert [(outage.process, outage.slot, outage.until) for outage in recovery.outages] == [("smart", 10, until)]
 
 
+@pytest.mark.parametrize(("lost", "told"), [("smart", "smart"), ("router", "recorder")])
 @pytest.mark.parametrize("again", [False, True])
-def test_an_outage_after_which_the_run_did_not_go_on_is_open(again: bool) -> None:
+def test_an_outage_after_which_the_run_did_not_go_on_is_open(lost: str, told: str, again: bool) -> None:
     """The process is back, but no slot is joined before the run fails; if it is lost once more, that is the same outage."""
     conducted, clock = Conducted(), TestClock()
     recovery = recovery_of(conducted, clock, 30.0)
     recovery.poll(10)
-    conducted.lose("smart")
+    conducted.lose(lost)
     recovery.poll(10)
     conducted.lost = {}
     recovery.poll(10)
     if again:
-        conducted.lose("smart")
+        conducted.lose(lost)
         recovery.poll(10)
     clock.now += 5.0
     recovery.give_up(10)
     recovery.give_up(10)
     outages = [(outage.process, outage.slot, outage.until, outage.seconds) for outage in recovery.outages]
-    assert outages == [("smart", 10, None, 5.0)]
+    assert outages == [(told, 10, None, 5.0)]
 
 
 def recovery_of(conducted: Conducted, clock: TestClock, longest_outage: float, pace: float = 0.0) -> Recovery:

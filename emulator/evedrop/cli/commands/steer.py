@@ -127,7 +127,9 @@ def _answer(run: Path, control: Control, request: OperatorRequest, subject: str,
             run, f"no router answers at {control.router}: it was killed, or it lost its router and is restarting it"
         ) from error
     if answer is None and world().monotonic() - began >= patience:
-        raise UsageError(f"{subject}: no answer from the run in {run}; look at its logs, or end it")
+        raise UsageError(
+            f"{subject}: no answer from the run in {run} in {patience:g} s; it may still do this: look at its logs, or end it"
+        )
     if answer is None:
         raise no_run(run, "it ended before it answered, or its router did, which is then restarted")
     if answer.refused:

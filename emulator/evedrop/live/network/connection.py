@@ -451,15 +451,15 @@ class RecorderWatchdog:
         self._over.set()
 
     def _watch(self, reached: Callable[[], bool], patience: float) -> None:
-        away, limit, why = 0.0, patience, f"did not appear within {patience:g} s; start it, or look at its log"
-        while away <= limit:
+        steps, limit, why = 0, patience, f"did not appear within {patience:g} s; start it, or look at its log"
+        while (steps - 1) * _STEP_SECONDS <= limit:  # of the first step it is not known how much it was gone
             if self._over.wait(_STEP_SECONDS):
                 return
             if reached():
-                away, limit = 0.0, self._brief.flow.longest_outage
+                steps, limit = 0, self._brief.flow.longest_outage
                 why = f"has been gone for {limit:g} s; look at its log"
             elif self._linked():
-                away += _STEP_SECONDS
+                steps += 1
         say(f"{self._brief.process}: the recorder {why}")
         sys.stderr.flush()
         world().process.exit(RunError.exit_status)

@@ -314,11 +314,8 @@ class Recovery:
         complete: whether these are all slots, so that none was waited for: the outages lasted to the end.
         """
         now, until = self._clock.monotonic(), done if complete else None
-        missing = self._missing
+        missing = {} if RECORDER in self._back else self._missing  # which nobody sees without its connection
         missing = next(({name: missing[name]} for name in (RELAY, ROUTER) if name in missing), missing)
-        opened = {
-            **missing,
-            **self._back,
-        }  # one that was lost again before the run went on has been away since the first time
+        opened = {**missing, **self._back}  # one that was lost again before the run went on has been away since then
         self.outages += [ConnectionOutage(name, slot, until, now - since) for name, (slot, since) in opened.items()]
         self._missing, self._back = {}, {}

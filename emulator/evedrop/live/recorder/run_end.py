@@ -65,14 +65,13 @@ class RunEnd:
             raise
         except OSError as error:
             self.saved = False
-            self.fail(self.how if self.status == RunError.exit_status else unwritten(error))
+            self.fail(self.how if self.status == RunError.exit_status else reason_of(error))
         except NoAnswer as error:  # of a class that is asked again after the operator's change of a link
             self.fail(f"an eavesdropper's class could not give its theoretical covariance: {error}")
         except Exception as error:  # a bug in the recorder
-            lack = lack_of(error)
-            if lack is None:
+            if lack_of(error) is None:
                 traceback.print_exc()
-            self.fail(lack or f"the recorder failed ({error!r}); please report its log")
+            self.fail(reason_of(error))
 
     def judge(self, summary: Summary) -> None:
         """Note what the summary of a run that seemed to be complete says against it."""
@@ -92,4 +91,8 @@ def reason_of(error: Exception) -> str:
     """Why a run ended with this error, in words."""
     if isinstance(error, Interrupted):
         return "interrupted"
-    return str(error) if isinstance(error, EvedropError) else f"the recorder failed ({error!r})"
+    if isinstance(error, EvedropError):
+        return str(error)
+    if isinstance(error, OSError):
+        return unwritten(error)
+    return lack_of(error) or f"the recorder failed ({error!r}); please report its log"
