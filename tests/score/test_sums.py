@@ -133,4 +133,5 @@ def test_a_quantile_among_infinite_values_is_infinite() -> None:
     some = np.array([1.0, math.inf, 2.0, math.inf])
     assert [quantile_of(some, level) for level in (0.0, 0.25, 0.5, 0.95)] == [1.0, 1.75, math.inf, math.inf]
     assert quantile_of(np.full(4, math.inf), 0.5) == math.inf
+    assert quantile_of(np.array([1.0, 2.0, math.inf]), 0.5) == 2.0
     assert quantile_of(np.array([1.0, 2.0, 5.0]), 0.75) == 3.5

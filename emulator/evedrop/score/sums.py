@@ -387,8 +387,8 @@ def trial_means(tally: Tally | DirectionTally) -> Floats:
 
 def quantile_of(values: Floats, level: float) -> float:
     """The quantile of values (R,), the largest of which may be infinite; between two neighbours, in proportion."""
-    above = float(np.quantile(values, level, method="higher"))
-    return float(np.quantile(values, level)) if math.isfinite(above) else above
+    low, high = (float(np.quantile(values, level, method=method)) for method in ("lower", "higher"))
+    return high if low == high or not math.isfinite(high) else float(np.quantile(values, level))
 
 
 _COUNTED = [one.name for one in fields(ReceiverTally) if one.name != "lost"]
