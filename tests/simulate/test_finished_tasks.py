@@ -200,12 +200,18 @@ def cut_short(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+def earlier(path: Path) -> None:
+    """Make it a file in the first format, intact."""
+    magic = finished_tasks._MAGIC
+    path.write_bytes(path.read_bytes().replace(magic, b"evedrop finished task 1\n", 1))
+
+
 def renamed(path: Path) -> None:
     """Give it the name of other trials."""
     path.rename(path.with_name(path.name.replace("-0-", "-2000-").replace("-2000-2000", "-2000-4000")))
 
 
-@pytest.mark.parametrize("damage", [flip, cut_short, renamed])
+@pytest.mark.parametrize("damage", [flip, cut_short, earlier, renamed])
 def test_a_damaged_part_is_not_used(damage: Callable[[Path], None], cut: Path, evedrop: Evedrop, whole: Whole) -> None:
     """Its trials are computed again, which a line on standard error says."""
     damage(task_files(cut)[0])

@@ -46,7 +46,7 @@ TASKS = "finished_tasks"
 """The folder in a results folder."""
 _STUDY = "study.json"
 _SECONDS = "seconds.json"
-_MAGIC = b"evedrop finished task 1\n"
+_MAGIC = b"evedrop finished task 2\n"
 _NAME = re.compile(r"([0-9a-f]{32})-([0-9]+)-([0-9]+)")
 _MOST_BYTES = 2**33
 """The most bytes of a task's result, uncompressed."""
