@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from evedrop.model import modulated as module
+from evedrop.model.links import loss_of
 from evedrop.model.links.chain import Chain
 from evedrop.model.modulated import ModulatedCovariance, modulated_streaks
 from evedrop.model.process import Floats, Process
@@ -124,6 +125,25 @@ def test_a_link_that_changes_during_the_run() -> None:
     assert np.all(np.diff(streaks.number) <= 0.0)
 
 
+def test_a_link_that_stops_turning_bad() -> None:
+    """Its chain has a single state from then on; the streaks are those of a chain with the same losses and two states."""
+    loses = {"model": "gilbert-elliott", "p": 0.1, "r": 0.4, "good": 0.2, "bad": 0.9}
+    before, after = (loss_of({**loses, "p": p}).chain for p in (0.1, 0.0))
+    assert before is not None
+    assert after is not None
+    assert len(before.stationary) > len(after.stationary)
+    two = Chain(np.full((2, 2), 0.5), np.full(2, 0.5), np.repeat(after.quality, 2))
+    at, first = AT["suspicious"](0.4), LinkDistribution.steady(before).segments[0]
+    for chains, equal in (((before, after), (before, two)), ((after, before), (two, before))):
+        result, same = (
+            found_in(LinkDistribution((replace(first, chain=one), Segment(50, other, 1.0, np.ones(1)))), at, 90)
+            for one, other in (chains, equal)
+        )
+        assert result.number == pytest.approx(same.number, rel=1e-12, abs=1e-18)
+        assert result.carried == pytest.approx(same.carried, rel=1e-12, abs=1e-18)
+        assert result.carried.sum() == pytest.approx(result.total, rel=2e-9)
+
+
 def test_bursts_make_rare_events_rarer_and_larger() -> None:
     """Of two links with the same mean loss, the one with long bursts has more of its error in streaks that trials miss."""
     at, process = AT["legitimate"](0.6), Process(np.eye(1), np.eye(1), np.eye(1))
@@ -134,12 +154,11 @@ def test_bursts_make_rare_events_rarer_and_larger() -> None:
 
 
 def test_what_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Late packets, outages, models with other states, errors beyond double precision, and more numbers than are allowed."""
+    """Late packets, outages, errors beyond double precision, and more numbers than are allowed."""
     at, link = AT["legitimate"](0.5), LinkDistribution.steady(BURSTS)
     late = LinkDistribution((replace(link.segments[0], arrived=np.array([0.5, 1.0])),))
     away = replace(link, outages=((3, 5, True),))
-    other = LinkDistribution((*link.segments, Segment(3, STEADY, 1.0, np.ones(1))))
-    for schedule in (late, away, other):
+    for schedule in (late, away):
         assert modulated_streaks(PLANE, schedule, at, 9, 1.0) is None
     assert modulated_streaks(PLANE, link, at, 9, float("inf")) is None
     total = found_in(link, at, 9).total

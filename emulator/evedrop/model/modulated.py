@@ -399,12 +399,11 @@ def modulated_streaks(
 ) -> Streaks | None:
     """The streaks of a receiver in slots 0 … slots−1; total: Σ_k tr E P_k.
 
-    None for late packets and outages, for links whose models have different numbers of states, if the error leaves double
-    precision, and for runs that are so long that too much had to be computed (MOST_NUMBERS).
+    None for late packets and outages, if the error leaves double precision, and for runs that are so long that too much had to
+    be computed (MOST_NUMBERS).
     """
-    states = {len(segment.chain.stationary) for segment in link.segments}
-    too_long = slots * process.n**2 * max(states) > _LARGEST_RUN
-    if link.window or link.outages or len(states) > 1 or not np.isfinite(total) or too_long:
+    too_long = slots * process.n**2 * _most_states(link) > _LARGEST_RUN
+    if link.window or link.outages or not np.isfinite(total) or too_long:
         return None
     distributions = _slot_distributions_of(process, link, slots, outcomes_at, slots_at)
     groups = _begun(process, distributions)
@@ -422,18 +421,24 @@ def modulated_streaks(
         groups = [_lasting(distributions, carry, *segment, length) for segment in groups]
 
 
+def _most_states(link: LinkDistribution) -> int:
+    return max(len(segment.chain.stationary) for segment in link.segments)
+
+
 def _slot_distributions_of(
     process: Process, link: LinkDistribution, slots: int, outcomes_at: OutcomesAt, slots_at: SlotOutcomes | None
 ) -> _SlotDistributions:
     starts = [*(segment.start for segment in link.segments[1:]), slots]
-    shape = (slots, len(link.last.stationary))
-    transitions, stationary, quality = np.empty((*shape, shape[1])), np.empty(shape), np.empty(shape)
+    shape = (slots, _most_states(link))
+    transitions, stationary, quality = np.zeros((*shape, shape[1])), np.zeros(shape), np.zeros(shape)
     for segment, stop in zip(link.segments, starts, strict=True):
-        some = slice(segment.start, min(stop, slots))
-        transitions[some], stationary[some] = segment.chain.transitions, segment.chain.stationary
+        # A chain with fewer states than another has more here, in which it never is.
+        some, states = slice(segment.start, min(stop, slots)), len(segment.chain.stationary)
+        transitions[some, :states, :states] = segment.chain.transitions
+        stationary[some, :states] = segment.chain.stationary
         if not segment.continues:
-            transitions[some][:1] = segment.chain.stationary
-        quality[some] = segment.quality(range(some.start, max(some.start, some.stop)))
+            transitions[some][:1, :, :states] = segment.chain.stationary
+        quality[some, :states] = segment.quality(range(some.start, max(some.start, some.stop)))
     odds = SlotOdds.of(outcomes_at).at(quality)
     if slots_at is not None:
         for k in range(slots):
