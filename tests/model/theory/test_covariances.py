@@ -379,6 +379,22 @@ def test_a_multiple_root_on_the_unit_circle_in_a_long_run(A: list[list[float]]) 
     assert theoretical_traces(process, misled, 4000)[-1] == pytest.approx(0.5 * np.trace(twice), rel=1e-2)
 
 
+@pytest.mark.parametrize("order", [3, 4])
+def test_a_root_of_higher_order_on_the_unit_circle_in_a_very_long_run(order: int) -> None:
+    """Of (λ − 1)^order in companion form, in whole numbers: tr Σ_k is a sum of squares of the entries of A^j."""
+    A = np.eye(order, k=-1)
+    A[0] = [-((-1) ** j) * math.comb(order, j) for j in range(1, order + 1)]
+    process, slots = Process(A, np.eye(order), np.eye(order)), 300_000
+    traces = theoretical_traces(process, NOBODY, slots)
+    power, total = np.eye(order, dtype=object).astype(int).astype(object), 0
+    dynamics = A.astype(int).astype(object)
+    for k in range(slots):
+        total += (power * power).sum()
+        if k in {29_999, slots - 1}:
+            assert traces[k] == pytest.approx(float(total), rel=1e-8)
+        power = dynamics @ power
+
+
 def test_importing_theory_and_design_does_not_import_scipy() -> None:
     """Both are on start-up paths: scipy waits until a function needs it."""
     code = "import sys, evedrop.model.theory.design, evedrop.model.theory.covariances; sys.exit('scipy' in sys.modules)"

@@ -15,7 +15,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from evedrop.model.process import MARGINAL, Floats, Process, modulus_in
+from evedrop.model.process import MARGINAL, Floats, Process, eigenvalues, modulus_in
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 
 _BLOCK = 256  # slots computed from one starting point: long enough to hide Python's overhead, quick to set up (3 ms)
@@ -104,11 +104,33 @@ def without_cancellation(process: Process) -> tuple[Process, Floats | None]:
         half = np.linalg.matrix_power(process.A, _BLOCK // 2)
         if not _CANCELS * np.abs(half @ half).max() < (np.abs(half) @ np.abs(half)).max():
             return process, None
-    from scipy.linalg import schur  # noqa: PLC0415 - slow to import
-
-    A, Z = schur(process.A)
+    A, Z = _triangular(process.A)
     Q, initial = (Z.T @ covariance @ Z for covariance in (process.Q, process.initial_covariance))
     return Process(A, 0.5 * (Q + Q.T), 0.5 * (initial + initial.T), process.singular_noise), Z
+
+
+def _triangular(A: Floats) -> tuple[Floats, Floats]:
+    """Zᵀ A Z, block triangular, and Z, orthogonal, (n, n) each: the real eigenvalues first, then 2 × 2 blocks.
+
+    Rounding does not split a multiple real eigenvalue: its mean is split off, once for each time, with the nearest eigenvector.
+    """
+    from scipy.linalg import schur  # noqa: PLC0415 - slow to import
+
+    values = eigenvalues(A)
+    real = values.real[np.abs(values.imag) <= _ROUNDING * np.abs(values)]
+    Z, rest = np.eye(len(A)), A
+    for first, value in enumerate(real):
+        turn = np.linalg.svd(rest - value * np.eye(len(rest)))[2][::-1].T
+        Z[:, first:] = Z[:, first:] @ turn
+        rest = (turn.T @ rest @ turn)[1:, 1:]
+    count = len(real)
+    if rest.size:
+        rest, turn = schur(rest)
+        Z[:, count:] = Z[:, count:] @ turn
+    T: Floats = np.triu(Z.T @ A @ Z)
+    T[count:, count:] = rest
+    T[range(count), range(count)] = real
+    return T, Z
 
 
 def state_covariances(process: Process, slots: int) -> Floats:
@@ -192,15 +214,7 @@ class TheoreticalCovariance:
 
     def next(self, slots: int) -> Floats:
         """The expectation in the next slots, (slots, n, n)."""
-        parts = []
-        while slots > 0:
-            if self._next == len(self._block):
-                self._advance()
-            part = self._block[self._next : self._next + slots]
-            self._next += len(part)
-            slots -= len(part)
-            parts.append(part)
-        covariances = np.concatenate(parts) if parts else np.empty((0, *self._sigma.shape))
+        covariances = self._next_own(slots)
         if self._Z is None:
             return covariances
         with np.errstate(over="ignore", invalid="ignore"):
@@ -209,8 +223,20 @@ class TheoreticalCovariance:
     def next_traces(self, slots: int) -> Floats:
         """The trace of the expectation in the next slots, (slots,)."""
         with np.errstate(over="ignore"):
-            traces: Floats = np.trace(self.next(slots), axis1=1, axis2=2)
+            traces: Floats = np.trace(self._next_own(slots), axis1=1, axis2=2)
         return traces
+
+    def _next_own(self, slots: int) -> Floats:
+        """The expectation in the next slots, (slots, n, n), in the coordinates Zᵀx."""
+        parts = []
+        while slots > 0:
+            if self._next == len(self._block):
+                self._advance()
+            part = self._block[self._next : self._next + slots]
+            self._next += len(part)
+            slots -= len(part)
+            parts.append(part)
+        return np.concatenate(parts) if parts else np.empty((0, *self._sigma.shape))
 
     def _advance(self) -> None:
         E = self._block[-1]
@@ -430,7 +456,10 @@ class Growth(NamedTuple):
     """The same of those outside which it certainly does not, (n, s)."""
 
     def along(self, v: Floats) -> bool | None:
-        """Whether the error of vᵀx grows without bound, v (n,); None if theory does not know."""
+        """Whether the error of vᵀx grows without bound, v (n,); None if theory does not know.
+
+        A part of v in these directions counts only if it exceeds 1e-9 of v, in the units of the states.
+        """
         if _touches(self.basis, v):
             return True
         return None if _touches(self.within, v) else False
