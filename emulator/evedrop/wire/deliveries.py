@@ -55,7 +55,7 @@ class KeyDeliveries:
     sampled: how many of them count, picked at random; None: all.
 
     The variance is exact for losses without a memory, and for those of a Markov chain, whatever is left out. For other losses
-    with a memory it is that of the model for a single range, and an upper bound for several.
+    with a memory it is as exact as the model's `rate_variance` for a single range, and an upper bound for several.
     """
 
     __slots__ = ("_groups", "mean", "parts", "sampled", "variance")

@@ -111,12 +111,13 @@ class LossModel(ABC):
     def count_variance(self, parts: Sequence[Thinned]) -> float:
         """Variance, over trials, of the number of packets that get through; parts: in ascending order.
 
-        Exact for a chain, for losses without a memory, and for a single part; otherwise an upper bound.
+        Exact for a chain and for losses without a memory; for one part as exact as `rate_variance`; else an upper bound.
         """
         if self.chain is not None:
             return self.chain.count_variance(parts)
         each = [
-            passes**2 * self.rate_variance(slots) * len(slots) ** 2 + passes * (1.0 - passes) * self.count_mean(slots)
+            passes**2 * self.rate_variance(slots) * len(slots) ** 2
+            + (passes * (1.0 - passes) * self.count_mean(slots) if passes < 1.0 else 0.0)
             for slots, passes in parts
         ]
         return sum_in_order(each) if self.memoryless else sum_in_order(map(sqrt, each)) ** 2
