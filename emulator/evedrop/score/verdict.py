@@ -49,10 +49,8 @@ def weakest(outcomes: Iterable[SecrecyOutcome]) -> SecrecyOutcome:
     return min(outcomes, key=_ORDER.index)
 
 
-_NEAR, _MOST_PLACES = (
-    0.1,
-    7,
-)  # how near to 1 two digits hide on which side a ratio is; and more decimals than its text has
+_NEAR = 0.1  # how near to 1 two digits hide on which side a ratio is
+_MOST_PLACES = 7  # more decimals than a ratio's text has
 _SMALLER = 0.8  # times the legitimate error: less is "more than the estimator", and the rest "as much"
 
 

@@ -174,9 +174,8 @@ class Simulation:
         errors = {name: np.zeros((n, trials)) for name in self._receivers}
         covariances = {name: receiver.prior().P for name, receiver in self._receivers.items()}
 
-        @np.errstate(
-            over="ignore"
-        )  # the square of an error may leave double precision; then it is inf, as it should be
+        # The square of an error may leave double precision; then it is inf, as it should be.
+        @np.errstate(over="ignore")
         def play(chunk: range, links: Mapping[str, LinkCore]) -> Chunk:
             measured = self._blank(chunk, links)
             delivered = {name: link.in_time for name, link in links.items()}
