@@ -28,7 +28,7 @@ COMPARISON = "compare.json"
 _MOST_BYTES = 2**26
 _NOT_IN_NAMES, _LONGEST_NAME = re.compile(r"[^a-z0-9_-]"), 32  # of receivers
 _ALIKE = 1e-6  # relative difference of two errors of theory that count as equal: allows for rounding only
-_REACH = 3.0  # standard errors around a mean over trials within which its expectation is taken to be
+_REACH = 3.0  # standard errors around a mean over very many trials within which its expectation is taken to be
 
 Range = tuple[float, float]
 """The least and the largest value that an error may have."""
@@ -94,15 +94,19 @@ class SimulatedError:
         """The metric to compare by: the mean over trials, or the median if the variance is infinite."""
         return self.quantiles["0.5"] if self.infinite_variance else self.mean
 
-    @property
-    def expected(self) -> Range:
-        """Where its expectation over the slots of the run is: as in theory, else as trials tell, unless rare events matter."""
+    def expected(self, trials: int) -> Range:
+        """Where its expectation over the slots of the run is: as in theory, else as trials tell, unless rare events matter.
+
+        trials: of which this is the mean. Few of them tell less: the range is that of Student's t.
+        """
         if self.theory is not None and not self.theory.bound:
             return self.theory.mean, self.theory.mean
         least = 0.0 if self.theory is None else self.theory.mean
         if self.standard_error is None or (self.rare_events and self.rare_events.fraction > RARE_FRACTION):
             return least, math.inf
-        reach = _REACH * self.standard_error
+        from scipy.special import ndtr, stdtrit  # noqa: PLC0415 - 0.2 s that only this needs
+
+        reach = float(stdtrit(trials - 1, ndtr(_REACH))) * self.standard_error
         return max(least, self.mean - reach), max(least, self.mean + reach)
 
     @property
@@ -236,7 +240,11 @@ class SchemeResult:
     @property
     def protection_range(self) -> Range:
         """Where the least of the expected errors of these adversaries is."""
-        ranges = [cell.eavesdropper.expected for cell in self._played if cell.eavesdropper is not None]
+        ranges = [
+            cell.eavesdropper.expected(cell.secrecy.trials)
+            for cell in self._played
+            if cell.eavesdropper is not None and cell.secrecy is not None
+        ]
         least, most = (min(ends) for ends in zip(*ranges, strict=True)) if ranges else (0.0, math.inf)
         return least, most
 
