@@ -101,6 +101,19 @@ def test_what_names_an_eavesdropper_is_left_out_with_it(named: dict[str, Any], a
     assert secrecy_cost(load("microgrid", {**own, **named}), lambda _: None) == alone
 
 
+def test_an_event_of_several_receivers_still_concerns_the_legitimate_one() -> None:
+    """As one that names it alone, until another event names it again."""
+    own = {"slots": 130, "trials": 2, "expect": []}
+    several = [{"from": 20, "to": 60, "partition": ["legitimate", "smart"]}, {"at": 70, "cut": ["smart", "legitimate"]}]
+    alone = [{"from": 20, "to": 60, "cut": "legitimate"}, {"at": 70, "cut": "legitimate"}]
+    heal = {"at": 80, "heal": "legitimate"}
+    costs = [
+        secrecy_cost(load("microgrid", {**own, "event": events}), lambda _: None)
+        for events in ([*several, heal], [*alone, heal], [])
+    ]
+    assert costs[0] == costs[1] != costs[2]
+
+
 @pytest.mark.long
 def test_a_days_cost_is_that_of_the_document() -> None:
     """Twenty whole days at μ_d = 0.1, within five standard errors of the table of docs/microgrid.md, made from a hundred."""

@@ -8,7 +8,7 @@ Source: docs/compare.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
 from evedrop.results.comparison import Match, receiver_name
 from evedrop.scenario.across import lacking_streams
-from evedrop.scenario.events.event import Jamming
+from evedrop.scenario.events.event import EventKind, Jamming
 from evedrop.scenario.loading import checked
 from evedrop.scenario.process_noise import unsuited
 from evedrop.scenario.tables import Scenario
@@ -225,7 +225,7 @@ def _encoding(scenario: Scenario, scheme: str, parameters: Mapping[str, Any]) ->
 
 
 def without_eavesdroppers(scenario: Scenario, encoding: Tables) -> Scenario:
-    """The scenario with another encoding, and without eavesdroppers, their attacks, and events that name one.
+    """The scenario with another encoding, without eavesdroppers and attacks; events concern only the legitimate estimator.
 
     Raises ScenarioError if the encoding cannot be used.
     """
@@ -241,11 +241,7 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
         "title": scenario.title[: _LONGEST_TITLE - len(suffix)] + suffix,
         "encoding": encoding,
         "eavesdroppers": {match.receiver: _eavesdropper(scenario, scheme, str(match.strategy)) for match in matches},
-        "event": [
-            table
-            for event, table in zip(scenario.event, tables["event"], strict=True)
-            if event.does.attacked != Jamming.attacked and set(event.names) <= {LEGITIMATE}
-        ],
+        "event": list(_events_alone(scenario.event, tables["event"])),
         "expect": [],
         "record_trials": 1,
     }
@@ -259,6 +255,17 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
             more = {"jammer": matches[0].receiver}
         tables["acknowledgements"] = {**ack_channel, "attack": attack, **more}
     return checked(tables, scenario.title)
+
+
+def _events_alone(events: Iterable[EventKind], tables: Iterable[Tables]) -> Iterator[Tables]:
+    """The tables of events as they concern the legitimate estimator: none names others, or attacks acknowledgements."""
+    for event, table in zip(events, tables, strict=True):
+        if event.does.attacked == Jamming.attacked:
+            continue
+        if set(event.names) <= {LEGITIMATE}:
+            yield table
+        elif LEGITIMATE in event.names:
+            yield {**table, str(event.names_in): [LEGITIMATE]}
 
 
 def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:

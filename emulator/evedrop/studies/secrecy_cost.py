@@ -149,7 +149,7 @@ def _part_of(scenario: Scenario, trials: range, on_progress: OnProgress, stopped
 
 
 def _pair(scenario: Scenario) -> tuple[Scenario, Scenario]:
-    """The scenario with its own scheme, then with `plain`; eavesdroppers change nothing, and are left out."""
+    """The scenario with its own scheme, then with `plain`, both without eavesdroppers and attacks on acknowledgements."""
     ours, plain = (
         without_eavesdroppers(scenario, encoding) for encoding in (scenario.encoding.spec, {"scheme": "plain"})
     )
