@@ -399,8 +399,21 @@ def test_a_value_with_which_a_wire_would_not_work(text: str, place: str) -> None
     assert places_of(mistakes_of(of, text)) == [place]
 
 
-@pytest.mark.parametrize("link", ["robot-base", "x"])
-def test_correlated_links_keep_their_model(link: str) -> None:
+def test_a_side_without_key_expressions_is_told_what_is_expected() -> None:
+    """As the one that all messages match."""
+    assert mistakes_of(of, BASE.replace("[side.base]", "[side.base]\nkeys = []")) == [
+        'side.base.keys: is empty; expected key expressions, such as ["**"]'
+    ]
+
+
+@pytest.mark.parametrize(
+    ("link", "tie"),
+    [
+        ("robot-base", "its losses are tied to those of x"),
+        ("x", "the losses of robot-base are tied to its losses"),
+    ],
+)
+def test_correlated_links_keep_their_model(link: str, tie: str) -> None:
     """The uniform numbers of one are the other's, and each model uses them in its own way."""
     mistakes = mistakes_of(
         of,
@@ -415,10 +428,7 @@ def test_correlated_links_keep_their_model(link: str) -> None:
     set = {{ loss = {{ model = "pattern", outcomes = "10" }} }}
     """,
     )
-    assert mistakes == [
-        "event.0.set.loss.model: differs from the first one, but the link's losses are tied to another link's; expected the same "
-        "model"
-    ]
+    assert mistakes == [f"event.0.set.loss.model: gives {link} another loss model, but {tie}; expected the same model"]
 
 
 @pytest.mark.parametrize(

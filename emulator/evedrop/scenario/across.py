@@ -34,7 +34,7 @@ from evedrop.scenario.expect import Around
 from evedrop.scenario.plant import PlantTable
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.process_noise import filter_mistakes, singular_mistakes
-from evedrop.scenario.receivers import CHANGEABLE, OTHER_MODEL, LinkTable, changed_link, unchangeable
+from evedrop.scenario.receivers import CHANGEABLE, LinkTable, changed_link, other_model, tie_of, unchangeable
 from evedrop.scenario.table import Table, sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import expectations_of
@@ -156,14 +156,10 @@ def change_mistakes(
         yield from (f"{path}.{line}" for line in changed.delay_mistakes(scenario.slot_seconds))
     if changes.get("rate") is not None and scenario.scheme.may_be_silent:
         yield f"{path}.rate: {_silent(scenario)}"
-    if _is_tied(name, scenario) and changed.loss_spec["model"] != link.loss_spec["model"]:
-        yield f"{path}.{OTHER_MODEL}"
-
-
-def _is_tied(name: str, scenario: Scenario) -> bool:
-    """Whether the losses of a receiver's link are tied to another link's, or another link's to them."""
     ties = {receiver: link.correlation.to for receiver, link in scenario.links.items() if link.correlation is not None}
-    return name in ties or name in ties.values()
+    tie = tie_of(name, ties)
+    if tie is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
+        yield f"{path}.{other_model(name, changes, tie)}"
 
 
 def _silent(scenario: Scenario) -> str:

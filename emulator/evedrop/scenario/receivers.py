@@ -152,10 +152,6 @@ def _in_slots(value: Any, slot_seconds: float) -> Any:
 
 CHANGEABLE = tuple(entry for entry in LinkTable.model_fields if entry != "correlation")
 """The entries of a link that an event can change."""
-OTHER_MODEL = (
-    "loss.model: differs from the first one, but the link's losses are tied to another link's; expected the same model"
-)
-"""The mistake of a change that gives a correlated link another loss model."""
 LinkField = Annotated[LinkTable, Field(examples=[{"quality": 0.9}])]
 WindowField = Annotated[int, Field(strict=True, ge=0, le=10_000, examples=[8])]
 
@@ -175,6 +171,23 @@ def changed_link(link: LinkTable, changes: Mapping[str, Any]) -> LinkTable:
     if "loss" in changes:
         entries.pop("quality", None)
     return LinkTable.model_validate({**entries, **changes})
+
+
+def tie_of(name: str, ties: Mapping[str, str]) -> str | None:
+    """How the losses of a link and another's are tied, in words; None if they are not.
+
+    ties: link → the one to whose losses its own are tied.
+    """
+    if name in ties:
+        return f"its losses are tied to those of {ties[name]}"
+    tied = [link for link, other in ties.items() if other == name]
+    return f"the losses of {', '.join(tied)} are tied to its losses" if tied else None
+
+
+def other_model(name: str, changes: Mapping[str, Any], tie: str) -> str:
+    """The mistake of changes that give a link another loss model although there is a tie, as from `tie_of`."""
+    entry = "loss.model" if "loss" in changes else "quality"
+    return f"{entry}: gives {name} another loss model, but {tie}; expected the same model"
 
 
 class AckChannelTable(Table):

@@ -458,7 +458,9 @@ class Scenario(Table):
 
     def _changed_settings(self, receiver: str, changes: Mapping[str, Any]) -> dict[str, Any]:
         """A link's settings with some entries changed; `changes` includes those of earlier events."""
-        return changed_link(self.link(receiver), changes).settings(self.slot_seconds)
+        link = self.link(receiver)
+        # Without changes it is as in the scenario: pooled links are no link that a file could describe.
+        return (changed_link(link, changes) if changes else link).settings(self.slot_seconds)
 
     def schedule(self, receiver: str) -> LinkSchedule:
         """The schedule of a receiver's link: its settings, its changes and the receiver's outages, all known in advance."""

@@ -24,7 +24,7 @@ from evedrop.model.links import loss_of
 from evedrop.scenario.input_files import locate_recordings, read_recordings
 from evedrop.scenario.line_numbers import with_line_numbers
 from evedrop.scenario.loading import set_entry, tables_in
-from evedrop.scenario.receivers import CHANGEABLE, OTHER_MODEL, unchangeable
+from evedrop.scenario.receivers import CHANGEABLE, other_model, tie_of, unchangeable
 from evedrop.scenario.table import sentences, unusable
 from evedrop.scenario.words import listed, toml_text
 from evedrop.system.files import Unreadable, shown, text_of
@@ -222,9 +222,10 @@ def _event_table(event: WireEvent) -> dict[str, Any]:
 class LinkNow(NamedTuple):
     """What a change of a link depends on."""
 
+    name: str
     settings: Mapping[str, Any]
-    correlated: bool
-    """Whether its losses are tied to another link's, or another's to its own."""
+    tie: str | None
+    """How its losses and another link's are tied, in words; None if they are not."""
     ordered: bool
 
 
@@ -235,9 +236,11 @@ def mistakes_across(file: WireFile, sides: Mapping[str, Mapping[str, Any]]) -> I
     yield from _side_mistakes([*file.side], file.link)
     yield from _name_mistakes(file.link)
     yield from _correlation_mistakes(names, file.link)
-    tied_to = {link.correlation.to for link in file.link if link.correlation is not None}
+    ties = {
+        name: link.correlation.to for name, link in zip(names, file.link, strict=True) if link.correlation is not None
+    }
     links = {
-        name: LinkNow(link.wire_settings(), link.correlation is not None or name in tied_to, link.ordered)
+        name: LinkNow(name, link.wire_settings(), tie_of(name, ties), link.ordered)
         for name, link in zip(names, file.link, strict=True)
         if link.name is not None or {link.source, link.target} <= {*file.side}  # otherwise the name is mistaken, too
     }
@@ -323,8 +326,8 @@ def change_mistakes(link: LinkNow, changes: Mapping[str, Any]) -> Iterator[str]:
         return
     if link.ordered and made.get("reorder"):
         yield f"reorder: {IN_ORDER}"
-    if link.correlated and made.get("loss", settings["loss"])["model"] != settings["loss"]["model"]:
-        yield OTHER_MODEL
+    if link.tie is not None and made.get("loss", settings["loss"])["model"] != settings["loss"]["model"]:
+        yield other_model(link.name, changes, link.tie)
 
 
 def _endpoint_mistakes(sides: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:

@@ -306,6 +306,12 @@ def _in_a_line(text: str) -> str:
     return text
 
 
+def _some_keys(keys: list[str]) -> list[str]:
+    if not keys:
+        refuse([("", 'is empty; expected key expressions, such as ["**"]')])
+    return keys
+
+
 KeyExpression = Annotated[str, Field(strict=True), AfterValidator(_key_expression)]
 KeyExpressions = Annotated[list[KeyExpression], BeforeValidator(_listed), Field(examples=["robot/**"])]
 Endpoints = Annotated[list[Annotated[str, AfterValidator(checked_endpoint)]], BeforeValidator(_listed)]
@@ -417,7 +423,7 @@ class SideTable(Table):
         | None,
         Field(examples=[{"ada": "a long password"}]),
     ] = None
-    keys: Annotated[KeyExpressions, Field(default_factory=lambda: ["**"], min_length=1)]
+    keys: Annotated[KeyExpressions, Field(default_factory=lambda: ["**"]), AfterValidator(_some_keys)]
     peers: Annotated[bool, Field(strict=True)] = False
 
     def mistakes(self) -> Iterator[Mistake]:

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from evedrop.errors import ScenarioError
 from evedrop.model.checks import as_toml
+from evedrop.scenario.receivers import tie_of
 from evedrop.scenario.table import sentences
 from evedrop.wire.file import LinkNow, event_mistakes, unknown, wire_event
 from evedrop.wire.plan import WireEvent, WirePlan
@@ -72,10 +73,9 @@ def with_change(plan: WirePlan, table: Mapping[str, Any], time: float) -> tuple[
         checked = WireEventTable.model_validate({"at": 0.0, **table})  # a wire may run for longer than a file can say
     except ValidationError as error:
         raise ScenarioError("event", sentences(error, WireEventTable)) from None
-    tied_to = {link.correlation[0] for link in plan.links if link.correlation is not None}
+    ties = {link.name: link.correlation[0] for link in plan.links if link.correlation is not None}
     links = {
-        link.name: LinkNow(now[link.name], link.correlation is not None or link.name in tied_to, link.ordered)
-        for link in plan.links
+        link.name: LinkNow(link.name, now[link.name], tie_of(link.name, ties), link.ordered) for link in plan.links
     }
     if mistakes := list(event_mistakes(checked, [*plan.sides], links)):
         raise ScenarioError("event", mistakes)

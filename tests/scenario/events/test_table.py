@@ -197,17 +197,28 @@ def test_correlation_needs_links_that_lose_alike() -> None:
     assert line == f"legitimate.link.correlation.with: {several}"
 
 
-@pytest.mark.parametrize("name", ["eve", "legitimate"])
-def test_neither_of_two_tied_links_gets_another_loss_model(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "tie"),
+    [
+        ("eve", "its losses are tied to those of legitimate"),
+        ("legitimate", "the losses of eve are tied to its losses"),
+    ],
+)
+def test_neither_of_two_tied_links_gets_another_loss_model(name: str, tie: str) -> None:
     """By an event, or by a nemesis."""
-    eve = {"strategy": "smart", "link": {"quality": 0.9, "correlation": {"with": "legitimate", "strength": 0.5}}}
+    correlation = {"correlation": {"with": "legitimate", "strength": 0.5}}
+    eve = {"strategy": "smart", "link": {"quality": 0.9, **correlation}}
     bursts = {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.5}}
     event = {"at": 5, "link": name, "set": bursts}
     (line,) = mistakes_of(right, event, eavesdroppers={"eve": eve})
-    assert line.startswith("event.0.set.loss.model: differs from the first one, but the link's losses are tied")
+    mistake = f"gives {name} another loss model, but {tie}; expected the same model"
+    assert line == f"event.0.set.loss.model: {mistake}"
     nemesis = {"faults": ["set"], "every": 5, "lasting": 5, "set": bursts, "targets": [name]}
     (line,) = mistakes_of(right, nemesis=nemesis, eavesdroppers={"eve": eve})
-    assert line.startswith("nemesis.set.loss.model: differs from the first one, but the link's losses are tied")
+    assert line == f"nemesis.set.loss.model: {mistake}"
+    bursty = {"eavesdroppers": {"eve": {**eve, "link": {**bursts, **correlation}}}}
+    event = {"at": 5, "link": name, "set": {"quality": 0.3}}
+    assert mistakes_of(right, event, legitimate={"link": bursts}, **bursty) == [f"event.0.set.quality: {mistake}"]
 
 
 def test_changes_are_checked_on_top_of_earlier_ones() -> None:
@@ -285,6 +296,17 @@ def test_what_events_come_to() -> None:
     }
     assert sorted(scenario.timeline.holds) == [5, 10, 20, 25, 30, 40, 50, 60, 70, 80, 90]
     assert scenario.timeline.holds[20][0].text == "cut legitimate, eve"
+
+
+def test_pooled_links_come_back_when_a_change_ends() -> None:
+    """One link replaces them meanwhile."""
+    pool = right({"from": 10, "to": 20, "link": "pool", "set": {"quality": 0.5}}, eavesdroppers={"pool": POOL})
+    schedule = pool.schedule("pool")
+    one, back = schedule.changes
+    assert (one.at, one.settings) == (10, {"loss": {"model": "bernoulli", "quality": 0.5}})
+    assert (back.at, back.settings) == (20, schedule.settings)
+    nemesis = {"faults": ["set"], "every": 20, "lasting": 5, "set": {"quality": 0.5}, "targets": ["pool"]}
+    assert right(nemesis=nemesis, eavesdroppers={"pool": POOL}).schedule("pool").changes
 
 
 def test_a_restart_keeps_the_state_that_it_says() -> None:
