@@ -107,7 +107,7 @@ REFUSED = {
         """,
     "test": """
         test full
-        test full vehicle
+        test full bare
         test vehicle --jobs 0
         test vehicle --scheduler tcp://127.0.0.1:8786
         test vehicle --resume
@@ -151,6 +151,7 @@ def test_what_a_command_refuses(command: str, evedrop: Evedrop, golden: Golden) 
     """Status 2, a sentence on standard error, nothing on standard output and nothing in the folder."""
     (evedrop.folder / "full").mkdir()
     (evedrop.folder / "full" / "file").touch()
+    (evedrop.folder / "bare").mkdir()
     (evedrop.folder / "short").write_bytes(b"3" * 31)
     if " done" in REFUSED[command]:
         study = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "1", "--workers", "1", "--out", "done")

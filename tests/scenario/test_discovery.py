@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
+from evedrop.errors import UsageError
 from evedrop.scenario.discovery import is_scenario, scenarios_in
 from evedrop.scenarios import shipped
 from evedrop.studies.scenario_tests import scenarios_of
@@ -60,3 +62,14 @@ def test_folders_are_searched_in_order_and_each_scenario_is_taken_once(tmp_path:
     assert [str(path) for path in scenarios_in(tmp_path)] == places
     z, c, b = (places[i] for i in (2, 1, 0))
     assert scenarios_of([z, "vehicle", str(tmp_path), z, str(shipped()["vehicle"])]) == [z, "vehicle", b, c]
+
+
+def test_a_folder_without_a_scenario_does_not_stop_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is named in a warning, unless there is nothing to test: then in an error."""
+    bare = str(tmp_path)
+    assert scenarios_of([bare, "vehicle"]) == ["vehicle"]
+    assert f"warning: no scenario in {bare}; a scenario is a TOML file" in capsys.readouterr().err
+    with pytest.raises(UsageError, match=re.escape(f"no scenario in {bare}; ")):
+        scenarios_of([bare])

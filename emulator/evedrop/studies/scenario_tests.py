@@ -32,6 +32,7 @@ from evedrop.scenario.discovery import scenarios_in
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import silent
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.words import listed
 from evedrop.scenarios import shipped
 from evedrop.score.summary import Judged, failed
 from evedrop.show.report.writing import has_results, try_report
@@ -39,6 +40,7 @@ from evedrop.simulate.finished_tasks import TASKS
 from evedrop.simulate.montecarlo import Plan, simulate
 from evedrop.simulate.simulation import Mode
 from evedrop.studies.simulated_tests import SeedsToPlay, check_simulated, play_seeds
+from evedrop.system.output import warn
 from evedrop.system.parents import continue_when_parent_dies
 from evedrop.system.processes import SUSPENDED_SECONDS, SuspensionWatch, kill, wait_for
 from evedrop.system.signals import stop_on_signals
@@ -122,8 +124,12 @@ class Finding:
 
 
 def scenarios_of(places: Sequence[str]) -> list[str]:
-    """The scenarios in files, folders and built-in names, each once. Raises UsageError for a place without one."""
+    """The scenarios in files, folders and built-in names, each once. Warns of a folder without one.
+
+    Raises UsageError if there is none at all.
+    """
     scenarios: dict[Path, str] = {}
+    empty: list[str] = []
     for place in places:
         paths: Sequence[Path] = [Path(place)]
         if place in shipped():
@@ -132,9 +138,14 @@ def scenarios_of(places: Sequence[str]) -> list[str]:
         if Path(place).is_dir():
             paths = list(scenarios_in(Path(place)))
             if not paths:
-                raise UsageError(f"no scenario in {place}; a scenario is a TOML file with [process] and [encoding]")
+                empty.append(place)
         for path in paths:
             scenarios.setdefault(path.resolve(), str(path))
+    if empty:
+        told = f"no scenario in {listed(empty)}; a scenario is a TOML file with [process] and [encoding]"
+        if not scenarios:
+            raise UsageError(told)
+        warn(told)
     return list(scenarios.values())
 
 
