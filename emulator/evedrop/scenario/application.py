@@ -156,11 +156,13 @@ class PanelCurve:
     """One curve of a panel."""
 
     name: str
-    """The label; a receiver's name for a curve of its beliefs."""
+    """Its name in the recording; a receiver's name for a curve of its beliefs."""
     colour: tuple[int, int, int] | None = None
     """None: the colour of the receiver of this name."""
     drawn: Literal["line", "steps", "points"] = "line"
     width: float = 1.8
+    label: str | None = None
+    """What the view calls it. None: its name."""
 
 
 @dataclass(frozen=True)

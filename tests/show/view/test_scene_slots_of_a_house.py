@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 
 from evedrop import load_results, montecarlo
 from evedrop.errors import UsageError
@@ -75,6 +76,8 @@ def test_guesses_are_shown_from_where_their_minute_began(day: Path) -> None:
     shown = rows(path, "guesses/legitimate", "Scalars:scalars")
     assert sorted(shown) == [0, 60, 120, 180]
     load = rows(path, "guesses/Truth", "Scalars:scalars")
+    (style,) = RrdReader(path).stream().filter(content="/guesses/Truth", is_static=True)
+    assert style.to_record_batch().to_pydict()["SeriesLines:names"] == [["truth"]]
     for first, guess in shown.items():
         assert guess[0] == pytest.approx(np.mean([load[k][0] for k in range(first, first + 60)]), abs=0.8)
 

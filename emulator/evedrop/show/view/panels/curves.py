@@ -425,11 +425,11 @@ class ApplicationPanels(ViewPanel):
         styles: dict[str, rr.SeriesLines | rr.SeriesPoints] = {}
         for panel in self.scene.panels:
             for curve in panel.curves:
-                bright = curve.colour or self.scene.colours[curve.name]
+                bright, label = curve.colour or self.scene.colours[curve.name], curve.label or curve.name
                 styles[f"{panel.path}/{curve.name}"] = (
-                    rr.SeriesPoints(names=curve.name, colors=bright, markers="circle", marker_sizes=curve.width)
+                    rr.SeriesPoints(names=label, colors=bright, markers="circle", marker_sizes=curve.width)
                     if curve.drawn == "points"
-                    else line_style(curve.name, bright, curve.width, steps=curve.drawn == "steps")
+                    else line_style(label, bright, curve.width, steps=curve.drawn == "steps")
                 )
         return styles
 

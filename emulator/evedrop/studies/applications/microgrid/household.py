@@ -411,7 +411,7 @@ class Household(Application):
             Panel(
                 GUESSES,
                 f"{loop.disturbance_labels[loop.disturbance(house.load)]}, and what each would guess from its estimate",
-                (PanelCurve("Truth", TRUTH_CURVE, "steps", 1.4), *guesses),
+                (PanelCurve("Truth", TRUTH_CURVE, "steps", 1.4, "truth"), *guesses),
                 (-0.1 * most, 1.15 * most),
                 with_beliefs=True,
             ),
