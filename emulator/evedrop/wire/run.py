@@ -88,9 +88,8 @@ def run_wire(
             if journal.history.start > 1:
                 say(continuation(journal.history.start, journal.counts))
             relay = WireRelay(plan, journal, warn, happened)
-            conductor = WireConductor(
-                plan, relay, happened
-            )  # before the sides open: it applies what is in force at first
+            # Before the sides open: it applies what is in force at first.
+            conductor = WireConductor(plan, relay, happened)
             with ExitStack() as stack:
                 with watchdog.doing(Duty("while the sides were opened", ANSWER_SECONDS)):
                     stack.enter_context(relay)

@@ -54,9 +54,8 @@ class WireScorekeeper:
         self._links = {link.number: LinkTally() for link in plan.links}
         self._unlinked = LinkTally()
         self._lossless: dict[int, bool] = {}
-        self._histories: dict[
-            str, int
-        ] = {}  # key that numbers a history → the first key of it, which counts its numbers
+        # Key that numbers a history → the first key of it, which counts its numbers.
+        self._histories: dict[str, int] = {}
         self._history_of: dict[int, int | None] = {}
         self._lock = world().lock()
         journal.listeners.append(self.add)
