@@ -104,6 +104,26 @@ def test_what_waits_at_a_change_of_the_rate_passes_at_the_new_one(
         assert delay == pytest.approx(max(0.0, sent_at - room_at - 0.001) if rate else 0.0, abs=1e-9)
 
 
+def test_a_higher_rate_holds_at_once_for_keys_of_which_none_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where a key that waits was forgotten meanwhile, which keeps its order."""
+    now = [100.0]
+    monkeypatch.setattr(world(), "monotonic", lambda: now[0])
+    slow, fast = ({**PERFECT, "rate": rate, "queue": 100_000} for rate in (1e3, 1e6))
+    plan = both_ways(slow, largest=100_000)
+    with WireJournal(tmp_path, plan) as journal:
+        state = RunningLink(plan.links[0], plan, journal)
+        scan, pose = (state.lane("put", key, lossless=False) for key in ("scan", "pose"))
+        assert scan(now[0], 60_000)[1:3] == (0, 60.0)
+        state.change(fast)
+        now[0] = 101.0
+        assert pose(now[0], 1000)[2] == pytest.approx(0.001)
+        state.forget("put", "scan")
+        scan = state.lane("put", "scan", lossless=False)
+        assert scan(now[0], 1000)[2] == pytest.approx(59.0)
+
+
 def test_a_higher_rate_after_a_lower_one_makes_room_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The messages that overflowed while the link was slow are the last ones that do."""
     now = [100.0]

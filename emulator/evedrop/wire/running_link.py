@@ -317,7 +317,8 @@ class RunningLink:
         self._lock = world().lock()
         self._rate = 0.0
         self._free = 0.0  # when the queue will be empty, on the monotonic clock, as are all its times
-        self._latest = 0.0  # when the latest message leaves it: no earlier, whatever the rate becomes
+        # The order in which a key's messages leave the queue, whatever the rate becomes.
+        self._queued: dict[_Stream, KeyOrder] = {}
         self._set(link.settings)
 
     def change(self, settings: Mapping[str, Any]) -> None:
@@ -355,9 +356,10 @@ class RunningLink:
             n = self._numbers.pop(stream, None) if fates is None else fates.n
             if n is not None and n != self._counted(stream):
                 self._numbers[stream] = n
-            order = self._orders.get(stream)
-            if order is not None and order.due <= world().monotonic():
-                del self._orders[stream]
+            now = world().monotonic()
+            for orders in (self._orders, self._queued):
+                if stream in orders and orders[stream].due <= now:
+                    del orders[stream]
 
     def _decide(self, stream: _Stream) -> Lane:
         lock, largest = self._lock, self._largest
@@ -372,7 +374,7 @@ class RunningLink:
                 at = fates.n  # not counted here: another key may have the same fates
                 code, delay, again = after()
                 if self._rate:
-                    wait = self._wait(now, size)
+                    wait = self._wait(stream, now, size)
                     if wait is None:
                         return at, _OVERFLOW, 0.0, False
                     delay += wait
@@ -432,14 +434,16 @@ class RunningLink:
         self._rate = rate
         self._queue = float(settings.get("queue") or 0.0)
 
-    def _wait(self, now: float, size: int) -> float | None:
+    def _wait(self, stream: _Stream, now: float, size: int) -> float | None:
         """Seconds until the link has sent a message; None if its queue is full. The queue is never too small for one message.
 
-        Messages leave the queue in order: one that came before a change of the rate keeps its time.
+        A message that came before a change of the rate keeps its time, and later ones of its key and kind do not overtake it.
         """
         wait = max(0.0, self._free - now)
         if wait > 0 and wait * self._rate + size > self._queue:
             return None
         self._free = max(self._free, now) + size / self._rate
-        self._latest = max(self._latest, self._free)
-        return self._latest - now
+        order = self._queued.get(stream)
+        if order is None:
+            order = self._queued[stream] = KeyOrder()
+        return order.delay(self._free - now, now)
