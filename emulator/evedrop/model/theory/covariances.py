@@ -112,7 +112,7 @@ def without_cancellation(process: Process) -> tuple[Process, Floats | None]:
 def _triangular(A: Floats) -> tuple[Floats, Floats]:
     """Zᵀ A Z, block triangular, and Z, orthogonal, (n, n) each: the real eigenvalues first, then 2 × 2 blocks.
 
-    Rounding does not split a multiple real eigenvalue: its mean is split off, once for each time, with the nearest eigenvector.
+    Rounding does not split a multiple real eigenvalue: its mean is split off, each time with the nearest eigenvector.
     """
     from scipy.linalg import schur  # noqa: PLC0415 - slow to import
 
