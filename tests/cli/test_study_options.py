@@ -35,7 +35,7 @@ def test_a_changed_entry_sets_the_trials(command: str, evedrop: Evedrop) -> None
 
 
 def test_what_a_comparison_changes_is_the_scenario(evedrop: Evedrop) -> None:
-    """A name that is no entry of a scenario is refused, also one that the function of Python takes; nothing is removed."""
+    """`--set` refuses names that a scenario lacks, even if they are arguments of the Python function. No file is removed."""
     assert evedrop(*STUDIES["compare"], "--trials", "2").status == 0
     kept = sorted(path.name for path in (evedrop.folder / "out").iterdir())
     for change in ("overwrite=true", "resume=true", "workers=1", "schemes=3"):

@@ -409,7 +409,7 @@ def test_a_full_window_always_holds_the_end_of_a_batch(window: int) -> None:
 
 
 def test_a_belief_that_is_saved_again_is_kept_until_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The barrier may come again; whoever is killed while it saves finds the belief of the first time when it is restarted."""
+    """A receiver that is killed during a second save at the same barrier restarts with the belief of the first."""
     saved = tmp_path / "legitimate.state"
     brief = cast("Brief[ReceiverPart]", briefs()["legitimate"])
     brief = replace(brief, part=replace(brief.part, state_file=str(saved)))

@@ -537,7 +537,7 @@ def test_a_power_cut_may_take_hundreds_of_rounds(tmp_path: Path) -> None:
 
 
 def test_a_reader_does_not_keep_a_run_from_its_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever looks just then whether the run goes on has the lock for a moment; later readers must see that it does."""
+    """A reader that checks whether the run goes on holds the lock for a moment. Later readers must still see that it does."""
     lock, readers = try_lock, [True, True]
     monkeypatch.setattr(
         crash_proof_tables, "try_lock", lambda descriptor: not (readers and readers.pop()) and lock(descriptor)

@@ -155,7 +155,7 @@ class Slow(DelayModel):
 
 
 def test_lengths_of_an_own_delay_model_may_be_left_out_and_wrong(tmp_path: Path) -> None:
-    """In seconds: what is left out keeps its default, and a text is a mistake of who gives it."""
+    """Lengths in seconds: an omitted one keeps its default, and a text is reported as a mistake."""
     (tmp_path / "slow.py").write_text(SLOW)
     delay = {"model": "slow:Slow", "value": 1.0, "unit": "seconds"}
     tables = {**GOOD, "slot_seconds": 0.5, "modules": str(tmp_path)}

@@ -79,8 +79,8 @@ class Steps:
             0.5 * (predicted + predicted.T),
         )
         change, variances = predicted - P, np.maximum(np.diag(predicted), self._initial)
-        self.settled = bool(np.abs(change).max() <= _SETTLED * np.abs(predicted).max())
-        self.settled = self.settled and has_settled(change, variances, _SETTLED_EACH)
+        as_a_whole = bool(np.abs(change).max() <= _SETTLED * np.abs(predicted).max())
+        self.settled = as_a_whole and has_settled(change, variances, _SETTLED_EACH)
         self._predicted, self._last = predicted, step
         return step
 

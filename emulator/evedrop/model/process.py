@@ -53,10 +53,10 @@ def eigenvalues(A: Floats) -> NDArray[np.complex128]:
     signs, moved = np.random.default_rng(0).choice((-_LAST_BITS, _LAST_BITS), (4, *A.shape)), np.zeros(len(A))
     for changed in np.linalg.eigvals(A * (1.0 + signs)):
         moved = np.maximum(moved, np.abs(values[:, None] - changed).min(axis=1))
-    one = np.abs(values[:, None] - values) <= 4.0 * (moved[:, None] + moved)
+    alike = np.abs(values[:, None] - values) <= 4.0 * (moved[:, None] + moved)
     for _ in range(len(A).bit_length()):
-        one = one @ one
-    means: NDArray[np.complex128] = (one @ values) / one.sum(axis=1)
+        alike = alike @ alike
+    means: NDArray[np.complex128] = (alike @ values) / alike.sum(axis=1)
     return means
 
 

@@ -84,8 +84,8 @@ class TrialsTask(Task[BatchResult]):
         scenario = Scenario.read(self.scenario)
         expected = {name: np.zeros(scenario.slots) for name in scenario.receivers}
         histograms = {name: SlotHistograms(1, 1.0) for name in scenario.receivers}
-        one = replace(self, stop=self.start + 1)
-        (block, _) = _empty_block(scenario, one, self.start, expected, HeardBitsStream(scenario))
+        first = replace(self, stop=self.start + 1)
+        (block, _) = _empty_block(scenario, first, self.start, expected, HeardBitsStream(scenario))
         block.run_tally.begin()
         return BatchResult(self.start, [block], histograms, histograms, [Slots.example(scenario.receivers)])
 

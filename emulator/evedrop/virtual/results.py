@@ -43,7 +43,7 @@ def wrong_summary(summary: Mapping[str, Any], reference: RunReference, done: boo
     for name, link in summary["links"].items():
         in_bursts = sum(length * count for length, count in enumerate(link["bursts"] or (), start=1))
         if in_bursts > link["lost_by"].get("lost", 0):
-            yield f"bursts of {in_bursts} packets to {name}, of which {link['lost_by']} were lost"
+            yield f"the bursts of {name} have {in_bursts} packets, and its losses are {link['lost_by']}"
     if done:
         if summary["ended"] != "complete":
             yield f"the run ended well, and its summary says {summary['ended']}"

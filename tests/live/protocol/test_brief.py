@@ -306,7 +306,7 @@ def test_probabilities_that_are_not_one_for_each_slot_are_refused(wrong: list[fl
 
 
 def test_a_process_whose_packets_show_its_noise_is_refused_by_who_reads_leaks(tmp_path: Path) -> None:
-    """A and Q are both singular: there is no posterior of what a packet holds, and no traceback of that."""
+    """A and Q are both singular, so the posterior of a packet's type does not exist. The brief is refused without a traceback."""
     brief = json.loads(made(briefed())["smart"].text)
     assert refusal(brief, tmp_path) is None
     brief["part"] |= {"strategy": "bayesian", "parameters": {}}

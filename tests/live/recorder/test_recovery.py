@@ -127,7 +127,7 @@ def test_an_outage_that_is_open_at_the_end_lasts_to_the_last_slot_of_a_complete_
 @pytest.mark.parametrize(("lost", "told"), [("smart", "smart"), ("router", "recorder")])
 @pytest.mark.parametrize("again", [False, True])
 def test_an_outage_after_which_the_run_did_not_go_on_is_open(lost: str, told: str, again: bool) -> None:
-    """The process is back, but no slot is joined before the run fails; if it is lost once more, that is the same outage."""
+    """The process returns, but the run fails before it joins another slot. A second loss belongs to the same outage."""
     conducted, clock = Conducted(), TestClock()
     recovery = recovery_of(conducted, clock, 30.0)
     recovery.poll(10)

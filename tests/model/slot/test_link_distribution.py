@@ -124,7 +124,7 @@ def test_a_chain_with_delays_is_a_chain_of_two_ends() -> None:
 
 
 def test_a_change_that_leaves_the_losses_alone_leaves_their_chain_alone() -> None:
-    """A cut of one slot ends no burst; the same chain with another parameter starts anew. Slot by slot, state by state."""
+    """A burst outlasts a cut of one slot. A chain with another parameter starts afresh. Checked slot by slot, in every state."""
     bursts = {"loss": {"model": "gilbert-elliott", "p": 0.02, "r": 0.05}}
     other = {"loss": {"model": "gilbert-elliott", "p": 0.04, "r": 0.1}}
     changes = (Change(20, cut=True), Change(21, cut=False), Change(30, {**bursts, "corrupt": 0.1}), Change(40, other))

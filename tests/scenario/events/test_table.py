@@ -241,7 +241,7 @@ def test_changes_are_checked_on_top_of_earlier_ones() -> None:
 
 
 def test_a_scheme_that_may_be_silent_gets_no_rate_later_either() -> None:
-    """Whoever limits the link."""
+    """Neither an event nor a nemesis may limit the link."""
     silent = {"encoding": {"scheme": "scheduled", "threshold": 3}, "acknowledgements": {"link": {"quality": 1.0}}}
     tables = {**silent, "eavesdroppers": {"eve": listener("clear-states", 0.9)}}
     why = "rate: is given, but the scheme scheduled may stay silent"

@@ -196,7 +196,7 @@ def test_a_part_of_a_run_is_not_promised_again(study: Path, tmp_path: Path) -> N
     (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))
     write_report(tmp_path / "run")
     texts = checked(tmp_path / "run").texts
-    assert any("the whole run, of which this one is a part" in text for text in texts)
+    assert any("the whole run; this one ended early" in text for text in texts)
     assert any("--trials 20 --rare --out again" in text for text in texts)
     texts = checked(study).texts
     assert any("the same results to the same bits" in text for text in texts)

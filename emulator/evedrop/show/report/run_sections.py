@@ -427,7 +427,7 @@ def _repeat(of: RunSource) -> Iterator[Markup]:
     summary = of.summary
     if of.scenario_text:
         whole = summary.ended == "complete"
-        same = "the same results to the same bits" if whole else "the whole run, of which this one is a part"
+        same = "the same results to the same bits" if whole else "the whole run; this one ended early"
         yield made("paragraph", f"Save the scenario, and run it in its folder: {same}, and a look at them.")
         yield download(SCENARIO, of.scenario_text)
         yield from input_files(of.folder)

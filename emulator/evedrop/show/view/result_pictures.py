@@ -260,7 +260,7 @@ def _sweep_size(count: int) -> tuple[float, float]:
 
 
 def _others(rows: list[dict[str, Any]], keys: Sequence[str]) -> list[tuple[Any, ...]]:
-    """The combinations of values of all entries but the first, of which the first `_MOST_PANELS` have a panel each."""
+    """The combinations of values of all entries but the first. The first `_MOST_PANELS` get a panel each."""
     return list(dict.fromkeys(tuple(row[key] for key in keys[1:]) for row in rows))
 
 
