@@ -66,6 +66,16 @@ def same(fates: Fates, other: Fates) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(whole_of(fates), whole_of(other), strict=True))
 
 
+@pytest.mark.parametrize("stop", [1, 20, 45])
+@pytest.mark.parametrize("name", SCHEDULES)
+def test_skipped_slots_are_as_good_as_read(name: str, stop: int) -> None:
+    """A link that goes on later has the fates of one that read all slots before."""
+    whole, later = (link(SCHEDULES[name], Batch(70, 6, 3)) for _ in range(2))
+    whole.fates(range(stop))
+    later.skip(stop)
+    assert same(later.fates(range(stop, 70)), whole.fates(range(stop, 70)))
+
+
 @pytest.mark.parametrize("name", SCHEDULES)
 def test_a_link_like_another_is_one_of_its_own(name: str) -> None:
     """With other keys it has their fates, whatever becomes of the link that it was made from, and the other way round."""

@@ -379,12 +379,17 @@ def test_a_multiple_root_on_the_unit_circle_in_a_long_run(A: list[list[float]]) 
     assert theoretical_traces(process, misled, 4000)[-1] == pytest.approx(0.5 * np.trace(twice), rel=1e-2)
 
 
-@pytest.mark.parametrize("order", [3, 4])
-def test_a_root_of_higher_order_on_the_unit_circle_in_a_very_long_run(order: int) -> None:
-    """Of (λ − 1)^order in companion form, in whole numbers: tr Σ_k is a sum of squares of the entries of A^j."""
+@pytest.mark.parametrize(
+    "coefficients",
+    [[-3, 3, -1], [-4, 6, -4, 1], [-3, 4, -4, 3, -1]],
+    ids=["triple", "quadruple", "triple, and a complex pair"],
+)
+def test_a_root_of_higher_order_on_the_unit_circle_in_a_very_long_run(coefficients: list[int]) -> None:
+    """Of a companion matrix, in whole numbers: tr Σ_k is a sum of squares of the entries of A^j."""
+    order = len(coefficients)
     A = np.eye(order, k=-1)
-    A[0] = [-((-1) ** j) * math.comb(order, j) for j in range(1, order + 1)]
-    process, slots = Process(A, np.eye(order), np.eye(order)), 300_000
+    A[0] = [-coefficient for coefficient in coefficients]
+    process, slots = Process(A, np.eye(order), np.eye(order)), 60_000
     traces = theoretical_traces(process, NOBODY, slots)
     power, total = np.eye(order, dtype=object).astype(int).astype(object), 0
     dynamics = A.astype(int).astype(object)
