@@ -62,6 +62,11 @@ def test_a_reader_that_left_has_no_place(tmp_path: Path) -> None:
         served_at.stop()
 
 
+def threads_named(name: str) -> set[threading.Thread]:
+    """The threads of this name, of whichever test."""
+    return {thread for thread in threading.enumerate() if thread.name == name}
+
+
 def first_bytes(served_at: Served) -> bytes:
     """What a reader gets who leaves at once; nothing without a place."""
     try:
@@ -73,10 +78,12 @@ def first_bytes(served_at: Served) -> bytes:
 
 def test_a_recording_is_found_although_its_folder_was_moved(tmp_path: Path) -> None:
     """The first reader may come later than that."""
+    others = threads_named("recording")
     followed = Followed(tmp_path / "run" / "r.rrd")
+    (opener,) = threads_named("recording") - others
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "r.rrd").write_bytes(b"abc")
-    wait_until(lambda: "recording" not in {thread.name for thread in threading.enumerate()}, "opened files")
+    opener.join(LIMIT)
     (tmp_path / "run").rename(tmp_path / "moved")
     followed.complete()
     assert b"".join(followed.pieces()) == b"abc"

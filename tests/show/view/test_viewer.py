@@ -280,9 +280,10 @@ def test_a_pipe_gets_the_recording_as_it_grows(tmp_path: Path) -> None:
         followed.complete()
         assert len(pipe.read()) == 3_000_000 - 1000
     reading, writing = os.pipe()
+    others = set(threading.enumerate())
     feed(followed, os.fdopen(writing, "wb", buffering=0))
     os.close(reading)
-    wait_until(lambda: not [thread for thread in threading.enumerate() if thread.name == "view"], "no thread left")
+    wait_until(lambda: "view" not in {thread.name for thread in set(threading.enumerate()) - others}, "no thread left")
 
 
 def test_stop_ends_it_and_may_be_repeated(viewer: Viewer) -> None:
