@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from evedrop.cli.options import changes_of, entries, loaded, output
+from evedrop.cli.options import changes_of, entries, loaded, option, output
 from evedrop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -25,18 +25,16 @@ def crew(parser: argparse.ArgumentParser) -> None:
     scheduler(parser)
 
 
-def scheduler(parser: argparse.ArgumentParser) -> None:
-    """Add `--scheduler`, the address of a Dask scheduler."""
-    help_text = "let the workers of this Dask scheduler compute the trials, tcp://HOST:PORT (docs/montecarlo.md)"
-    parser.add_argument("--scheduler", metavar="ADDRESS", help=help_text)
-
-
-def resuming(parser: argparse.ArgumentParser) -> None:
-    """Add `--resume`, to go on with a study that was interrupted."""
-    help_text = (
-        "go on with the interrupted study in the folder of --out; all but --workers and --scheduler must be as it was"
-    )
-    parser.add_argument("--resume", action="store_true", help=help_text)
+scheduler = option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="let the workers of this Dask scheduler compute the trials, tcp://HOST:PORT (docs/montecarlo.md)",
+)
+resuming = option(
+    "--resume",
+    action="store_true",
+    help="go on with the interrupted study in the folder of --out; all but --workers and --scheduler must be as it was",
+)
 
 
 def check_resuming(options: argparse.Namespace) -> None:

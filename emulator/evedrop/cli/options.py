@@ -46,14 +46,30 @@ class Command:
     """The page of the documentation about it, such as `links`, as `evedrop docs` knows it."""
 
 
+def command(
+    options: tuple[Option, ...] = (), name: str = "", **more: str
+) -> Callable[[Callable[[argparse.Namespace], int]], Command]:
+    """Make a command of a function, with its name unless another is given; its docstring says what the command does.
+
+    more: other entries of `Command`.
+    """
+
+    def made(run: Callable[[argparse.Namespace], int]) -> Command:
+        sentence = str(run.__doc__).partition("\n")[0]
+        does = f"{sentence[0].lower()}{sentence[1:].removesuffix('.')}"
+        return Command(name or run.__name__, run, does, options, **more)
+
+    return made
+
+
 _SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
 
 
-def argument(name: str, shown: str) -> Option:
-    """An option that adds a positional argument, a path; shown: its name in the help."""
+def option(*names: str, **how: Any) -> Option:
+    """An option, or an argument, as `ArgumentParser.add_argument` takes it."""
 
     def add(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument(name, type=Path, metavar=shown)
+        parser.add_argument(*names, **how)
 
     return add
 
@@ -73,14 +89,8 @@ def number_type(least: float, most: float, words: str) -> Callable[[str], float]
     return number
 
 
-def scenario(parser: argparse.ArgumentParser) -> None:
-    """Add the argument for the scenario."""
-    parser.add_argument("scenario", metavar="SCENARIO", help="a built-in scenario, a file, or a results folder")
-
-
-def changes(parser: argparse.ArgumentParser) -> None:
-    """Add `--set`, which changes an entry of the scenario by its dotted key."""
-    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=_SET_HELP)
+scenario = option("scenario", metavar="SCENARIO", help="a built-in scenario, a file, or a results folder")
+changes = option("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=_SET_HELP)
 
 
 def entries(parser: argparse.ArgumentParser) -> None:
@@ -105,9 +115,7 @@ def output(parser: argparse.ArgumentParser) -> None:
     verbose(parser)
 
 
-def verbose(parser: argparse.ArgumentParser) -> None:
-    """Add `--verbose`, for all details of a closing report."""
-    parser.add_argument("--verbose", action="store_true", help="print everything that the report page says")
+verbose = option("--verbose", action="store_true", help="print everything that the report page says")
 
 
 def as_json(parser: argparse.ArgumentParser, help_text: str = "print JSON") -> None:
@@ -115,11 +123,9 @@ def as_json(parser: argparse.ArgumentParser, help_text: str = "print JSON") -> N
     parser.add_argument("--json", action="store_true", help=help_text)
 
 
-def served(parser: argparse.ArgumentParser) -> None:
-    """Add `--serve`, the address where a run is shown to browsers."""
-    parser.add_argument(
-        "--serve", metavar="HOST:PORT", help="show the run to browsers, at this address and port (and the next port)"
-    )
+served = option(
+    "--serve", metavar="HOST:PORT", help="show the run to browsers, at this address and port (and the next port)"
+)
 
 
 def changes_of(options: argparse.Namespace) -> dict[str, Any]:

@@ -7,14 +7,58 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from evedrop.cli.options import Command, as_json, changes, changes_of, scenario
+from evedrop.cli.options import as_json, changes, changes_of, command, scenario
 from evedrop.cli.tables import tables
 from evedrop.errors import UsageError
 from evedrop.system.output import print_json
 
 
+def _designs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--max-trace",
+        type=float,
+        metavar="Ω",
+        help="find the least μ_d whose limiting trace stays below Ω; with --schedule: the trace stays within Ω in every slot",
+    )
+    parser.add_argument(
+        "--min-ratio",
+        type=float,
+        metavar="R",
+        help="find the cheapest μ_d at which every eavesdropper's error is at least R times the estimator's in the limit",
+    )
+    parser.add_argument(
+        "--plot", type=Path, metavar="FILE", help="draw the errors over μ_d: a picture as .pdf, .png or .svg"
+    )
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument(
+        "--schedule", type=int, metavar="N", help="a μ_d for each of N slots that makes the eavesdropper's error large"
+    )
+    kind.add_argument(
+        "--policy",
+        action="store_true",
+        help="when to send, for a scheme that depends on acknowledgements: the Pareto front",
+    )
+    kind.add_argument(
+        "--budget",
+        type=float,
+        metavar="E",
+        help="the threshold from which to encrypt, so that a slot costs an energy of at most E on average",
+    )
+    parser.add_argument(
+        "--weight",
+        type=float,
+        nargs="+",
+        metavar="β",
+        help="weights of the legitimate error, 0 to 1 (default 0, 0.05 … 1)",
+    )
+    parser.add_argument("--price", type=float, nargs="+", metavar="λ", help="costs of a transmission (default 0)")
+    parser.add_argument("--states", type=int, metavar="N", help="holding times that are distinguished (default 10)")
+    parser.add_argument("--block", type=int, metavar="L", help="slots of --schedule that share a μ_d (default 1)")
+
+
+@command((scenario, changes, _designs, as_json, tables), section="study", example="design numerical", page="design")
 def design(options: argparse.Namespace) -> int:
-    """Print the admissible μ_d, the cost and secrecy of each choice; or when to send or to encrypt, or a μ_d for each slot."""
+    """Choose μ_d, or when to send or encrypt, for a scenario."""
     from evedrop.cli import api
     from evedrop.cli.design_report import print_budget, print_design, print_policies, print_schedules
     from evedrop.cli.report import terminal
@@ -77,57 +121,4 @@ def _show(options: argparse.Namespace, designed: _Printable, show: Callable[[], 
     return 0
 
 
-def _designs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--max-trace",
-        type=float,
-        metavar="Ω",
-        help="find the least μ_d whose limiting trace stays below Ω; with --schedule: the trace stays within Ω in every slot",
-    )
-    parser.add_argument(
-        "--min-ratio",
-        type=float,
-        metavar="R",
-        help="find the cheapest μ_d at which every eavesdropper's error is at least R times the estimator's in the limit",
-    )
-    parser.add_argument(
-        "--plot", type=Path, metavar="FILE", help="draw the errors over μ_d: a picture as .pdf, .png or .svg"
-    )
-    kind = parser.add_mutually_exclusive_group()
-    kind.add_argument(
-        "--schedule", type=int, metavar="N", help="a μ_d for each of N slots that makes the eavesdropper's error large"
-    )
-    kind.add_argument(
-        "--policy",
-        action="store_true",
-        help="when to send, for a scheme that depends on acknowledgements: the Pareto front",
-    )
-    kind.add_argument(
-        "--budget",
-        type=float,
-        metavar="E",
-        help="the threshold from which to encrypt, so that a slot costs an energy of at most E on average",
-    )
-    parser.add_argument(
-        "--weight",
-        type=float,
-        nargs="+",
-        metavar="β",
-        help="weights of the legitimate error, 0 to 1 (default 0, 0.05 … 1)",
-    )
-    parser.add_argument("--price", type=float, nargs="+", metavar="λ", help="costs of a transmission (default 0)")
-    parser.add_argument("--states", type=int, metavar="N", help="holding times that are distinguished (default 10)")
-    parser.add_argument("--block", type=int, metavar="L", help="slots of --schedule that share a μ_d (default 1)")
-
-
-COMMANDS = (
-    Command(
-        "design",
-        design,
-        "choose μ_d, or when to send or encrypt, for a scenario",
-        (scenario, changes, _designs, as_json, tables),
-        section="study",
-        example="design numerical",
-        page="design",
-    ),
-)
+COMMANDS = (design,)

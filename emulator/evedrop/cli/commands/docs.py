@@ -6,7 +6,7 @@ import argparse
 from importlib import resources
 from pathlib import Path
 
-from evedrop.cli.options import Command
+from evedrop.cli.options import command, option
 from evedrop.cli.parser import print_names
 from evedrop.cli.plain_formulas import plain
 from evedrop.errors import UsageError
@@ -15,8 +15,12 @@ from evedrop.system.hints import near
 _SHELLS = ("bash", "zsh", "fish")
 
 
+_PAGE = option("page", nargs="?", metavar="PAGE", help="the page, or a folder of pages, as evedrop docs lists it")
+
+
+@command((_PAGE,), section="inspect", example="docs view")
 def docs(options: argparse.Namespace) -> int:
-    """Print a page of the documentation; list the pages if none is named, or those of a folder."""
+    """Print a page of the documentation, or list the pages."""
     pages = _pages()
     if options.page is None:
         print_names({name: _title(path) for name, path in pages.items()})
@@ -33,8 +37,12 @@ def docs(options: argparse.Namespace) -> int:
     return 0
 
 
+_SHELL = option("shell", choices=_SHELLS, metavar="SHELL", help="bash, zsh or fish")
+
+
+@command((_SHELL,), section="inspect", example="completion bash >> ~/.bashrc")
 def completion(options: argparse.Namespace) -> int:
-    """Print the lines that make a shell complete commands and options."""
+    """Print what makes a shell complete commands and options."""
     from argcomplete.shell_integration import shellcode
 
     print(shellcode(["evedrop"], shell=options.shell))
@@ -53,32 +61,4 @@ def _title(path: Path) -> str:
     return first.lstrip("# ")
 
 
-def _page(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "page", nargs="?", metavar="PAGE", help="the page, or a folder of pages, as evedrop docs lists it"
-    )
-
-
-def _shell(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("shell", choices=_SHELLS, metavar="SHELL", help="bash, zsh or fish")
-
-
-COMMANDS = (
-    Command(
-        "docs",
-        docs,
-        "print a page of the documentation, or list the pages",
-        (_page,),
-        section="inspect",
-        example="docs view",
-        page="",
-    ),
-    Command(
-        "completion",
-        completion,
-        "print what makes a shell complete commands and options",
-        (_shell,),
-        section="inspect",
-        example="completion bash >> ~/.bashrc",
-    ),
-)
+COMMANDS = (docs, completion)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.options import Command, argument, as_json
+from evedrop.cli.options import as_json, command, option
 from evedrop.errors import UsageError
 from evedrop.system.output import print_json
 
@@ -15,8 +15,20 @@ if TYPE_CHECKING:
     from evedrop.scenario.recordings.message_recording import MessageRecording
 
 
+def _process_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--states", metavar="X,Y", help="the columns that are states; default all but time")
+    parser.add_argument("--reference", metavar="X,Y", help="the levels from which states are deviations; default 0")
+
+
+@command(
+    (option("file", type=Path, metavar="FILE"), _process_options, as_json),
+    group="process",
+    section="study",
+    example="process fit pose.csv",
+    page="programs",
+)
 def fit(options: argparse.Namespace) -> int:
-    """Fit a process to recorded states."""
+    """Find the process that explains recorded states."""
     from evedrop.scenario.recordings.process_fit import fit_process
 
     names = None if options.states is None else [name.strip() for name in options.states.split(",")]
@@ -35,13 +47,58 @@ def _numbers(text: str | None) -> list[float] | None:
         raise UsageError(f"--reference {text}: expected numbers such as 55,50") from None
 
 
-def _process_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--states", metavar="X,Y", help="the columns that are states; default all but time")
-    parser.add_argument("--reference", metavar="X,Y", help="the levels from which states are deviations; default 0")
+def _link_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--column",
+        metavar="C",
+        help="the column of outcomes, in which 1 means delivered; default received, or the only one",
+    )
+    parser.add_argument("--lost", metavar="C", help="in place of --column: the column in which 1 means lost")
+    parser.add_argument(
+        "--delay-column",
+        metavar="C",
+        help="the column of delays in slots; default the column named delay, if there is one",
+    )
+    parser.add_argument(
+        "--topic", metavar="T", help="the topic of an MCAP recording; default the only one with numbers"
+    )
+    parser.add_argument(
+        "--period", type=float, metavar="S", help="seconds between two messages of a sender that does not number them"
+    )
+    parser.add_argument("--link", metavar="NAME", help="the link of a wire; default the only one with messages")
+    parser.add_argument("--key", metavar="K", help="only messages of a wire with keys that this key expression takes")
+    parser.add_argument(
+        "--gaps",
+        action="store_true",
+        help="fit what was lost before the wire: the numbers that are missing in its journal",
+    )
+    parser.add_argument(
+        "--outage",
+        type=float,
+        metavar="S",
+        help="do not count silences longer than this many seconds as losses",
+    )
+    parser.add_argument(
+        "--slot", type=float, metavar="S", help="seconds of a scenario's slot; default the median time between messages"
+    )
+    parser.add_argument(
+        "--save",
+        type=Path,
+        metavar="FILE",
+        help="write the outcomes of messages to a CSV file, for the loss model trace",
+    )
 
 
+@command(
+    (option("trace", type=Path, metavar="RECORDING"), _link_options, as_json),
+    name="fit",
+    group="links",
+    section="study",
+    example="links fit walk.csv",
+    page="links",
+)
 def fit_link(options: argparse.Namespace) -> int:
-    """Fit loss and delay models to a recorded link."""
+    """Find the loss model and delays of a recorded link: a table, an MCAP recording or the folder of a wire."""
     from evedrop.scenario.recordings.mcap_recording import is_mcap
 
     if is_mcap(options.trace):
@@ -125,67 +182,4 @@ def _refuse_others(options: argparse.Namespace, subject: str, names: Sequence[st
             raise UsageError(f"--{name} {value:g}: expected seconds, more than 0")
 
 
-def _link_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--column",
-        metavar="C",
-        help="the column of outcomes, in which 1 means delivered; default received, or the only one",
-    )
-    parser.add_argument("--lost", metavar="C", help="in place of --column: the column in which 1 means lost")
-    parser.add_argument(
-        "--delay-column",
-        metavar="C",
-        help="the column of delays in slots; default the column named delay, if there is one",
-    )
-    parser.add_argument(
-        "--topic", metavar="T", help="the topic of an MCAP recording; default the only one with numbers"
-    )
-    parser.add_argument(
-        "--period", type=float, metavar="S", help="seconds between two messages of a sender that does not number them"
-    )
-    parser.add_argument("--link", metavar="NAME", help="the link of a wire; default the only one with messages")
-    parser.add_argument("--key", metavar="K", help="only messages of a wire with keys that this key expression takes")
-    parser.add_argument(
-        "--gaps",
-        action="store_true",
-        help="fit what was lost before the wire: the numbers that are missing in its journal",
-    )
-    parser.add_argument(
-        "--outage",
-        type=float,
-        metavar="S",
-        help="do not count silences longer than this many seconds as losses",
-    )
-    parser.add_argument(
-        "--slot", type=float, metavar="S", help="seconds of a scenario's slot; default the median time between messages"
-    )
-    parser.add_argument(
-        "--save",
-        type=Path,
-        metavar="FILE",
-        help="write the outcomes of messages to a CSV file, for the loss model trace",
-    )
-
-
-COMMANDS = (
-    Command(
-        "fit",
-        fit,
-        "find the process that explains recorded states",
-        (argument("file", "FILE"), _process_options, as_json),
-        group="process",
-        section="study",
-        example="process fit pose.csv",
-        page="programs",
-    ),
-    Command(
-        "fit",
-        fit_link,
-        "find the loss model and delays of a recorded link: a table, an MCAP recording or the folder of a wire",
-        (argument("trace", "RECORDING"), _link_options, as_json),
-        group="links",
-        section="study",
-        example="links fit walk.csv",
-        page="links",
-    ),
-)
+COMMANDS = (fit, fit_link)

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import Command, as_json
+from evedrop.cli.options import as_json, command
 from evedrop.cli.parser import print_names
 from evedrop.cli.tables import tables
 from evedrop.errors import UsageError
@@ -20,8 +20,18 @@ if TYPE_CHECKING:
     from evedrop.studies.papers.reproduction import Reproduction
 
 
+def _papers(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", nargs="?", metavar="NAME", help="the paper; without it, a list of all papers")
+    parser.add_argument("--quick", action="store_true", help="simulate little: seconds, and larger standard errors")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="also write NAME.json and NAME.md there")
+
+
+@command((_papers, as_json, tables), section="study", example="paper luecke2022", page="papers")
 def paper(options: argparse.Namespace) -> int:
-    """Compute the numbers of a paper; list the papers if none is named. 1 if a number differs and nothing explains it."""
+    """Compare the numbers of a published paper with ours.
+
+    Lists the papers if none is named. Returns 1 if a number differs and nothing explains it.
+    """
     from evedrop.studies.papers import paper as paper_of
     from evedrop.studies.papers import reproduce
 
@@ -29,8 +39,9 @@ def paper(options: argparse.Namespace) -> int:
         _list(options.json)
         return 0
     paper_of(options.name)
-    if options.out is not None:
-        _made(options.out)
+    if options.out is not None:  # before the numbers are computed
+        with _writable(options.out):
+            options.out.mkdir(parents=True, exist_ok=True)
     reproduction = reproduce(options.name, options.quick, lambda text: print(text, file=sys.stderr))
     if options.out is not None:
         _write(reproduction, options.out)
@@ -44,25 +55,13 @@ def paper(options: argparse.Namespace) -> int:
 def _list(as_json: bool) -> None:
     from evedrop.studies.papers import PAPERS
 
+    papers = {
+        name: {key: getattr(its, key) for key in ("title", "authors", "published")} for name, its in PAPERS.items()
+    }
     if as_json:
-        papers = {
-            name: {"title": paper_class.title, "authors": paper_class.authors, "published": paper_class.published}
-            for name, paper_class in PAPERS.items()
-        }
         print_json(papers)
-        return
-    print_names(
-        {
-            name: f"{paper_class.authors}: {paper_class.title}. {paper_class.published}"
-            for name, paper_class in PAPERS.items()
-        }
-    )
-
-
-def _made(folder: Path) -> None:
-    """Create the folder, if necessary, before the numbers are computed."""
-    with _writable(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    else:
+        print_names({name: "{authors}: {title}. {published}".format_map(its) for name, its in papers.items()})
 
 
 def _write(reproduction: Reproduction, folder: Path) -> None:
@@ -104,29 +103,6 @@ def _print(reproduction: Reproduction) -> None:
         console.say("these are quick estimates: without --quick the standard errors are smaller")
 
 
-def _papers(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", nargs="?", metavar="NAME", help="the paper; without it, a list of all papers")
-    parser.add_argument("--quick", action="store_true", help="simulate little: seconds, and larger standard errors")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="also write NAME.json and NAME.md there")
-
-
-def figures(options: argparse.Namespace) -> int:
-    """Draw the paper's figures."""
-    from evedrop.studies.papers.kennedy2022 import Size
-    from evedrop.studies.papers.kennedy2022 import figures as draw
-
-    try:
-        report = draw(
-            options.folder,
-            lambda text: print(text, file=sys.stderr),
-            Size(microgrid_trials=1000) if options.full else Size(),
-        )
-    except OSError as error:
-        raise UsageError(f"{options.folder} cannot be written ({error.strerror}); give another folder") from error
-    print(report)
-    return 0
-
-
 def _figures(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", nargs="?", type=Path, default=Path("figures"), metavar="DIR")
     parser.add_argument(
@@ -134,23 +110,16 @@ def _figures(parser: argparse.ArgumentParser) -> None:
     )
 
 
-COMMANDS = (
-    Command(
-        "paper",
-        paper,
-        "compare the numbers of a published paper with ours",
-        (_papers, as_json, tables),
-        section="study",
-        example="paper luecke2022",
-        page="papers",
-    ),
-    Command(
-        "figures",
-        figures,
-        "draw the figures of the paper, and a table of its numbers and ours",
-        (_figures,),
-        section="study",
-        example="figures paper/",
-        page="papers",
-    ),
-)
+@command((_figures,), section="study", example="figures paper/", page="papers")
+def figures(options: argparse.Namespace) -> int:
+    """Draw the figures of the paper, and a table of its numbers and ours."""
+    from evedrop.studies.papers.kennedy2022 import Size
+    from evedrop.studies.papers.kennedy2022 import figures as draw
+
+    size = Size(microgrid_trials=1000) if options.full else Size()
+    with _writable(options.folder):
+        print(draw(options.folder, lambda text: print(text, file=sys.stderr), size))
+    return 0
+
+
+COMMANDS = (paper, figures)

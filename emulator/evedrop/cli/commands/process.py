@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.cli.commands import ROLES
-from evedrop.cli.options import Command, Option, argument, changes_of, entries, loaded, scenario, served
+from evedrop.cli.options import Command, Option, changes_of, command, entries, loaded, option, scenario, served
 from evedrop.errors import BriefError, EvedropError, RunError, UsageError
 
 if TYPE_CHECKING:
@@ -26,8 +26,51 @@ _BY_HAND = ("results", "listen", "connect", "relay", "relay_connect", "wait", "i
 _MOST_TOLD = 5  # mistakes of a scenario in a brief, which is not written by hand
 
 
+def _briefs(parser: argparse.ArgumentParser) -> None:
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--out", type=Path, metavar="DIR", help="folder for the briefs")
+    where.add_argument("--compose", type=Path, metavar="DIR", help="write the files for Docker Compose instead")
+    parser.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="with --compose: DIR may contain files; replace those with the same names",
+    )
+    parser.add_argument(
+        "--results",
+        type=Path,
+        default=Path("results"),
+        metavar="DIR",
+        help="the recorder's results folder, on its host; relative to its working directory",
+    )
+    parser.add_argument(
+        "--listen",
+        default="tls/127.0.0.1:17447",
+        metavar="ENDPOINT",
+        help="the endpoint where the router listens, such as tls/router.lan:7447",
+    )
+    parser.add_argument(
+        "--connect", metavar="ENDPOINT", help="the endpoint that the others connect to; default that of --listen"
+    )
+    parser.add_argument("--relay", metavar="ENDPOINT", help="where the second router listens, if the scenario has two")
+    parser.add_argument(
+        "--relay-connect",
+        metavar="ENDPOINT",
+        help="the endpoint that its processes connect to; default that of --relay",
+    )
+    parser.add_argument(
+        "--wait", type=int, default=600, metavar="SECONDS", help="how long processes wait for each other; default 600"
+    )
+    parser.add_argument(
+        "--insecure", action="store_true", help="listen without encryption although other machines can reach it"
+    )
+    parser.add_argument(
+        "--paused", action="store_true", help="hold the run before slot 0, until `evedrop resume` or `evedrop step`"
+    )
+
+
+@command((scenario, entries, _briefs), section="processes", example="brief vehicle --out briefs", page="hosts")
 def brief(options: argparse.Namespace) -> int:
-    """Write the briefs of a scenario's processes, or the files of their containers."""
+    """Write the files with which each process of a run is started by hand, or by Docker Compose."""
     from evedrop.live.launch.briefs import write_briefs
     from evedrop.live.launch.ports import endpoints_at, warn_if_exposed
 
@@ -206,8 +249,12 @@ def _report(folder: Path, status: int, how: str) -> None:
     print_ending(folder, status, how)
 
 
+_BRIEF = option("brief", type=Path, metavar="BRIEF")
+
+
+@command((_BRIEF,), section="processes", example="health briefs/smart.json", page="containers")
 def health(options: argparse.Namespace) -> int:
-    """Print whether the process of a brief is on the network."""
+    """Check that the process of a brief is on the network."""
     from evedrop.live.network.operator import is_there
     from evedrop.live.protocol.brief import read_brief
 
@@ -217,61 +264,16 @@ def health(options: argparse.Namespace) -> int:
     return 0 if there else 1
 
 
-def _results_folder(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty; default the brief's")
-
-
-def _briefs(parser: argparse.ArgumentParser) -> None:
-    where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("--out", type=Path, metavar="DIR", help="folder for the briefs")
-    where.add_argument("--compose", type=Path, metavar="DIR", help="write the files for Docker Compose instead")
-    parser.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="with --compose: DIR may contain files; replace those with the same names",
-    )
-    parser.add_argument(
-        "--results",
-        type=Path,
-        default=Path("results"),
-        metavar="DIR",
-        help="the recorder's results folder, on its host; relative to its working directory",
-    )
-    parser.add_argument(
-        "--listen",
-        default="tls/127.0.0.1:17447",
-        metavar="ENDPOINT",
-        help="the endpoint where the router listens, such as tls/router.lan:7447",
-    )
-    parser.add_argument(
-        "--connect", metavar="ENDPOINT", help="the endpoint that the others connect to; default that of --listen"
-    )
-    parser.add_argument("--relay", metavar="ENDPOINT", help="where the second router listens, if the scenario has two")
-    parser.add_argument(
-        "--relay-connect",
-        metavar="ENDPOINT",
-        help="the endpoint that its processes connect to; default that of --relay",
-    )
-    parser.add_argument(
-        "--wait", type=int, default=600, metavar="SECONDS", help="how long processes wait for each other; default 600"
-    )
-    parser.add_argument(
-        "--insecure", action="store_true", help="listen without encryption although other machines can reach it"
-    )
-    parser.add_argument(
-        "--paused", action="store_true", help="hold the run before slot 0, until `evedrop resume` or `evedrop step`"
-    )
+_RESULTS_FOLDER = option("--out", type=Path, metavar="DIR", help="results folder, new or empty; default the brief's")
 
 
 def _role(role: str) -> Option:
     return lambda parser: parser.set_defaults(role=role)
 
 
-_BRIEF = argument("brief", "BRIEF")
-
-
+@command(section="processes", example="host", page="hosts")
 def host(options: argparse.Namespace) -> int:
-    """Start processes of a run for a launcher on another host."""
+    """Start processes of a run for `evedrop run --hosts`, which calls this over ssh."""
     from evedrop.live.launch.other_hosts import serve_launcher
 
     del options
@@ -282,42 +284,19 @@ def host(options: argparse.Namespace) -> int:
 
 
 COMMANDS = (
-    Command(
-        "brief",
-        brief,
-        "write the files with which each process of a run is started by hand, or by Docker Compose",
-        (scenario, entries, _briefs),
-        section="processes",
-        example="brief vehicle --out briefs",
-        page="hosts",
-    ),
-    Command(
-        "health",
-        health,
-        "check that the process of a brief is on the network",
-        (_BRIEF,),
-        section="processes",
-        example="health briefs/smart.json",
-        page="containers",
-    ),
+    brief,
+    health,
     *(
         Command(
             role,
             process,
             f"run only the {role}",
-            (_BRIEF, _role(role), *((_results_folder, served) if role == "recorder" else ())),
+            (_BRIEF, _role(role), *((_RESULTS_FOLDER, served) if role == "recorder" else ())),
             section="processes",
             example=f"{role} briefs/{role}.json",
             page="hosts",
         )
         for role in ROLES
     ),
-    Command(
-        "host",
-        host,
-        "start processes of a run for `evedrop run --hosts`, which calls this over ssh",
-        section="processes",
-        example="host",
-        page="hosts",
-    ),
+    host,
 )

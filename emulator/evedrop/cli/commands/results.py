@@ -6,12 +6,13 @@ import argparse
 import math
 from pathlib import Path
 
-from evedrop.cli.options import Command, argument, number_type
+from evedrop.cli.options import command, number_type, option
 from evedrop.errors import UsageError
 
 
+@command((option("run", type=Path, metavar="FOLDER"),), section="inspect", example="report runs/vehicle", page="export")
 def report(options: argparse.Namespace) -> int:
-    """Write the page of a results folder."""
+    """Write report.html: a run, sweep, comparison or wire on one page."""
     from evedrop.results.wire_summary import is_wire
     from evedrop.show.report.writing import write_report
 
@@ -30,14 +31,36 @@ def report(options: argparse.Namespace) -> int:
 _LONGEST = 3600.0  # seconds per slot, as for pace
 
 
+def _written(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, metavar="FILE", help=".mcap, .pdf, .png, .svg, .csv or .tex")
+    parser.add_argument(
+        "--width", choices=("page", "column"), default="page", help="of the picture of a run; column: that of a journal"
+    )
+    parser.add_argument(
+        "--panel", choices=("errors", "lanes", "plane"), help="draw only one part of the picture of a run"
+    )
+    parser.add_argument(
+        "--period",
+        type=number_type(math.ulp(0.0), _LONGEST, f"a number of seconds above 0 and up to {_LONGEST:.0f}"),
+        metavar="SECONDS",
+        help="seconds per slot; default those of the scenario, or 1",
+    )
+
+
+@command(
+    (option("run", type=Path, metavar="FOLDER"), _written),
+    section="inspect",
+    example="export runs/vehicle vehicle.mcap",
+    page="export",
+)
 def export(options: argparse.Namespace) -> int:
-    """Write a run as MCAP, a wire's journal as CSV, or the picture or tables of a study; the file's ending decides."""
+    """Write a run as MCAP, a wire's journal as CSV, or any study's picture or tables."""
     from evedrop.scenario.words import listed
 
     kind = options.file.suffix.lower()
-    for option, is_given in (("--panel", options.panel is not None), ("--width", options.width != "page")):
+    for name, is_given in (("--panel", options.panel is not None), ("--width", options.width != "page")):
         if is_given and kind not in _PICTURES:
-            raise UsageError(f"{option} is for pictures, whose files end in {', '.join(_PICTURES)}; leave it out")
+            raise UsageError(f"{name} is for pictures, whose files end in {', '.join(_PICTURES)}; leave it out")
     if kind not in {_MCAP, *_PICTURES, *_TABLES}:
         raise UsageError(f"{options.file}: expected a file that ends in {listed([_MCAP, *_PICTURES, *_TABLES])}")
     if options.period is not None and kind != _MCAP:
@@ -108,24 +131,12 @@ def _export_wire(options: argparse.Namespace, kind: str) -> int:
     return 0
 
 
-def _written(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, metavar="FILE", help=".mcap, .pdf, .png, .svg, .csv or .tex")
-    parser.add_argument(
-        "--width", choices=("page", "column"), default="page", help="of the picture of a run; column: that of a journal"
-    )
-    parser.add_argument(
-        "--panel", choices=("errors", "lanes", "plane"), help="draw only one part of the picture of a run"
-    )
-    parser.add_argument(
-        "--period",
-        type=number_type(math.ulp(0.0), _LONGEST, f"a number of seconds above 0 and up to {_LONGEST:.0f}"),
-        metavar="SECONDS",
-        help="seconds per slot; default those of the scenario, or 1",
-    )
+_TWO_RUNS = option("runs", nargs=2, type=Path, metavar="RUN")
 
 
+@command((_TWO_RUNS,), section="inspect", example="diff runs/one runs/other", page="results")
 def diff(options: argparse.Namespace) -> int:
-    """Compare two runs."""
+    """Show the first difference between two runs."""
     from evedrop.results.diff import difference
     from evedrop.results.reading import Results
 
@@ -137,36 +148,4 @@ def diff(options: argparse.Namespace) -> int:
     return 0 if differences.same else 1
 
 
-def _two_runs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("runs", nargs=2, type=Path, metavar="RUN")
-
-
-COMMANDS = (
-    Command(
-        "report",
-        report,
-        "write report.html: a run, sweep, comparison or wire on one page",
-        (argument("run", "FOLDER"),),
-        section="inspect",
-        example="report runs/vehicle",
-        page="export",
-    ),
-    Command(
-        "export",
-        export,
-        "write a run as MCAP, a wire's journal as CSV, or any study's picture or tables",
-        (argument("run", "FOLDER"), _written),
-        section="inspect",
-        example="export runs/vehicle vehicle.mcap",
-        page="export",
-    ),
-    Command(
-        "diff",
-        diff,
-        "show the first difference between two runs",
-        (_two_runs,),
-        section="inspect",
-        example="diff runs/one runs/other",
-        page="results",
-    ),
-)
+COMMANDS = (report, export, diff)

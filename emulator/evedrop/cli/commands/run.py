@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import Command, entries, hold, loaded, output, over_wire, print_so_far, scenario
+from evedrop.cli.options import command, entries, hold, loaded, option, output, over_wire, print_so_far, scenario
 from evedrop.cli.tables import tables
 from evedrop.errors import Interrupted, RunError, UsageError
 
@@ -22,14 +22,38 @@ if TYPE_CHECKING:
     from evedrop.show.view.viewer import Viewer
 
 
+def _live(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--view", choices=("auto", "native", "web", "off"), default="auto", help="default auto")
+    parser.add_argument(
+        "--listen", metavar="ENDPOINT", help="the router's endpoint, such as tls/127.0.0.1:PORT; by default no port"
+    )
+    parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's endpoint, if the scenario has two")
+    parser.add_argument(
+        "--metrics",
+        metavar="HOST:PORT",
+        help="serve metrics for Prometheus while the run goes on, such as 127.0.0.1:9464",
+    )
+    parser.add_argument(
+        "--paused", action="store_true", help="hold the run before slot 0, until `evedrop resume` or `evedrop step`"
+    )
+
+
+_LIVE = (entries, output, _live, tables)
+
+
+@command(_LIVE, section="run", example="demo", page="run")
 def demo(options: argparse.Namespace) -> int:
-    """Run the built-in scenario `vehicle` live."""
+    """Run the built-in scenario `vehicle` live, with the view."""
     options.scenario = "vehicle"
-    return run(options)
+    return run.run(options)
 
 
+_OVER_SSH = option("--hosts", type=Path, metavar="FILE", help="start processes on other hosts, over ssh, as FILE says")
+
+
+@command((scenario, over_wire, *_LIVE, _OVER_SSH), section="run", example="run vehicle --view web", page="run")
 def run(options: argparse.Namespace) -> int:
-    """Run a scenario live."""
+    """Run a scenario live: separate processes over a network, with a view and results."""
     from evedrop.live.launch.starter import process_starter
 
     with process_starter():  # the servers make their imports while the scenario is read
@@ -110,48 +134,4 @@ def _keep_open(viewer: Viewer) -> None:
         viewer.stop()
 
 
-def _live(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--view", choices=("auto", "native", "web", "off"), default="auto", help="default auto")
-    parser.add_argument(
-        "--listen", metavar="ENDPOINT", help="the router's endpoint, such as tls/127.0.0.1:PORT; by default no port"
-    )
-    parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's endpoint, if the scenario has two")
-    parser.add_argument(
-        "--metrics",
-        metavar="HOST:PORT",
-        help="serve metrics for Prometheus while the run goes on, such as 127.0.0.1:9464",
-    )
-    parser.add_argument(
-        "--paused", action="store_true", help="hold the run before slot 0, until `evedrop resume` or `evedrop step`"
-    )
-
-
-def _over_ssh(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--hosts", type=Path, metavar="FILE", help="start processes on other hosts, over ssh, as FILE says"
-    )
-
-
-_LIVE = (entries, output, _live, tables)
-
-
-COMMANDS = (
-    Command(
-        "demo",
-        demo,
-        "run the built-in scenario `vehicle` live, with the view",
-        _LIVE,
-        section="run",
-        example="demo",
-        page="run",
-    ),
-    Command(
-        "run",
-        run,
-        "run a scenario live: separate processes over a network, with a view and results",
-        (scenario, over_wire, *_LIVE, _over_ssh),
-        section="run",
-        example="run vehicle --view web",
-        page="run",
-    ),
-)
+COMMANDS = (demo, run)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 from typing import Any
 
-from evedrop.cli.options import Command, argument, changes, changes_of
+from evedrop.cli.options import changes, changes_of, command, option
 from evedrop.errors import UsageError
 from evedrop.system.output import YELLOW, tell
 
 
+@command(name="list", section="make", example="list", page="scenario")
 def list_scenarios(_: argparse.Namespace) -> int:
-    """Print the name and title of each built-in scenario, even if it needs an extra that is not installed."""
+    """List built-in scenarios."""
     import tomllib
 
     from evedrop.cli.parser import print_names
@@ -22,8 +24,17 @@ def list_scenarios(_: argparse.Namespace) -> int:
     return 0
 
 
+_ORIGIN = option("--from", dest="origin", metavar="NAME", help="copy this built-in scenario")
+
+
+@command(
+    (option("file", type=Path, metavar="FILE"), _ORIGIN),
+    section="make",
+    example="new my-scenario.toml --from vehicle",
+    page="scenario",
+)
 def new(options: argparse.Namespace) -> int:
-    """Write a scenario to start from."""
+    """Write a scenario to start from: commented, or a copy of a built-in one."""
     from evedrop.scenarios import write_new
 
     write_new(options.file, options.origin)
@@ -31,6 +42,10 @@ def new(options: argparse.Namespace) -> int:
     return 0
 
 
+_NAME = option("name", metavar="NAME", help="the name of a built-in scenario, as evedrop list prints it")
+
+
+@command((_NAME,), section="make", example="show vehicle", page="scenario")
 def show(options: argparse.Namespace) -> int:
     """Print the file of a built-in scenario."""
     from evedrop.scenarios import built_in_text
@@ -39,16 +54,25 @@ def show(options: argparse.Namespace) -> int:
     return 0
 
 
-def _origin(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--from", dest="origin", metavar="NAME", help="copy this built-in scenario")
+_SCENARIOS = option("scenarios", nargs="*", metavar="SCENARIO")
 
 
-def _name(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", metavar="NAME", help="the name of a built-in scenario, as evedrop list prints it")
+def _classes(parser: argparse.ArgumentParser) -> None:
+    for kind, subject in (
+        ("scheme", "a scheme, or the scheme to check an eavesdropper with"),
+        ("eavesdropper", "an eavesdropper"),
+        ("link", "a loss model"),
+        ("delay", "a delay model"),
+    ):
+        text = (
+            f"check {subject}: MODULE:CLASS of a module in this folder or an installed one; --set gives its parameters"
+        )
+        parser.add_argument(f"--{kind}", metavar="NAME", help=text)
 
 
+@command((_SCENARIOS, changes, _classes), section="make", example="check my-scenario.toml", page="scenario")
 def check(options: argparse.Namespace) -> int:
-    """Validate scenarios, or check classes against the rules."""
+    """Check scenarios or classes of your own, and start nothing."""
     from evedrop.scenario.estimates import warnings_of
     from evedrop.scenario.loading import load
 
@@ -88,50 +112,4 @@ def _check_classes(names: dict[str, str], parameters: dict[str, Any]) -> int:
     return status
 
 
-def _scenarios(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO")
-
-
-def _classes(parser: argparse.ArgumentParser) -> None:
-    for kind, subject in (
-        ("scheme", "a scheme, or the scheme to check an eavesdropper with"),
-        ("eavesdropper", "an eavesdropper"),
-        ("link", "a loss model"),
-        ("delay", "a delay model"),
-    ):
-        text = (
-            f"check {subject}: MODULE:CLASS of a module in this folder or an installed one; --set gives its parameters"
-        )
-        parser.add_argument(f"--{kind}", metavar="NAME", help=text)
-
-
-COMMANDS = (
-    Command("list", list_scenarios, "list built-in scenarios", section="make", example="list", page="scenario"),
-    Command(
-        "show",
-        show,
-        "print the file of a built-in scenario",
-        (_name,),
-        section="make",
-        example="show vehicle",
-        page="scenario",
-    ),
-    Command(
-        "new",
-        new,
-        "write a scenario to start from: commented, or a copy of a built-in one",
-        (argument("file", "FILE"), _origin),
-        section="make",
-        example="new my-scenario.toml --from vehicle",
-        page="scenario",
-    ),
-    Command(
-        "check",
-        check,
-        "check scenarios or classes of your own, and start nothing",
-        (_scenarios, changes, _classes),
-        section="make",
-        example="check my-scenario.toml",
-        page="scenario",
-    ),
-)
+COMMANDS = (list_scenarios, show, new, check)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from evedrop.cli.options import Command
+from evedrop.cli.options import command
 from evedrop.errors import RunError
 
 
+@command(section="inspect", example="selftest", page="install")
 def selftest(_: argparse.Namespace) -> int:
-    """Check that this machine computes the golden digests."""
+    """Check this machine against reference digests."""
     from evedrop.cli.selftest import GOLDEN, selftest
 
     check = selftest()
@@ -23,13 +24,4 @@ def selftest(_: argparse.Namespace) -> int:
     return 0
 
 
-COMMANDS = (
-    Command(
-        "selftest",
-        selftest,
-        "check this machine against reference digests",
-        section="inspect",
-        example="selftest",
-        page="install",
-    ),
-)
+COMMANDS = (selftest,)

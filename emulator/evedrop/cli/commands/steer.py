@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.options import Command, as_json
+from evedrop.cli.options import as_json, command, option
 from evedrop.errors import BriefError, UsageError
 from evedrop.system.output import print_json
 from evedrop.system.world import world
@@ -26,46 +26,73 @@ _AGAIN_SECONDS = 0.2
 _STEP_PATIENCE = 30 * 86_400.0  # a step takes as long as its slots do
 
 
+_GOING_ON = option("run", type=Path, metavar="RUN", help="the results folder of a run or wire in progress")
+
+
+def _changed_link(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", help="the receiver whose link it is; of a wire, the link")
+    parser.add_argument(
+        "changes",
+        nargs="+",
+        metavar="KEY=VALUE",
+        help="an entry of the link, such as quality=0.2, with a dotted key for an entry of a table; or the word cut or heal",
+    )
+
+
+@command((_GOING_ON, _changed_link), section="steer", example="link runs/vehicle smart quality=0.2", page="control")
 def link(options: argparse.Namespace) -> int:
-    """Change, cut or heal a link."""
+    """Change, cut or heal a link of a running simulation or wire."""
     from evedrop.live.protocol.requests import LinkRequest
 
     event = _event(options.name, options.changes)
     return _ask(options.run, LinkRequest(event), f"link {options.name}")
 
 
+def _two_sides(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("one", metavar="A", help="a side of the wire")
+    parser.add_argument("other", metavar="B", help="another side of the wire")
+
+
+@command((_GOING_ON, _two_sides), section="steer", example="partition runs/wire robot base", page="wire/file")
 def partition(options: argparse.Namespace) -> int:
-    """Let nothing pass between two sides of a wire."""
+    """Let nothing pass between two sides of a running wire."""
     from evedrop.live.protocol.requests import LinkRequest
 
     event = {"partition": [options.one, options.other]}
     return _ask(options.run, LinkRequest(event), f"partition {options.one} {options.other}")
 
 
+@command((_GOING_ON, _two_sides), section="steer", example="heal runs/wire robot base", page="wire/file")
 def heal(options: argparse.Namespace) -> int:
-    """End the partition of two sides of a wire."""
+    """End the partition of two sides of a running wire."""
     from evedrop.live.protocol.requests import LinkRequest
 
     event = {"join": [options.one, options.other]}
     return _ask(options.run, LinkRequest(event), f"heal {options.one} {options.other}")
 
 
+@command((_GOING_ON,), section="steer", example="pause runs/vehicle", page="control")
 def pause(options: argparse.Namespace) -> int:
-    """Hold the run before its next slot."""
+    """Pause a running simulation."""
     from evedrop.live.protocol.requests import PauseRequest
 
     return _ask(options.run, PauseRequest(), "pause")
 
 
+@command((_GOING_ON,), section="steer", example="resume runs/vehicle", page="control")
 def resume(options: argparse.Namespace) -> int:
-    """Let a held run continue."""
+    """Resume a paused run."""
     from evedrop.live.protocol.requests import ResumeRequest
 
     return _ask(options.run, ResumeRequest(), "resume")
 
 
+_SLOTS = option("slots", type=int, metavar="N", help="number of slots")
+
+
+@command((_GOING_ON, _SLOTS), section="steer", example="step runs/vehicle 10", page="control")
 def step(options: argparse.Namespace) -> int:
-    """Let the run continue for some slots, and hold it again."""
+    """Advance a paused run by N slots."""
     from evedrop.live.protocol.requests import StepRequest
     from evedrop.model.streams import MOST_SLOTS
 
@@ -74,8 +101,9 @@ def step(options: argparse.Namespace) -> int:
     return _ask(options.run, StepRequest(options.slots), f"step {options.slots}", _STEP_PATIENCE)
 
 
+@command((_GOING_ON, as_json), section="steer", example="status runs/vehicle", page="control")
 def status(options: argparse.Namespace) -> int:
-    """Print the run's status."""
+    """Show the status of a running simulation or wire."""
     from msgspec import to_builtins
 
     from evedrop.live.network.control_file import read_controls
@@ -174,91 +202,4 @@ def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
     inner[last] = value
 
 
-def _going_on(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", type=Path, metavar="RUN", help="the results folder of a run or wire in progress")
-
-
-def _changed_link(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", metavar="NAME", help="the receiver whose link it is; of a wire, the link")
-    parser.add_argument(
-        "changes",
-        nargs="+",
-        metavar="KEY=VALUE",
-        help="an entry of the link, such as quality=0.2, with a dotted key for an entry of a table; or the word cut or heal",
-    )
-
-
-def _two_sides(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("one", metavar="A", help="a side of the wire")
-    parser.add_argument("other", metavar="B", help="another side of the wire")
-
-
-def _slots(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("slots", type=int, metavar="N", help="number of slots")
-
-
-COMMANDS = (
-    Command(
-        "link",
-        link,
-        "change, cut or heal a link of a running simulation or wire",
-        (_going_on, _changed_link),
-        section="steer",
-        example="link runs/vehicle smart quality=0.2",
-        page="control",
-    ),
-    Command(
-        "partition",
-        partition,
-        "let nothing pass between two sides of a running wire",
-        (_going_on, _two_sides),
-        section="steer",
-        example="partition runs/wire robot base",
-        page="wire/file",
-    ),
-    Command(
-        "heal",
-        heal,
-        "end the partition of two sides of a running wire",
-        (_going_on, _two_sides),
-        section="steer",
-        example="heal runs/wire robot base",
-        page="wire/file",
-    ),
-    Command(
-        "pause",
-        pause,
-        "pause a running simulation",
-        (_going_on,),
-        section="steer",
-        example="pause runs/vehicle",
-        page="control",
-    ),
-    Command(
-        "resume",
-        resume,
-        "resume a paused run",
-        (_going_on,),
-        section="steer",
-        example="resume runs/vehicle",
-        page="control",
-    ),
-    Command(
-        "step",
-        step,
-        "advance a paused run by N slots",
-        (_going_on, _slots),
-        section="steer",
-        example="step runs/vehicle 10",
-        page="control",
-    ),
-    Command(
-        "status",
-        status,
-        "show the status of a running simulation or wire",
-        (_going_on, as_json),
-        section="steer",
-        example="status runs/vehicle",
-        page="control",
-    ),
-)
+COMMANDS = (link, partition, heal, pause, resume, step, status)

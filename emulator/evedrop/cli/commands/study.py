@@ -8,7 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.cli.in_memory import MEMORY, check_resuming, crew, default_trials, keeping, plan_of, resuming, studied
-from evedrop.cli.options import Command, as_json, changes_of, entries, loaded, output, over_wire, print_so_far, scenario
+from evedrop.cli.options import (
+    as_json,
+    changes_of,
+    command,
+    entries,
+    loaded,
+    option,
+    output,
+    over_wire,
+    print_so_far,
+    scenario,
+)
 from evedrop.cli.tables import tables
 from evedrop.errors import Interrupted, UsageError
 from evedrop.model.metrics.text import ShownNumber, number_text
@@ -19,8 +30,21 @@ if TYPE_CHECKING:
     from evedrop.studies.secrecy_cost import MeanEstimate, SecrecyCost
 
 
+_RARE = option(
+    "--rare",
+    action="store_true",
+    help="also estimate the mean errors that rare events carry: split trials with large errors (docs/montecarlo.md)",
+)
+
+
+@command(
+    (scenario, over_wire, *MEMORY, _RARE, tables),
+    section="run",
+    example="montecarlo vehicle --trials 200",
+    page="montecarlo",
+)
 def montecarlo(options: argparse.Namespace) -> int:
-    """Run the trials of a scenario in memory."""
+    """Simulate the trials of a scenario in memory (1000 unless told otherwise)."""
     from evedrop.cli.console import ProgressLine
     from evedrop.results.folder import results_folder
     from evedrop.simulate.montecarlo import simulate
@@ -40,16 +64,23 @@ def montecarlo(options: argparse.Namespace) -> int:
     return status
 
 
-def _rare(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--rare",
-        action="store_true",
-        help="also estimate the mean errors that rare events carry: split trials with large errors (docs/montecarlo.md)",
-    )
+_OVER = option(
+    "--over",
+    action="append",
+    required=True,
+    metavar="KEY=VALUES",
+    help="an entry and its values, first:last:step or a,b,c; repeatable",
+)
 
 
+@command(
+    (scenario, _OVER, *MEMORY, tables),
+    section="study",
+    example="sweep numerical --over encoding.state_probability=0.6,0.7,0.8",
+    page="montecarlo",
+)
 def sweep(options: argparse.Namespace) -> int:
-    """Run Monte Carlo over a grid."""
+    """Simulate a scenario in memory over a grid of values."""
     from evedrop.cli.console import ProgressLine
     from evedrop.cli.report import print_sweep, report_page
     from evedrop.results.folder import results_folder
@@ -75,18 +106,27 @@ def sweep(options: argparse.Namespace) -> int:
     return 0
 
 
-def _over(parser: argparse.ArgumentParser) -> None:
+def _compares(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--schemes", metavar="A,B", help="default all that the process allows")
+    parser.add_argument("--adversaries", metavar="X,Y", help="default all but learners, which take long")
     parser.add_argument(
-        "--over",
+        "--with",
+        dest="parameters",
         action="append",
-        required=True,
-        metavar="KEY=VALUES",
-        help="an entry and its values, first:last:step or a,b,c; repeatable",
+        default=[],
+        metavar="SCHEME.PARAMETER=VALUE",
+        help="a parameter of a scheme other than the scenario's own; repeatable",
     )
 
 
+@command(
+    (scenario, entries, output, _compares, crew, resuming, tables),
+    section="study",
+    example="compare vehicle --trials 100",
+    page="compare",
+)
 def compare(options: argparse.Namespace) -> int:
-    """Compare schemes against adversaries."""
+    """Compare schemes, each against all adversaries, in memory."""
     from evedrop.cli.console import ProgressLine
     from evedrop.cli.report import print_comparison, report_page
     from evedrop.results.folder import results_folder
@@ -124,21 +164,11 @@ def _names(listed: str | None) -> list[str] | None:
     return None if listed is None else [name.strip() for name in listed.split(",")]
 
 
-def _compares(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--schemes", metavar="A,B", help="default all that the process allows")
-    parser.add_argument("--adversaries", metavar="X,Y", help="default all but learners, which take long")
-    parser.add_argument(
-        "--with",
-        dest="parameters",
-        action="append",
-        default=[],
-        metavar="SCHEME.PARAMETER=VALUE",
-        help="a parameter of a scheme other than the scenario's own; repeatable",
-    )
-
-
+@command(
+    (scenario, entries, as_json, keeping, crew, tables), section="study", example="cost microgrid", page="microgrid"
+)
 def cost(options: argparse.Namespace) -> int:
-    """Compare a scenario's scheme with `plain`, trial by trial."""
+    """Compute the energy that secrecy costs a house."""
     from evedrop.results.summary_file import plain
     from evedrop.studies.secrecy_cost import secrecy_cost
 
@@ -180,8 +210,14 @@ def _cells(estimate: MeanEstimate, scale: float, unit: str) -> tuple[str, str, s
 _ROUNDING = 1e-12  # a standard error that is smaller, over the mean, is rounding
 
 
+@command(
+    (scenario, entries, as_json, keeping, crew, tables),
+    section="study",
+    example="learned learning --trials 20",
+    page="learning",
+)
 def learned(options: argparse.Namespace) -> int:
-    """Print what has been learned after 8, 16, 32, … slots."""
+    """Show what eavesdroppers that learn the process know, slot by slot."""
     from evedrop.results.summary_file import plain
     from evedrop.studies.learning_curve import learning_curve
 
@@ -233,50 +269,4 @@ def _with_error(value: float, error: float | None) -> ShownNumber:
     return ShownNumber(f"{value:.3g} ± {error if error > _ROUNDING * abs(value) else 0.0:.1g}", value, error)
 
 
-COMMANDS = (
-    Command(
-        "montecarlo",
-        montecarlo,
-        "simulate the trials of a scenario in memory (1000 unless told otherwise)",
-        (scenario, over_wire, *MEMORY, _rare, tables),
-        section="run",
-        example="montecarlo vehicle --trials 200",
-        page="montecarlo",
-    ),
-    Command(
-        "sweep",
-        sweep,
-        "simulate a scenario in memory over a grid of values",
-        (scenario, _over, *MEMORY, tables),
-        section="study",
-        example="sweep numerical --over encoding.state_probability=0.6,0.7,0.8",
-        page="montecarlo",
-    ),
-    Command(
-        "compare",
-        compare,
-        "compare schemes, each against all adversaries, in memory",
-        (scenario, entries, output, _compares, crew, resuming, tables),
-        section="study",
-        example="compare vehicle --trials 100",
-        page="compare",
-    ),
-    Command(
-        "cost",
-        cost,
-        "compute the energy that secrecy costs a house",
-        (scenario, entries, as_json, keeping, crew, tables),
-        section="study",
-        example="cost microgrid",
-        page="microgrid",
-    ),
-    Command(
-        "learned",
-        learned,
-        "show what eavesdroppers that learn the process know, slot by slot",
-        (scenario, entries, as_json, keeping, crew, tables),
-        section="study",
-        example="learned learning --trials 20",
-        page="learning",
-    ),
-)
+COMMANDS = (montecarlo, sweep, compare, cost, learned)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.cli.in_memory import check_resuming, resuming, scheduler
-from evedrop.cli.options import Command
+from evedrop.cli.options import command, option
 from evedrop.errors import UsageError
 from evedrop.system.output import tell, warn
 
@@ -20,8 +20,36 @@ if TYPE_CHECKING:
 _PROGRAM = "evedrop.cli.simulated:program"
 
 
+_PLACES = option(
+    "places",
+    nargs="+",
+    metavar="PATH",
+    help="a scenario, a folder that contains scenarios, or the name of a built-in one",
+)
+
+
+def _tests(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--in-memory", action="store_true", help="in memory instead of live")
+    parser.add_argument(
+        "--simulated", action="store_true", help="in the simulated world, disturbed by faults that seeds decide"
+    )
+    parser.add_argument(
+        "--seeds", type=int, metavar="N", help="with --simulated: how many seeds of each scenario; default 100"
+    )
+    parser.add_argument("--seed", type=int, metavar="FIRST", help="with --simulated: the first seed; default 1")
+    parser.add_argument("--trials", type=int, metavar="N", help="number of trials; default the scenario's")
+    parser.add_argument("--junit", type=Path, metavar="FILE", help="write a report in JUnit XML")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the results, with a folder for each scenario; default runs/"
+    )
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="how many to run at the same time; default 1")
+
+
+@command(
+    (_PLACES, _tests, resuming, scheduler), section="run", example="test scenarios/ --junit report.xml", page="testing"
+)
 def test(options: argparse.Namespace) -> int:
-    """Run scenarios as tests; returns the worst of their exit statuses."""
+    """Run scenarios as tests, with a report for CI."""
     from evedrop.studies.junit import check_junit, write_junit
     from evedrop.studies.scenario_tests import Finding, Manner, results, scenarios_of
     from evedrop.studies.tests_page import write_tests_page
@@ -89,40 +117,4 @@ def _simulation(options: argparse.Namespace) -> SeedsToPlay | None:
     return SeedsToPlay(first, seeds, _PROGRAM)
 
 
-def _places(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "places",
-        nargs="+",
-        metavar="PATH",
-        help="a scenario, a folder that contains scenarios, or the name of a built-in one",
-    )
-
-
-def _tests(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--in-memory", action="store_true", help="in memory instead of live")
-    parser.add_argument(
-        "--simulated", action="store_true", help="in the simulated world, disturbed by faults that seeds decide"
-    )
-    parser.add_argument(
-        "--seeds", type=int, metavar="N", help="with --simulated: how many seeds of each scenario; default 100"
-    )
-    parser.add_argument("--seed", type=int, metavar="FIRST", help="with --simulated: the first seed; default 1")
-    parser.add_argument("--trials", type=int, metavar="N", help="number of trials; default the scenario's")
-    parser.add_argument("--junit", type=Path, metavar="FILE", help="write a report in JUnit XML")
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the results, with a folder for each scenario; default runs/"
-    )
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="how many to run at the same time; default 1")
-
-
-COMMANDS = (
-    Command(
-        "test",
-        test,
-        "run scenarios as tests, with a report for CI",
-        (_places, _tests, resuming, scheduler),
-        section="run",
-        example="test scenarios/ --junit report.xml",
-        page="testing",
-    ),
-)
+COMMANDS = (test,)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import Command, argument, hold, number_type, served, verbose
+from evedrop.cli.options import command, hold, number_type, option, served, verbose
 from evedrop.cli.tables import tables
 from evedrop.errors import UsageError
 from evedrop.system.output import tell
@@ -27,8 +27,49 @@ _MOST_TIMES = 1_000_000  # frames of a video of a wire: eighteen hours at 15 a s
 _LEAST, _MOST = 200, 3840  # pixels; the viewer takes more than its time limit for larger pictures
 
 
+def _shown(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument(
+        "--picture", type=Path, metavar="FILE.png", help="draw the run into a file instead; needs no screen"
+    )
+    instead.add_argument(
+        "--video", type=Path, metavar="FILE.mp4|gif", help="draw some slots as a video instead; needs no screen"
+    )
+    verbose(parser)
+    instead.add_argument("--table", action="store_true", help="print its table and sentences instead")
+    moment = parser.add_mutually_exclusive_group()
+    moment.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default the most telling one")
+    moment.add_argument("--time", type=float, metavar="SECONDS", help="for a wire: the time to draw; default the end")
+    moment.add_argument(
+        "--slots",
+        type=_moments,
+        metavar="A:B[:STEP]",
+        help="the slots of a video; default ten seconds around the most telling one",
+    )
+    moment.add_argument(
+        "--times", type=_moments, metavar="A:B[:STEP]", help="for a wire: the times of a video, in seconds; default all"
+    )
+    parser.add_argument(
+        "--panel",
+        metavar="NAME",
+        help="the tab or panel to draw, such as numbers or packets; default the first tab",
+    )
+    rate = number_type(1, _MOST_RATE, f"a number of frames per second from 1 to {_MOST_RATE}")
+    parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of a video; default 15")
+    parser.add_argument(
+        "--size", type=_size, metavar="WxH", help="in pixels; default 1600x950 for a picture, 880x660 for a video"
+    )
+
+
+@command(
+    (option("run", type=Path, metavar="RUN"), _shown, served, tables),
+    section="inspect",
+    example="view runs/vehicle --picture vehicle.png",
+    page="view",
+)
 def view(options: argparse.Namespace) -> int:
-    """Open a finished run or wire, draw it, or print its closing report again."""
+    """Open a finished run or wire, draw it, or print its report again."""
     from evedrop.results.wire_summary import is_wire
 
     if is_wire(options.run):
@@ -244,49 +285,4 @@ def _moments(text: str) -> tuple[float, float, float | None]:
     return first, last, step[0] if step else None
 
 
-def _shown(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
-    instead = parser.add_mutually_exclusive_group()
-    instead.add_argument(
-        "--picture", type=Path, metavar="FILE.png", help="draw the run into a file instead; needs no screen"
-    )
-    instead.add_argument(
-        "--video", type=Path, metavar="FILE.mp4|gif", help="draw some slots as a video instead; needs no screen"
-    )
-    verbose(parser)
-    instead.add_argument("--table", action="store_true", help="print its table and sentences instead")
-    moment = parser.add_mutually_exclusive_group()
-    moment.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default the most telling one")
-    moment.add_argument("--time", type=float, metavar="SECONDS", help="for a wire: the time to draw; default the end")
-    moment.add_argument(
-        "--slots",
-        type=_moments,
-        metavar="A:B[:STEP]",
-        help="the slots of a video; default ten seconds around the most telling one",
-    )
-    moment.add_argument(
-        "--times", type=_moments, metavar="A:B[:STEP]", help="for a wire: the times of a video, in seconds; default all"
-    )
-    parser.add_argument(
-        "--panel",
-        metavar="NAME",
-        help="the tab or panel to draw, such as numbers or packets; default the first tab",
-    )
-    rate = number_type(1, _MOST_RATE, f"a number of frames per second from 1 to {_MOST_RATE}")
-    parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of a video; default 15")
-    parser.add_argument(
-        "--size", type=_size, metavar="WxH", help="in pixels; default 1600x950 for a picture, 880x660 for a video"
-    )
-
-
-COMMANDS = (
-    Command(
-        "view",
-        view,
-        "open a finished run or wire, draw it, or print its report again",
-        (argument("run", "RUN"), _shown, served, tables),
-        section="inspect",
-        example="view runs/vehicle --picture vehicle.png",
-        page="view",
-    ),
-)
+COMMANDS = (view,)

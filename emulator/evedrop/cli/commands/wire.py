@@ -6,14 +6,42 @@ import argparse
 import sys
 from pathlib import Path
 
-from evedrop.cli.options import Command, changes_of
+from evedrop.cli.options import changes_of, command
 from evedrop.errors import UsageError
 from evedrop.system.output import say as complain
 from evedrop.system.output import tell, warn
 
 
+def _file(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", nargs="?", type=Path, metavar="FILE", help="a wire file")
+    parser.add_argument("keys", nargs="*", metavar="KEY", help="with --check: a key, or key expression, of messages")
+    parser.add_argument(
+        "--check", action="store_true", help="say what the file means, and which link each KEY takes; start nothing"
+    )
+    parser.add_argument("--example", action="store_true", help="print an example of a wire file")
+    help_text = "change an entry of the file by its dotted key, such as link.1.quality=0.5; repeatable"
+    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=help_text)
+
+
+def _course(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="results folder; that of an earlier wire, to go on with its fates"
+    )
+    parser.add_argument(
+        "--view",
+        default="off",
+        metavar="VIEW",
+        help="auto, native or web: show the wire; FILE.rrd: write the view to a file; default off",
+    )
+    parser.add_argument("--quiet", action="store_true", help="print only warnings and errors")
+    parser.add_argument(
+        "--for", dest="seconds", metavar="TIME", help='end after this time, such as "60 s"; default: at Ctrl-C'
+    )
+
+
+@command((_file, _course), section="run", example="wire robot.toml --out runs/wire", page="wire/tutorial")
 def wire(options: argparse.Namespace) -> int:
-    """Run the wire that a file describes; or say what the file means, or print an example."""
+    """Run links with faults between programs that use Zenoh or ROS 2."""
     from evedrop.wire.file import example_wire, load_wire
 
     if options.example:
@@ -76,44 +104,4 @@ def _seconds(text: str) -> float:
     return seconds
 
 
-def _file(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", nargs="?", type=Path, metavar="FILE", help="a wire file")
-    parser.add_argument("keys", nargs="*", metavar="KEY", help="with --check: a key, or key expression, of messages")
-    parser.add_argument(
-        "--check", action="store_true", help="say what the file means, and which link each KEY takes; start nothing"
-    )
-    parser.add_argument("--example", action="store_true", help="print an example of a wire file")
-
-
-def _changes(parser: argparse.ArgumentParser) -> None:
-    help_text = "change an entry of the file by its dotted key, such as link.1.quality=0.5; repeatable"
-    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=help_text)
-
-
-def _course(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="results folder; that of an earlier wire, to go on with its fates"
-    )
-    parser.add_argument(
-        "--view",
-        default="off",
-        metavar="VIEW",
-        help="auto, native or web: show the wire; FILE.rrd: write the view to a file; default off",
-    )
-    parser.add_argument("--quiet", action="store_true", help="print only warnings and errors")
-    parser.add_argument(
-        "--for", dest="seconds", metavar="TIME", help='end after this time, such as "60 s"; default: at Ctrl-C'
-    )
-
-
-COMMANDS = (
-    Command(
-        "wire",
-        wire,
-        "run links with faults between programs that use Zenoh or ROS 2",
-        (_file, _changes, _course),
-        section="run",
-        example="wire robot.toml --out runs/wire",
-        page="wire/tutorial",
-    ),
-)
+COMMANDS = (wire,)
