@@ -9,11 +9,10 @@ from __future__ import annotations
 import mmap
 import os
 import shutil
-from abc import ABC, abstractmethod
 from contextlib import suppress
 from io import BufferedWriter, FileIO, TextIOWrapper
 from pathlib import Path
-from typing import IO, Any, final
+from typing import IO, Any, Protocol, final
 
 _FILE_MODE = 0o600
 _POPULATE = getattr(mmap, "MAP_POPULATE", 0)
@@ -34,49 +33,39 @@ def write_all(file: FileIO, data: Any) -> None:
         left = left[file.write(left) :]
 
 
-class Disk(ABC):
+class Disk(Protocol):
     """What a program changes on a disk. All methods raise OSError if it refuses."""
 
-    @abstractmethod
     def open(self, path: Path, mode: str) -> FileIO:
         """Open a file without a buffer, which only this user can read; mode: as for `FileIO`."""
 
-    @abstractmethod
     def hold(self, folder: Path) -> int:
         """Open a folder; its descriptor, on which a lock lasts until `let_go` or the end of the process."""
 
-    @abstractmethod
     def let_go(self, descriptor: int) -> None:
         """Close a folder."""
 
-    @abstractmethod
     def again(self, file: IO[bytes]) -> IO[bytes]:
         """The same open file, without a buffer, to be closed on its own."""
 
-    @abstractmethod
     def sync(self, path: Path) -> None:
         """Return once a power cut would leave what was written to a file."""
 
-    @abstractmethod
     def map(self, file: FileIO, start: int, length: int, *, populate: bool = False) -> mmap.mmap:
         """The last bytes of an open file as memory, with zeros for those that the file does not have yet.
 
         start: where a mapping may begin; populate: whether to have all of them in memory at once.
         """
 
-    @abstractmethod
     def replace(self, old: Path, new: Path) -> None:
         """Give a file or folder another name; at any moment, a file that had this name is the old or the new one."""
 
-    @abstractmethod
     def remove(self, path: Path, missing_ok: bool = False) -> None:
         """Remove a file."""
 
-    @abstractmethod
     def make_folder(self, path: Path, mode: int, exist_ok: bool = False) -> None:
         """Make a folder whose parent exists."""
 
-    @abstractmethod
     def remove_tree(self, folder: Path, ignore_errors: bool = False) -> None:
         """Remove a folder and all that is in it."""
 

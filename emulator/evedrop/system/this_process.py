@@ -12,11 +12,10 @@ import select
 import signal
 import sys
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import NoReturn, TextIO, cast, final
+from typing import NoReturn, Protocol, TextIO, cast, final
 
 from evedrop.system.allocator import keep_for_messages
 from evedrop.system.guard import dismiss, guard_of
@@ -38,108 +37,94 @@ _SWITCH_SECONDS = 5e-4
 """How long a thread may keep the interpreter while another one waits for it."""
 
 
-class ThisProcess(ABC):
+class ThisProcess(Protocol):
     """What a program can do to its own process, and ask about it."""
 
     @property
-    @abstractmethod
     def pid(self) -> int:
         """Its id."""
 
-    @abstractmethod
     def exit(self, status: int) -> NoReturn:
         """End it at once: no handler runs, and nothing is flushed."""
 
-    @abstractmethod
     def interrupt(self) -> None:
         """Send it SIGTERM."""
 
-    @abstractmethod
     def on_signals(self, handle: Callable[[], object]) -> None:
         """Call this at Ctrl-C, SIGTERM and SIGHUP, unless they are ignored from the start."""
 
-    @abstractmethod
     def leave_on_signals(self) -> None:
         """Let these signals end it at once, with status 130."""
 
-    @abstractmethod
     def stop_on_signals(self) -> AbstractContextManager[ThreadEvent]:
         """An event that these signals set while the block runs."""
 
-    @abstractmethod
     def stop_or_leave_on_signals(self, leave: Callable[[], object]) -> AbstractContextManager[ThreadEvent]:
         """An event that the first of these signals sets while the block runs; a second one calls `leave`, which exits."""
 
-    @abstractmethod
     def raise_on_signals(self) -> AbstractContextManager[None]:
         """Let the first of these signals raise KeyboardInterrupt on the thread of the block, while it runs."""
 
-    @abstractmethod
     def on_thread_failure(self, handle: Callable[[BaseException], object]) -> None:
         """Call this, on the thread, when an error ends a thread other than the first."""
 
-    @abstractmethod
     def told_when_suspended(self, tell: Callable[[], object]) -> AbstractContextManager[None]:
         """Call `tell` before Ctrl-Z suspends it while the block runs."""
 
-    @abstractmethod
     def removed_with_it(self, folder: Path) -> AbstractContextManager[None]:
         """Have a folder, which is made in the block, removed after it, or should this process die, however it dies.
 
         Raises OSError.
         """
 
-    @abstractmethod
     def switch_threads_soon(self) -> None:
         """Let a thread that computes for long give way to others much sooner than by Python's default."""
 
-    @abstractmethod
     def prepare_for_messages(self, largest: int) -> None:
         """Keep memory for messages of up to `largest` bytes, and modules."""
 
-    @abstractmethod
     def keep_modules(self) -> None:
         """Let no collection of garbage look at imported modules."""
 
-    @abstractmethod
     def keep_files_private(self) -> None:
         """Let only this user read the files that it makes from now on."""
 
-    @abstractmethod
     def show_stacks(self) -> None:
         """Write the stack of every thread to standard error upon `SHOW_STACKS`, even while native code holds Python's lock."""
 
-    @abstractmethod
     def continue_when_parent_dies(self) -> None:
         """Let the system continue it if it is suspended when its parent dies: it would not notice."""
 
-    @abstractmethod
     def native_log_apart(self) -> AbstractContextManager[None]:
         """While the block runs, pass what native code prints on to standard error, escaped and up to a limit."""
 
-    @abstractmethod
     def read_input(self, most: int) -> bytes:
         """Wait for what comes on standard input; empty at its end."""
 
-    @abstractmethod
     def input_closed(self) -> bool:
         """Whether nothing more can come there: the other end of the pipe is closed."""
 
-    @abstractmethod
     def keep_events_apart(self, launched: bool) -> None:
         """Redirect standard output to standard error: Zenoh logs to it, and would mix its lines into the events.
 
         launched: whether a launcher reads the events, from the former standard output; `print` then writes to the log.
         """
 
-    @abstractmethod
     def send_event(self, line: bytes) -> None:
         """Send a line to the launcher, or to standard output without one. Raises OSError or ValueError if nobody reads it."""
 
 
 @final
 class RealProcess(ThisProcess):
-    """The process of this interpreter."""
+    """The process of this interpreter. Blocks that handle signals have no effect outside the main thread."""
+
+    leave_on_signals = staticmethod(leave_on_signals)
+    stop_on_signals = staticmethod(stop_on_signals)
+    stop_or_leave_on_signals = staticmethod(stop_or_leave_on_signals)
+    raise_on_signals = staticmethod(raise_on_signals)
+    told_when_suspended = staticmethod(told_when_suspended)
+    continue_when_parent_dies = staticmethod(continue_when_parent_dies)
+    native_log_apart = staticmethod(native_log_apart)
 
     def __init__(self) -> None:
         self._line = threading.Lock()  # one line at a time
@@ -164,22 +149,6 @@ class RealProcess(ThisProcess):
         for number in heeded():
             signal.signal(number, lambda *_: handle())
 
-    def leave_on_signals(self) -> None:
-        """Let these signals end it at once."""
-        leave_on_signals()
-
-    def stop_on_signals(self) -> AbstractContextManager[ThreadEvent]:
-        """An event that these signals set; has no effect outside the main thread."""
-        return stop_on_signals()
-
-    def stop_or_leave_on_signals(self, leave: Callable[[], object]) -> AbstractContextManager[ThreadEvent]:
-        """An event that the first signal sets; has no effect outside the main thread."""
-        return stop_or_leave_on_signals(leave)
-
-    def raise_on_signals(self) -> AbstractContextManager[None]:
-        """Let the first of these signals raise KeyboardInterrupt; has no effect outside the main thread."""
-        return raise_on_signals()
-
     def on_thread_failure(self, handle: Callable[[BaseException], object]) -> None:
         """Call this when an error ends a thread."""
 
@@ -188,10 +157,6 @@ class RealProcess(ThisProcess):
                 handle(failure.exc_value)
 
         threading.excepthook = hook
-
-    def told_when_suspended(self, tell: Callable[[], object]) -> AbstractContextManager[None]:
-        """Call `tell` before Ctrl-Z suspends it; has no effect outside the main thread."""
-        return told_when_suspended(tell)
 
     @contextmanager
     def removed_with_it(self, folder: Path) -> Iterator[None]:
@@ -222,14 +187,6 @@ class RealProcess(ThisProcess):
     def show_stacks(self) -> None:
         """Write the stack of every thread to standard error upon `SHOW_STACKS`."""
         faulthandler.register(SHOW_STACKS, all_threads=True)
-
-    def continue_when_parent_dies(self) -> None:
-        """Let the system continue it (Linux only)."""
-        continue_when_parent_dies()
-
-    def native_log_apart(self) -> AbstractContextManager[None]:
-        """Let file descriptor 1 lead to a file in memory while the block runs."""
-        return native_log_apart()
 
     def read_input(self, most: int) -> bytes:
         """Wait for what comes on standard input."""

@@ -14,12 +14,11 @@ import socket
 import tempfile
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from queue import SimpleQueue
-from typing import IO, TYPE_CHECKING, Any, TypeVar, final
+from typing import IO, TYPE_CHECKING, Any, Protocol, TypeVar, final
 
 from evedrop.system.disk import REAL_DISK, Disk
 from evedrop.system.this_process import REAL_PROCESS, ThisProcess
@@ -36,101 +35,79 @@ Address = tuple[str, int] | Path
 """Host and port, or the path of a Unix socket."""
 
 
-class World(ABC):
+class World(Protocol):
     """What a program needs of the machine that it runs on."""
 
-    @abstractmethod
     def monotonic(self) -> float:
         """Seconds since some moment."""
 
-    @abstractmethod
     def time(self) -> float:
         """Seconds since 1970, by the machine's clock."""
 
-    @abstractmethod
     def sleep(self, seconds: float) -> None:
         """Let time pass."""
 
-    @abstractmethod
     def thread(self, work: Callable[..., object], *arguments: object, name: str, daemon: bool = True) -> Thread:
         """A thread, not started yet."""
 
-    @abstractmethod
     def lock(self) -> Lock:
         """A lock."""
 
-    @abstractmethod
     def rlock(self) -> Lock:
         """A lock that the thread that holds it can take again."""
 
-    @abstractmethod
     def condition(self) -> Condition:
         """A condition with a lock of its own."""
 
-    @abstractmethod
     def event(self) -> ThreadEvent:
         """An event."""
 
-    @abstractmethod
     def queue(self) -> Queue[Any]:
         """A queue without a limit."""
 
-    @abstractmethod
     def token(self, size: int) -> bytes:
         """Bytes that nobody can guess."""
 
-    @abstractmethod
     def dial(self, address: Address, seconds: float) -> socket.socket:
         """Connect to the program that listens at an address, within this time. Raises OSError."""
 
-    @abstractmethod
     def certificate(self, link: socket.socket, trust: ssl.SSLContext, host: str) -> bytes:
         """The certificate, as DER, that a host shows on a connection, which is of no use afterwards.
 
         Raises SSLCertVerificationError if it is not to be trusted, and any other OSError.
         """
 
-    @abstractmethod
     def expect_free(self, host: str, port: int) -> None:
         """Raise OSError unless this machine can listen at this port."""
 
-    @abstractmethod
     def pipe(self) -> tuple[IO[bytes], IO[bytes]]:
         """The two ends of a pipe, which other processes can inherit: to read from, and to write to. Raises OSError."""
 
     @property
-    @abstractmethod
     def forks(self) -> bool:
         """Whether there can be fork servers: not outside Linux, or where a sandbox forbids them."""
 
-    @abstractmethod
     def fork_channels(self, modules: Sequence[Sequence[str]]) -> AbstractContextManager[Sequence[ForkChannel]]:
         """Channels with fork servers, each of which imports these modules and those of the servers before it. Raises OSError."""
 
-    @abstractmethod
     def ssh(self, command: Sequence[str]) -> SshClient:
         """Start ssh with a command. Raises OSError."""
 
-    @abstractmethod
     def temporary_folder(self) -> Path:
         """Where temporary files are made. Raises OSError if there is no such folder."""
 
-    @abstractmethod
     def is_suspended(self, pid: int) -> bool:
         """Whether a process is suspended, as by SIGSTOP; False where the system does not say."""
 
     @property
-    @abstractmethod
     def process(self) -> ThisProcess:
         """The process that asks."""
 
     @property
-    @abstractmethod
     def disk(self) -> Disk:
         """The disks of the machine."""
 
     @property
-    @abstractmethod
     def zenoh(self) -> Any:
         """The module `zenoh`, or what stands for it."""
 
