@@ -112,6 +112,17 @@ class ControlledPlant:
         return self.disturbance_names.index(name)
 
 
+def nested(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
+    """A table, with tables in it, of values at places."""
+    table: dict[str, Any] = {}
+    for (*outer, name), value in values.items():
+        inner = table
+        for part in outer:
+            inner = inner.setdefault(part, {})
+        inner[name] = value
+    return table
+
+
 class ApplicationTally(ABC):
     """An application's tally over a set of trials, whose slots come in order. Pickled between processes."""
 
@@ -142,12 +153,7 @@ class ApplicationTally(ABC):
 
     def entry(self) -> Summary:
         """The summary's entry, with the standard errors of its metrics if there are any."""
-        errors: dict[str, Any] = {}
-        for (*outer, name), values in self.of_trials.items():
-            inner = errors
-            for part in outer:
-                inner = inner.setdefault(part, {})
-            inner[name] = standard_error(values)
+        errors = nested({place: standard_error(values) for place, values in self.of_trials.items()})
         return {**self.summary(), **({STANDARD_ERRORS: errors} if errors else {})}
 
 

@@ -41,6 +41,7 @@ from evedrop.scenario.application import (
     Sketch,
     Spot,
     Summary,
+    nested,
 )
 from evedrop.scenario.table import Table
 from evedrop.score.energy import Meter, energy
@@ -207,30 +208,10 @@ class HouseholdTally(ApplicationTally):
         }
 
     def summary(self) -> dict[str, Any]:
-        """The summary's entry: means over trials; None for metrics that do not exist."""
-        meter, seconds = self.meter, self._slot_seconds
-        apart = meter.difference
-        return {
-            "bought_energy": _mean(energy(meter.bought, seconds)),
-            "sold_energy": _mean(energy(meter.sold, seconds)),
-            "knowing_truth": {
-                "bought_energy": _mean(energy(meter.other_bought, seconds)),
-                "sold_energy": _mean(energy(meter.other_sold, seconds)),
-            },
-            "net_difference": _mean(apart.net),
-            "total_difference": _mean(apart.total),
-            "summed_difference": _mean(apart.summed),
-            **self._activity(),
-        }
-
-    def _activity(self) -> dict[str, Any]:
-        """How well each receiver's guesses detect active windows, over the windows that have ended."""
-        active = self._active
-        told = {
-            name: {"activity_area": _mean(areas), "detection_rate": _mean(rates)}
-            for name, (areas, rates) in self._detected(active).items()
-        }
-        return {"windows": len(active), "active_windows": int(active.sum()), "receivers": told}
+        """The summary's entry: means over trials, and the number of windows; None for metrics that do not exist."""
+        told = nested({place: _mean(values) for place, values in self.of_trials.items()})
+        receivers, active = told.pop(RECEIVERS), self._active
+        return {**told, "windows": len(active), "active_windows": int(active.sum()), RECEIVERS: receivers}
 
     @property
     def _active(self) -> Flags:
