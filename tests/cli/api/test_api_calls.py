@@ -27,14 +27,14 @@ import pytest
 
 from evedrop import Scenario, compare, load_results, montecarlo, run, sweep
 from evedrop.cli.api import RunResults
-from evedrop.cli.api.running import place_for
+from evedrop.cli.api.running import results_of
 from evedrop.cli.main import parser_of
 from evedrop.cli.options import changes_of
 from evedrop.errors import RunError, ScenarioError, UsageError
 from evedrop.model.metrics import all_metrics
 from evedrop.results.reading import ByName
 from evedrop.scenario.loading import load
-from evedrop.scenario.progress_events import ProgressEvent, RunProgress, ViewOpened
+from evedrop.scenario.progress_events import OnEvent, ProgressEvent, RunProgress, ViewOpened
 from evedrop.score.summary import BuiltInMetrics, PeerSummary
 from evedrop.show.report import closing
 from evedrop.simulate.montecarlo import Plan
@@ -129,12 +129,17 @@ def at_exit(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def failed(error: BaseException, *files: str) -> tuple[Path, list[str]]:
     """A call that fails after it has written these files: its folder, and the notes of the error."""
-    place = place_for(None, overwrite=False)
-    folder = place.__enter__().folder
-    for name in files:
-        (folder / name).write_text("{}")
-    assert not place.__exit__(type(error), error, None)
-    return folder, getattr(error, "__notes__", [])
+    folders: list[Path] = []
+
+    def study(folder: Path, _: OnEvent) -> RunResults:
+        folders.append(folder)
+        for name in files:
+            (folder / name).write_text("{}")
+        raise error
+
+    with pytest.raises(type(error)):
+        results_of(study, None, False, None, 0)
+    return folders[0], getattr(error, "__notes__", [])
 
 
 def test_results_so_far_of_a_failed_call_stay_until_the_program_ends(at_exit: list[Any]) -> None:

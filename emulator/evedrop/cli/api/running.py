@@ -8,10 +8,10 @@ import math
 import shutil
 import tempfile
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from evedrop.cli.api.notebook import progress, shown_when_open, view_in
 from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from evedrop.studies.learning_curve import LearningRow
     from evedrop.studies.secrecy_cost import SecrecyCost
 
+
+_Results = TypeVar("_Results", RunResults, SweepResults, ComparisonResults)
 
 _OF_RESULTS = ("summary.json", "unfinished", "shards", "sweep.json", "compare.json", "finished_tasks")
 """Files and folders that show that a folder is a results folder."""
@@ -54,62 +56,52 @@ def plan_of(plan: Plan | None, workers: int | None, scheduler: str | None) -> Pl
     )
 
 
-@final
-@dataclass
-class ResultsPlace:
-    """Where a call writes: the folder that it was given, or a temporary one."""
+def results_of(
+    study: Callable[[Path, OnEvent], _Results],
+    out: str | Path | None,
+    overwrite: bool,
+    on_event: OnEvent | None,
+    total: int,
+    resume: bool = False,
+) -> _Results:
+    """The results of a study, which writes a folder and tells events: `out`, or without it a temporary folder.
 
-    folder: Path
-    temporary: bool
-    _stays: bool = field(default=False, init=False)
-
-    def keep_for(self, results: object) -> None:
-        """Keep a temporary folder as long as the results object exists, and this program runs."""
-        if self.temporary:
-            self._stays = True
-            weakref.finalize(results, shutil.rmtree, self.folder, ignore_errors=True)
-
-    def end(self, error: EvedropError | None = None) -> None:
-        """Remove a temporary folder that nothing keeps; after an error, results so far stay until this program ends."""
-        if not self.temporary or self._stays:
-            return
-        if error is not None and self.folder.is_dir() and any(self.folder.iterdir()):
-            atexit.register(shutil.rmtree, self.folder, ignore_errors=True)
-            error.add_note(f"Until this program ends, load_results({str(self.folder)!r}) reads the results so far.")
-        else:
-            shutil.rmtree(self.folder, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def place_for(out: str | Path | None, overwrite: bool, resume: bool = False) -> Iterator[ResultsPlace]:
-    """Where to write: `out`, which must be new or empty unless `overwrite`, or a temporary folder without `out`.
-
-    resume: `out` may have an interrupted study, which goes on.
+    `out` must be new or empty unless `overwrite`. A temporary folder stays as long as the results exist and this program runs;
+    after an error, the results so far in it stay until this program ends. on_event, total: as for `progress`; resume: `out` may
+    have an interrupted study, which goes on.
 
     Raises UsageError if `out` is in use and must not be overwritten, or is not a results folder.
     """
     if resume and (out is None or overwrite):
         raise UsageError(_NO_FOLDER)
-    if resume and out is not None:
-        place = ResultsPlace(Path(out), temporary=False)
-    elif out is None:
-        place = ResultsPlace(Path(tempfile.mkdtemp(prefix="evedrop-")), temporary=True)
+    if out is None:
+        folder = Path(tempfile.mkdtemp(prefix="evedrop-"))
+    elif resume:
+        folder = Path(out)
     else:
         path_argument("out", out, "the name of a folder, or None for a temporary one")
         refuse_unless(isinstance(overwrite, bool), "overwrite", overwrite, "True or False")
-        place = ResultsPlace(Path(out), temporary=False)
-        _clear(place.folder, overwrite)
+        folder = Path(out)
+        _clear(folder, overwrite)
+    kept = out is not None
     try:
-        yield place
+        with progress(on_event, total) as emit:
+            results = study(folder, emit)
+        if not kept:
+            weakref.finalize(results, shutil.rmtree, folder, ignore_errors=True)
+            kept = True
+        return results
     except EvedropError as error:
-        place.end(error)
-        if not place.temporary:
+        if out is not None:
             _say_how_to_resume(error)
+        elif folder.is_dir() and any(folder.iterdir()):
+            kept = True
+            atexit.register(shutil.rmtree, folder, ignore_errors=True)
+            error.add_note(f"Until this program ends, load_results({str(folder)!r}) reads the results so far.")
         raise
-    except BaseException:
-        place.end()
-        raise
-    place.end()
+    finally:
+        if not kept:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -179,13 +171,14 @@ def run(
     refuse_unless(
         listen is None or isinstance(listen, str), "listen", listen, "an endpoint such as tls/127.0.0.1:17460"
     )
-    with place_for(out, overwrite) as place, progress(on_event, made.slots) as emit:
-        ended = launch(made, place.folder, view, listen, shown_when_open(view, emit))
+
+    def launched(folder: Path, emit: OnEvent) -> RunResults:
+        ended = launch(made, folder, view, listen, shown_when_open(view, emit))
         if ended.viewer is not None and view != NOTEBOOK:
             ended.viewer.stop()
-        results = RunResults.read(ended.folder)
-        place.keep_for(results)
-        return results
+        return RunResults.read(ended.folder)
+
+    return results_of(launched, out, overwrite, on_event, made.slots)
 
 
 @speaks_python
@@ -213,11 +206,12 @@ def montecarlo(
 
     plan = plan_of(plan, workers, scheduler)
     made = scenario_of(scenario, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
-    with place_for(out, overwrite, resume) as place, progress(on_event, made.trials * made.slots) as emit:
-        simulate(made, place.folder, emit, plan, resume=resume)
-        results = RunResults.read(place.folder)
-        place.keep_for(results)
-        return results
+
+    def simulated(folder: Path, emit: OnEvent) -> RunResults:
+        simulate(made, folder, emit, plan, resume=resume)
+        return RunResults.read(folder)
+
+    return results_of(simulated, out, overwrite, on_event, made.trials * made.slots, resume)
 
 
 @speaks_python
@@ -254,13 +248,12 @@ def sweep(
             raise UsageError(f"over: {key} is {chosen!r}; expected a list of values, such as [0.2, 0.4]")
     if not values or math.prod(map(len, values.values())) > MOST_POINTS:
         raise UsageError(f"over: expected 1 to {MOST_POINTS} points, such as {{'slots': [100, 200]}}")
-    with place_for(out, overwrite, resume) as place, progress(on_event, 0) as emit:
-        table = sweep_over(
-            scenario, given, values, place.folder, emit, plan_of(plan, workers, scheduler), resume=resume
-        )
-        results = SweepResults(place.folder, table, tuple(values))
-        place.keep_for(results)
-        return results
+
+    def swept(folder: Path, emit: OnEvent) -> SweepResults:
+        table = sweep_over(scenario, given, values, folder, emit, plan_of(plan, workers, scheduler), resume=resume)
+        return SweepResults(folder, table, tuple(values))
+
+    return results_of(swept, out, overwrite, on_event, 0, resume)
 
 
 @speaks_python
@@ -303,11 +296,12 @@ def compare(
     chosen = _named({"schemes": schemes, "adversaries": adversaries}, "compare", scenario, given)
     made = scenario_of(scenario, given)
     matchups = matchups_of(made, chosen.get("schemes"), chosen.get("adversaries"), parameters)
-    with place_for(out, overwrite, resume) as place, progress(on_event, 0) as emit:
-        comparison = compare_all(matchups, place.folder, emit, plan_of(plan, workers, scheduler), resume=resume)
-        results = ComparisonResults.of(comparison, place.folder)
-        place.keep_for(results)
-        return results
+
+    def compared(folder: Path, emit: OnEvent) -> ComparisonResults:
+        comparison = compare_all(matchups, folder, emit, plan_of(plan, workers, scheduler), resume=resume)
+        return ComparisonResults.of(comparison, folder)
+
+    return results_of(compared, out, overwrite, on_event, 0, resume)
 
 
 @speaks_python
