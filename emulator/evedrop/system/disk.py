@@ -69,18 +69,15 @@ class Disk(Protocol):
     def remove_tree(self, folder: Path, ignore_errors: bool = False) -> None:
         """Remove a folder and all that is in it."""
 
-    @final
     def write(self, path: Path, data: bytes) -> None:
         """Write a file that only this user can read; replaces what it contained."""
         with self.open(path, "wb") as file:
             write_all(file, data)
 
-    @final
     def writer(self, path: Path, mode: str = "wb") -> BufferedWriter:
         """Open a file in the same way, with a buffer."""
         return BufferedWriter(self.open(path, mode))
 
-    @final
     def text_writer(self, path: Path, mode: str) -> TextIOWrapper:
         """Open a text in UTF-8 in the same way, with a buffer."""
         return TextIOWrapper(self.writer(path, mode), encoding="utf-8")
