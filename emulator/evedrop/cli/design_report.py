@@ -10,19 +10,33 @@ from typing import TYPE_CHECKING
 from evedrop.cli.report import ReportConsole, left_out_line
 from evedrop.model.checks import toml_of
 from evedrop.model.metrics.text import finite_text, number_text
+from evedrop.model.theory.design import Design
+from evedrop.model.theory.schedules import ScheduleDesign
+from evedrop.scenario.designs import BudgetDesign, PolicyDesign
 from evedrop.show.report.text_table import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from evedrop.model.theory.design import Design
     from evedrop.model.theory.policies import Front, PolicyMetrics
     from evedrop.model.theory.ratio import Choice, LargestRatio
-    from evedrop.model.theory.schedules import MeanSchedule, ScheduleDesign
-    from evedrop.scenario.designs import BudgetDesign, PolicyDesign
+    from evedrop.model.theory.schedules import MeanSchedule
 
 
-def print_design(design: Design, console: ReportConsole) -> None:
+def print_designed(design: object, console: ReportConsole) -> None:
+    """Print a design of any kind as text."""
+    match design:
+        case Design():
+            _print_design(design, console)
+        case ScheduleDesign():
+            _print_schedules(design, console)
+        case PolicyDesign():
+            _print_policies(design, console)
+        case BudgetDesign():
+            _print_budget(design, console)
+
+
+def _print_design(design: Design, console: ReportConsole) -> None:
     """Print a design as text: bounds, intervals, optima and the price of secrecy."""
     if (answer := _answer(design)) is not None:
         console.say(answer, "bold")
@@ -126,7 +140,7 @@ def _half_open(interval: tuple[float, float], bound: float) -> str:
     return f"({low:.5f}, {high:.5f}{')' if high == bound == 1.0 else ']'}"
 
 
-def print_budget(design: BudgetDesign, console: ReportConsole) -> None:
+def _print_budget(design: BudgetDesign, console: ReportConsole) -> None:
     """Print the thresholds as a table, the one for the budget among them."""
     console.say(
         f"an unencrypted packet costs {design.unencrypted:g}, an encrypted one {design.encrypted:g}; errors are traces in the "
@@ -153,7 +167,7 @@ def print_budget(design: BudgetDesign, console: ReportConsole) -> None:
 _METRICS = ("legitimate error", "its error", "sent")
 
 
-def print_policies(design: PolicyDesign, console: ReportConsole) -> None:
+def _print_policies(design: PolicyDesign, console: ReportConsole) -> None:
     """Print the fronts as text."""
     console.say(
         f"legitimate link quality μ = {design.mu:g}; errors are traces in the limit; sent: the fraction of slots with a packet"
@@ -209,7 +223,7 @@ def _metrics(metrics: PolicyMetrics) -> tuple[str, ...]:
     return (*map(finite_text, (metrics.legitimate, metrics.eavesdropper)), number_text(metrics.transmissions, ".4f"))
 
 
-def print_schedules(design: ScheduleDesign, console: ReportConsole) -> None:
+def _print_schedules(design: ScheduleDesign, console: ReportConsole) -> None:
     """Print the schedules as text."""
     for name, schedule in design.schedules.items():
         console.say(

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from evedrop.cli.options import changes_of, entries, loaded, option, output
+from evedrop.cli.options import changes_of, entries, flag, loaded, one_of, option, output, together
 from evedrop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -18,23 +18,19 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-def crew(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say where trials are computed."""
-    help_text = "number of worker processes; does not affect the results"
-    parser.add_argument("--workers", type=int, metavar="N", help=help_text)
-    scheduler(parser)
-
-
 scheduler = option(
     "--scheduler",
-    metavar="ADDRESS",
-    help="let the workers of this Dask scheduler compute the trials, tcp://HOST:PORT (docs/montecarlo.md)",
+    "ADDRESS",
+    "let the workers of this Dask scheduler compute the trials, tcp://HOST:PORT (docs/montecarlo.md)",
 )
-resuming = option(
+resuming = flag(
     "--resume",
-    action="store_true",
-    help="go on with the interrupted study in the folder of --out; all but --workers and --scheduler must be as it was",
+    "go on with the interrupted study in the folder of --out; all but --workers and --scheduler must be as it was",
 )
+crew = together(
+    option("--workers", "N", "number of worker processes; does not affect the results", type=int), scheduler
+)
+"""Where trials are computed."""
 
 
 def check_resuming(options: argparse.Namespace) -> None:
@@ -49,32 +45,39 @@ def default_trials(options: argparse.Namespace, trials: int) -> None:
         options.trials = trials
 
 
-def keeping(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a study that needs no results folder: one that keeps finished trials, and `--resume`."""
-    help_text = "write the result there, new or empty, and keep finished trials for --resume until it is complete"
-    parser.add_argument("--out", type=Path, metavar="DIR", help=help_text)
-    resuming(parser)
+keeping = together(
+    option(
+        "--out",
+        "DIR",
+        "write the result there, new or empty, and keep finished trials for --resume until it is complete",
+        type=Path,
+    ),
+    resuming,
+)
+"""For a study that needs no results folder: one that keeps finished trials, and `--resume`."""
 
 
-def memory(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how trials are computed."""
-    crew(parser)
-    mode = parser.add_mutually_exclusive_group()
-    mode.add_argument(
-        "--covariance-only",
-        dest="mode",
-        action="store_const",
-        const="covariance-only",
-        help="simulate covariances given the events; draws no noise",
-    )
-    mode.add_argument(
-        "--error-coordinates",
-        dest="mode",
-        action="store_const",
-        const="error-coordinates",
-        help="simulate the errors themselves: any number of slots, no digest",
-    )
-    parser.set_defaults(mode="exact")
+memory = together(
+    crew,
+    one_of(
+        option(
+            "--covariance-only",
+            help_text="simulate covariances given the events; draws no noise",
+            dest="mode",
+            action="store_const",
+            const="covariance-only",
+        ),
+        option(
+            "--error-coordinates",
+            help_text="simulate the errors themselves: any number of slots, no digest",
+            dest="mode",
+            action="store_const",
+            const="error-coordinates",
+        ),
+    ),
+    lambda parser: parser.set_defaults(mode="exact"),
+)
+"""How trials are computed."""
 
 
 def studied(

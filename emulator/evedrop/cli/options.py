@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from evedrop.errors import UsageError
 from evedrop.system.output import warn
@@ -65,11 +65,40 @@ def command(
 _SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
 
 
-def option(*names: str, **how: Any) -> Option:
-    """An option, or an argument, as `ArgumentParser.add_argument` takes it."""
+def option(name: str, shown: str | None = None, help_text: str | None = None, **how: Any) -> Option:
+    """An option, or a positional argument; shown: what the help calls its value; how: as for `ArgumentParser.add_argument`."""
 
     def add(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument(*names, **how)
+        parser.add_argument(name, metavar=shown, help=help_text, **how)
+
+    return add
+
+
+def flag(name: str, help_text: str) -> Option:
+    """An option without a value."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument(name, action="store_true", help=help_text)
+
+    return add
+
+
+def together(*options: Option) -> Option:
+    """Several options as one."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        for each in options:
+            each(parser)
+
+    return add
+
+
+def one_of(*options: Option, required: bool = False) -> Option:
+    """Options of which at most one can be given; required: one must be."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        group = parser.add_mutually_exclusive_group(required=required)
+        together(*options)(cast("argparse.ArgumentParser", group))
 
     return add
 
@@ -89,43 +118,28 @@ def number_type(least: float, most: float, words: str) -> Callable[[str], float]
     return number
 
 
-scenario = option("scenario", metavar="SCENARIO", help="a built-in scenario, a file, or a results folder")
-changes = option("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=_SET_HELP)
-
-
-def entries(parser: argparse.ArgumentParser) -> None:
-    """Add `--set`, and an option for each of the entries that are changed most often."""
-    changes(parser)
-    for name, help_text in (
-        ("seed", "seed of all random numbers"),
-        ("slots", "number of slots"),
-        ("trials", "number of trials"),
-        ("first-trial", "number of the first trial"),
-        ("record-trials", "how many trials are recorded in full"),
-    ):
-        parser.add_argument(f"--{name}", type=int, metavar="N", help=help_text)
-    parser.add_argument("--pace", type=float, metavar="SECONDS", help="seconds per slot; 0 = as fast as possible")
-    parser.add_argument("--secret", type=Path, metavar="FILE", help="a secret that is not derived from the seed")
-
-
-def output(parser: argparse.ArgumentParser) -> None:
-    """Add the options for the results folder and for JSON."""
-    parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty")
-    as_json(parser, "print only the summary, as JSON, on standard output")
-    verbose(parser)
-
-
-verbose = option("--verbose", action="store_true", help="print everything that the report page says")
-
-
-def as_json(parser: argparse.ArgumentParser, help_text: str = "print JSON") -> None:
-    """Add `--json`, for JSON instead of text; help_text: the help."""
-    parser.add_argument("--json", action="store_true", help=help_text)
-
-
-served = option(
-    "--serve", metavar="HOST:PORT", help="show the run to browsers, at this address and port (and the next port)"
+scenario = option("scenario", "SCENARIO", "a built-in scenario, a file, or a results folder")
+changes = option("--set", "KEY=VALUE", _SET_HELP, dest="changes", action="append", default=[])
+entries = together(
+    changes,
+    option("--seed", "N", "seed of all random numbers", type=int),
+    option("--slots", "N", "number of slots", type=int),
+    option("--trials", "N", "number of trials", type=int),
+    option("--first-trial", "N", "number of the first trial", type=int),
+    option("--record-trials", "N", "how many trials are recorded in full", type=int),
+    option("--pace", "SECONDS", "seconds per slot; 0 = as fast as possible", type=float),
+    option("--secret", "FILE", "a secret that is not derived from the seed", type=Path),
 )
+"""`--set`, and an option for each of the entries that are changed most often."""
+verbose = flag("--verbose", "print everything that the report page says")
+as_json = flag("--json", "print JSON")
+output = together(
+    option("--out", "DIR", "results folder, new or empty", type=Path),
+    flag("--json", "print only the summary, as JSON, on standard output"),
+    verbose,
+)
+served = option("--serve", "HOST:PORT", "show the run to browsers, at this address and port (and the next port)")
+paused = flag("--paused", "hold the run before slot 0, until `evedrop resume` or `evedrop step`")
 
 
 def changes_of(options: argparse.Namespace) -> dict[str, Any]:
@@ -147,21 +161,22 @@ def changes_of(options: argparse.Namespace) -> dict[str, Any]:
     return changes
 
 
-def over_wire(parser: argparse.ArgumentParser) -> None:
-    """Add the options for a wire as the network."""
-    parser.add_argument("--wire", type=Path, metavar="FILE", help="take links and events from this wire file")
-    parser.add_argument(
+over_wire = together(
+    option("--wire", "FILE", "take links and events from this wire file", type=Path),
+    option(
         "--wire-key",
-        metavar="KEY",
-        help="the key that the packets have on the wire; default the key of the program that gives the states",
-    )
-    parser.add_argument(
+        "KEY",
+        "the key that the packets have on the wire; default the key of the program that gives the states",
+    ),
+    option(
         "--wire-side",
+        "PROCESS=SIDE",
+        "the side of the wire that the sensor or a receiver is on; default the side of its name; repeatable",
         action="append",
         default=[],
-        metavar="PROCESS=SIDE",
-        help="the side of the wire that the sensor or a receiver is on; default the side of its name; repeatable",
-    )
+    ),
+)
+"""A wire as the network."""
 
 
 def _of_wire(options: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:

@@ -81,10 +81,7 @@ def design(
     from evedrop.cli.api.shown_designs import ShownDesign, shown_as  # a run does not need it
     from evedrop.model.theory.design import design as design_of  # the same
 
-    made = scenario_of(scenario, changes or {}, beyond_horizon=True)
-    measured = measuring_command(scenario, changes or {}, made)
-    if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
-        raise UsageError(_not_for(made.encoding.scheme, measured))
+    made, measured = _designable(scenario, changes or {})
     _refuse_texts(max_trace=max_trace, min_ratio=min_ratio)
     if max_trace == math.inf:
         raise UsageError("an infinite largest trace is kept by every admissible μ_d; give a finite one")
@@ -104,6 +101,15 @@ def design(
         )
     designed = design_of(made.process.process, mu, made.encoding.mu_d, adversaries, made.slots, max_trace, min_ratio)
     return shown_as(ShownDesign, replace(designed, left_out=left_out, measuring=measured))
+
+
+def _designable(given: str | Path | Scenario, changes: Mapping[str, Any]) -> tuple[Scenario, str]:
+    """The scenario, and the command that measures what cannot be designed. Raises UsageError if its scheme cannot be designed."""
+    made = scenario_of(given, changes, beyond_horizon=True)
+    measured = measuring_command(given, changes, made)
+    if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
+        raise UsageError(_not_for(made.encoding.scheme, measured))
+    return made, measured
 
 
 def _adversaries(made: Scenario, measured: str) -> tuple[float, list[Adversary], dict[str, str]]:
@@ -156,10 +162,7 @@ def design_schedule(
     from evedrop.cli.api.shown_designs import ShownScheduleDesign  # a run does not need it
     from evedrop.model.theory.schedules import best_schedule  # the same
 
-    made = scenario_of(scenario, changes or {}, beyond_horizon=True)
-    measured = measuring_command(scenario, changes or {}, made)
-    if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
-        raise UsageError(_not_for(made.encoding.scheme, measured))
+    made, measured = _designable(scenario, changes or {})
     _refuse_texts(max_trace=max_trace, weight=weight)
     _refuse_texts(whole=True, slots=slots, block=block)
     if not 2 <= slots <= _LONGEST_SCHEDULE:

@@ -3,86 +3,82 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.options import as_json, changes, changes_of, command, scenario
+from evedrop.cli.options import as_json, changes, changes_of, command, flag, one_of, option, scenario, together
 from evedrop.cli.tables import tables
 from evedrop.errors import UsageError
 from evedrop.system.output import print_json
 
+if TYPE_CHECKING:
+    from evedrop.model.theory.design import Design
+    from evedrop.model.theory.schedules import ScheduleDesign
+    from evedrop.scenario.designs import BudgetDesign, PolicyDesign
 
-def _designs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+
+_DESIGNS = together(
+    option(
         "--max-trace",
+        "Ω",
+        "find the least μ_d whose limiting trace stays below Ω; with --schedule: the trace stays within Ω in every slot",
         type=float,
-        metavar="Ω",
-        help="find the least μ_d whose limiting trace stays below Ω; with --schedule: the trace stays within Ω in every slot",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--min-ratio",
+        "R",
+        "find the cheapest μ_d at which every eavesdropper's error is at least R times the estimator's in the limit",
         type=float,
-        metavar="R",
-        help="find the cheapest μ_d at which every eavesdropper's error is at least R times the estimator's in the limit",
-    )
-    parser.add_argument(
-        "--plot", type=Path, metavar="FILE", help="draw the errors over μ_d: a picture as .pdf, .png or .svg"
-    )
-    kind = parser.add_mutually_exclusive_group()
-    kind.add_argument(
-        "--schedule", type=int, metavar="N", help="a μ_d for each of N slots that makes the eavesdropper's error large"
-    )
-    kind.add_argument(
-        "--policy",
-        action="store_true",
-        help="when to send, for a scheme that depends on acknowledgements: the Pareto front",
-    )
-    kind.add_argument(
-        "--budget",
-        type=float,
-        metavar="E",
-        help="the threshold from which to encrypt, so that a slot costs an energy of at most E on average",
-    )
-    parser.add_argument(
-        "--weight",
-        type=float,
-        nargs="+",
-        metavar="β",
-        help="weights of the legitimate error, 0 to 1 (default 0, 0.05 … 1)",
-    )
-    parser.add_argument("--price", type=float, nargs="+", metavar="λ", help="costs of a transmission (default 0)")
-    parser.add_argument("--states", type=int, metavar="N", help="holding times that are distinguished (default 10)")
-    parser.add_argument("--block", type=int, metavar="L", help="slots of --schedule that share a μ_d (default 1)")
+    ),
+    option("--plot", "FILE", "draw the errors over μ_d: a picture as .pdf, .png or .svg", type=Path),
+    one_of(
+        option("--schedule", "N", "a μ_d for each of N slots that makes the eavesdropper's error large", type=int),
+        flag("--policy", "when to send, for a scheme that depends on acknowledgements: the Pareto front"),
+        option(
+            "--budget",
+            "E",
+            "the threshold from which to encrypt, so that a slot costs an energy of at most E on average",
+            type=float,
+        ),
+    ),
+    option("--weight", "β", "weights of the legitimate error, 0 to 1 (default 0, 0.05 … 1)", type=float, nargs="+"),
+    option("--price", "λ", "costs of a transmission (default 0)", type=float, nargs="+"),
+    option("--states", "N", "holding times that are distinguished (default 10)", type=int),
+    option("--block", "L", "slots of --schedule that share a μ_d (default 1)", type=int),
+)
 
 
-@command((scenario, changes, _designs, as_json, tables), section="study", example="design numerical", page="design")
+@command((scenario, changes, _DESIGNS, as_json, tables), section="study", example="design numerical", page="design")
 def design(options: argparse.Namespace) -> int:
     """Choose μ_d, or when to send or encrypt, for a scenario."""
     from evedrop.cli import api
-    from evedrop.cli.design_report import print_budget, print_design, print_policies, print_schedules
+    from evedrop.cli.design_report import print_designed
     from evedrop.cli.report import terminal
 
-    chosen = {"--policy": options.policy, "--schedule": options.schedule, "--budget": options.budget}
-    kind = next((name for name, value in chosen.items() if value is not None and value is not False), None)
-    given, changed = _given(options, kind), changes_of(options)
+    asked = {"--policy": options.policy, "--schedule": options.schedule, "--budget": options.budget}
+    kind = next((name for name, value in asked.items() if value is not None and value is not False), None)
+    given = {**_given(options, kind), "changes": changes_of(options)}
     if options.plot is not None and kind is not None:
         raise UsageError(f"--plot is for the design of μ_d, and {kind} is another; leave it out")
+    designed: Design | PolicyDesign | ScheduleDesign | BudgetDesign
     if kind == "--policy":
-        policies = api.design_policy(options.scenario, changes=changed, **given)
-        return _show(options, policies, lambda: print_policies(policies, terminal()))
-    if kind == "--schedule":
-        schedules = api.design_schedule(options.scenario, options.schedule, changes=changed, **given)
-        return _show(options, schedules, lambda: print_schedules(schedules, terminal()))
-    if kind == "--budget":
-        budget = api.design_budget(options.scenario, options.budget, changes=changed)
-        return _show(options, budget, lambda: print_budget(budget, terminal()))
-    designed = api.design(options.scenario, changes=changed, **given)
-    if options.plot is not None:
-        from evedrop.show.view.design_picture import draw_design
+        designed = api.design_policy(options.scenario, **given)
+    elif kind == "--schedule":
+        designed = api.design_schedule(options.scenario, options.schedule, **given)
+    elif kind == "--budget":
+        designed = api.design_budget(options.scenario, options.budget, **given)
+    else:
+        designed = api.design(options.scenario, **given)
+        if options.plot is not None:
+            from evedrop.show.view.design_picture import draw_design
 
-        draw_design(options.plot, designed)
-    return _show(options, designed, lambda: print_design(designed, terminal()))
+            draw_design(options.plot, designed)
+    if options.json:
+        print_json(designed.as_dict())
+    else:
+        print_designed(designed, terminal())
+    return 0
 
 
 _OPTIONS: Mapping[str | None, Mapping[str, str]] = {
@@ -92,10 +88,6 @@ _OPTIONS: Mapping[str | None, Mapping[str, str]] = {
     "--budget": {},
 }
 """The design asked for → the options that it takes, with their names in Python."""
-
-
-class _Printable(Protocol):
-    def as_dict(self) -> Mapping[str, object]: ...
 
 
 def _given(options: argparse.Namespace, kind: str | None) -> dict[str, Any]:
@@ -111,14 +103,6 @@ def _given(options: argparse.Namespace, kind: str | None) -> dict[str, Any]:
             raise UsageError("--weight takes one number for --schedule")
         (given["weight"],) = given["weight"]
     return given
-
-
-def _show(options: argparse.Namespace, designed: _Printable, show: Callable[[], None]) -> int:
-    if options.json:
-        print_json(designed.as_dict())
-    else:
-        show()
-    return 0
 
 
 COMMANDS = (design,)

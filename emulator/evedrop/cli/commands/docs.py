@@ -15,7 +15,7 @@ from evedrop.system.hints import near
 _SHELLS = ("bash", "zsh", "fish")
 
 
-_PAGE = option("page", nargs="?", metavar="PAGE", help="the page, or a folder of pages, as evedrop docs lists it")
+_PAGE = option("page", "PAGE", "the page, or a folder of pages, as evedrop docs lists it", nargs="?")
 
 
 @command((_PAGE,), section="inspect", example="docs view")
@@ -37,7 +37,7 @@ def docs(options: argparse.Namespace) -> int:
     return 0
 
 
-_SHELL = option("shell", choices=_SHELLS, metavar="SHELL", help="bash, zsh or fish")
+_SHELL = option("shell", "SHELL", "bash, zsh or fish", choices=_SHELLS)
 
 
 @command((_SHELL,), section="inspect", example="completion bash >> ~/.bashrc")

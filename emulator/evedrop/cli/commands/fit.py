@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.options import as_json, command, option
+from evedrop.cli.options import as_json, command, flag, option, together
 from evedrop.errors import UsageError
 from evedrop.system.output import print_json
 
@@ -15,13 +15,14 @@ if TYPE_CHECKING:
     from evedrop.scenario.recordings.message_recording import MessageRecording
 
 
-def _process_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--states", metavar="X,Y", help="the columns that are states; default all but time")
-    parser.add_argument("--reference", metavar="X,Y", help="the levels from which states are deviations; default 0")
+_PROCESS_OPTIONS = together(
+    option("--states", "X,Y", "the columns that are states; default all but time"),
+    option("--reference", "X,Y", "the levels from which states are deviations; default 0"),
+)
 
 
 @command(
-    (option("file", type=Path, metavar="FILE"), _process_options, as_json),
+    (option("file", "FILE", type=Path), _PROCESS_OPTIONS, as_json),
     group="process",
     section="study",
     example="process fit pose.csv",
@@ -47,50 +48,23 @@ def _numbers(text: str | None) -> list[float] | None:
         raise UsageError(f"--reference {text}: expected numbers such as 55,50") from None
 
 
-def _link_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--column",
-        metavar="C",
-        help="the column of outcomes, in which 1 means delivered; default received, or the only one",
-    )
-    parser.add_argument("--lost", metavar="C", help="in place of --column: the column in which 1 means lost")
-    parser.add_argument(
-        "--delay-column",
-        metavar="C",
-        help="the column of delays in slots; default the column named delay, if there is one",
-    )
-    parser.add_argument(
-        "--topic", metavar="T", help="the topic of an MCAP recording; default the only one with numbers"
-    )
-    parser.add_argument(
-        "--period", type=float, metavar="S", help="seconds between two messages of a sender that does not number them"
-    )
-    parser.add_argument("--link", metavar="NAME", help="the link of a wire; default the only one with messages")
-    parser.add_argument("--key", metavar="K", help="only messages of a wire with keys that this key expression takes")
-    parser.add_argument(
-        "--gaps",
-        action="store_true",
-        help="fit what was lost before the wire: the numbers that are missing in its journal",
-    )
-    parser.add_argument(
-        "--outage",
-        type=float,
-        metavar="S",
-        help="do not count silences longer than this many seconds as losses",
-    )
-    parser.add_argument(
-        "--slot", type=float, metavar="S", help="seconds of a scenario's slot; default the median time between messages"
-    )
-    parser.add_argument(
-        "--save",
-        type=Path,
-        metavar="FILE",
-        help="write the outcomes of messages to a CSV file, for the loss model trace",
-    )
+_LINK_OPTIONS = together(
+    option("--column", "C", "the column of outcomes, in which 1 means delivered; default received, or the only one"),
+    option("--lost", "C", "in place of --column: the column in which 1 means lost"),
+    option("--delay-column", "C", "the column of delays in slots; default the column named delay, if there is one"),
+    option("--topic", "T", "the topic of an MCAP recording; default the only one with numbers"),
+    option("--period", "S", "seconds between two messages of a sender that does not number them", type=float),
+    option("--link", "NAME", "the link of a wire; default the only one with messages"),
+    option("--key", "K", "only messages of a wire with keys that this key expression takes"),
+    flag("--gaps", "fit what was lost before the wire: the numbers that are missing in its journal"),
+    option("--outage", "S", "do not count silences longer than this many seconds as losses", type=float),
+    option("--slot", "S", "seconds of a scenario's slot; default the median time between messages", type=float),
+    option("--save", "FILE", "write the outcomes of messages to a CSV file, for the loss model trace", type=Path),
+)
 
 
 @command(
-    (option("trace", type=Path, metavar="RECORDING"), _link_options, as_json),
+    (option("trace", "RECORDING", type=Path), _LINK_OPTIONS, as_json),
     name="fit",
     group="links",
     section="study",

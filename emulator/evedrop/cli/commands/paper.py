@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import as_json, command
+from evedrop.cli.options import as_json, command, flag, option, together
 from evedrop.cli.parser import print_names
 from evedrop.cli.tables import tables
 from evedrop.errors import UsageError
@@ -20,13 +20,14 @@ if TYPE_CHECKING:
     from evedrop.studies.papers.reproduction import Reproduction
 
 
-def _papers(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", nargs="?", metavar="NAME", help="the paper; without it, a list of all papers")
-    parser.add_argument("--quick", action="store_true", help="simulate little: seconds, and larger standard errors")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="also write NAME.json and NAME.md there")
+_PAPERS = together(
+    option("name", "NAME", "the paper; without it, a list of all papers", nargs="?"),
+    flag("--quick", "simulate little: seconds, and larger standard errors"),
+    option("--out", "FOLDER", "also write NAME.json and NAME.md there", type=Path),
+)
 
 
-@command((_papers, as_json, tables), section="study", example="paper luecke2022", page="papers")
+@command((_PAPERS, as_json, tables), section="study", example="paper luecke2022", page="papers")
 def paper(options: argparse.Namespace) -> int:
     """Compare the numbers of a published paper with ours.
 
@@ -103,14 +104,13 @@ def _print(reproduction: Reproduction) -> None:
         console.say("these are quick estimates: without --quick the standard errors are smaller")
 
 
-def _figures(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", nargs="?", type=Path, default=Path("figures"), metavar="DIR")
-    parser.add_argument(
-        "--full", action="store_true", help="simulate the paper's 1000 trials of a day; takes minutes, not seconds"
-    )
+_FIGURES = together(
+    option("folder", "DIR", nargs="?", type=Path, default=Path("figures")),
+    flag("--full", "simulate the paper's 1000 trials of a day; takes minutes, not seconds"),
+)
 
 
-@command((_figures,), section="study", example="figures paper/", page="papers")
+@command((_FIGURES,), section="study", example="figures paper/", page="papers")
 def figures(options: argparse.Namespace) -> int:
     """Draw the figures of the paper, and a table of its numbers and ours."""
     from evedrop.studies.papers.kennedy2022 import Size

@@ -14,7 +14,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.cli.commands import ROLES
-from evedrop.cli.options import Command, Option, changes_of, command, entries, loaded, option, scenario, served
+from evedrop.cli.options import (
+    Command,
+    Option,
+    changes_of,
+    command,
+    entries,
+    flag,
+    loaded,
+    one_of,
+    option,
+    paused,
+    scenario,
+    served,
+    together,
+)
 from evedrop.errors import BriefError, EvedropError, RunError, UsageError
 
 if TYPE_CHECKING:
@@ -26,49 +40,36 @@ _BY_HAND = ("results", "listen", "connect", "relay", "relay_connect", "wait", "i
 _MOST_TOLD = 5  # mistakes of a scenario in a brief, which is not written by hand
 
 
-def _briefs(parser: argparse.ArgumentParser) -> None:
-    where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("--out", type=Path, metavar="DIR", help="folder for the briefs")
-    where.add_argument("--compose", type=Path, metavar="DIR", help="write the files for Docker Compose instead")
-    parser.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="with --compose: DIR may contain files; replace those with the same names",
-    )
-    parser.add_argument(
+_BRIEFS = together(
+    one_of(
+        option("--out", "DIR", "folder for the briefs", type=Path),
+        option("--compose", "DIR", "write the files for Docker Compose instead", type=Path),
+        required=True,
+    ),
+    flag("--overwrite", "with --compose: DIR may contain files; replace those with the same names"),
+    option(
         "--results",
+        "DIR",
+        "the recorder's results folder, on its host; relative to its working directory",
         type=Path,
         default=Path("results"),
-        metavar="DIR",
-        help="the recorder's results folder, on its host; relative to its working directory",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--listen",
+        "ENDPOINT",
+        "the endpoint where the router listens, such as tls/router.lan:7447",
         default="tls/127.0.0.1:17447",
-        metavar="ENDPOINT",
-        help="the endpoint where the router listens, such as tls/router.lan:7447",
-    )
-    parser.add_argument(
-        "--connect", metavar="ENDPOINT", help="the endpoint that the others connect to; default that of --listen"
-    )
-    parser.add_argument("--relay", metavar="ENDPOINT", help="where the second router listens, if the scenario has two")
-    parser.add_argument(
-        "--relay-connect",
-        metavar="ENDPOINT",
-        help="the endpoint that its processes connect to; default that of --relay",
-    )
-    parser.add_argument(
-        "--wait", type=int, default=600, metavar="SECONDS", help="how long processes wait for each other; default 600"
-    )
-    parser.add_argument(
-        "--insecure", action="store_true", help="listen without encryption although other machines can reach it"
-    )
-    parser.add_argument(
-        "--paused", action="store_true", help="hold the run before slot 0, until `evedrop resume` or `evedrop step`"
-    )
+    ),
+    option("--connect", "ENDPOINT", "the endpoint that the others connect to; default that of --listen"),
+    option("--relay", "ENDPOINT", "where the second router listens, if the scenario has two"),
+    option("--relay-connect", "ENDPOINT", "the endpoint that its processes connect to; default that of --relay"),
+    option("--wait", "SECONDS", "how long processes wait for each other; default 600", type=int, default=600),
+    flag("--insecure", "listen without encryption although other machines can reach it"),
+    paused,
+)
 
 
-@command((scenario, entries, _briefs), section="processes", example="brief vehicle --out briefs", page="hosts")
+@command((scenario, entries, _BRIEFS), section="processes", example="brief vehicle --out briefs", page="hosts")
 def brief(options: argparse.Namespace) -> int:
     """Write the files with which each process of a run is started by hand, or by Docker Compose."""
     from evedrop.live.launch.briefs import write_briefs
@@ -249,7 +250,7 @@ def _report(folder: Path, status: int, how: str) -> None:
     print_ending(folder, status, how)
 
 
-_BRIEF = option("brief", type=Path, metavar="BRIEF")
+_BRIEF = option("brief", "BRIEF", type=Path)
 
 
 @command((_BRIEF,), section="processes", example="health briefs/smart.json", page="containers")
@@ -264,7 +265,7 @@ def health(options: argparse.Namespace) -> int:
     return 0 if there else 1
 
 
-_RESULTS_FOLDER = option("--out", type=Path, metavar="DIR", help="results folder, new or empty; default the brief's")
+_RESULTS_FOLDER = option("--out", "DIR", "results folder, new or empty; default the brief's", type=Path)
 
 
 def _role(role: str) -> Option:

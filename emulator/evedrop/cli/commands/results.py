@@ -6,11 +6,11 @@ import argparse
 import math
 from pathlib import Path
 
-from evedrop.cli.options import command, number_type, option
+from evedrop.cli.options import command, number_type, option, together
 from evedrop.errors import UsageError
 
 
-@command((option("run", type=Path, metavar="FOLDER"),), section="inspect", example="report runs/vehicle", page="export")
+@command((option("run", "FOLDER", type=Path),), section="inspect", example="report runs/vehicle", page="export")
 def report(options: argparse.Namespace) -> int:
     """Write report.html: a run, sweep, comparison or wire on one page."""
     from evedrop.results.wire_summary import is_wire
@@ -31,24 +31,27 @@ def report(options: argparse.Namespace) -> int:
 _LONGEST = 3600.0  # seconds per slot, as for pace
 
 
-def _written(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, metavar="FILE", help=".mcap, .pdf, .png, .svg, .csv or .tex")
-    parser.add_argument(
-        "--width", choices=("page", "column"), default="page", help="of the picture of a run; column: that of a journal"
-    )
-    parser.add_argument(
-        "--panel", choices=("errors", "lanes", "plane"), help="draw only one part of the picture of a run"
-    )
-    parser.add_argument(
+_WRITTEN = together(
+    option("file", "FILE", ".mcap, .pdf, .png, .svg, .csv or .tex", type=Path),
+    option(
+        "--width",
+        None,
+        "of the picture of a run; column: that of a journal",
+        choices=("page", "column"),
+        default="page",
+    ),
+    option("--panel", None, "draw only one part of the picture of a run", choices=("errors", "lanes", "plane")),
+    option(
         "--period",
+        "SECONDS",
+        "seconds per slot; default those of the scenario, or 1",
         type=number_type(math.ulp(0.0), _LONGEST, f"a number of seconds above 0 and up to {_LONGEST:.0f}"),
-        metavar="SECONDS",
-        help="seconds per slot; default those of the scenario, or 1",
-    )
+    ),
+)
 
 
 @command(
-    (option("run", type=Path, metavar="FOLDER"), _written),
+    (option("run", "FOLDER", type=Path), _WRITTEN),
     section="inspect",
     example="export runs/vehicle vehicle.mcap",
     page="export",
@@ -131,7 +134,7 @@ def _export_wire(options: argparse.Namespace, kind: str) -> int:
     return 0
 
 
-_TWO_RUNS = option("runs", nargs=2, type=Path, metavar="RUN")
+_TWO_RUNS = option("runs", "RUN", nargs=2, type=Path)
 
 
 @command((_TWO_RUNS,), section="inspect", example="diff runs/one runs/other", page="results")

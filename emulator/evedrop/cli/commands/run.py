@@ -9,7 +9,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import command, entries, hold, loaded, option, output, over_wire, print_so_far, scenario
+from evedrop.cli.options import (
+    command,
+    entries,
+    hold,
+    loaded,
+    option,
+    output,
+    over_wire,
+    paused,
+    print_so_far,
+    scenario,
+)
 from evedrop.cli.tables import tables
 from evedrop.errors import Interrupted, RunError, UsageError
 
@@ -22,23 +33,16 @@ if TYPE_CHECKING:
     from evedrop.show.view.viewer import Viewer
 
 
-def _live(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--view", choices=("auto", "native", "web", "off"), default="auto", help="default auto")
-    parser.add_argument(
-        "--listen", metavar="ENDPOINT", help="the router's endpoint, such as tls/127.0.0.1:PORT; by default no port"
-    )
-    parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's endpoint, if the scenario has two")
-    parser.add_argument(
-        "--metrics",
-        metavar="HOST:PORT",
-        help="serve metrics for Prometheus while the run goes on, such as 127.0.0.1:9464",
-    )
-    parser.add_argument(
-        "--paused", action="store_true", help="hold the run before slot 0, until `evedrop resume` or `evedrop step`"
-    )
-
-
-_LIVE = (entries, output, _live, tables)
+_LIVE = (
+    entries,
+    output,
+    option("--view", None, "default auto", choices=("auto", "native", "web", "off"), default="auto"),
+    option("--listen", "ENDPOINT", "the router's endpoint, such as tls/127.0.0.1:PORT; by default no port"),
+    option("--relay", "ENDPOINT", "the second router's endpoint, if the scenario has two"),
+    option("--metrics", "HOST:PORT", "serve metrics for Prometheus while the run goes on, such as 127.0.0.1:9464"),
+    paused,
+    tables,
+)
 
 
 @command(_LIVE, section="run", example="demo", page="run")
@@ -48,7 +52,7 @@ def demo(options: argparse.Namespace) -> int:
     return run.run(options)
 
 
-_OVER_SSH = option("--hosts", type=Path, metavar="FILE", help="start processes on other hosts, over ssh, as FILE says")
+_OVER_SSH = option("--hosts", "FILE", "start processes on other hosts, over ssh, as FILE says", type=Path)
 
 
 @command((scenario, over_wire, *_LIVE, _OVER_SSH), section="run", example="run vehicle --view web", page="run")

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from evedrop.cli.options import changes, changes_of, command, option
+from evedrop.cli.options import changes, changes_of, command, option, together
 from evedrop.errors import UsageError
 from evedrop.system.output import YELLOW, tell
 
@@ -24,11 +24,11 @@ def list_scenarios(_: argparse.Namespace) -> int:
     return 0
 
 
-_ORIGIN = option("--from", dest="origin", metavar="NAME", help="copy this built-in scenario")
+_ORIGIN = option("--from", "NAME", "copy this built-in scenario", dest="origin")
 
 
 @command(
-    (option("file", type=Path, metavar="FILE"), _ORIGIN),
+    (option("file", "FILE", type=Path), _ORIGIN),
     section="make",
     example="new my-scenario.toml --from vehicle",
     page="scenario",
@@ -42,7 +42,7 @@ def new(options: argparse.Namespace) -> int:
     return 0
 
 
-_NAME = option("name", metavar="NAME", help="the name of a built-in scenario, as evedrop list prints it")
+_NAME = option("name", "NAME", "the name of a built-in scenario, as evedrop list prints it")
 
 
 @command((_NAME,), section="make", example="show vehicle", page="scenario")
@@ -54,23 +54,27 @@ def show(options: argparse.Namespace) -> int:
     return 0
 
 
-_SCENARIOS = option("scenarios", nargs="*", metavar="SCENARIO")
+_SCENARIOS = option("scenarios", "SCENARIO", nargs="*")
 
 
-def _classes(parser: argparse.ArgumentParser) -> None:
-    for kind, subject in (
-        ("scheme", "a scheme, or the scheme to check an eavesdropper with"),
-        ("eavesdropper", "an eavesdropper"),
-        ("link", "a loss model"),
-        ("delay", "a delay model"),
-    ):
-        text = (
-            f"check {subject}: MODULE:CLASS of a module in this folder or an installed one; --set gives its parameters"
+_CLASSES = together(
+    *(
+        option(
+            f"--{kind}",
+            "NAME",
+            f"check {subject}: MODULE:CLASS of a module in this folder or an installed one; --set gives its parameters",
         )
-        parser.add_argument(f"--{kind}", metavar="NAME", help=text)
+        for kind, subject in (
+            ("scheme", "a scheme, or the scheme to check an eavesdropper with"),
+            ("eavesdropper", "an eavesdropper"),
+            ("link", "a loss model"),
+            ("delay", "a delay model"),
+        )
+    )
+)
 
 
-@command((_SCENARIOS, changes, _classes), section="make", example="check my-scenario.toml", page="scenario")
+@command((_SCENARIOS, changes, _CLASSES), section="make", example="check my-scenario.toml", page="scenario")
 def check(options: argparse.Namespace) -> int:
     """Check scenarios or classes of your own, and start nothing."""
     from evedrop.scenario.estimates import warnings_of

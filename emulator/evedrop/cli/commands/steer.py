@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.options import as_json, command, option
+from evedrop.cli.options import as_json, command, option, together
 from evedrop.errors import BriefError, UsageError
 from evedrop.system.output import print_json
 from evedrop.system.world import world
@@ -26,20 +26,21 @@ _AGAIN_SECONDS = 0.2
 _STEP_PATIENCE = 30 * 86_400.0  # a step takes as long as its slots do
 
 
-_GOING_ON = option("run", type=Path, metavar="RUN", help="the results folder of a run or wire in progress")
+_GOING_ON = option("run", "RUN", "the results folder of a run or wire in progress", type=Path)
 
 
-def _changed_link(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", metavar="NAME", help="the receiver whose link it is; of a wire, the link")
-    parser.add_argument(
+_CHANGED_LINK = together(
+    option("name", "NAME", "the receiver whose link it is; of a wire, the link"),
+    option(
         "changes",
+        "KEY=VALUE",
+        "an entry of the link, such as quality=0.2, with a dotted key for an entry of a table; or the word cut or heal",
         nargs="+",
-        metavar="KEY=VALUE",
-        help="an entry of the link, such as quality=0.2, with a dotted key for an entry of a table; or the word cut or heal",
-    )
+    ),
+)
 
 
-@command((_GOING_ON, _changed_link), section="steer", example="link runs/vehicle smart quality=0.2", page="control")
+@command((_GOING_ON, _CHANGED_LINK), section="steer", example="link runs/vehicle smart quality=0.2", page="control")
 def link(options: argparse.Namespace) -> int:
     """Change, cut or heal a link of a running simulation or wire."""
     from evedrop.live.protocol.requests import LinkRequest
@@ -48,12 +49,10 @@ def link(options: argparse.Namespace) -> int:
     return _ask(options.run, LinkRequest(event), f"link {options.name}")
 
 
-def _two_sides(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("one", metavar="A", help="a side of the wire")
-    parser.add_argument("other", metavar="B", help="another side of the wire")
+_TWO_SIDES = together(option("one", "A", "a side of the wire"), option("other", "B", "another side of the wire"))
 
 
-@command((_GOING_ON, _two_sides), section="steer", example="partition runs/wire robot base", page="wire/file")
+@command((_GOING_ON, _TWO_SIDES), section="steer", example="partition runs/wire robot base", page="wire/file")
 def partition(options: argparse.Namespace) -> int:
     """Let nothing pass between two sides of a running wire."""
     from evedrop.live.protocol.requests import LinkRequest
@@ -62,7 +61,7 @@ def partition(options: argparse.Namespace) -> int:
     return _ask(options.run, LinkRequest(event), f"partition {options.one} {options.other}")
 
 
-@command((_GOING_ON, _two_sides), section="steer", example="heal runs/wire robot base", page="wire/file")
+@command((_GOING_ON, _TWO_SIDES), section="steer", example="heal runs/wire robot base", page="wire/file")
 def heal(options: argparse.Namespace) -> int:
     """End the partition of two sides of a running wire."""
     from evedrop.live.protocol.requests import LinkRequest
@@ -87,7 +86,7 @@ def resume(options: argparse.Namespace) -> int:
     return _ask(options.run, ResumeRequest(), "resume")
 
 
-_SLOTS = option("slots", type=int, metavar="N", help="number of slots")
+_SLOTS = option("slots", "N", "number of slots", type=int)
 
 
 @command((_GOING_ON, _SLOTS), section="steer", example="step runs/vehicle 10", page="control")

@@ -13,12 +13,14 @@ from evedrop.cli.options import (
     changes_of,
     command,
     entries,
+    flag,
     loaded,
     option,
     output,
     over_wire,
     print_so_far,
     scenario,
+    together,
 )
 from evedrop.cli.tables import tables
 from evedrop.errors import Interrupted, UsageError
@@ -30,10 +32,9 @@ if TYPE_CHECKING:
     from evedrop.studies.secrecy_cost import MeanEstimate, SecrecyCost
 
 
-_RARE = option(
+_RARE = flag(
     "--rare",
-    action="store_true",
-    help="also estimate the mean errors that rare events carry: split trials with large errors (docs/montecarlo.md)",
+    "also estimate the mean errors that rare events carry: split trials with large errors (docs/montecarlo.md)",
 )
 
 
@@ -66,10 +67,10 @@ def montecarlo(options: argparse.Namespace) -> int:
 
 _OVER = option(
     "--over",
+    "KEY=VALUES",
+    "an entry and its values, first:last:step or a,b,c; repeatable",
     action="append",
     required=True,
-    metavar="KEY=VALUES",
-    help="an entry and its values, first:last:step or a,b,c; repeatable",
 )
 
 
@@ -106,21 +107,22 @@ def sweep(options: argparse.Namespace) -> int:
     return 0
 
 
-def _compares(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--schemes", metavar="A,B", help="default all that the process allows")
-    parser.add_argument("--adversaries", metavar="X,Y", help="default all but learners, which take long")
-    parser.add_argument(
+_COMPARES = together(
+    option("--schemes", "A,B", "default all that the process allows"),
+    option("--adversaries", "X,Y", "default all but learners, which take long"),
+    option(
         "--with",
+        "SCHEME.PARAMETER=VALUE",
+        "a parameter of a scheme other than the scenario's own; repeatable",
         dest="parameters",
         action="append",
         default=[],
-        metavar="SCHEME.PARAMETER=VALUE",
-        help="a parameter of a scheme other than the scenario's own; repeatable",
-    )
+    ),
+)
 
 
 @command(
-    (scenario, entries, output, _compares, crew, resuming, tables),
+    (scenario, entries, output, _COMPARES, crew, resuming, tables),
     section="study",
     example="compare vehicle --trials 100",
     page="compare",

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.cli.in_memory import check_resuming, resuming, scheduler
-from evedrop.cli.options import command, option
+from evedrop.cli.options import command, flag, option, together
 from evedrop.errors import UsageError
 from evedrop.system.output import tell, warn
 
@@ -21,32 +21,24 @@ _PROGRAM = "evedrop.cli.simulated:program"
 
 
 _PLACES = option(
-    "places",
-    nargs="+",
-    metavar="PATH",
-    help="a scenario, a folder that contains scenarios, or the name of a built-in one",
+    "places", "PATH", "a scenario, a folder that contains scenarios, or the name of a built-in one", nargs="+"
 )
 
 
-def _tests(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--in-memory", action="store_true", help="in memory instead of live")
-    parser.add_argument(
-        "--simulated", action="store_true", help="in the simulated world, disturbed by faults that seeds decide"
-    )
-    parser.add_argument(
-        "--seeds", type=int, metavar="N", help="with --simulated: how many seeds of each scenario; default 100"
-    )
-    parser.add_argument("--seed", type=int, metavar="FIRST", help="with --simulated: the first seed; default 1")
-    parser.add_argument("--trials", type=int, metavar="N", help="number of trials; default the scenario's")
-    parser.add_argument("--junit", type=Path, metavar="FILE", help="write a report in JUnit XML")
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the results, with a folder for each scenario; default runs/"
-    )
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="how many to run at the same time; default 1")
+_TESTS = together(
+    flag("--in-memory", "in memory instead of live"),
+    flag("--simulated", "in the simulated world, disturbed by faults that seeds decide"),
+    option("--seeds", "N", "with --simulated: how many seeds of each scenario; default 100", type=int),
+    option("--seed", "FIRST", "with --simulated: the first seed; default 1", type=int),
+    option("--trials", "N", "number of trials; default the scenario's", type=int),
+    option("--junit", "FILE", "write a report in JUnit XML", type=Path),
+    option("--out", "DIR", "folder for the results, with a folder for each scenario; default runs/", type=Path),
+    option("--jobs", "N", "how many to run at the same time; default 1", type=int, default=1),
+)
 
 
 @command(
-    (_PLACES, _tests, resuming, scheduler), section="run", example="test scenarios/ --junit report.xml", page="testing"
+    (_PLACES, _TESTS, resuming, scheduler), section="run", example="test scenarios/ --junit report.xml", page="testing"
 )
 def test(options: argparse.Namespace) -> int:
     """Run scenarios as tests, with a report for CI."""

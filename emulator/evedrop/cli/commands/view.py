@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import command, hold, number_type, option, served, verbose
+from evedrop.cli.options import command, hold, number_type, one_of, option, served, together, verbose
 from evedrop.cli.tables import tables
 from evedrop.errors import UsageError
 from evedrop.system.output import tell
@@ -27,43 +27,70 @@ _MOST_TIMES = 1_000_000  # frames of a video of a wire: eighteen hours at 15 a s
 _LEAST, _MOST = 200, 3840  # pixels; the viewer takes more than its time limit for larger pictures
 
 
-def _shown(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
-    instead = parser.add_mutually_exclusive_group()
-    instead.add_argument(
+def _size(text: str) -> tuple[int, int]:
+    """A width and a height. Raises ArgumentTypeError."""
+    width, _, height = text.partition("x")
+    try:
+        size = int(width), int(height)
+    except ValueError:
+        size = 0, 0
+    if not (_LEAST <= size[0] <= _MOST and _LEAST <= size[1] <= _MOST):
+        raise argparse.ArgumentTypeError(
+            f"{text} is not a width and a height from {_LEAST} to {_MOST} pixels, such as 1200x720"
+        )
+    return size
+
+
+def _moments(text: str) -> tuple[float, float, float | None]:
+    """First, last and step of slots or times; the step is None if it is not given. Raises ArgumentTypeError."""
+    try:
+        first, last, *step = (float(part) for part in text.split(":"))
+    except ValueError:
+        first, last, step = 0.0, -1.0, []
+    if not (0 <= first <= last < math.inf and len(step) <= 1 and all(0 < seconds < math.inf for seconds in step)):
+        raise argparse.ArgumentTypeError(f"{text} is not FIRST:LAST or FIRST:LAST:STEP, such as 100:200 or 100:200:2")
+    return first, last, step[0] if step else None
+
+
+def _instead(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument(
         "--picture", type=Path, metavar="FILE.png", help="draw the run into a file instead; needs no screen"
     )
-    instead.add_argument(
+    group.add_argument(
         "--video", type=Path, metavar="FILE.mp4|gif", help="draw some slots as a video instead; needs no screen"
     )
-    verbose(parser)
-    instead.add_argument("--table", action="store_true", help="print its table and sentences instead")
-    moment = parser.add_mutually_exclusive_group()
-    moment.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default the most telling one")
-    moment.add_argument("--time", type=float, metavar="SECONDS", help="for a wire: the time to draw; default the end")
-    moment.add_argument(
-        "--slots",
-        type=_moments,
-        metavar="A:B[:STEP]",
-        help="the slots of a video; default ten seconds around the most telling one",
-    )
-    moment.add_argument(
-        "--times", type=_moments, metavar="A:B[:STEP]", help="for a wire: the times of a video, in seconds; default all"
-    )
-    parser.add_argument(
-        "--panel",
-        metavar="NAME",
-        help="the tab or panel to draw, such as numbers or packets; default the first tab",
-    )
-    rate = number_type(1, _MOST_RATE, f"a number of frames per second from 1 to {_MOST_RATE}")
-    parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of a video; default 15")
-    parser.add_argument(
-        "--size", type=_size, metavar="WxH", help="in pixels; default 1600x950 for a picture, 880x660 for a video"
-    )
+    verbose(parser)  # the help lists it here
+    group.add_argument("--table", action="store_true", help="print its table and sentences instead")
+
+
+_SHOWN = together(
+    option("--view", help_text="default auto", choices=("auto", "native", "web"), default="auto"),
+    _instead,
+    one_of(
+        option("--slot", "K", "the slot to draw; default the most telling one", type=int),
+        option("--time", "SECONDS", "for a wire: the time to draw; default the end", type=float),
+        option(
+            "--slots",
+            "A:B[:STEP]",
+            "the slots of a video; default ten seconds around the most telling one",
+            type=_moments,
+        ),
+        option("--times", "A:B[:STEP]", "for a wire: the times of a video, in seconds; default all", type=_moments),
+    ),
+    option("--panel", "NAME", "the tab or panel to draw, such as numbers or packets; default the first tab"),
+    option(
+        "--fps",
+        "F",
+        "frames per second of a video; default 15",
+        type=number_type(1, _MOST_RATE, f"a number of frames per second from 1 to {_MOST_RATE}"),
+    ),
+    option("--size", "WxH", "in pixels; default 1600x950 for a picture, 880x660 for a video", type=_size),
+)
 
 
 @command(
-    (option("run", type=Path, metavar="RUN"), _shown, served, tables),
+    (option("run", "RUN", type=Path), _SHOWN, served, tables),
     section="inspect",
     example="view runs/vehicle --picture vehicle.png",
     page="view",
@@ -258,31 +285,6 @@ def _hold(subject: str, viewer: Viewer) -> None:
     if viewer.warning is not None:
         print(f"evedrop: warning: {viewer.warning}", file=sys.stderr)
     hold(viewer)
-
-
-def _size(text: str) -> tuple[int, int]:
-    """A width and a height. Raises ArgumentTypeError."""
-    width, _, height = text.partition("x")
-    try:
-        size = int(width), int(height)
-    except ValueError:
-        size = 0, 0
-    if not (_LEAST <= size[0] <= _MOST and _LEAST <= size[1] <= _MOST):
-        raise argparse.ArgumentTypeError(
-            f"{text} is not a width and a height from {_LEAST} to {_MOST} pixels, such as 1200x720"
-        )
-    return size
-
-
-def _moments(text: str) -> tuple[float, float, float | None]:
-    """First, last and step of slots or times; the step is None if it is not given. Raises ArgumentTypeError."""
-    try:
-        first, last, *step = (float(part) for part in text.split(":"))
-    except ValueError:
-        first, last, step = 0.0, -1.0, []
-    if not (0 <= first <= last < math.inf and len(step) <= 1 and all(0 < seconds < math.inf for seconds in step)):
-        raise argparse.ArgumentTypeError(f"{text} is not FIRST:LAST or FIRST:LAST:STEP, such as 100:200 or 100:200:2")
-    return first, last, step[0] if step else None
 
 
 COMMANDS = (view,)

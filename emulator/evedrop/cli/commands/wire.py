@@ -6,40 +6,41 @@ import argparse
 import sys
 from pathlib import Path
 
-from evedrop.cli.options import changes_of, command
+from evedrop.cli.options import changes_of, command, flag, option, together
 from evedrop.errors import UsageError
 from evedrop.system.output import say as complain
 from evedrop.system.output import tell, warn
 
+_FILE = together(
+    option("file", "FILE", "a wire file", nargs="?", type=Path),
+    option("keys", "KEY", "with --check: a key, or key expression, of messages", nargs="*"),
+    flag("--check", "say what the file means, and which link each KEY takes; start nothing"),
+    flag("--example", "print an example of a wire file"),
+    option(
+        "--set",
+        "KEY=VALUE",
+        "change an entry of the file by its dotted key, such as link.1.quality=0.5; repeatable",
+        dest="changes",
+        action="append",
+        default=[],
+    ),
+)
 
-def _file(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", nargs="?", type=Path, metavar="FILE", help="a wire file")
-    parser.add_argument("keys", nargs="*", metavar="KEY", help="with --check: a key, or key expression, of messages")
-    parser.add_argument(
-        "--check", action="store_true", help="say what the file means, and which link each KEY takes; start nothing"
-    )
-    parser.add_argument("--example", action="store_true", help="print an example of a wire file")
-    help_text = "change an entry of the file by its dotted key, such as link.1.quality=0.5; repeatable"
-    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=help_text)
 
-
-def _course(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="results folder; that of an earlier wire, to go on with its fates"
-    )
-    parser.add_argument(
+_COURSE = together(
+    option("--out", "DIR", "results folder; that of an earlier wire, to go on with its fates", type=Path),
+    option(
         "--view",
+        "VIEW",
+        "auto, native or web: show the wire; FILE.rrd: write the view to a file; default off",
         default="off",
-        metavar="VIEW",
-        help="auto, native or web: show the wire; FILE.rrd: write the view to a file; default off",
-    )
-    parser.add_argument("--quiet", action="store_true", help="print only warnings and errors")
-    parser.add_argument(
-        "--for", dest="seconds", metavar="TIME", help='end after this time, such as "60 s"; default: at Ctrl-C'
-    )
+    ),
+    flag("--quiet", "print only warnings and errors"),
+    option("--for", "TIME", 'end after this time, such as "60 s"; default: at Ctrl-C', dest="seconds"),
+)
 
 
-@command((_file, _course), section="run", example="wire robot.toml --out runs/wire", page="wire/tutorial")
+@command((_FILE, _COURSE), section="run", example="wire robot.toml --out runs/wire", page="wire/tutorial")
 def wire(options: argparse.Namespace) -> int:
     """Run links with faults between programs that use Zenoh or ROS 2."""
     from evedrop.wire.file import example_wire, load_wire
