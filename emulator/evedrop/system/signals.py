@@ -18,6 +18,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     import threading
     from collections.abc import Callable, Iterator
+    from contextlib import AbstractContextManager
     from types import FrameType
     from typing import NoReturn
 
@@ -93,40 +94,32 @@ def stop_or_leave_on_signals(leave: Callable[[], object]) -> Iterator[threading.
         os.close(ours)
 
     threading.Thread(target=listen, name="signals", daemon=True).start()
-    before = {number: signal.getsignal(number) for number in heeded()}
     woken = signal.set_wakeup_fd(theirs, warn_on_full_buffer=False)
-    for number in before:
-        signal.signal(number, _ignore)
     try:
-        yield stop
+        with _handled_by(_ignore):
+            yield stop
     finally:
-        for number, old in before.items():
-            signal.signal(number, old)
         signal.set_wakeup_fd(woken)
         os.close(theirs)
 
 
-@contextmanager
-def raise_on_signals() -> Iterator[None]:
+def raise_on_signals() -> AbstractContextManager[None]:
     """Make Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt while the block runs, so that its files are removed."""
 
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    with _handled(interrupt):
-        yield
+    return _handled(interrupt)
 
 
-@contextmanager
-def leave_after(act: Callable[[], object]) -> Iterator[None]:
+def leave_after(act: Callable[[], object]) -> AbstractContextManager[None]:
     """Make Ctrl-C, SIGTERM and SIGHUP call `act` and exit at once while the block runs."""
 
     def interrupt() -> None:
         act()
         os._exit(INTERRUPTED)
 
-    with _handled(interrupt):
-        yield
+    return _handled(interrupt)
 
 
 @contextmanager
@@ -177,10 +170,16 @@ def _handled(interrupt: Callable[[], object]) -> Iterator[None]:
         return
 
     def handler(_number: int, _frame: FrameType | None) -> None:
-        for number in before:  # by a function: Python reports a signal that is under way to SIG_IGN as an error
+        for number in heeded():  # by a function: Python reports a signal that is under way to SIG_IGN as an error
             signal.signal(number, _ignore)
         interrupt()
 
+    with _handled_by(handler):
+        yield
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     # Signals ignored from the start stay ignored: by nohup, and the interrupts of a background job.
     before = {number: signal.getsignal(number) for number in heeded()}
     for number in before:
