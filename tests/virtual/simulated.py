@@ -90,7 +90,7 @@ def show(case: AnyCase, view: Path | None = None, say: Callable[[str], object] =
 def record(steps: Sequence[Step], view: Path) -> None:
     """Write a recording, or open a viewer of it until it is closed."""
     from evedrop.show.view.viewer import open_run
-    from evedrop.studies.simulated_view import write_recording
+    from tests.virtual.simulated_view import write_recording
 
     if view != WINDOW:
         write_recording(steps, view)

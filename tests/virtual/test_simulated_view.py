@@ -7,8 +7,8 @@ from typing import Any
 
 from rerun.chunk import RrdReader
 
-from evedrop.studies.simulated_view import write_recording
 from evedrop.virtual.steps import steps_of
+from tests.virtual.simulated_view import write_recording
 from tests.virtual.test_diagram import HAPPENED
 
 
