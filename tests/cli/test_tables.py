@@ -17,7 +17,7 @@ import pytest
 import evedrop.cli
 from evedrop.cli.api import montecarlo, sweep
 from evedrop.cli.commands import MODULES, ROLES
-from evedrop.cli.tables import tables
+from evedrop.cli.options import tables
 from evedrop.errors import RunError
 from evedrop.model.metrics.text import estimate, finite_text, number_text
 from evedrop.show.report.text_table import TextTable, csv_text, latex_escaped, latex_text

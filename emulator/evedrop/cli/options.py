@@ -138,6 +138,11 @@ output = together(
     flag("--json", "print only the summary, as JSON, on standard output"),
     verbose,
 )
+tables = together(
+    option("--csv", "FILE", "also write the table as CSV, at full precision", type=Path),
+    option("--latex", "FILE", "also write the table as a tabular of LaTeX", type=Path),
+)
+"""For the tables that the command prints, which `evedrop.cli.tables` writes."""
 served = option("--serve", "HOST:PORT", "show the run to browsers, at this address and port (and the next port)")
 paused = flag("--paused", "hold the run before slot 0, until `evedrop resume` or `evedrop step`")
 

@@ -14,7 +14,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import option, together
 from evedrop.errors import UsageError
 from evedrop.system.files import check_writable
 from evedrop.system.output import warn
@@ -24,13 +23,6 @@ if TYPE_CHECKING:
 
 TAKEN: ContextVar[list[TextTable] | None] = ContextVar("TAKEN", default=None)
 """The tables that the current command has printed, if they are to be written to files."""
-
-
-tables = together(
-    option("--csv", "FILE", "also write the table as CSV, at full precision", type=Path),
-    option("--latex", "FILE", "also write the table as a tabular of LaTeX", type=Path),
-)
-"""For the tables that the command prints."""
 
 
 @contextlib.contextmanager

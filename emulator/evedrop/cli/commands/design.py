@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.options import as_json, changes, changes_of, command, flag, one_of, option, scenario, together
-from evedrop.cli.tables import tables
+from evedrop.cli.options import as_json, changes, changes_of, command, flag, one_of, option, scenario, tables, together
 from evedrop.errors import UsageError
 from evedrop.system.output import print_json
 

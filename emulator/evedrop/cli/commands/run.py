@@ -20,8 +20,8 @@ from evedrop.cli.options import (
     paused,
     print_so_far,
     scenario,
+    tables,
 )
-from evedrop.cli.tables import tables
 from evedrop.errors import Interrupted, RunError, UsageError
 
 if TYPE_CHECKING:

@@ -20,9 +20,9 @@ from evedrop.cli.options import (
     over_wire,
     print_so_far,
     scenario,
+    tables,
     together,
 )
-from evedrop.cli.tables import tables
 from evedrop.errors import Interrupted, UsageError
 from evedrop.model.metrics.text import ShownNumber, number_text
 from evedrop.system.output import print_json

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import command, hold, number_type, one_of, option, served, together, verbose
-from evedrop.cli.tables import tables
+from evedrop.cli.options import command, hold, number_type, one_of, option, served, tables, together, verbose
 from evedrop.errors import UsageError
 from evedrop.system.output import tell
 
