@@ -118,6 +118,13 @@ class RealWorld(World):
 
     # The functions themselves: a wire asks for the time three times for each message.
     monotonic, time = staticmethod(time.monotonic), staticmethod(time.time)
+    lock = staticmethod(threading.Lock)
+    rlock = staticmethod(threading.RLock)
+    condition = staticmethod(threading.Condition)
+    event = staticmethod(threading.Event)
+    queue = staticmethod(SimpleQueue[Any])
+    process = REAL_PROCESS
+    disk = REAL_DISK
 
     def sleep(self, seconds: float) -> None:
         """Let time pass."""
@@ -126,26 +133,6 @@ class RealWorld(World):
     def thread(self, work: Callable[..., object], *arguments: object, name: str, daemon: bool = True) -> Thread:
         """A thread of the system."""
         return threading.Thread(target=work, args=arguments, name=name, daemon=daemon)
-
-    def lock(self) -> Lock:
-        """A lock."""
-        return threading.Lock()
-
-    def rlock(self) -> Lock:
-        """A lock that its holder can take again."""
-        return threading.RLock()
-
-    def condition(self) -> Condition:
-        """A condition."""
-        return threading.Condition()
-
-    def event(self) -> ThreadEvent:
-        """An event."""
-        return threading.Event()
-
-    def queue(self) -> Queue[Any]:
-        """A queue."""
-        return SimpleQueue()
 
     def token(self, size: int) -> bytes:
         """Bytes that nobody can guess."""
@@ -213,16 +200,6 @@ class RealWorld(World):
             return Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()[:1] == ["T"]
         except OSError:
             return False
-
-    @property
-    def process(self) -> ThisProcess:
-        """The process of this interpreter."""
-        return REAL_PROCESS
-
-    @property
-    def disk(self) -> Disk:
-        """The disks of the machine."""
-        return REAL_DISK
 
     @property
     def zenoh(self) -> Any:
