@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.options import Command
+from evedrop.cli.command import Command
 from evedrop.errors import EvedropError, UsageError
 from evedrop.model import update
 from evedrop.model.checks import probability_mistakes

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from evedrop.cli.command import Command
 from evedrop.cli.main import main, parser_of
-from evedrop.cli.options import Command
 from tests.conftest import LIMIT
 
 SECTIONS = ["make", "run", "study", "steer", "inspect", "processes"]

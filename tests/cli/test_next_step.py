@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from evedrop.cli.command import Command
 from evedrop.cli.commands import ROLES
 from evedrop.cli.main import main, parser_of
 from evedrop.cli.next_step import next_step
-from evedrop.cli.options import Command
 from evedrop.errors import UsageError
 from tests.cli.terminal import Terminal
 from tests.cli.test_help import commands, parsed

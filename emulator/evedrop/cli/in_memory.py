@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from evedrop.cli.options import changes_of, entries, flag, loaded, one_of, option, output, together
+from evedrop.cli.command import flag, one_of, option, together
+from evedrop.cli.options import changes_of, entries, loaded, output
 from evedrop.errors import UsageError
 
 if TYPE_CHECKING:

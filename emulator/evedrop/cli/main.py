@@ -22,7 +22,7 @@ from evedrop.system.lacks import lack_of, refuse_scipy_without_room, report_refu
 from evedrop.system.output import say, standard_streams, warn
 
 if TYPE_CHECKING:
-    from evedrop.cli.options import Command
+    from evedrop.cli.command import Command
 
 __all__ = ["is_role", "main", "parser_of", "status_of"]
 

@@ -15,7 +15,7 @@ from evedrop.cli.parser import name_lines
 from evedrop.system.output import columns_of, tell
 
 if TYPE_CHECKING:
-    from evedrop.cli.options import Command
+    from evedrop.cli.command import Command
 
 _USUAL = 100  # columns, where there is no terminal
 _START = {

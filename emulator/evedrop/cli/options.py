@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
+from evedrop.cli.command import flag, option, together
 from evedrop.errors import UsageError
 from evedrop.system.output import warn
 
@@ -22,102 +20,7 @@ if TYPE_CHECKING:
     from evedrop.show.view.viewer import Viewer
 
 
-Option = Callable[[argparse.ArgumentParser], None]
-"""A function that adds an option, or several, to a command's parser."""
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command: its name, the function that carries it out, its description, and its options."""
-
-    name: str
-    run: Callable[[argparse.Namespace], int]
-    """Takes the options, and returns the exit status. Slow imports belong inside: all commands are loaded for `--help`."""
-    does: str
-    """In a few words, for `--help`."""
-    options: tuple[Option, ...] = ()
-    group: str | None = None
-    """The word before its name, such as `links` in `links fit`; None if it has no such word."""
-    section: str = "other commands"
-    """The title under which `--help` lists it."""
-    example: str = ""
-    """A command line that shows its use, without the program's name."""
-    page: str = ""
-    """The page of the documentation about it, such as `links`, as `evedrop docs` knows it."""
-
-
-def command(
-    options: tuple[Option, ...] = (), name: str = "", **more: str
-) -> Callable[[Callable[[argparse.Namespace], int]], Command]:
-    """Make a command of a function, with its name unless another is given; its docstring says what the command does.
-
-    more: other entries of `Command`.
-    """
-
-    def made(run: Callable[[argparse.Namespace], int]) -> Command:
-        sentence = str(run.__doc__).partition("\n")[0]
-        does = f"{sentence[0].lower()}{sentence[1:].removesuffix('.')}"
-        return Command(name or run.__name__, run, does, options, **more)
-
-    return made
-
-
 _SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
-
-
-def option(name: str, shown: str | None = None, help_text: str | None = None, **how: Any) -> Option:
-    """An option, or a positional argument; shown: what the help calls its value; how: as for `ArgumentParser.add_argument`."""
-
-    def add(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument(name, metavar=shown, help=help_text, **how)
-
-    return add
-
-
-def flag(name: str, help_text: str) -> Option:
-    """An option without a value."""
-
-    def add(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument(name, action="store_true", help=help_text)
-
-    return add
-
-
-def together(*options: Option) -> Option:
-    """Several options as one."""
-
-    def add(parser: argparse.ArgumentParser) -> None:
-        for each in options:
-            each(parser)
-
-    return add
-
-
-def one_of(*options: Option, required: bool = False) -> Option:
-    """Options of which at most one can be given; required: one must be."""
-
-    def add(parser: argparse.ArgumentParser) -> None:
-        group = parser.add_mutually_exclusive_group(required=required)
-        together(*options)(cast("argparse.ArgumentParser", group))
-
-    return add
-
-
-def number_type(least: float, most: float, words: str) -> Callable[[str], float]:
-    """The type of an option that is a number from `least` to `most`; words: what it must be, for the message."""
-
-    def number(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"{text} is not {words}")
-        return value
-
-    return number
-
-
 scenario = option("scenario", "SCENARIO", "a built-in scenario, a file, or a results folder")
 changes = option("--set", "KEY=VALUE", _SET_HELP, dest="changes", action="append", default=[])
 entries = together(

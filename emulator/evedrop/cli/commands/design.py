@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.options import as_json, changes, changes_of, command, flag, one_of, option, scenario, tables, together
+from evedrop.cli.command import command, flag, one_of, option, together
+from evedrop.cli.options import as_json, changes, changes_of, scenario, tables
 from evedrop.errors import UsageError
 from evedrop.system.output import print_json
 

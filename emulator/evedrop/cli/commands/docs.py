@@ -6,7 +6,7 @@ import argparse
 from importlib import resources
 from pathlib import Path
 
-from evedrop.cli.options import command, option
+from evedrop.cli.command import command, option
 from evedrop.cli.parser import print_names
 from evedrop.cli.plain_formulas import plain
 from evedrop.errors import UsageError

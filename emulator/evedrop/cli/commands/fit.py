@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.options import as_json, command, flag, option, together
+from evedrop.cli.command import command, flag, option, together
+from evedrop.cli.options import as_json
 from evedrop.errors import UsageError
 from evedrop.system.output import print_json
 

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import as_json, command, flag, option, tables, together
+from evedrop.cli.command import command, flag, option, together
+from evedrop.cli.options import as_json, tables
 from evedrop.cli.parser import print_names
 from evedrop.errors import UsageError
 from evedrop.system.output import print_json

@@ -13,22 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from evedrop.cli.command import Command, Option, command, flag, one_of, option, together
 from evedrop.cli.commands import ROLES
-from evedrop.cli.options import (
-    Command,
-    Option,
-    changes_of,
-    command,
-    entries,
-    flag,
-    loaded,
-    one_of,
-    option,
-    paused,
-    scenario,
-    served,
-    together,
-)
+from evedrop.cli.options import changes_of, entries, loaded, paused, scenario, served
 from evedrop.errors import BriefError, EvedropError, RunError, UsageError
 
 if TYPE_CHECKING:

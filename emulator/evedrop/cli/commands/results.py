@@ -6,7 +6,7 @@ import argparse
 import math
 from pathlib import Path
 
-from evedrop.cli.options import command, number_type, option, together
+from evedrop.cli.command import command, number_type, option, together
 from evedrop.errors import UsageError
 
 

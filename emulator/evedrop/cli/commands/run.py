@@ -9,19 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import (
-    command,
-    entries,
-    hold,
-    loaded,
-    option,
-    output,
-    over_wire,
-    paused,
-    print_so_far,
-    scenario,
-    tables,
-)
+from evedrop.cli.command import command, option
+from evedrop.cli.options import entries, hold, loaded, output, over_wire, paused, print_so_far, scenario, tables
 from evedrop.errors import Interrupted, RunError, UsageError
 
 if TYPE_CHECKING:

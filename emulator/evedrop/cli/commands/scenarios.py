@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from evedrop.cli.options import changes, changes_of, command, option, together
+from evedrop.cli.command import command, option, together
+from evedrop.cli.options import changes, changes_of
 from evedrop.errors import UsageError
 from evedrop.system.output import YELLOW, tell
 

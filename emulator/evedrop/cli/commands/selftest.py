@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from evedrop.cli.options import command
+from evedrop.cli.command import command
 from evedrop.errors import RunError
 
 

@@ -10,7 +10,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.options import as_json, command, option, together
+from evedrop.cli.command import command, option, together
+from evedrop.cli.options import as_json
 from evedrop.errors import BriefError, UsageError
 from evedrop.system.output import print_json
 from evedrop.system.world import world

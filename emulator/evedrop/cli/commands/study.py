@@ -7,22 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from evedrop.cli.command import command, flag, option, together
 from evedrop.cli.in_memory import MEMORY, check_resuming, crew, default_trials, keeping, plan_of, resuming, studied
-from evedrop.cli.options import (
-    as_json,
-    changes_of,
-    command,
-    entries,
-    flag,
-    loaded,
-    option,
-    output,
-    over_wire,
-    print_so_far,
-    scenario,
-    tables,
-    together,
-)
+from evedrop.cli.options import as_json, changes_of, entries, loaded, output, over_wire, print_so_far, scenario, tables
 from evedrop.errors import Interrupted, UsageError
 from evedrop.model.metrics.text import ShownNumber, number_text
 from evedrop.system.output import print_json

@@ -9,8 +9,8 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from evedrop.cli.command import command, flag, option, together
 from evedrop.cli.in_memory import check_resuming, resuming, scheduler
-from evedrop.cli.options import command, flag, option, together
 from evedrop.errors import UsageError
 from evedrop.system.output import tell, warn
 

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import command, hold, number_type, one_of, option, served, tables, together, verbose
+from evedrop.cli.command import command, number_type, one_of, option, together
+from evedrop.cli.options import hold, served, tables, verbose
 from evedrop.errors import UsageError
 from evedrop.system.output import tell
 

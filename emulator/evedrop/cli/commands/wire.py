@@ -6,7 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from evedrop.cli.options import changes_of, command, flag, option, together
+from evedrop.cli.command import command, flag, option, together
+from evedrop.cli.options import changes_of
 from evedrop.errors import UsageError
 from evedrop.system.output import say as complain
 from evedrop.system.output import tell, warn
