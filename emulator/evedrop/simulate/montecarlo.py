@@ -339,6 +339,14 @@ class Merger:
         self._whole = mode is Mode.EXACT
         self.trials = 0
 
+    @classmethod
+    def of(cls, scenario: Scenario, mode: Mode, results: Iterable[BatchResult]) -> Merger:
+        """All these results, merged."""
+        merger = cls(scenario, mode)
+        for result in results:
+            merger.add_batch(result)
+        return merger
+
     @property
     def at(self) -> str:
         """How far it has come, in words."""

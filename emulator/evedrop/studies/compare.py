@@ -12,7 +12,7 @@ import contextlib
 import itertools
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,14 +45,12 @@ from evedrop.simulate.chunk import PacketTally
 from evedrop.simulate.finished_tasks import finished_tasks, study_of
 from evedrop.simulate.montecarlo import Merger, Plan, progress_counter
 from evedrop.simulate.simulation import Mode
-from evedrop.simulate.trials import BatchResult, tasks_of
+from evedrop.simulate.trials import tasks_of
 from evedrop.studies.matchups import Group, Matchups
 from evedrop.system.signals import stop_on_signals
 
-_WRITE_SECONDS, _WRITE_PAUSE = (
-    3.0,
-    50.0,
-)  # from one compare.json to the next, and as a multiple of the time to write one
+_WRITE_SECONDS = 3.0  # from one compare.json to the next
+_WRITE_PAUSE = 50.0  # the same, as a multiple of the time to write one
 
 
 def compare_all(matchups: Matchups, folder: Path, on_event: OnEvent, plan: Plan, *, resume: bool = False) -> Comparison:
@@ -87,7 +85,7 @@ def compare_all(matchups: Matchups, folder: Path, on_event: OnEvent, plan: Plan,
             written, took = time.monotonic(), 0.0
             try:
                 for group, its_tasks in zip(groups, tasks, strict=True):
-                    merger = _merged(group, plan, itertools.islice(results, len(its_tasks)))
+                    merger = Merger.of(group.scenario, plan.mode, itertools.islice(results, len(its_tasks)))
                     if not merger.complete:
                         break
                     played.append((group, merger))
@@ -111,13 +109,6 @@ def compare_all(matchups: Matchups, folder: Path, on_event: OnEvent, plan: Plan,
             )
         finished.forget()
     return comparison
-
-
-def _merged(group: Group, plan: Plan, results: Iterator[BatchResult]) -> Merger:
-    merger = Merger(group.scenario, plan.mode)
-    for result in results:
-        merger.add_batch(result)
-    return merger
 
 
 def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> Comparison:

@@ -118,7 +118,7 @@ def matchups_of(
             if not some and attack != "none":
                 continue
             try:
-                groups.append(Group(_scenario(scenario, encoding, attack, some), some))
+                groups.append(Group(with_encoding(scenario, encoding, attack, some), some))
             except ScenarioError as error:
                 unusable = _unusable(scenario, encoding)
                 if unusable:
@@ -144,7 +144,7 @@ def _with_scheme(scheme: str, mistakes: Iterable[str]) -> list[str]:
 def _unusable(scenario: Scenario, encoding: Tables) -> tuple[str, ...]:
     """Why a scheme cannot be used with this process, whatever the adversaries, in lines; empty if it can."""
     try:
-        _scenario(scenario, encoding, "none", ())
+        with_encoding(scenario, encoding)
     except ScenarioError as error:
         return tuple(error.mistakes)
     return ()
@@ -224,15 +224,13 @@ def _encoding(scenario: Scenario, scheme: str, parameters: Mapping[str, Any]) ->
     }
 
 
-def without_eavesdroppers(scenario: Scenario, encoding: Tables) -> Scenario:
-    """The scenario with another encoding, without eavesdroppers and attacks; events concern only the legitimate estimator.
+def with_encoding(
+    scenario: Scenario, encoding: Tables, attack: str = "none", matches: Sequence[Match] = ()
+) -> Scenario:
+    """The scenario with another encoding; its eavesdroppers are those of the matches, without other attacks than this one.
 
-    Raises ScenarioError if the encoding cannot be used.
+    Events concern only the legitimate estimator. Raises ScenarioError if the encoding cannot be used.
     """
-    return _scenario(scenario, encoding, "none", ())
-
-
-def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequence[Match]) -> Scenario:
     tables: Tables = scenario.model_dump(mode="json", exclude_none=True)
     scheme = encoding["scheme"]
     under = "" if attack == "none" else f", acknowledgements attacked: {attack}"

@@ -24,7 +24,7 @@ from evedrop.score.energy import Meter, energy
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Simulation
 from evedrop.simulate.tasks import OnProgress, Stopped, Task
-from evedrop.studies.matchups import without_eavesdroppers
+from evedrop.studies.matchups import with_encoding
 from evedrop.studies.parts import StudyPlace, all_results, parts_of, write_found
 
 _SIDE_BY_SIDE = 50  # trials
@@ -150,9 +150,7 @@ def _part_of(scenario: Scenario, trials: range, on_progress: OnProgress, stopped
 
 def _pair(scenario: Scenario) -> tuple[Scenario, Scenario]:
     """The scenario with its own scheme, then with `plain`, both without eavesdroppers and attacks on acknowledgements."""
-    ours, plain = (
-        without_eavesdroppers(scenario, encoding) for encoding in (scenario.encoding.spec, {"scheme": "plain"})
-    )
+    ours, plain = (with_encoding(scenario, encoding) for encoding in (scenario.encoding.spec, {"scheme": "plain"}))
     return ours, plain
 
 

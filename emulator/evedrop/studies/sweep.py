@@ -179,9 +179,7 @@ def _draw(folder: Path, table: pa.Table, grid: Grid, applications: Iterable[str]
 def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> Summary | None:
     """The summary of a point; None if it was interrupted."""
     started = time.monotonic()
-    merger = Merger(scenario, plan.mode)
-    for result in results:
-        merger.add_batch(result)
+    merger = Merger.of(scenario, plan.mode, results)
     if not merger.complete:
         return None
     ending = RunOutcome(time.monotonic() - started)

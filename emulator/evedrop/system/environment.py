@@ -15,19 +15,8 @@ from evedrop.names import KERNELS_VARIABLE, RELAY, ROUTER
 _NEEDED = frozenset(
     {
         KERNELS_VARIABLE,
-        *(
-            "PATH",
-            "HOME",
-            "LANG",
-            "LANGUAGE",
-            "TZ",
-            "TMPDIR",
-            "TEMP",
-            "TMP",
-            "VIRTUAL_ENV",
-            "RUST_LOG",
-            "RUST_BACKTRACE",
-        ),
+        *("PATH", "HOME", "LANG", "LANGUAGE", "TZ", "TMPDIR", "TEMP", "TMP", "VIRTUAL_ENV"),
+        *("RUST_LOG", "RUST_BACKTRACE"),
         *("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH"),
     }
 )

@@ -35,8 +35,7 @@ _WRITTEN = together(
     option("file", "FILE", ".mcap, .pdf, .png, .svg, .csv or .tex", type=Path),
     option(
         "--width",
-        None,
-        "of the picture of a run; column: that of a journal",
+        help_text="of the picture of a run; column: that of a journal",
         choices=("page", "column"),
         default="page",
     ),

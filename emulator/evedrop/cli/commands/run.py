@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _LIVE = (
     entries,
     output,
-    option("--view", None, "default auto", choices=("auto", "native", "web", "off"), default="auto"),
+    option("--view", help_text="default auto", choices=("auto", "native", "web", "off"), default="auto"),
     option("--listen", "ENDPOINT", "the router's endpoint, such as tls/127.0.0.1:PORT; by default no port"),
     option("--relay", "ENDPOINT", "the second router's endpoint, if the scenario has two"),
     option("--metrics", "HOST:PORT", "serve metrics for Prometheus while the run goes on, such as 127.0.0.1:9464"),

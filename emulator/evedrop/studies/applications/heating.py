@@ -132,11 +132,8 @@ class ComfortFeed(PanelFeed):
     """The heating energy and the discomfort as each receiver estimates it, since slot 0, in one trial."""
 
     def __init__(self, loop: ControlledPlant, table: ComfortTable) -> None:
-        self._range, self._heater, self._hours = (
-            _Range(loop, table),
-            loop.input(table.heater),
-            loop.slot_seconds / _HOUR,
-        )
+        self._range = _Range(loop, table)
+        self._heater, self._hours = loop.input(table.heater), loop.slot_seconds / _HOUR
         self._sums: dict[str, float] = {}
 
     def take(self, first: int, u: Floats, estimates: Mapping[str, Floats]) -> Mapping[str, Floats]:
