@@ -117,7 +117,7 @@ def sweep_over(
     done = 0
     description = {"scenario": _title(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
     text = json.dumps(description, indent=1, ensure_ascii=False, default=str)
-    study = study_of("sweep", json.loads(text) | {"mode": plan.mode.value}, [scenario for _, scenario in scenarios])
+    study = study_of("sweep", json.loads(text), [scenario for _, scenario in scenarios])
     with (
         stop_on_signals() as stop,
         plan.crew(scenario for _, scenario in scenarios) as crew,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,7 +93,7 @@ def _table(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
     """The fit of a table of outcomes."""
     from evedrop.scenario.recordings.link_fit import fit, lines
 
-    _refuse_others(options, "a table of outcomes", ("column", "lost", "delay_column"))
+    _refuse_others(options, "a table of outcomes", {"a table of outcomes"})
     fitted = fit(options.trace, options.column, options.delay_column, options.lost)
     return fitted.as_dict(), lines(fitted)
 
@@ -102,7 +102,7 @@ def _mcap(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
     """The fit of a topic of an MCAP recording."""
     from evedrop.scenario.recordings.mcap_recording import mcap_recording
 
-    _refuse_others(options, "an MCAP recording", ("topic", "period", "outage", "slot", "save"))
+    _refuse_others(options, "an MCAP recording", {"an MCAP recording", "a recording of messages"})
     return _messages(mcap_recording(options.trace, options.topic, options.period, options.outage), options)
 
 
@@ -110,7 +110,7 @@ def _journal(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]
     """The fit of a link of a wire."""
     from evedrop.wire.recorded_link import journal_recording
 
-    _refuse_others(options, "a folder", ("link", "key", "gaps", "outage", "slot", "save"))
+    _refuse_others(options, "a folder", {"the folder of a wire", "a recording of messages"})
     if options.outage is not None and not options.gaps:
         raise UsageError("--outage: expected --gaps with it; losses by the wire itself are never counted")
     recording = journal_recording(options.trace, options.link, options.key, gaps=options.gaps, longest=options.outage)
@@ -129,27 +129,21 @@ def _messages(recording: MessageRecording, options: argparse.Namespace) -> tuple
 
 
 _ONLY = {
-    "column": "a table of outcomes",
-    "lost": "a table of outcomes",
-    "delay_column": "a table of outcomes",
-    "topic": "an MCAP recording",
-    "period": "an MCAP recording",
-    "link": "the folder of a wire",
-    "key": "the folder of a wire",
-    "gaps": "the folder of a wire",
-    "outage": "a recording of messages",
-    "slot": "a recording of messages",
-    "save": "a recording of messages",
+    "a table of outcomes": ("column", "lost", "delay_column"),
+    "an MCAP recording": ("topic", "period"),
+    "the folder of a wire": ("link", "key", "gaps"),
+    "a recording of messages": ("outage", "slot", "save"),
 }
-"""Option → the recordings that it is for."""
+"""Recordings → the options that are only for them."""
 
 
-def _refuse_others(options: argparse.Namespace, subject: str, names: Sequence[str]) -> None:
-    """Raise UsageError for options that this kind of recording does not have, and for times that are not positive."""
-    for name, whose in _ONLY.items():
-        if name not in names and getattr(options, name) not in {None, False}:
+def _refuse_others(options: argparse.Namespace, subject: str, kinds: Collection[str]) -> None:
+    """Raise UsageError for options that are only for recordings of other kinds, and for times that are not positive."""
+    others = [(kind, name) for kind, names in _ONLY.items() if kind not in kinds for name in names]
+    for kind, name in others:
+        if getattr(options, name) not in {None, False}:
             raise UsageError(
-                f"--{name.replace('_', '-')} is for {whose}, and {options.trace} is {subject}; leave it out"
+                f"--{name.replace('_', '-')} is for {kind}, and {options.trace} is {subject}; leave it out"
             )
     for name in ("period", "outage", "slot"):
         value = getattr(options, name)

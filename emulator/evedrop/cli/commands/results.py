@@ -39,7 +39,7 @@ _WRITTEN = together(
         choices=("page", "column"),
         default="page",
     ),
-    option("--panel", None, "draw only one part of the picture of a run", choices=("errors", "lanes", "plane")),
+    option("--panel", help_text="draw only one part of the picture of a run", choices=("errors", "lanes", "plane")),
     option(
         "--period",
         "SECONDS",
