@@ -17,6 +17,9 @@ from evedrop.cli.command import Command, Option, command, flag, one_of, option, 
 from evedrop.cli.commands import ROLES
 from evedrop.cli.options import changes_of, entries, loaded, paused, scenario, served
 from evedrop.errors import BriefError, EvedropError, RunError, UsageError
+from evedrop.system.lacks import lack_of
+from evedrop.system.output import say
+from evedrop.system.world import world
 
 if TYPE_CHECKING:
     from evedrop.live.protocol.brief import AnyBrief, Brief, RecorderPart
@@ -105,7 +108,6 @@ def process(options: argparse.Namespace) -> int:
     """Run one process of a run."""
     from evedrop.live.protocol.brief import ImportingPart, RecorderPart, RoutingPart, read_brief
     from evedrop.scenario.plugins import look_in
-    from evedrop.system.world import world
 
     world().process.keep_files_private()
     world().process.show_stacks()
@@ -139,9 +141,6 @@ def _end_of_thread(error: BaseException, last_word: str | None = None) -> None:
     import traceback
 
     from evedrop.live.protocol.last_word import LastWord
-    from evedrop.system.lacks import lack_of
-    from evedrop.system.output import say
-    from evedrop.system.world import world
 
     if isinstance(error, EvedropError):  # such as a message that breaks the protocol
         LastWord.about(error).leave(last_word)
@@ -168,7 +167,6 @@ def _play(brief: AnyBrief, serve: str | None) -> int:
         with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
             return _record(brief, serve)
     brief.expect_usable()
-    from evedrop.system.world import world
 
     with classes_known(), world().process.native_log_apart() if _listens(brief) else contextlib.nullcontext():
         _take_part(brief)
