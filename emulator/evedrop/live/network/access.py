@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evedrop.live.protocol.brief import Wiring
-from evedrop.live.protocol.keys import RunKeys, ZenohConfig
+from evedrop.live.protocol.keys import RunKeys, ZenohConfig, reader_of, reads, writer_of
 from evedrop.names import CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.system.world import world
 
@@ -53,62 +53,35 @@ def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, rel
     relayed: whether there is a relay, which the recorder watches, and tells when the run ends.
     """
     keys = RunKeys(run)
-    followers = (*receivers, RECORDER)
-    processes = (SENSOR, *receivers) if loop is None else (SENSOR, *receivers, CONTROLLER)
-    state = (keys.state,) if loop is not None and loop.on_truth else ()
-    estimate = (keys.estimate,) if loop is not None and not loop.on_truth else ()
+    steered = () if loop is None else (CONTROLLER,)
+    reporters = (SENSOR, *receivers, *steered)
     routers = (ROUTER, RELAY) if relayed else (ROUTER,)
+    all_keys = (
+        *(keys.uplink, keys.journal, keys.acknowledged, keys.acknowledgements),
+        *(() if loop is None else (keys.input, keys.state if loop.on_truth else keys.estimate)),
+        *(keys.downlink(name) for name in receivers),
+        *(keys.telemetry(name) for name in reporters),
+        *(keys.progress(name) for name in (*receivers, RECORDER)),
+        *(keys.control(name) for name in (*reporters, *routers)),
+    )
+    untold = {LEGITIMATE: keys.input} if loop is not None and not loop.knows_input else {}
     table = [
         Grant(
-            SENSOR,
-            writes=(keys.uplink, keys.telemetry(SENSOR), *state),
-            reads=(
-                *(keys.progress(name) for name in followers),
-                keys.control(SENSOR),
-                keys.acknowledgements,
-                *(() if loop is None else (keys.input,)),
-            ),
-            token=keys.alive(SENSOR),
-            checks=(keys.alive(SENSOR),),
-        ),
-        Grant(
-            RECORDER,
-            writes=(keys.progress(RECORDER), *(keys.control(name) for name in (*processes, *routers))),
-            reads=(*(keys.telemetry(name) for name in processes), keys.journal),
-            token=keys.alive(RECORDER),
-            checks=(keys.alive(RECORDER),),
-            watches=tuple(keys.alive(name) for name in (*processes, *routers)),
-            answers=(keys.control(RECORDER),),
-        ),
+            name,
+            writes=tuple(key for key in all_keys if writer_of(key) == name),
+            reads=tuple(key for key in all_keys if reads(name, key) and key != untold.get(name)),
+            token=keys.alive(name),
+            checks=(keys.alive(name),),
+            watches=tuple(keys.alive(other) for other in (*reporters, *routers)) if name == RECORDER else (),
+            answers=(keys.control(RECORDER),) if name == RECORDER else (),
+        )
+        for name in (SENSOR, RECORDER, *steered, *receivers)
+    ]
+    return [
+        *table,
         Grant(OPERATOR, writes=(), reads=(), token=None, asks=(keys.control(RECORDER),)),
         *(Grant(name, writes=(), reads=(), token=None, checks=(keys.alive(name),)) for name in routers),
     ]
-    if loop is not None:
-        table.append(
-            Grant(
-                CONTROLLER,
-                writes=(keys.input, keys.telemetry(CONTROLLER)),
-                reads=(*estimate, *state, keys.control(CONTROLLER)),
-                token=keys.alive(CONTROLLER),
-                checks=(keys.alive(CONTROLLER),),
-            )
-        )
-    for name in receivers:
-        legitimate, told = name == LEGITIMATE, loop is not None and loop.knows_input
-        table.append(
-            Grant(
-                name,
-                writes=(
-                    keys.telemetry(name),
-                    keys.progress(name),
-                    *((keys.acknowledged, *estimate) if legitimate else ()),
-                ),
-                reads=(keys.downlink(name), keys.control(name), *((keys.input,) if legitimate and told else ())),
-                token=keys.alive(name),
-                checks=(keys.alive(name),),
-            )
-        )
-    return table
 
 
 def access_control(table: list[Grant], certified: bool = False) -> ZenohConfig:
@@ -195,18 +168,9 @@ def _tokens(site: list[Grant]) -> tuple[str, ...]:
 def _crossing(table: list[Grant]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The keys of messages that go to the router's site, and of those that come from it."""
     keys = dict.fromkeys(key for grant in table for key in (*grant.writes, *grant.reads))
-    to_router, from_router = [], []
-    for key in keys:
-        # The router writes the keys that no process in the table writes; it reads those that none reads, except the
-        # relay's control key.
-        writers = {row.process for row in table if key in row.writes} or {ROUTER}
-        other = RELAY if key.endswith(f"/control/{RELAY}") else ROUTER
-        readers = {row.process for row in table if key in row.reads} or {other}
-        if writers - _NEAR and readers & _NEAR:
-            to_router.append(key)
-        if writers & _NEAR and readers - _NEAR:
-            from_router.append(key)
-    return tuple(to_router), tuple(from_router)
+    to_router = tuple(key for key in keys if writer_of(key) not in _NEAR and reader_of(key) in _NEAR)
+    from_router = tuple(key for key in keys if writer_of(key) in _NEAR and reader_of(key) not in _NEAR)
+    return to_router, from_router
 
 
 _FAREWELL_SECONDS = 10.0

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 from evedrop.model.digest import BLOCK_SLOTS, DIGEST_BYTES
 from evedrop.model.links.loss_model import REASONS
@@ -24,86 +24,77 @@ MOST_PARTS = 4096
 """How many lists and maps a message of more than 64 KiB may have; enough for many processes."""
 
 
-@dataclass(frozen=True)
+@final
 class RunKeys:
     """The keys of one run."""
 
-    run: str
-
-    def _under(self, path: str) -> str:
-        return f"evedrop/{self.run}/{path}"
-
-    @property
-    def uplink(self) -> str:
+    def __init__(self, run: str) -> None:
+        self.run = run
+        self._under = f"evedrop/{run}"
+        self.uplink = f"{self._under}/uplink"
         """Packets, sensor to router."""
-        return self._under("uplink")
-
-    @property
-    def journal(self) -> str:
+        self.journal = f"{self._under}/journal"
         """Fates, router to recorder."""
-        return self._under("journal")
-
-    @property
-    def acknowledged(self) -> str:
+        self.acknowledged = f"{self._under}/ack/sent"
         """Acknowledgements, legitimate estimator to router."""
-        return self._under("ack/sent")
-
-    @property
-    def acknowledgements(self) -> str:
+        self.acknowledgements = f"{self._under}/ack/delivered"
         """Acknowledgements that were neither lost nor blocked, and forged ones: router to sensor."""
-        return self._under("ack/delivered")
-
-    @property
-    def estimate(self) -> str:
+        self.estimate = f"{self._under}/estimate"
         """Estimates, legitimate estimator to controller."""
-        return self._under("estimate")
-
-    @property
-    def state(self) -> str:
+        self.state = f"{self._under}/state"
         """The true state, sensor to controller, if the controller acts on the truth."""
-        return self._under("state")
-
-    @property
-    def input(self) -> str:
+        self.input = f"{self._under}/input"
         """Inputs, controller to sensor, and to a legitimate estimator that knows the inputs."""
-        return self._under("input")
 
     def downlink(self, receiver: str) -> str:
         """Deliveries, router to one receiver."""
-        return self._under(f"downlink/{receiver}")
+        return f"{self._under}/downlink/{receiver}"
 
     def telemetry(self, process: str) -> str:
         """Reports, one process to recorder."""
-        return self._under(f"telemetry/{process}")
+        return f"{self._under}/telemetry/{process}"
 
     def progress(self, process: str) -> str:
         """Progress, a receiver or the recorder to the sensor."""
-        return self._under(f"progress/{process}")
+        return f"{self._under}/progress/{process}"
 
     def control(self, process: str) -> str:
         """Commands to one process."""
-        return self._under(f"control/{process}")
+        return f"{self._under}/control/{process}"
 
     def alive(self, process: str) -> str:
         """Liveliness token of a process."""
-        return self._under(f"alive/{process}")
+        return f"{self._under}/alive/{process}"
+
+
+_ENDS: Mapping[str, tuple[str | None, str | None]] = {
+    "uplink": (SENSOR, ROUTER),
+    "downlink": (ROUTER, None),
+    "ack": (ROUTER, SENSOR),
+    "ack/sent": (LEGITIMATE, ROUTER),
+    "estimate": (LEGITIMATE, CONTROLLER),
+    "state": (SENSOR, CONTROLLER),
+    "input": (CONTROLLER, SENSOR),
+    "telemetry": (None, RECORDER),
+    "journal": (ROUTER, RECORDER),
+    "progress": (None, SENSOR),
+    "control": (RECORDER, None),
+    "control/recorder": (OPERATOR, RECORDER),
+}
+"""A key after the run's name, or its kind → its writer and its reader; None: the process that the key names."""
+
+
+def _ends(key: str) -> tuple[str, str]:
+    """The writer and the reader of a key; empty if it is not a key of a run."""
+    path = "/".join(key.split("/")[2:])
+    kind, _, name = path.partition("/")
+    writer, reader = _ENDS.get(path) or _ENDS.get(kind, (None, None))
+    return writer or name, reader or name
 
 
 def reader_of(key: str) -> str:
     """The process that reads a key; the sensor for inputs, which the legitimate estimator may read, too."""
-    kind, _, name = "/".join(key.split("/")[2:]).partition("/")
-    if kind == "ack":
-        return ROUTER if name == "sent" else SENSOR
-    readers = {
-        "uplink": ROUTER,
-        "journal": RECORDER,
-        "telemetry": RECORDER,
-        "progress": SENSOR,
-        "estimate": CONTROLLER,
-        "state": CONTROLLER,
-        "input": SENSOR,
-    }
-    return readers.get(kind, name)
+    return _ends(key)[1]
 
 
 def reads(process: str, key: str) -> bool:
@@ -113,19 +104,7 @@ def reads(process: str, key: str) -> bool:
 
 def writer_of(key: str) -> str:
     """The only process that may write a key; empty if it is not a key of a run."""
-    kind, _, name = "/".join(key.split("/")[2:]).partition("/")
-    if kind == "ack":
-        return LEGITIMATE if name == "sent" else ROUTER
-    writers = {
-        "uplink": SENSOR,
-        "downlink": ROUTER,
-        "journal": ROUTER,
-        "control": OPERATOR if name == RECORDER else RECORDER,
-        "estimate": LEGITIMATE,
-        "state": SENSOR,
-        "input": CONTROLLER,
-    }
-    return writers.get(kind, name)
+    return _ends(key)[0]
 
 
 ZenohConfig = dict[str, Any]
