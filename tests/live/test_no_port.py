@@ -21,7 +21,7 @@ import pytest
 from evedrop.errors import Interrupted, RunError
 from evedrop.live.launch.ports import RouterEndpoints, endpoints_at
 from evedrop.live.launch.private_folder import private_folder, socket_folder
-from evedrop.live.launch.process_set import launch_one
+from evedrop.live.launch.process_set import Launch, launch_one
 from evedrop.live.launch.starter import StartedProcess, Starter, process_starter
 from evedrop.live.network.endpoint import Endpoint, SocketEndpoint, endpoint_in
 from evedrop.live.protocol.launcher_events import RouterListens
@@ -174,14 +174,16 @@ def launch(
     """Run the small scenario with this starter."""
     with contextlib.chdir(folder):
         launch_one(
-            scenario or small_network(),
-            folder / "run",
-            "off",
-            endpoints,
-            silent,
-            stop or threading.Event(),
-            starter,
-            patience=patience,
+            Launch(
+                scenario or small_network(),
+                folder / "run",
+                "off",
+                silent,
+                stop or threading.Event(),
+                starter,
+                patience=patience,
+                endpoints=endpoints,
+            )
         )
 
 

@@ -32,5 +32,7 @@ def test_no_process_waits_for_a_viewer(tmp_path: Path, monkeypatch: pytest.Monke
 
     monkeypatch.setattr(Viewer, "start", slow)
     with pytest.raises(Interrupted):
-        process_set.launch_one(load("eavesdroppers"), tmp_path / "run", "web", None, lambda _: None, stop, never)
+        process_set.launch_one(
+            process_set.Launch(load("eavesdroppers"), tmp_path / "run", "web", lambda _: None, stop, never)
+        )
     assert Results.read(tmp_path / "run").summary["ended"] == "interrupted"

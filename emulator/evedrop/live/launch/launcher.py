@@ -6,24 +6,23 @@ It imports neither zenoh nor rerun. It alone decides how the run ended.
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.errors import UsageError
 from evedrop.live.launch.briefs import MOST_SLOTS_AHEAD
 from evedrop.live.launch.ports import loopback_endpoints, warn_if_exposed
-from evedrop.live.launch.process_set import FinishedRun, launch_one
+from evedrop.live.launch.process_set import FinishedRun, Launch, launch_one
 from evedrop.live.launch.starter import process_starter
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import choose
 from evedrop.system.output import say
-from evedrop.system.threads import ThreadEvent
 from evedrop.system.world import world
 
 if TYPE_CHECKING:
     from evedrop.live.launch.hosts_file import HostsPlan
-    from evedrop.live.launch.starter import Starter
 
 _HOSTS_PATIENCE = 120  # seconds; some hosts take long to start Python
 
@@ -58,14 +57,15 @@ def launch(
 
     this = world().process
     with this.stop_on_signals() as stop, this.told_when_suspended(suspended), process_starter(stop) as start:
+        run = Launch(scenario, folder, view, on_event, stop, start, ahead, paused)
         if hosts is not None:
-            return _on_hosts(scenario, folder, view, on_event, stop, start, hosts, paused, ahead)
+            return _on_hosts(run, hosts)
         if scenario.shards == 1:
             endpoints = None
             if listen is not None or relay is not None or scenario.relayed:
                 endpoints = loopback_endpoints(listen, relay, scenario.relayed)
                 warn_if_exposed(endpoints)
-            return launch_one(scenario, folder, view, endpoints, on_event, stop, start, paused=paused, ahead=ahead)
+            return launch_one(replace(run, endpoints=endpoints))
         from evedrop.live.launch.shards import launch_shards  # noqa: PLC0415 - not needed for one set of processes
 
         given = {"listen": listen, "relay": relay}
@@ -77,39 +77,18 @@ def launch(
                 )
         if paused:
             raise UsageError(f"--paused: a run in {scenario.shards} shards cannot be steered; give --set shards=1")
-        return launch_shards(scenario, folder, view, on_event, stop, start, ahead)
+        return launch_shards(run)
 
 
-def _on_hosts(
-    scenario: Scenario,
-    folder: Path,
-    view: str,
-    on_event: OnEvent,
-    stop: ThreadEvent,
-    here: Starter,
-    hosts: HostsPlan,
-    paused: bool,
-    ahead: int,
-) -> FinishedRun:
+def _on_hosts(run: Launch, hosts: HostsPlan) -> FinishedRun:
     """Run a scenario as `launch` does, with processes on other hosts."""
     # Not needed on one machine.
     from evedrop.live.launch.other_hosts import ssh_starter  # noqa: PLC0415
 
-    if scenario.shards > 1:
+    if run.scenario.shards > 1:
         raise UsageError(
-            f"--hosts: the scenario has {scenario.shards} shards, and hosts carry one run; give --set shards=1"
+            f"--hosts: the scenario has {run.scenario.shards} shards, and hosts carry one run; give --set shards=1"
         )
     warn_if_exposed(hosts.endpoints)
-    with ssh_starter(hosts, here, stop, scenario.longest_outage) as start:
-        return launch_one(
-            scenario,
-            folder,
-            view,
-            hosts.endpoints,
-            on_event,
-            stop,
-            start,
-            paused=paused,
-            patience=_HOSTS_PATIENCE,
-            ahead=ahead,
-        )
+    with ssh_starter(hosts, run.starter, run.stop, run.scenario.longest_outage) as start:
+        return launch_one(replace(run, endpoints=hosts.endpoints, starter=start, patience=_HOSTS_PATIENCE))

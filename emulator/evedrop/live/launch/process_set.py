@@ -46,29 +46,35 @@ class FinishedRun:
     """The results folder, which may have been renamed."""
 
 
-def launch_one(
-    scenario: Scenario,
-    folder: Path,
-    view: str,
-    endpoints: RouterEndpoints | None,
-    on_event: OnEvent,
-    stop: ThreadEvent,
-    starter: Starter,
-    *,
-    shard: bool = False,
-    paused: bool = False,
-    patience: int = LAUNCHED_PATIENCE,
-    ahead: int = MOST_SLOTS_AHEAD,
-) -> FinishedRun:
-    """Run a scenario as `launch` does, in one set of processes, until `stop` is set.
+@dataclass(frozen=True)
+class Launch:
+    """What one set of processes is launched with."""
 
-    endpoints: None for a socket in a private folder, which other users cannot enter.
-    shard: whether other sets of processes carry further trials; patience: seconds for which processes wait for each other;
-    ahead: as for `launch`.
-    """
+    scenario: Scenario
+    folder: Path
+    """Of the results."""
+    view: str
+    on_event: OnEvent
+    stop: ThreadEvent
+    """Ends the run once it is set."""
+    starter: Starter
+    ahead: int = MOST_SLOTS_AHEAD
+    """As for `launch`."""
+    paused: bool = False
+    shard: bool = False
+    """Whether other sets of processes carry further trials."""
+    patience: int = LAUNCHED_PATIENCE
+    """Seconds for which processes wait for each other."""
+    endpoints: RouterEndpoints | None = None
+    """None for a socket in a private folder, which other users cannot enter."""
+
+
+def launch_one(launch: Launch) -> FinishedRun:
+    """Run a scenario as `evedrop.live.launch.launcher.launch` does, in one set of processes, until it is stopped."""
+    scenario, folder, on_event, stop = launch.scenario, launch.folder, launch.on_event, launch.stop
     with (
         private_folder() as private,
-        _endpoints(endpoints, private) as at,
+        _endpoints(launch.endpoints, private) as at,
         contextlib.closing(HeldFolder(new_folder(folder))) as held,
     ):
         make_private(folder / "logs")
@@ -77,20 +83,20 @@ def launch_one(
             # At once, so that a run that is interrupted or killed in its first moments can be run again.
             with contextlib.suppress(OSError):  # the recorder writes it, too, and reports why it cannot
                 write_resolved(folder, scenario)
-            task = RecorderTask(folder.absolute(), view != "off", shard, paused)
-            briefs = briefs_of(scenario, at, task, patience=patience, ahead=ahead)
+            task = RecorderTask(folder.absolute(), launch.view != "off", launch.shard, launch.paused)
+            briefs = briefs_of(scenario, at, task, patience=launch.patience, ahead=launch.ahead)
             recorder = briefs.pop(RECORDER)
             # Before all processes: a viewer may take longer to start than they wait for the recorder.
             viewer = Viewer.start(
-                view, folder / "logs", folder.absolute() / "recording.rrd", meanwhile=lambda: _heed(stop)
+                launch.view, folder / "logs", folder.absolute() / "recording.rrd", meanwhile=lambda: _heed(stop)
             )
             if viewer is not None:
                 on_event(ViewOpened(viewer.address, viewer.warning))
-            with Children(held, private, scenario.controller is not None, starter) as children:
+            with Children(held, private, scenario.controller is not None, launch.starter) as children:
                 for name in (ROUTER, RELAY):
                     if name in briefs:
                         children.start(briefs.pop(name))
-                        _wait_until_listening(children, name, stop, patience)
+                        _wait_until_listening(children, name, stop, launch.patience)
                 for brief in briefs.values():
                     children.start(brief)
                 children.start(recorder)

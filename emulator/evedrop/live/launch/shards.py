@@ -19,8 +19,7 @@ from msgspec import structs
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.gathering import SHARDS_FOLDER, Shard, shards_of
 from evedrop.live.launch.ports import RouterEndpoints, loopback_endpoints
-from evedrop.live.launch.process_set import FinishedRun, launch_one
-from evedrop.live.launch.starter import Starter
+from evedrop.live.launch.process_set import FinishedRun, Launch, launch_one
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.results.folder import HeldFolder, new_folder
 from evedrop.results.resolved_scenario import write_resolved
@@ -35,7 +34,6 @@ from evedrop.scenario.progress_events import (
 )
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
-from evedrop.system.threads import ThreadEvent
 from evedrop.system.waiting import wait_for_thread
 from evedrop.system.world import world
 
@@ -109,22 +107,13 @@ class _ShardsState:
     """In order of time."""
     viewer: Viewer | None = None
 
-    def launched(
-        self,
-        shard: Shard,
-        at: RouterEndpoints | None,
-        on_event: OnEvent,
-        view: str,
-        stop: ThreadEvent,
-        starter: Starter,
-        ahead: int,
-    ) -> None:
-        """Run one shard to its end, its routers at these endpoints, or at a socket; if it ends early, all shards end."""
+    def launched(self, shard: Shard, launch: Launch) -> None:
+        """Run one shard to its end; if it ends early, all shards end."""
         try:
-            ended = launch_one(shard.scenario, shard.folder, view, at, on_event, stop, starter, shard=True, ahead=ahead)
+            ended = launch_one(launch)
         except BaseException as error:
             self.failures.append((shard, error))
-            stop.set()
+            launch.stop.set()
         else:
             self.viewer = self.viewer or ended.viewer
 
@@ -135,34 +124,38 @@ class _ShardsState:
         return next(failures, None)
 
 
-def launch_shards(
-    scenario: Scenario,
-    folder: Path,
-    view: str,
-    on_event: OnEvent,
-    stop: ThreadEvent,
-    starter: Starter,
-    ahead: int,
-) -> FinishedRun:
+def launch_shards(run: Launch) -> FinishedRun:
     """Run a scenario in its shards, all at the same time, into one results folder; raises as `launch` does.
 
     The view shows the first shard, which has the recorded trials.
     """
+    scenario, folder, on_event, stop = run.scenario, run.folder, run.on_event, run.stop
     endpoints = _endpoints(scenario.shards) if scenario.relayed else [None] * scenario.shards
     held = HeldFolder(new_folder(folder))
     with contextlib.suppress(OSError):  # it is written again when the shards are merged, and an error reported then
         write_resolved(folder, scenario)
     shards = shards_of(scenario, folder)
     progress, state = OneProgress(shards, on_event), _ShardsState()
-    first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, endpoints, strict=True)]
+    launches = [
+        replace(
+            run,
+            scenario=shard.scenario,
+            folder=shard.folder,
+            view=run.view if shard.number == 1 else "off",
+            on_event=progress.of(shard),
+            shard=True,
+            endpoints=at,
+        )
+        for shard, at in zip(shards, endpoints, strict=True)
+    ]
     threads = [
-        world().thread(state.launched, *shard, "off", stop, starter, ahead, name="shard", daemon=False)
-        for shard in others
+        world().thread(state.launched, shard, launch, name="shard", daemon=False)
+        for shard, launch in zip(shards[1:], launches[1:], strict=True)
     ]
     for thread in threads:
         thread.start()
     # On this thread, not on another one: a viewer ends with the thread that started it.
-    state.launched(*first, view, stop, starter, ahead)
+    state.launched(shards[0], launches[0])
     try:
         for thread in threads:
             while thread.is_alive() and not stop.is_set():  # a run lasts as long as it lasts
