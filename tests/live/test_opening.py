@@ -127,7 +127,7 @@ def test_every_command_says_that_threads_are_lacking(
 def test_a_session_without_threads_is_an_error_of_the_run() -> None:
     """So those who try again after a lost connection do; they handle no panic."""
     with pytest.raises(RunError, match="no further process or thread can be started"):
-        open_session(zenoh.Config())
+        open_session({})
 
 
 @pytest.mark.parametrize("error", [zenoh.ZError("no"), PanicException("other"), KeyboardInterrupt()])
@@ -139,4 +139,4 @@ def test_other_errors_of_a_session_stay(error: BaseException, monkeypatch: pytes
 
     monkeypatch.setattr(zenoh, "open", fails)
     with pytest.raises(type(error)):
-        open_session(zenoh.Config())
+        open_session({})

@@ -6,7 +6,6 @@ Source: docs/wire/file.md, sides.
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 from collections.abc import Iterable
 from dataclasses import replace
@@ -87,7 +86,7 @@ def _opened(side: Side, largest: int, users: str | None) -> tuple[zenoh.Session,
         endpoints = tuple(_with_port(endpoint) for endpoint in side.listen)
         config = side_config(replace(side, listen=endpoints), largest, users)
         try:
-            return open_session(zenoh.Config.from_json5(json.dumps(config))), endpoints
+            return open_session(config), endpoints
         except zenoh.ZError as error:
             fixed = endpoints == side.listen or "in use" not in str(error)
             if fixed or not attempts:

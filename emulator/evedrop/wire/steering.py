@@ -9,7 +9,6 @@ Source: docs/wire/file.md, events and control.
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -172,7 +171,7 @@ class WireControl:
                 access = access_control([Grant(OPERATOR, writes=(), reads=(), token=None, asks=(self._key,))])
                 config = listening_config(router, str(users), access, _TRANSPORT)
                 try:
-                    return open_session(zenoh.Config.from_json5(json.dumps(config))), router
+                    return open_session(config), router
                 except zenoh.ZError:
                     if not attempts:
                         raise

@@ -22,9 +22,9 @@ from evedrop.errors import BriefError, RunError, UsageError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network.certificates import Authority, check_identity, tls_section
-from evedrop.live.network.connecting import RouterAddress, connected
+from evedrop.live.network.connecting import connected
 from evedrop.live.network.control_file import Control, read_control
-from evedrop.live.network.session import Session, client_config, router_address_of
+from evedrop.live.network.session import Session, client_config
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol.brief import AnyBrief, Identity, RecorderPart, read_brief
 from evedrop.system.ports import free_port
@@ -174,15 +174,16 @@ def test_an_eavesdropper_cannot_pose_as_the_router(stage: Bench) -> None:
         with pytest.raises(
             BriefError, match=r"has the certificate of another process of evedrop r.*, and is not a router"
         ):
-            connected(router_address_of(lured), 20.0)
+            connected(lured, client_config(lured), 20.0)
 
 
 def test_a_router_is_trusted_at_its_own_names_alone(stage: Bench) -> None:
     """The router of this run at a host that its certificate does not name: one line with the option that mends it."""
     brief = stage.briefs[EVE]
     port = brief.router.rpartition(":")[2]
+    elsewhere = replace(brief, router=f"tls/localhost:{port}")
     with pytest.raises(BriefError, match=rf"does not name localhost; .* --connect tls/localhost:{port}, all of them"):
-        connected(router_address_of(replace(brief, router=f"tls/localhost:{port}")), 20.0)
+        connected(elsewhere, client_config(elsewhere), 20.0)
 
 
 def test_a_router_is_trusted_at_its_own_addresses_alone(stage: Bench) -> None:
@@ -202,14 +203,14 @@ def test_a_router_is_trusted_at_its_own_addresses_alone(stage: Bench) -> None:
             BriefError, match=rf"does not name 127\.0\.0\.1; .* --connect tls/127\.0\.0\.1:{port}, all of them"
         ),
     ):
-        connected(router_address_of(brief), 20.0)
+        connected(brief, client_config(brief), 20.0)
 
 
 def test_another_runs_router_is_told_apart(stage: Bench) -> None:
     """A brief of another run says whose router it found, within seconds."""
     other = briefs_of(stage.scenario, endpoints_at(stage.briefs[EVE].router), RecorderTask(Path("nowhere"), False))[EVE]
     with pytest.raises(BriefError) as caught:
-        connected(router_address_of(other), 60.0)
+        connected(other, client_config(other), 60.0)
     assert f"has a certificate of evedrop {stage.keys.run}, and this brief is of run {other.run}" in str(caught.value)
 
 
@@ -335,18 +336,18 @@ def test_a_router_whose_clock_is_wrong_is_told_apart(stage: Bench) -> None:
             BriefError, match=r"not valid now by this host's clock \(certificate has expired\); set the clock"
         ),
     ):
-        connected(RouterAddress(endpoint, stage.keys.run, config, eve), 20.0)
+        connected(Control(stage.keys.run, endpoint, EVE, "", eve), config, 20.0)
 
 
 @pytest.mark.thorough
 def test_a_router_that_is_not_there_is_waited_for() -> None:
     """Nobody listens: the process says so when its patience ends, as a failure of the run."""
     calls: list[None] = []
-    address = RouterAddress(f"tcp/127.0.0.1:{free_port()}", "r01", {})
+    control = Control("r01", f"tcp/127.0.0.1:{free_port()}", "operator", "")
     with pytest.raises(
         RunError, match=r"no router answered at tcp/.* within 1 s \(Connection refused\); start it there"
     ):
-        connected(address, 1.0, lambda: calls.append(None))
+        connected(control, {}, 1.0, lambda: calls.append(None))
     assert len(calls) > 1
 
 
@@ -354,13 +355,13 @@ def test_briefs_that_fit_no_endpoint_are_refused(stage: Bench) -> None:
     """Certificates for a router without TLS, none for a router that requires them, and malformed endpoints."""
     with pytest.raises(BriefError, match="7447 is not an endpoint"):
         Session(replace(stage.briefs[EVE], router="7447"))
-    for address, message in (
-        (RouterAddress("tls/127.0.0.1:7447", "r01", {}), "there is no identity"),
-        (RouterAddress("tcp/127.0.0.1:7447", "r01", {}, EVES), "takes no identity"),
-        (RouterAddress("7447", "r01", {}), "7447 is not an endpoint"),
+    for control, message in (
+        (Control("r01", "tls/127.0.0.1:7447", "operator", ""), "there is no identity"),
+        (Control("r01", "tcp/127.0.0.1:7447", "operator", "", EVES), "takes no identity"),
+        (Control("r01", "7447", "operator", ""), "7447 is not an endpoint"),
     ):
         with pytest.raises(BriefError, match=message):
-            connected(address, 1.0)
+            connected(control, {}, 1.0)
 
 
 def test_the_routers_certificate_passes_the_strictest_check(stage: Bench) -> None:

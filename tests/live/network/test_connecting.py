@@ -17,8 +17,10 @@ from evedrop.errors import RunError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network import connecting
-from evedrop.live.network.connecting import Failures, RouterAddress
+from evedrop.live.network.connecting import Failures
+from evedrop.live.network.control_file import Control
 from evedrop.live.network.session import Session
+from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.system.ports import free_port
 from tests.clock import TestClock
 from tests.live.network.bench import small_network
@@ -39,7 +41,7 @@ def test_a_process_says_that_it_waits_for_its_router(tmp_path: Path, capfd: pyte
 
 
 @contextlib.contextmanager
-def listener(lasting: float | None) -> Iterator[RouterAddress]:
+def listener(lasting: float | None) -> Iterator[tuple[Control, ZenohConfig]]:
     """A listener that ends every connection after this number of seconds, unless the client ends it first."""
     with socket.create_server(("127.0.0.1", 0)) as server, contextlib.ExitStack() as links:
 
@@ -58,29 +60,29 @@ def listener(lasting: float | None) -> Iterator[RouterAddress]:
             "scouting": {"multicast": {"enabled": False}},
             "transport": {"unicast": {"open_timeout": 500}},
         }
-        yield RouterAddress(endpoint, "r01", config)
+        yield Control("r01", endpoint, "operator", ""), config
         server.shutdown(socket.SHUT_RDWR)
 
 
 @pytest.mark.long
 def test_a_network_that_cuts_connections_is_no_refusal() -> None:
     """Connections that flap are lost in the middle of a handshake, as of a router that refuses; an idle one is lost as well."""
-    with listener(0.3) as address, pytest.raises(RunError, match="no router answered"):
-        connecting.connected(address, 6.0)
+    with listener(0.3) as given, pytest.raises(RunError, match="no router answered"):
+        connecting.connected(*given, 6.0)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("lasting", [0.0, None], ids=["hangs up on everybody", "says nothing"])
 def test_what_ends_connections_by_itself_is_not_the_network(lasting: float | None) -> None:
     """A program that hangs up at once, and one, as a router that refused a brief, that keeps an idle connection."""
-    with listener(lasting) as address:
-        assert not connecting.cut_off(connecting.endpoint_of(address.router, None))
+    with listener(lasting) as (control, _):
+        assert not connecting.cut_off(connecting.endpoint_of(control.router, None))
 
 
 def test_a_connection_that_ends_before_there_is_a_certificate_is_no_refusal(tmp_path: Path) -> None:
     """A proxy accepts and hangs up while its router is down: a process waits for it as for one that does not listen."""
-    with listener(0.0) as address:
-        endpoint = address.router.replace("tcp/", "tls/")
+    with listener(0.0) as (control, _):
+        endpoint = control.router.replace("tcp/", "tls/")
         brief = briefs_of(
             small_network(), endpoints_at(endpoint), RecorderTask(tmp_path, False), ends_with_stdin=False
         )["eve"]

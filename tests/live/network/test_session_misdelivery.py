@@ -271,15 +271,18 @@ def test_a_subscription_that_is_closed_says_so(stage: Stage) -> None:
     assert [str(error) for error in caught] == [stage.keys.downlink("eve")]
 
 
-def test_zenoh_reconnects_no_session(stage: Stage) -> None:
+def test_zenoh_reconnects_no_session(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither the first session of a process nor a later one: what keys mean would be confused before it is replaced."""
     seen: list[dict[str, Any]] = []
 
+    really_open = zenoh.open
+
     def opened(config: zenoh.Config) -> zenoh.Session:
         seen.append(json.loads(config.get_json("connect/retry")))
-        return zenoh.open(config)
+        return really_open(config)
 
-    with Session(stage.eve, opened=opened) as session:
+    monkeypatch.setattr(zenoh, "open", opened)
+    with Session(stage.eve) as session:
         stage.cable.flap()
         wait_until(lambda: session.connection.openings > 1, "another session")
     assert len(seen) > 1

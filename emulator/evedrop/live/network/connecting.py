@@ -13,14 +13,14 @@ import socket
 import ssl
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol, final
+from typing import final
 
 import zenoh
 
 from evedrop.errors import BriefError, NoRouter, RunError
+from evedrop.live.network.control_file import Control
 from evedrop.live.network.endpoint import AnyEndpoint, Endpoint, SocketEndpoint, endpoint_in
-from evedrop.live.protocol.brief import Identity
+from evedrop.live.protocol.brief import AnyBrief, Identity
 from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.system.environment import check_zenoh_runtime
 from evedrop.system.lacks import lack_of
@@ -28,14 +28,14 @@ from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 from evedrop.system.world import world
 
 
-def open_session(config: zenoh.Config) -> zenoh.Session:
-    """Open a session.
+def open_session(config: ZenohConfig) -> zenoh.Session:
+    """Open a session with this configuration.
 
     Raises zenoh.ZError, UsageError if `ZENOH_RUNTIME` is malformed, and RunError if the machine lacks threads or memory.
     """
     check_zenoh_runtime()
     try:
-        session: zenoh.Session = world().zenoh.open(config)
+        session: zenoh.Session = world().zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except zenoh.ZError:
         raise
     except BaseException as error:
@@ -59,42 +59,8 @@ _AT_ONCE_SECONDS = 0.1
 _NOT_YET_VALID, _EXPIRED, _WRONG_PURPOSE, _WRONG_NAME, _WRONG_ADDRESS = 9, 10, 26, 62, 64  # of OpenSSL's X509_V_ERR
 
 
-class Credentials(Protocol):
-    """The router's address, and a user with a password: a brief, or the operator's control file."""
-
-    @property
-    def run(self) -> str:
-        """Name of the run."""
-
-    @property
-    def router(self) -> str:
-        """Zenoh endpoint."""
-
-    @property
-    def user(self) -> str:
-        """Name of the user."""
-
-    @property
-    def password(self) -> str:
-        """Password of the user."""
-
-    @property
-    def identity(self) -> Identity | None:
-        """Certificate of the user, if the router takes certificates."""
-
-
-@dataclass(frozen=True)
-class RouterAddress:
-    """A router's address, and the configuration and user to connect with."""
-
-    router: str
-    """Zenoh endpoint."""
-    run: str
-    config: ZenohConfig
-    """Zenoh's configuration for one attempt."""
-    identity: Identity | None = None
-    process: str = "operator"
-    """The connecting process."""
+Credentials = AnyBrief | Control
+"""The router's address, and a user with a password."""
 
 
 @final
@@ -135,26 +101,26 @@ def _reason(error: OSError | zenoh.ZError) -> object:
 
 
 def connected(
-    address: RouterAddress,
+    entry: Credentials,
+    config: ZenohConfig,
     patience: float,
     meanwhile: Callable[[], None] = lambda: None,
     clock: Clock = SYSTEM_CLOCK,
-    opened: Callable[[zenoh.Config], zenoh.Session] = open_session,
 ) -> zenoh.Session:
-    """Open a session with the router; `meanwhile` is called before each attempt, `opened` opens it.
+    """Open a session with the router; config: for one attempt; `meanwhile` is called before each attempt.
 
     Raises BriefError for an error that waiting cannot mend, RunError if no router has answered after `patience` seconds.
     """
-    endpoint = endpoint_of(address.router, address.identity)
+    endpoint = endpoint_of(entry.router, entry.identity)
     began = clock.monotonic()
-    failures, wait = Failures(clock, endpoint.secure), WaitReporter(address.process, address.router, clock)
+    failures, wait = Failures(clock, endpoint.secure), WaitReporter(entry.user, entry.router, clock)
     pause, longest = _AGAIN_SECONDS
     while True:
         meanwhile()
         tried = clock.monotonic()
         try:
-            _knock(endpoint, address)
-            return opened(zenoh.Config.from_json5(json.dumps(address.config)))
+            _knock(endpoint, entry)
+            return open_session(config)
         except (OSError, zenoh.ZError) as error:
             failures.add_attempt(error, clock.monotonic() - tried)
             why = _reason(error)
@@ -167,12 +133,12 @@ def connected(
                 failures = Failures(clock, endpoint.secure)
             if failures.refused:
                 raise BriefError(
-                    f"{address.router} does not let this brief in, which is of run {address.run}: the router there is of another "
+                    f"{entry.router} does not let this brief in, which is of run {entry.run}: the router there is of another "
                     "run, or another program listens there; start the router of this run, or give the brief of that one"
                 ) from error
             if clock.monotonic() - began > patience:
                 raise NoRouter(
-                    f"no router answered at {address.router} within {patience:.0f} s ({why}); start it there, and check that no "
+                    f"no router answered at {entry.router} within {patience:.0f} s ({why}); start it there, and check that no "
                     "firewall is in between"
                 ) from error
             wait.poll(why)
@@ -259,41 +225,41 @@ def endpoint_of(router: str, identity: Identity | None) -> AnyEndpoint:
     return endpoint
 
 
-def _knock(endpoint: AnyEndpoint, address: RouterAddress) -> None:
+def _knock(endpoint: AnyEndpoint, entry: Credentials) -> None:
     """Check that a program listens there and, by its certificate, is the router of this run.
 
     Raises OSError if none does, BriefError if the certificate cannot be trusted.
     """
-    if address.identity is None or not isinstance(endpoint, Endpoint):
+    if entry.identity is None or not isinstance(endpoint, Endpoint):
         endpoint.dial(_ATTEMPT_SECONDS).close()
         return
     try:
         with endpoint.dial(_ATTEMPT_SECONDS) as link:
-            trust = ssl.create_default_context(cadata=address.identity.authority)
+            trust = ssl.create_default_context(cadata=entry.identity.authority)
             # The router shows its certificate first; nothing more is needed here.
             world().certificate(link, trust, endpoint.host)
     except ssl.SSLCertVerificationError as error:
-        raise _mistrusted(endpoint, address, error) from error
+        raise _mistrusted(endpoint, entry, error) from error
 
 
-def _mistrusted(endpoint: Endpoint, address: RouterAddress, error: ssl.SSLCertVerificationError) -> BriefError:
+def _mistrusted(endpoint: Endpoint, entry: Credentials, error: ssl.SSLCertVerificationError) -> BriefError:
     """The error that says why an endpoint's certificate cannot be trusted."""
     if error.verify_code in {_NOT_YET_VALID, _EXPIRED}:
         return BriefError(
-            f"{address.router}: the router's certificate is not valid now by this host's clock ({error.verify_message}); set the "
+            f"{entry.router}: the router's certificate is not valid now by this host's clock ({error.verify_message}); set the "
             "clock, or write the briefs again with `evedrop brief`, all of them"
         )
     maker = _maker_at(endpoint)
     if error.verify_code in {_WRONG_NAME, _WRONG_ADDRESS}:
         return BriefError(
-            f"{address.router}: the router's certificate does not name {endpoint.host}; write the briefs again with "
+            f"{entry.router}: the router's certificate does not name {endpoint.host}; write the briefs again with "
             f"--connect tls/{endpoint.host}:{endpoint.port}, all of them"
         )
-    whose = f"has a certificate of {maker}, and this brief is of run {address.run}"
+    whose = f"has a certificate of {maker}, and this brief is of run {entry.run}"
     if error.verify_code == _WRONG_PURPOSE:
         whose = f"has the certificate of another process of {maker}, and is not a router"
     return BriefError(
-        f"{address.router}: the program listening there {whose}; start the router of this run there, or give the brief "
+        f"{entry.router}: the program listening there {whose}; start the router of this run there, or give the brief "
         "of that one"
     )
 
@@ -316,7 +282,7 @@ def listening(listen: str, identity: Identity | None, config: ZenohConfig) -> ze
     endpoint = endpoint_of(listen, identity)
     try:
         endpoint.try_to_listen()
-        return open_session(zenoh.Config.from_json5(json.dumps(config)))
+        return open_session(config)
     except (OSError, zenoh.ZError) as error:
         raise _cannot_listen(endpoint, error) from error
 

@@ -7,7 +7,6 @@ Source: docs/protocol.md, request and answer.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import final
 
@@ -95,7 +94,7 @@ def ask(control: Control, request: OperatorRequest, patience: float) -> Answer |
     world().zenoh.init_log_from_env_or("off")
     key = RunKeys(control.run).control(RECORDER)
     # A run in progress has a router: one attempt is enough.
-    with open_session(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
+    with open_session(client_config(control)) as session:
         for reply in session.get(key, payload=enclosed(key, request.pack()), timeout=patience):
             answer = None if reply.ok is None else payload_of(key, reply.ok.payload.to_bytes())
             if answer is not None:
@@ -121,7 +120,7 @@ def is_there(brief: AnyBrief) -> bool:
         config["connect"]["endpoints"] = [str(endpoint_in(listens).nearby)]
         config["transport"]["link"].get("tls", {})["verify_name_on_connect"] = False
     try:
-        with open_session(zenoh.Config.from_json5(json.dumps(config))) as session:
+        with open_session(config) as session:
             answers = session.liveliness().get(RunKeys(brief.run).alive(brief.process), timeout=_ANSWER_SECONDS)
             return any(answer.ok is not None for answer in answers)
     except zenoh.ZError:

@@ -5,7 +5,6 @@ Source: docs/programs.md.
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from types import TracebackType
 from typing import Self, final
@@ -60,7 +59,7 @@ class ProgramStates:
         self._waited = 0.0
         where = entry.listen or entry.connect
         try:
-            self._session = open_session(zenoh.Config.from_json5(json.dumps(program_config(entry))))
+            self._session = open_session(program_config(entry))
         except zenoh.ZError as error:
             problem = (
                 "cannot listen at" if entry.listen is not None else f"cannot connect within {_CONNECT_SECONDS:.0f} s to"

@@ -30,7 +30,7 @@ from evedrop.errors import EvedropError, MalformedMessage
 from evedrop.live.network.access import access_control, at_relay, at_router, grants, until_all_left, users_file
 from evedrop.live.network.connecting import connected
 from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession
-from evedrop.live.network.session import ATTEMPT, Session, client_config, router_address_of, router_config
+from evedrop.live.network.session import ATTEMPT, Session, client_config, router_config
 from evedrop.live.protocol.brief import AnyBrief, Brief, RelayPart, RouterPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Again, ControlCommand, EndRun, Go, LinkChange
@@ -547,7 +547,7 @@ def relay(brief: Brief[RelayPart]) -> None:
     part = brief.part
     table = at_relay(brief.run, grants(brief.run, tuple(part.receivers), part.controller, relayed=True), part.zid)
     # Connect as a client first, which reports errors; Zenoh links routers in the background and reports none.
-    with connected(router_address_of(brief), float(brief.patience)):
+    with connected(brief, client_config(brief), float(brief.patience)):
         pass
     with _opened_relay(brief, access_control(table, brief.identity is not None)) as session:
         present = session.presence(grant.process for grant in table if grant.token is not None and grant.zid is None)

@@ -9,23 +9,18 @@ dropped.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from queue import Empty
 from types import TracebackType
 from typing import Self, final
 
-import zenoh
-
 from evedrop.errors import Gap, MalformedMessage, MissingProcesses, RunError
 from evedrop.live.network.connecting import (
     LOGGED,
     Credentials,
-    RouterAddress,
     WaitReporter,
     connected,
     listening,
@@ -127,17 +122,14 @@ def client_config(entry: Credentials) -> ZenohConfig:
     }
 
 
-def router_address_of(entry: Credentials) -> RouterAddress:
-    """The router's address for a brief, or for the operator."""
-    return RouterAddress(entry.router, entry.run, client_config(entry), entry.identity, entry.user)
-
-
-def _once(address: RouterAddress) -> RouterAddress:
-    """The same address for sessions that are closed when their connection is lost: Zenoh must not reconnect them."""
-    config = dict(address.config)
-    config["connect"] = {**config["connect"], "retry": {"period_init_ms": _NEVER_MS, "period_max_ms": _NEVER_MS}}
-    config["transport"] = {**config["transport"], "unicast": dict(ATTEMPT)}
-    return replace(address, config=config)
+def _once(config: ZenohConfig) -> ZenohConfig:
+    """The same for sessions that are closed when their connection is lost: Zenoh must not reconnect them."""
+    never = {"period_init_ms": _NEVER_MS, "period_max_ms": _NEVER_MS}
+    return {
+        **config,
+        "connect": {**config["connect"], "retry": never},
+        "transport": {**config["transport"], "unicast": dict(ATTEMPT)},
+    }
 
 
 def listening_config(listen: str, users_file: str, access: ZenohConfig, transport: ZenohConfig) -> ZenohConfig:
@@ -172,12 +164,8 @@ class Session:
         listen: str | None = None,
         meanwhile: Callable[[], None] = lambda: None,
         clock: Clock = SYSTEM_CLOCK,
-        opened: Callable[[zenoh.Config], zenoh.Session] = open_session,
     ) -> None:
-        """config, listen: a router's configuration, and its address; meanwhile: called while waiting for the router.
-
-        opened: opens a session with the router, the first one and those after a lost connection.
-        """
+        """config, listen: a router's configuration, and its address; meanwhile: called while waiting for the router."""
         world().zenoh.init_log_from_env_or(_LOGGED)
         if brief.ends_with_stdin:
             when_launcher_is_gone(lambda: world().process.exit(3))
@@ -195,10 +183,9 @@ class Session:
         self._watchdog = ConnectionWatchdog(brief) if brief.role not in ("router", "relay", "recorder") else None
         self._wait = WaitReporter(brief.process, brief.router, clock)
         if config is None or listen is None:
-            address = _once(router_address_of(brief))
-            first = connected(address, self.patience, meanwhile, clock, opened)
-            once = zenoh.Config.from_json5(json.dumps(address.config))
-            self.connection = Connection(first, lambda: self._wait.attempt(lambda: opened(once)), self._changed)
+            once = _once(client_config(brief))
+            first = connected(brief, once, self.patience, meanwhile, clock)
+            self.connection = Connection(first, lambda: self._wait.attempt(lambda: open_session(once)), self._changed)
         else:
             self.connection = Connection(listening(listen, brief.identity, config), None)
             if brief.ends_with_stdin:
