@@ -54,7 +54,7 @@ def test_a_run_begins_when_all_are_there() -> None:
     assert conductor.missing == ["router", "sensor", "legitimate", "smart"]
     conductor.assemble()
     assert conductor.missing == []
-    assert conductor.there("smart")
+    assert conductor.present["smart"]
     assert network.opened
     assert network.clock.now == 1000.0
     conductor.start()
@@ -123,7 +123,7 @@ def test_processes_that_come_and_go_are_noted() -> None:
     assert conductor.next_message() is None
     assert conductor.lost == {"smart": 1005.0}
     assert conductor.missing == ["smart"]
-    assert conductor.processes == {"router": True, "sensor": True, "legitimate": True, "smart": False}
+    assert conductor.present == {"router": True, "sensor": True, "legitimate": True, "smart": False}
     conductor.absent.add("smart")
     assert conductor.missing == []
     network.watches["smart"](True)

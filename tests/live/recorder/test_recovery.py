@@ -20,7 +20,7 @@ from tests.live.recorder.test_conductor_ending import Network
 class Conducted:
     """The part of a conductor and of a steering that a recovery uses, with the connections in the test's hands."""
 
-    relayed = False
+    hub = "router"
     at: int | None = None
     awaits_belief = False
 
@@ -29,7 +29,7 @@ class Conducted:
         self.rounds: list[int] = []
         self.repeated: list[str | int] = []
         """What was said again in rounds: the progress, as a number, and other commands."""
-        self.processes = dict.fromkeys(("router", "sensor", "smart"), True)
+        self.present = dict.fromkeys(("router", "sensor", "smart"), True)
         self.changes: dict[str, Any] = {}
         self.restarts = 0
         """How often the time limit of a hold began again."""

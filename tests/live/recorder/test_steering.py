@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -47,17 +48,13 @@ class RecordingConductor:
     """A conductor that keeps the messages that it would send, and the processes that are present."""
 
     absent: set[str] = field(default_factory=set)
-    away: set[str] = field(default_factory=set)
+    present: defaultdict[str, bool] = field(default_factory=lambda: defaultdict(lambda: True))
     missing: list[str] = field(default_factory=list)
     sent: list[Sent] = field(default_factory=list)
 
     def send_to(self, name: str, command: ControlCommand) -> None:
         """Keep it."""
         self.sent.append((name, command))
-
-    def there(self, name: str) -> bool:
-        """Whether it is."""
-        return name not in self.away
 
     def told(self) -> list[Sent]:
         """All since the last time."""
@@ -184,7 +181,7 @@ def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
     assert run.conductor.told() == []
     assert asked.answers == []
     run.steering.done(1)
-    run.conductor.away.add("smart")
+    run.conductor.present["smart"] = False
     run.steering.carry_on(30, dict)
     assert [type(sent) for _, sent in run.conductor.told()] == [LinkChange, Go, Go]
     assert asked.answers[0].slot == 30

@@ -71,9 +71,10 @@ class Conductor:
         """reporters: the processes that report besides router and sensor: the receivers, and a controller."""
         self._session, self._clock = session, clock
         self._stop = stop
-        self._present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
-        self.relayed = relayed
-        """Whether the recorder is connected to a relay, and not to the router itself."""
+        self.present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
+        """Process → whether it is on the network."""
+        self.hub = RELAY if relayed else ROUTER
+        """The router that the recorder is connected to, and through which it sees all others."""
         self._router: str | None = None
         self.lost: dict[str, float] = {}
         """Process that has vanished from the network → when, on the clock."""
@@ -83,7 +84,7 @@ class Conductor:
         self._mailbox = Mailbox(self.keys, session.allowance, clock)
         for source, key in self.keys.items():
             session.subscribe_with(key, partial(self._mailbox.put, source))
-        for name in self._present:
+        for name in self.present:
             session.watch(name, partial(self._mailbox.put, name))
         self.misdelivered: dict[str, int] = {}
         """Process that has confirmed its end → how many messages it dropped because they name another key."""
@@ -92,28 +93,19 @@ class Conductor:
         self.questions: Queue[Question] = world().queue()
         """The operator's questions."""
         session.asked(keys.control(RECORDER), self.questions.put)
-        self._commands = {name: session.publisher(keys.control(name)) for name in self._present}
+        self._commands = {name: session.publisher(keys.control(name)) for name in self.present}
         self._progress = session.publisher(keys.progress(RECORDER))
         self._settled = 0
 
     @property
     def missing(self) -> list[str]:
         """The processes that are not on the network."""
-        return [name for name, there in self._present.items() if not there and name not in self.absent]
+        return [name for name, there in self.present.items() if not there and name not in self.absent]
 
     def router_changed(self) -> bool:
         """Whether the recorder is connected to another router than at the previous call, or at the start of the run."""
         before, self._router = self._router, self._session.router_id
         return before != self._router
-
-    def there(self, name: str) -> bool:
-        """Whether a process is on the network."""
-        return self._present[name]
-
-    @property
-    def processes(self) -> dict[str, bool]:
-        """Process → whether it is on the network."""
-        return dict(self._present)
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -127,7 +119,7 @@ class Conductor:
 
         Behind a relay, a process's token may be back before its subscriptions, and a command put meanwhile is lost.
         """
-        return [name for name, there in self._present.items() if there and not self._reaches(name)]
+        return [name for name, there in self.present.items() if there and not self._reaches(name)]
 
     def assemble(self) -> None:
         """Wait for every process. Raises RunError, naming the missing ones, after the brief's patience."""
@@ -172,7 +164,7 @@ class Conductor:
     def send_to_all(self, command: ControlCommand) -> None:
         """Send a command to every process that reports and is present."""
         for name in self.keys:
-            if self._present[name]:
+            if self.present[name]:
                 self.send_to(name, command)
 
     def report_progress(self, settled: int) -> None:
@@ -190,18 +182,18 @@ class Conductor:
         patience: seconds to wait for the others, some of which may be cut off. If this process is told to end, it tells them
         once more and does not wait: its launcher might kill it before it has written the results.
         """
-        others = [name for name in self._present if name not in {ROUTER, RELAY} and name not in self.absent]
+        others = [name for name in self.present if name not in {ROUTER, RELAY} and name not in self.absent]
         told: set[str] = set()
         deadline = self._clock.monotonic() + patience
         sent = 0.0
         while self._clock.monotonic() < deadline:
             left = [name for name in others if not self._has_ended(name, told)]
-            if not left and self._present[ROUTER]:
+            if not left and self.present[ROUTER]:
                 break
             if self._clock.monotonic() - sent > _END_SECONDS:
                 sent = self._clock.monotonic()
                 for name in left:
-                    if self._present[name]:
+                    if self.present[name]:
                         self.send_to(name, EndRun())
                         told.add(name)
             if self._stop.asked:
@@ -209,12 +201,12 @@ class Conductor:
             self._hear_out(self._next())
         # The relay after the router: the router's messages pass through it.
         for name in (ROUTER, RELAY):
-            if name in self._present:
+            if name in self.present:
                 self._end_router(name)
 
     def _has_ended(self, name: str, told: Collection[str]) -> bool:
         """Whether a process has left for good: it confirmed its end, or it vanished when told to end and did not return."""
-        if self._present[name]:
+        if self.present[name]:
             return False
         gone = self._clock.monotonic() - self.lost.get(name, -math.inf)
         return name in self.misdelivered or (name in told and gone > _RETURN_SECONDS)
@@ -225,9 +217,9 @@ class Conductor:
         sent, cut_off = 0.0, -math.inf
         while self._clock.monotonic() < deadline and name not in self.misdelivered:
             # All tokens vanish with the connection, and return one after the other.
-            if not (self._session.linked() and self._present[ROUTER]):
+            if not (self._session.linked() and self.present[ROUTER]):
                 cut_off = self._clock.monotonic()
-            elif name == RELAY and not self._present[name] and self._clock.monotonic() - cut_off > _RETURN_SECONDS:
+            elif name == RELAY and not self.present[name] and self._clock.monotonic() - cut_off > _RETURN_SECONDS:
                 return
             if self._clock.monotonic() - sent > _END_SECONDS:
                 sent = self._clock.monotonic()
@@ -278,7 +270,7 @@ class Conductor:
         if item is None or not isinstance(item[1], bool):
             return
         name, there = item[0], item[1]
-        self._present[name] = there
+        self.present[name] = there
         if there:
             at = self.lost.pop(name, None)
             if name in {ROUTER, RELAY} and at is not None:

@@ -22,7 +22,7 @@ from evedrop.live.recorder.conductor import Conductor
 from evedrop.live.recorder.recorded_run import RecordedRun
 from evedrop.live.recorder.recovery import Recovery, Stall, patience_of
 from evedrop.live.recorder.steering import Steering, status_of
-from evedrop.names import CONTROLLER, OPERATOR, RELAY, ROUTER
+from evedrop.names import CONTROLLER, OPERATOR
 from evedrop.scenario.progress_events import Started
 from evedrop.system.threads import Queue
 
@@ -48,12 +48,12 @@ class Direction:
         """confirmations: the launcher's, each with the number of an event."""
         scenario, flow = run.score.scenario, brief.flow
         self._conductor, self._brief, self._run, self._confirmations = conductor, brief, run, confirmations
+        self._joiner = run.joiner
         self._steering = Steering(scenario, conductor, emit, run.amend, paused=brief.part.paused)
         self._recovery = Recovery(conductor, self._steering, flow, scenario.pace, emit)
         program = scenario.process.source == "zenoh"
         patience = patience_of(flow.longest_outage, scenario.pace, flow.batch, program)
-        router = RELAY if conductor.relayed else ROUTER
-        self._stall = Stall(patience, flow.batch, lambda: conductor.send_to_all(ReportStatus()), router)
+        self._stall = Stall(patience, flow.batch, lambda: conductor.send_to_all(ReportStatus()), conductor.hub)
         course = run.score.course
         course.events, course.outages = self._steering.events, self._recovery.outages  # which grow
 
@@ -78,10 +78,10 @@ class Direction:
         if status is not None:
             self._stall.add_answer(source, status)
             return
-        before = self._run.settled
+        before = self._joiner.settled
         self._run.take(source, message, self._steering)
-        if self._run.settled > before:
-            self._conductor.report_progress(self._run.settled)
+        if self._joiner.settled > before:
+            self._conductor.report_progress(self._joiner.settled)
 
     def steer(self) -> None:
         """Take the launcher's confirmations and the operator's questions, and carry out due events."""
@@ -89,35 +89,35 @@ class Direction:
             self._steering.done(int(self._confirmations.get_nowait()))
         while not self._conductor.questions.empty():
             self._answer(self._conductor.questions.get_nowait())
-        self._steering.carry_on(self._run.done, lambda: self._run.places(self._present))
+        self._steering.carry_on(self._joiner.done, self._places)
         self._run.view.note(self._steering.events)
 
     def look_after(self) -> None:
         """Recover from lost connections. Raises RunError if a process is lost for too long, or holds up the run."""
-        done, at = self._run.done, self._steering.at
+        done, at = self._joiner.done, self._steering.at
         self._recovery.poll(done)
         held = at is not None and done >= at
         # Slots are joined without the controller's reports, until the sensor waits for them.
         flow = self._brief.flow
-        owed = self._run.score.all_joined or done - self._run.settled >= flow.window - flow.batch
+        owed = self._run.score.all_joined or done - self._joiner.settled >= flow.window - flow.batch
         unneeded = () if owed else (CONTROLLER,)
         missing = bool(self._conductor.missing)
-        self._stall.poll(done, lambda: self._run.places(self._present), unneeded, held=held, missing=missing)
+        self._stall.poll(done, self._places, unneeded, held=held, missing=missing)
 
-    @property
-    def _present(self) -> list[str]:
-        """The processes that report, and that are not away because the scenario says so."""
-        return [name for name in self._run.score.scenario.digested if name not in self._conductor.absent]
+    def _places(self) -> dict[str, int]:
+        """Process → the first slot that it has not reported, except for those away because the scenario says so."""
+        reporters = self._run.score.scenario.digested
+        return self._joiner.places(name for name in reporters if name not in self._conductor.absent)
 
     def dismiss(self) -> None:
         """Remove the control file of the run, which is over, answer all open questions, and close open outages."""
         complete = self._run.score.all_joined
         with suppress(FileNotFoundError):
             remove_control(self._run.folder.now)
-        self._steering.answer_open_orders(self._run.done, complete=complete)
+        self._steering.answer_open_orders(self._joiner.done, complete=complete)
         while not self._conductor.questions.empty():
             self._conductor.questions.get_nowait().answer(Answer(refused=("the run is over",)).pack())
-        self._recovery.give_up(self._run.done, complete=complete)
+        self._recovery.give_up(self._joiner.done, complete=complete)
 
     def _answer(self, question: Question) -> None:
         """Take a question from the operator; a malformed one is refused and does not harm the run."""
@@ -125,10 +125,12 @@ class Direction:
         if order is None:
             return
         if isinstance(order.request, StatusRequest):
-            scenario, rate = run.score.scenario, run.progress.rate(run.done)
+            scenario, rate = run.score.scenario, run.progress.rate(self._joiner.done)
             tally = run.score.run_tally
-            order.answer(Answer(status=status_of(scenario, run.done, rate, self._steering, self._conductor, tally)))
+            order.answer(
+                Answer(status=status_of(scenario, self._joiner.done, rate, self._steering, self._conductor, tally))
+            )
         elif self._brief.part.shard:
             order.refuse("this run is in shards, which cannot be steered; run it with --set shards=1 to steer it")
         else:
-            self._steering.take_order(order, run.done)
+            self._steering.take_order(order, self._joiner.done)

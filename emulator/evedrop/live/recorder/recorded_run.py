@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import final
@@ -27,29 +26,11 @@ class RecordedRun:
     def __init__(self, brief: Brief[RecorderPart], scenario: Scenario) -> None:
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._intake = Intake(brief, scenario, self._keeper.run_tally)
-        self.score = RunScore(scenario, self._keeper.run_tally, self._intake.joiner)
+        self.joiner = self._intake.joiner
+        self.score = RunScore(scenario, self._keeper.run_tally, self.joiner)
         self.folder = RunFolder(Path(brief.part.results), self.score, brief.part.shard)
         self.view = RunView()
         self.progress = ProgressReporter()
-
-    @property
-    def done(self) -> int:
-        """The first slot that is not scored."""
-        return self._intake.joiner.done
-
-    @property
-    def settled(self) -> int:
-        """The first slot that is not scored, or that a controller has not reported."""
-        return self._intake.joiner.settled
-
-    @property
-    def complete(self) -> bool:
-        """Whether all slots are scored and, if there is a controller, it has reported them, too."""
-        return self._intake.joiner.complete(self.score.scenario.slots)
-
-    def places(self, reporters: Iterable[str]) -> Mapping[str, int]:
-        """Process → the first slot that it has not reported, for sensor, router, and these reporters."""
-        return self._intake.joiner.places(reporters)
 
     def start(self) -> None:
         """Note that the first slot begins."""
@@ -73,4 +54,4 @@ class RecordedRun:
         scored = self._keeper.add_slots(slots)
         self.folder.add_slots(slots, scored)
         self.view.add_slots(slots, scored)
-        self.progress.report(self.done, scored)
+        self.progress.report(self.joiner.done, scored)

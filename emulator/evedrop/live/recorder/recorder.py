@@ -108,7 +108,7 @@ def _conduct(
         try:
             direction.start()
             preload_meanwhile()
-            while not run.complete:
+            while not run.joiner.complete(scenario.slots):
                 direction.take_message()
                 direction.steer()
                 direction.look_after()

@@ -281,9 +281,9 @@ class Recovery:
         missing = self._missing
         # All processes vanish with the recorder's own router, or with the connection to it. Behind a relay, the sensor
         # vanishes with the router, and both with the link between the routers.
-        own = RELAY if self._conductor.relayed else ROUTER
-        if own in missing:
-            missing = {own if self._conductor.router_changed() else RECORDER: missing[own]}
+        hub = self._conductor.hub
+        if hub in missing:
+            missing = {hub if self._conductor.router_changed() else RECORDER: missing[hub]}
         elif ROUTER in missing:
             missing = {ROUTER: missing[ROUTER]}
         for name, beginning in missing.items():
@@ -299,7 +299,7 @@ class Recovery:
         self._wait = min(2.0 * self._limit, max(_LONGEST_SECONDS, self._limit))
         self._moved = now
         self._number += 1
-        for name, there in self._conductor.processes.items():
+        for name, there in self._conductor.present.items():
             if there:
                 links = self._steering.changes if name == ROUTER else None
                 self._conductor.send_to(name, Again(self._number, self._done, links))

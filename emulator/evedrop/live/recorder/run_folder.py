@@ -17,6 +17,7 @@ from evedrop.live.recorder.run_score import RunScore
 from evedrop.results.ending import note_end
 from evedrop.results.folder import HeldFolder
 from evedrop.results.resolved_scenario import write_resolved
+from evedrop.results.shard_score import dump_score
 from evedrop.results.summary_file import unwritten, write_summary
 from evedrop.results.writer import DigestRows, ResultsWriter, write_rows
 from evedrop.scenario.tables import Scenario
@@ -133,4 +134,4 @@ class RunFolder:
 
     def _dump_shard(self) -> None:
         if self._shard:
-            self._score.dump(self.now)
+            dump_score(self._score.run_tally, self.now, self._score.scenario)

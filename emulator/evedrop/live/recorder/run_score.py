@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import final
 
 from evedrop.live.recorder.joiner import Joiner
-from evedrop.results.shard_score import dump_score
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of
@@ -84,7 +83,3 @@ class RunScore:
             misdelivered=course.misdelivered,
         )
         return summary_of(self.scenario, self.run_tally, digests, outcome)
-
-    def dump(self, folder: Path) -> None:
-        """Dump the tallies of a shard, for the summary of the whole run. Raises OSError."""
-        dump_score(self.run_tally, folder, self.scenario)

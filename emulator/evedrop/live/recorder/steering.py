@@ -182,7 +182,7 @@ class Steering:
             return True
         act, action = self._waiting
         there = action.connected
-        if self._confirmed and (there is None or self._conductor.there(act.names[0]) is there):
+        if self._confirmed and (there is None or self._conductor.present[act.names[0]] is there):
             if act.effect.present:
                 self._conductor.absent -= set(act.names)
             self._waiting = None
@@ -320,7 +320,7 @@ def status_of(
         slots=scenario.slots,
         slots_per_second=0.0 if steering.paused else rate,
         state="paused" if steering.paused else "running" if steering.at is None else "held",
-        processes=conductor.processes,
+        processes=conductor.present,
         links={name: LinkStatus.of(account.offered, account.delivered) for name, account in accounts.items()},
         events=steering.events,
     )
