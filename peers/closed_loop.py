@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import final
 
-from evedrop.live.network.process_session import GapDetector, ProcessSession, ReplayBuffer
+from evedrop.live.network.process_session import InOrder, ProcessSession, ReplayBuffer
 from evedrop.live.protocol.brief import AnyBrief, EstimatorLoopPart, SensorLoopPart
-from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import known, read_decided
 from evedrop.model.plant import InputAwareEstimator
 from evedrop.model.process import Floats
@@ -24,16 +23,13 @@ class Decided:
 
     def __init__(self, session: ProcessSession, period: int, shape: tuple[int, int], patience: float) -> None:
         self._period, self._shape = period, shape
-        self._key = session.keys.input
-        self._subscription = session.subscribe(self._key)
-        self._due = GapDetector(self._key, patience)
+        self._messages = InOrder(session, session.keys.input, patience)
         self._now: tuple[Floats, Flags]
 
     def of(self, k: int) -> tuple[Floats, Flags]:
         """The inputs (m, R) of slot k, and where the decision failed, (R,); call it for slots in order."""
         if k % self._period == 0:
-            message = self._due.take_message(lambda: Reader(self._key, self._subscription.recv()), k)
-            self._now = read_decided(message, k, self._shape)
+            self._now = read_decided(self._messages.take(k), k, self._shape)
         return self._now
 
 

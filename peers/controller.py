@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from evedrop.live.network.process_session import GapDetector, ProcessSession
+from evedrop.live.network.process_session import InOrder, ProcessSession
 from evedrop.live.network.reporting import DecisionReporter
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief, ControllerPart, decoded
-from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.telemetry import decided, read_known
 from evedrop.model.slot.cores import ControllerCore
@@ -25,17 +24,16 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSes
     on_truth = part.acts_on == "truth"
     with connect(brief) as session:
         key, name = (session.keys.state, "x") if on_truth else (session.keys.estimate, "x_hat")
-        subscription, put = session.subscribe(key), kept_decisive(session, session.keys.input, brief, assignment.period)
+        known = InOrder(session, key, brief.flow.longest_outage)
+        put = kept_decisive(session, session.keys.input, brief, assignment.period)
         # The recorder joins slots without the controller's reports, so all kept reports are sent again.
         kept = brief.flow.window + 1 + assignment.period
         telemetry = session.replaying_publisher(session.keys.telemetry(CONTROLLER), kept, back=kept)
-        due = GapDetector(key, brief.flow.longest_outage)
         reporter = DecisionReporter(brief, telemetry, assignment.plant.inputs, assignment.period)
         session.ready()
         for k in range(0, brief.slots, assignment.period):
             session.status.slot = k
-            message = due.take_message(lambda: Reader(key, subscription.recv()), k)
-            x = read_known(message, name, k, (process.n, brief.trials))
+            x = read_known(known.take(k), name, k, (process.n, brief.trials))
             made = controller.decide(k, x)
             put(k, decided(k, made.u, made.failed))
             reporter.add_decision(k, *made)

@@ -9,12 +9,11 @@ from queue import Empty
 from typing import final
 
 from evedrop.errors import RunError
-from evedrop.live.network.process_session import GapDetector, Mailbox, ProcessSession, ReplayBuffer
+from evedrop.live.network.process_session import InOrder, Mailbox, ProcessSession, ReplayBuffer
 from evedrop.live.network.program import ProgramStates
 from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief, ProgramPart, SensorPart, decoded
-from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import EndRun, Go, Hold, Start
 from evedrop.live.protocol.notices import Progress
 from evedrop.live.protocol.packets import barrier, packets_of, read_acknowledgement, resend, uplink
@@ -22,7 +21,6 @@ from evedrop.live.protocol.telemetry import held
 from evedrop.model.detection import CusumBatch
 from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.local_filter import LocalFilter
-from evedrop.model.receiver import Flags
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.cores import GivenStates, PlantCore, SensorCore, recorded
@@ -158,22 +156,6 @@ class Barriers:
 
 
 @final
-class Acknowledgements:
-    """Waits for the acknowledgements of each slot before the next is sent."""
-
-    def __init__(self, brief: Brief[SensorPart], session: ProcessSession) -> None:
-        self._trials = brief.trials
-        self._key = session.keys.acknowledgements
-        self._subscription = session.subscribe(self._key)
-        self._due = GapDetector(self._key, brief.flow.longest_outage)
-
-    def wait(self, k: int) -> Flags:
-        """The acknowledgements of slot k, (R,)."""
-        message = self._due.take_message(lambda: Reader(self._key, self._subscription.recv()), k)
-        return read_acknowledgement(message, k, self._trials)
-
-
-@final
 class SensorLoop:
     """The sensor's work on a session that is being opened.
 
@@ -196,7 +178,10 @@ class SensorLoop:
         self._brief, self._session, self._core = brief, session, core
         self._send = session.replaying_publisher(session.keys.uplink, head=resend, back=part.history)
         self._window = Window(session, (*part.receivers, RECORDER), brief.flow.window, self._send)
-        self._back = Acknowledgements(brief, session) if scheme.needs_acknowledgements else None
+        self._back = None
+        """The acknowledgements, each awaited before the next slot is sent, if the scheme needs them."""
+        if scheme.needs_acknowledgements:
+            self._back = InOrder(session, session.keys.acknowledgements, brief.flow.longest_outage)
         self._steered = None
         if part.plant is not None and part.controller is not None:
             self._steered = Steered(brief, part.plant.inputs, part.controller, session)
@@ -239,7 +224,8 @@ class SensorLoop:
         k = slots.first
         if self._back is not None:
             sent = None if slots.sent is None else slots.sent[0]
-            alarms = self._core.acknowledged(k, self._back.wait(k), sent)
+            acknowledged = read_acknowledgement(self._back.take(k), k, self._brief.trials)
+            alarms = self._core.acknowledged(k, acknowledged, sent)
             slots = slots.changed(alarms=None if alarms is None else alarms[None])
         if self._steered is not None:
             u, failed = self._steered.wait(k, slots.states[0])

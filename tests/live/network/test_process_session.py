@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import msgpack
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.errors import Gap
-from evedrop.live.network.process_session import GapDetector, ReplayBuffer
-from evedrop.live.protocol.codec import Reader
+from evedrop.live.network.process_session import GapDetector, InOrder, ReplayBuffer
 from tests.clock import TestClock
 
 
@@ -186,15 +187,15 @@ def test_time_in_which_nothing_ran_hardly_counts() -> None:
 
 def test_the_message_of_the_slot_that_is_due_is_taken() -> None:
     """Those of earlier and later slots that come before it are left out."""
-    clock = TestClock()
-    gap = GapDetector(KEY, 5.0, clock)
-    coming = iter([3, 6, 5])
-    message = gap.take_message(lambda: Reader(KEY, slot_message(next(coming))), 5)
-    assert message.integer("k") == 5
+    clock, coming = TestClock(), iter([3, 6, 5])
 
-    def too_late() -> Reader:
+    def received() -> bytes:
         clock.now += 3.0
-        return Reader(KEY, slot_message(8))
+        return slot_message(next(coming, 8))
 
+    session = SimpleNamespace(subscribe=lambda _: SimpleNamespace(recv=received))
+    messages = InOrder(session, KEY, 5.0)  # type: ignore[arg-type]
+    messages._gaps = GapDetector(KEY, 5.0, clock)
+    assert messages.take(5).integer("k") == 5
     with pytest.raises(Gap):
-        gap.take_message(too_late, 6)
+        messages.take(6)

@@ -233,12 +233,6 @@ class GapDetector:
         self._step = max(1.0, patience / 4.0)
         self._slot, self._last, self._missing = -1, 0.0, 0.0
 
-    def take_message(self, receive: Callable[[], Reader], due: int) -> Reader:
-        """Wait for the message of slot `due`. Raises Gap as `missed` does."""
-        while (slot := (message := receive()).integer("k")) != due:
-            self.missed(due, slot)
-        return message
-
     def missed(self, due: int, slot: int) -> None:
         """Slot `slot` arrived when `due` was expected. Raises Gap if slot `due` has been missing for too long."""
         now = self._clock.monotonic()
@@ -251,3 +245,19 @@ class GapDetector:
         self._last = now
         if self._missing > self._patience:
             raise Gap(self._key, due, slot)
+
+
+@final
+class InOrder:
+    """Reads the messages of one key, each when its slot is due."""
+
+    def __init__(self, session: ProcessSession, key: str, patience: float) -> None:
+        """patience: as in `GapDetector`."""
+        self._subscription, self._key = session.subscribe(key), key
+        self._gaps = GapDetector(key, patience)
+
+    def take(self, due: int) -> Reader:
+        """Wait for the message of slot `due`. Raises Gap as `GapDetector.missed` does."""
+        while (slot := (message := Reader(self._key, self._subscription.recv())).integer("k")) != due:
+            self._gaps.missed(due, slot)
+        return message
