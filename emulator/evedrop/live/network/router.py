@@ -27,11 +27,11 @@ from typing import final
 import numpy as np
 
 from evedrop.errors import EvedropError, MalformedMessage
-from evedrop.live.network.access import access_control, at_relay, at_router, grants, until_all_left, users_file
+from evedrop.live.network.access import Grant, access_control, at_relay, at_router, grants, until_all_left, users_file
 from evedrop.live.network.connecting import connected
 from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession
 from evedrop.live.network.session import ATTEMPT, Session, client_config, router_config
-from evedrop.live.protocol.brief import AnyBrief, Brief, RelayPart, RouterPart
+from evedrop.live.protocol.brief import AnyBrief, Brief, RelayPart, RouterPart, RoutingPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Again, ControlCommand, EndRun, Go, LinkChange
 from evedrop.live.protocol.keys import ZenohConfig
@@ -71,7 +71,7 @@ class Downlink:
     ) -> None:
         """waited: whether deliveries are sent at once; in lock-step, waking up others would take most of the time."""
         keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, schedule)}
-        self._core = LinkCore(schedule, name, keys, brief.batch)
+        self.core = LinkCore(schedule, name, keys, brief.batch)
         self._schedule = schedule
         self._accountant = Accountant(schedule.window, brief.trials)
         self._put = put
@@ -82,25 +82,9 @@ class Downlink:
         self._waited, self._most = waited, brief.flow.message
         self._held: list[PacketSlots] = []
 
-    def plan(self, slots: range) -> None:
-        """Decide the fates of the next batch of slots."""
-        self._core.plan(slots)
-
-    def amend(self, at: int, changes: Iterable[Change]) -> None:
-        """Decide the slots of the batch from `at` on again, with these changes; none of them may have been journaled."""
-        self._core.amend(at, changes)
-
     def account(self, slots: range) -> Account:
         """The fates of the packets of the next slots, which belong to the current batch."""
-        return self._accountant.account(slots, self._core.part(slots))
-
-    def present(self, k: int) -> bool:
-        """Whether the receiver is present in slot k."""
-        return self._core.present(k)
-
-    def gamma(self, k: int) -> Flags:
-        """γ of slot k, which belongs to the current batch and was delivered, (R,)."""
-        return self._core.gamma(k)
+        return self._accountant.account(slots, self.core.part(slots))
 
     def take(self, packets: PacketSlots, again: bool = False) -> None:
         """Take the packets of the next slots of the batch, and deliver them; hold them if nobody waits for them.
@@ -108,7 +92,7 @@ class Downlink:
         again: the receiver has these deliveries; only update the packets under way.
         """
         if packets.sent is not None:
-            self._core.silence(packets.slots, packets.sent)
+            self.core.silence(packets.slots, packets.sent)
         if again:
             self._arrivals(packets)
         elif self._waited:
@@ -129,23 +113,23 @@ class Downlink:
             self._deliver(held)
 
     def _arrivals(self, packets: PacketSlots) -> Arrivals:
-        return self._core.arrivals(packets.slots, packets.z, packets.header)
+        return self.core.arrivals(packets.slots, packets.z, packets.header)
 
     def _deliver(self, packets: PacketSlots) -> None:
         """Send the delivery of some slots: the packets that arrive in each. Nothing is sent to a receiver that is absent."""
         slots, k = packets.slots, packets.first
         arrivals = self._arrivals(packets)
-        if self._schedule.outages and not self._core.present(k):
+        if self._schedule.outages and not self.core.present(k):
             return
         if packets.truth is not None and k == self._leak:
             arrivals = arrivals._replace(truth=dict(enumerate(packets.truth)))
-        rests = bool(self._rests) or self._core.fates.rests is not None
+        rests = bool(self._rests) or self.core.fates.rests is not None
         seconds = self._rest(k, arrivals.gamma[0], arrivals.late.get(0, ())) if rests else 0.0
         self._put(delivery(slots, arrivals), seconds)
 
     def _rest(self, k: int, gamma: Flags, late: tuple[Late, ...]) -> float:
         """The seconds by which to delay slot k's delivery: the longest rest among the first trial's packets in it."""
-        rest = self._core.rest(k)
+        rest = self.core.rest(k)
         if rest is not None:
             self._rests[k] = rest
         arrived = [packet.k for packet in late if packet.heard.gamma[0]] + [k] * bool(gamma[0])
@@ -180,15 +164,15 @@ class AckLink:
 
         An absent receiver acknowledges nothing. Raises the errors of `Commands.check`.
         """
-        there = downlinks[LEGITIMATE].present(k)
+        there = downlinks[LEGITIMATE].core.present(k)
         gamma = self._acknowledged(k, commands) if there else np.zeros(self._trials, np.bool_)
-        gamma_e = gamma if self._jammer is None else downlinks[self._jammer].gamma(k)
+        gamma_e = gamma if self._jammer is None else downlinks[self._jammer].core.gamma(k)
         self._put(acknowledgement(k, self._channel.arrived(k, sent, gamma, gamma_e)))
 
     def count(self, k: int, sent: Flags | None, downlinks: Mapping[str, Downlink]) -> None:
         """Count slot k, whose acknowledgements have reached the sensor, for those of later slots; sent as for `carry`."""
         if self._jammer is not None:
-            self._channel.count(k, sent, downlinks[self._jammer].gamma(k))
+            self._channel.count(k, sent, downlinks[self._jammer].core.gamma(k))
 
     def _acknowledged(self, k: int, commands: Commands) -> Flags:
         while True:
@@ -207,7 +191,7 @@ def route(brief: Brief[RouterPart]) -> None:
     """Run the router of a brief until the conductor ends it and all other processes have left."""
     table = grants(brief.run, tuple(brief.part.links), brief.part.controller)
     let_in = table if brief.part.zid is None else at_router(brief.run, table)
-    with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
+    with _opened(brief, let_in) as session:
         present = session.presence(grant.process for grant in table if grant.token is not None)
         RouterLoop(brief, session).carry_on()
         session.conclude()
@@ -291,7 +275,7 @@ class RouterLoop:
         self._slots = range(first, min(first + self._brief.flow.batch, self._brief.slots))
         if self._slots:
             for downlink in self._downlinks.values():
-                downlink.plan(self._slots)
+                downlink.core.plan(self._slots)
         return self._slots
 
     def _take(self) -> None:
@@ -385,7 +369,7 @@ class RouterLoop:
         schedule = self._changed(name, (*earlier, *changes), command)
         if any(change.at < k for change in changes):
             raise self._malformed(command, "a change before the hold", f"slots from {k} on")
-        self._downlinks[name].amend(k, changes)
+        self._downlinks[name].core.amend(k, changes)
         self._schedules[name] = schedule
 
     def _changed(self, name: str, changes: tuple[Change, ...], command: LinkChange | Again) -> LinkSchedule:
@@ -402,9 +386,13 @@ class RouterLoop:
         return Reader(self._session.keys.control(ROUTER), command.pack()).malformed(found, expected)
 
 
-def _opened(brief: Brief[RouterPart], access: ZenohConfig) -> Session:
+def _opened(brief: Brief[RoutingPart], table: list[Grant]) -> Session:
+    """The session of a router or relay that grants its users what the table says."""
+    access = access_control(table, brief.identity is not None)
+    listen = brief.part.listen if isinstance(brief.part, RelayPart) else brief.router
     with users_file(brief.part.users) as users:
-        return Session(brief, router_config(brief, str(users), access, brief.router), brief.router)
+        config = router_config(brief, str(users), access, listen)
+        return Session(brief, _linked(brief, config) if isinstance(brief.part, RelayPart) else config, listen)
 
 
 class ReplayRequested(Exception):
@@ -549,7 +537,7 @@ def relay(brief: Brief[RelayPart]) -> None:
     # Connect as a client first, which reports errors; Zenoh links routers in the background and reports none.
     with connected(brief, client_config(brief), float(brief.patience)):
         pass
-    with _opened_relay(brief, access_control(table, brief.identity is not None)) as session:
+    with _opened(brief, table) as session:
         present = session.presence(grant.process for grant in table if grant.token is not None and grant.zid is None)
         session.wait_for_link()
         # The recorder is present only once it sees everybody else, for whom it waits as long again.
@@ -559,14 +547,8 @@ def relay(brief: Brief[RelayPart]) -> None:
         until_all_left(present)
 
 
-def _opened_relay(brief: Brief[RelayPart], access: ZenohConfig) -> Session:
-    with users_file(brief.part.users) as users:
-        return Session(brief, _config(brief, str(users), access), brief.part.listen)
-
-
-def _config(brief: Brief[RelayPart], users: str, access: ZenohConfig) -> ZenohConfig:
+def _linked(brief: AnyBrief, listening: ZenohConfig) -> ZenohConfig:
     """Configuration of a router that also connects to the first router as a client, and reconnects when the link is lost."""
-    listening = router_config(brief, users, access, brief.part.listen)
     connecting = client_config(brief)
     auth = {"usrpwd": {**listening["transport"]["auth"]["usrpwd"], **connecting["transport"]["auth"]["usrpwd"]}}
     return {
