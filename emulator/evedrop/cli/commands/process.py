@@ -162,9 +162,9 @@ def _play(brief: AnyBrief, serve: str | None) -> int:
 
         check_identity(brief.identity, brief.process)
     if has_part(brief, RecorderPart):
-        from evedrop.live.network.launcher_pipe import Heartbeat
+        from evedrop.live.network.launcher_pipe import heartbeat
 
-        with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
+        with heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
             return _record(brief, serve)
     brief.expect_usable()
 

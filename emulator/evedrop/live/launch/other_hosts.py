@@ -38,13 +38,13 @@ from evedrop.live.launch.starter import (
     end_all,
     preloaded_without_recorder,
 )
+from evedrop.live.network.launcher_pipe import input_lines
 from evedrop.live.protocol.brief import AnyBrief, ImportingPart, ReceiverPart, brief_from, read_brief
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 from evedrop.system.environment import own_environment
 from evedrop.system.fields import NotNegative, Slot
 from evedrop.system.lacks import lack_of
 from evedrop.system.processes import kill, wait_for
-from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import ThreadEvent
 from evedrop.system.waiting import Alarm
 from evedrop.system.world import world
@@ -481,7 +481,7 @@ def serve_launcher() -> None:
         host, silence = HostProcesses(private, start, this.send_event), _Silence()
         try:
             host.greet()
-            for line in _lines_of(this):
+            for line in input_lines():
                 try:
                     order = order_in(line)
                     silence.heard(order)
@@ -493,14 +493,6 @@ def serve_launcher() -> None:
                     ) from error
         finally:
             host.end()
-
-
-def _lines_of(process: ThisProcess) -> Iterator[bytes]:
-    """The lines that come on the standard input of a process; one that the end cuts off is no line."""
-    rest = b""
-    while data := process.read_input(_MOST_BYTES):
-        *lines, rest = (rest + data).split(b"\n")
-        yield from lines
 
 
 @final

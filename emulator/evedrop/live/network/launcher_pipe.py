@@ -7,16 +7,15 @@ however long that takes on a busy machine.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
-from types import TracebackType
-from typing import Self, final
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 from evedrop.live.protocol.launcher_events import Alive
 from evedrop.scenario.progress_events import ProgressEvent
 from evedrop.system.world import world
 
 _BEAT_SECONDS = 1.0
+_MOST_BYTES = 2**16
 
 
 def emit(event: ProgressEvent) -> None:
@@ -25,28 +24,30 @@ def emit(event: ProgressEvent) -> None:
         world().process.send_event(event.line)
 
 
-@final
-class Heartbeat:
-    """Sends the heartbeat to the launcher, every second while the block runs."""
+@contextmanager
+def heartbeat(seconds: float = _BEAT_SECONDS) -> Iterator[None]:
+    """Send the heartbeat to the launcher, every second while the block runs."""
+    over = world().event()
 
-    def __init__(self, seconds: float = _BEAT_SECONDS) -> None:
-        self._seconds = seconds
-        self._over = world().event()
-        self._thread = world().thread(self._beat, name="heartbeat")
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._over.set()
-        self._thread.join(_BEAT_SECONDS)  # it waits if the launcher does not read
-
-    def _beat(self) -> None:
-        while not self._over.wait(self._seconds):
+    def beat() -> None:
+        while not over.wait(seconds):
             emit(Alive())
+
+    thread = world().thread(beat, name="heartbeat")
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(_BEAT_SECONDS)  # it waits if the launcher does not read
+
+
+def input_lines() -> Iterator[bytes]:
+    """The lines that come on standard input until it closes; one that the end cuts off is no line."""
+    rest = b""
+    while read := world().process.read_input(_MOST_BYTES):
+        *lines, rest = (rest + read).split(b"\n")
+        yield from lines
 
 
 def when_launcher_is_gone(then: Callable[[], None], hear: Callable[[bytes], None] = lambda _: None) -> None:
@@ -56,11 +57,8 @@ def when_launcher_is_gone(then: Callable[[], None], hear: Callable[[bytes], None
     """
 
     def wait() -> None:
-        rest = b""
-        while read := world().process.read_input(4096):
-            *lines, rest = (rest + read).split(b"\n")
-            for line in lines:
-                hear(line)
+        for line in input_lines():
+            hear(line)
         then()
 
     world().thread(wait, name="launcher-watchdog").start()

@@ -6,7 +6,6 @@ Source: docs/programs.md.
 from __future__ import annotations
 
 from collections import deque
-from types import TracebackType
 from typing import Self, final
 
 import zenoh
@@ -72,9 +71,7 @@ class ProgramStates:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._session.close()
 
     def hear(self, sample: zenoh.Sample) -> None:
