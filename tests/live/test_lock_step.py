@@ -32,7 +32,7 @@ def downlink(waited: bool, put: list[bytes], betrayed: int | None = None, messag
     if betrayed is not None:
         brief = replace(brief, part=replace(brief.part, leaks={"eve": betrayed}))
     link = Downlink("eve", brief.part.links["eve"], brief, lambda payload, _: put.append(payload), waited)
-    link.plan(range(BATCH))
+    link.core.plan(range(BATCH))
     return link
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import final
 
 import zenoh
-from msgspec import Struct, field, to_builtins
+from msgspec import field
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.network.connecting import open_session
@@ -20,7 +20,7 @@ from evedrop.live.network.control_file import Control
 from evedrop.live.network.endpoint import endpoint_in
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import AnyBrief, RelayPart, RoutingPart
-from evedrop.live.protocol.codec import Reader, enclosed, pack, payload_of
+from evedrop.live.protocol.codec import Reader, StructMessage, enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import OperatorRequest, RunStatus, WireStatus, read_request
 from evedrop.names import OPERATOR, RECORDER
@@ -28,7 +28,7 @@ from evedrop.system.fields import Slot
 from evedrop.system.world import world
 
 
-class Answer(Struct, frozen=True, omit_defaults=True):
+class Answer(StructMessage, frozen=True, omit_defaults=True):
     """The answer to a request."""
 
     slot: Slot | None = field(default=None, name="k")
@@ -45,10 +45,6 @@ class Answer(Struct, frozen=True, omit_defaults=True):
     def __post_init__(self) -> None:
         if None in {self.slot, self.effect} and not (self.refused or self.status or self.wire):
             raise ValueError("it has neither k and effect nor refused, status or wire")
-
-    def pack(self) -> bytes:
-        """Encode it as a message."""
-        return pack(to_builtins(self))
 
 
 @final

@@ -43,6 +43,14 @@ def binary(array: NDArray[Any], dtype: str) -> memoryview:
     return np.ascontiguousarray(array, dtype).data
 
 
+class StructMessage(msgspec.Struct, frozen=True):
+    """A message whose fields are those of its class."""
+
+    def pack(self) -> bytes:
+        """Encode it."""
+        return pack(msgspec.to_builtins(self))
+
+
 class _Packers(threading.local):
     """A packer for each thread: making one takes longer than packing a small message."""
 

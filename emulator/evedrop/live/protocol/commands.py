@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, final
 
-from msgspec import Meta, Struct, field, to_builtins
+from msgspec import Meta, field, to_builtins
 
-from evedrop.live.protocol.codec import Reader, pack, shown
+from evedrop.live.protocol.codec import Reader, StructMessage, pack, shown
 from evedrop.live.protocol.keys import reader_of
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR
@@ -34,12 +34,8 @@ class Bounds:
     """The names that it may have: of receivers, and to the sensor also the recorder; None: any."""
 
 
-class ControlCommand(Struct, frozen=True, omit_defaults=True, tag_field="do"):
+class ControlCommand(StructMessage, frozen=True, omit_defaults=True, tag_field="do"):
     """A command without fields; the others add theirs."""
-
-    def pack(self) -> bytes:
-        """Encode it as a message."""
-        return pack(to_builtins(self))
 
     def expect(self, message: Reader, bounds: Bounds) -> None:
         """Raise MalformedMessage if it names what the run does not have, or lacks what its reader needs."""
@@ -166,17 +162,13 @@ def read_command(message: Reader, bounds: Bounds) -> ControlCommand:
     return command
 
 
-class ProcessStatus(Struct, frozen=True):
+class ProcessStatus(StructMessage, frozen=True):
     """What a process reports of itself."""
 
     slot: Slot = field(name="k")
     """The slot that it is at."""
     waits: Annotated[tuple[str, ...], Meta(max_length=4096)]
     """The keys on which it waits for a message; empty if it does not wait."""
-
-    def pack(self) -> bytes:
-        """Encode it as a message."""
-        return pack(to_builtins(self))
 
 
 def is_process_status(message: Reader) -> bool:

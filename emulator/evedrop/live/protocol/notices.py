@@ -7,25 +7,17 @@ from __future__ import annotations
 
 from typing import Annotated, Self
 
-from msgspec import Meta, Struct, to_builtins
+from msgspec import Meta, to_builtins
 
 from evedrop.errors import Refusal
-from evedrop.live.protocol.codec import Reader, pack, shown
+from evedrop.live.protocol.codec import Reader, StructMessage, pack, shown
 from evedrop.live.protocol.keys import reads, writer_of
 from evedrop.system.fields import Slot
 
 _WHY_CHARACTERS = 1000
 
 
-class ProcessNotice(Struct, frozen=True, omit_defaults=True):
-    """A small message with neither arrays nor a word that says what to do."""
-
-    def pack(self) -> bytes:
-        """Encode it as a message."""
-        return pack(to_builtins(self))
-
-
-class Progress(ProcessNotice, frozen=True):
+class Progress(StructMessage, frozen=True):
     """From a receiver or the recorder to the sensor: all slots below k are done."""
 
     k: Slot
@@ -36,7 +28,7 @@ class Progress(ProcessNotice, frozen=True):
         return cls(Reader(key, payload).integer("k", 0, sent))
 
 
-class EndReport(ProcessNotice, frozen=True):
+class EndReport(StructMessage, frozen=True, omit_defaults=True):
     """The last message of a process that ends on command."""
 
     misdelivered: Annotated[int, Meta(ge=1, le=2**62)] = 0
@@ -52,7 +44,7 @@ class EndReport(ProcessNotice, frozen=True):
         return message.read(cls) if message.has("over") else None
 
 
-class RefusalNotice(ProcessNotice, frozen=True):
+class RefusalNotice(StructMessage, frozen=True):
     """The last message of a process that ends because it cannot read a message."""
 
     refuses: str

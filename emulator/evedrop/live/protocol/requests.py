@@ -8,22 +8,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
-from msgspec import Meta, Struct, structs, to_builtins
+from msgspec import Meta, Struct, structs
 
-from evedrop.live.protocol.codec import Reader, pack
+from evedrop.live.protocol.codec import Reader, StructMessage
 from evedrop.scenario.progress_events import RunEvent
 from evedrop.system.fields import NotNegative, Slot
 
 
-class OperatorRequest(Struct, frozen=True, tag_field="do"):
+class OperatorRequest(StructMessage, frozen=True, tag_field="do"):
     """A request without fields; the others add theirs."""
 
     repeatable: ClassVar[bool] = True
     """Whether nothing else happens if it is carried out twice."""
-
-    def pack(self) -> bytes:
-        """Encode it as a message."""
-        return pack(to_builtins(self))
 
 
 class LinkRequest(OperatorRequest, frozen=True, tag="link"):

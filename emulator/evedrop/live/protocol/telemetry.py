@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evedrop.live.protocol.codec import Reader, binary, pack, shown
 from evedrop.live.protocol.record_messages import RecordFormat, packed
@@ -108,13 +110,6 @@ def read_truth(message: Reader, first: int, extent: Extent) -> SensorSlots:
     return sensor_format(extent).read(message, first, message.span(first, extent.slots, extent.batch))
 
 
-def _read_failed(message: Reader, shape: tuple[int, ...]) -> Flags:
-    """Decode where decisions failed, (…, R); nowhere if the field is absent."""
-    if not message.has("failed"):
-        return np.zeros(shape, np.bool_)
-    return message.flags("failed", shape)
-
-
 def read_digests(message: Reader, trials: int, blocks: list[int]) -> dict[int, Digests]:
     """Decode digests: block, by its first slot → digests, (R, 16); blocks: those that end in the slots of the message."""
     digests: dict[int, Digests] = {}
@@ -150,14 +145,15 @@ class Report:
                 "k": self.slots.first,
                 "c": self.slots.count,
                 **packed(self.slots),
-                "digests": {block: binary(digests, "u1") for block, digests in self.digests.items()},
-                **({"trace_sums": sums} if (sums := _packed_sums(self.trace_sums)) else {}),
+                "digests": _packed_blocks(self.digests, "u1"),
+                **({"trace_sums": _packed_blocks(self.trace_sums, "<f8")} if self.trace_sums else {}),
             }
         )
 
 
-def _packed_sums(sums: Mapping[int, Floats]) -> dict[int, memoryview]:
-    return {block: binary(block_sums, "<f8") for block, block_sums in sums.items()}
+def _packed_blocks(numbers: Mapping[int, NDArray[Any]], dtype: str) -> dict[int, memoryview]:
+    """Numbers of each block, of this type, as a field to be packed."""
+    return {block: binary(of_block, dtype) for block, of_block in numbers.items()}
 
 
 def _read_sums(message: Reader, trials: int, blocks: list[int]) -> dict[int, Floats]:
@@ -308,7 +304,8 @@ def decided(k: int, u: Floats, failed: Flags) -> bytes:
 def read_decided(message: Reader, k: int, shape: tuple[int, int]) -> tuple[Floats, Flags]:
     """Decode the inputs (m, R), which must be from slot k on, and where the decision failed."""
     message.slot(k)
-    return message.finite("u", shape), _read_failed(message, (shape[1],))
+    u, trials = message.finite("u", shape), shape[1]
+    return u, message.flags("failed", (trials,)) if message.has("failed") else np.zeros(trials, np.bool_)
 
 
 @dataclass(frozen=True)
@@ -324,8 +321,8 @@ class Decisions:
 
     def pack(self) -> bytes:
         """Encode it as a message."""
-        digests = {block: binary(digests, "u1") for block, digests in self.digests.items()}
-        return pack({"k": self.first, "c": self.count, "seconds": binary(self.seconds, "<f8"), "digests": digests})
+        seconds, digests = binary(self.seconds, "<f8"), _packed_blocks(self.digests, "u1")
+        return pack({"k": self.first, "c": self.count, "seconds": seconds, "digests": digests})
 
 
 def read_decisions(message: Reader, first: int, extent: Extent, blocks: Blocks, period: int) -> Decisions:
