@@ -19,8 +19,7 @@ import subprocess
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from queue import Empty
 from typing import IO, Protocol, final
@@ -32,7 +31,6 @@ from evedrop.system.fork_channels import POLL_SECONDS, ForkChannel, ProcessHandl
 from evedrop.system.killable import KILLED_SECONDS, KillableProcess
 from evedrop.system.processes import kill, wait_for
 from evedrop.system.signals import SHOW_STACKS, held_back
-from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import Queue, ThreadEvent
 from evedrop.system.world import world
 
@@ -357,6 +355,13 @@ class PreloadedStarter:
 
     def __init__(self, servers: Sequence[ForkServer], stop: ThreadEvent | None = None) -> None:
         self._servers, self._stop = servers, stop
+        self._environment, self._process = _inherited(), world().process
+
+    @property
+    def usable(self) -> bool:
+        """Whether the servers live, and interpreters that were started now by this process would be no different."""
+        same = self._process is world().process and self._environment == _inherited()
+        return same and all(server.alive for server in self._servers)
 
     def until(self, stop: ThreadEvent) -> PreloadedStarter:
         """The same for a run that ends once this is set."""
@@ -368,24 +373,7 @@ class PreloadedStarter:
         return server.start(role, brief, log, environment, self._stop)
 
 
-@final
-@dataclass(frozen=True)
-class _Preloaded:
-    """The fork servers of a `preloaded` block, the environment in which their interpreters were started, and by which process."""
-
-    servers: tuple[ForkServer, ...]
-    starter: Starter
-    environment: Mapping[str, str]
-    process: ThisProcess
-
-    @property
-    def usable(self) -> bool:
-        """Whether the servers live, and interpreters that were started now would be no different."""
-        same = self.process is world().process and self.environment == _inherited()
-        return same and all(server.alive for server in self.servers)
-
-
-_preloaded: list[_Preloaded] = []
+_preloaded: list[PreloadedStarter] = []
 """What is kept for the `preloaded` blocks that this process is in."""
 
 
@@ -398,14 +386,11 @@ def process_starter(stop: ThreadEvent | None = None) -> Iterator[Starter]:
     """
     with ExitStack() as stack:
         usable = bool(_preloaded) and _preloaded[-1].usable
-        starter = _preloaded[-1].starter if usable else stack.enter_context(_waiting_servers(OF_OTHERS, OF_RECORDERS))
-        if stop is not None and isinstance(starter, PreloadedStarter):
-            starter = starter.until(stop)
-        yield starter
+        starter = _preloaded[-1] if usable else stack.enter_context(_waiting_servers(OF_OTHERS, OF_RECORDERS))
+        yield starter.until(stop) if stop is not None and isinstance(starter, PreloadedStarter) else starter
 
 
-@contextmanager
-def preloaded() -> Iterator[Starter]:
+def preloaded() -> AbstractContextManager[Starter]:
     """Make the imports of live runs once for all runs in the block, which then start and end faster.
 
     Two more processes wait meanwhile. Raises OSError if they cannot be started.
@@ -413,15 +398,12 @@ def preloaded() -> Iterator[Starter]:
     >>> with preloaded():                                                               # doctest: +SKIP
     ...     found = [run("eavesdroppers", slots=1000, seed=seed) for seed in range(10)]
     """
-    with _waiting_servers(OF_OTHERS, (*OF_RECORDERS, *OF_SUMMARIES)) as starter:
-        yield starter
+    return _waiting_servers(OF_OTHERS, (*OF_RECORDERS, *OF_SUMMARIES))
 
 
-@contextmanager
-def preloaded_without_recorder() -> Iterator[Starter]:
+def preloaded_without_recorder() -> AbstractContextManager[Starter]:
     """The same on a host that carries only other processes of a run: the imports of a recorder are not made. Raises OSError."""
-    with _waiting_servers(OF_OTHERS) as starter:
-        yield starter
+    return _waiting_servers(OF_OTHERS)
 
 
 @contextmanager
@@ -432,12 +414,11 @@ def _waiting_servers(*modules: Sequence[str]) -> Iterator[Starter]:
         return
     with fork_servers(*modules) as servers:
         starter = PreloadedStarter(servers)
-        waiting = _Preloaded(servers, starter, _inherited(), world().process)
-        _preloaded.append(waiting)
+        _preloaded.append(starter)
         try:
             yield starter
         finally:
-            _preloaded.remove(waiting)
+            _preloaded.remove(starter)
 
 
 def _inherited() -> dict[str, str]:
