@@ -14,7 +14,8 @@ from pathlib import Path
 
 from evedrop.errors import UsageError
 from evedrop.live.launch.briefs import expect_no_launcher_needed
-from evedrop.names import CONTROLLER, LEGITIMATE, RECORDER, RELAY, ROUTER, SENSOR
+from evedrop.live.launch.hosts_file import processes_of
+from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import make_private, write_private
 from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario.tables import Scenario
@@ -231,9 +232,7 @@ def _check(scenario: Scenario) -> None:
 
 def _services(scenario: Scenario) -> list[_Service]:
     """The processes, routers first; the name of a service is that of its process unless another service has it."""
-    relay = [RELAY] if scenario.relayed else []
-    steered = [] if scenario.controller is None else [CONTROLLER]
-    processes = [ROUTER, *relay, SENSOR, LEGITIMATE, *steered, *scenario.eavesdroppers, RECORDER]
+    processes = [*processes_of(scenario), RECORDER]
     services = []
     for process in processes:
         name = process
