@@ -107,7 +107,8 @@ def launch_one(launch: Launch) -> FinishedRun:
             if viewer is not None:
                 viewer.stop()
             if isinstance(error, UsageError):
-                _forget(folder)
+                with contextlib.suppress(OSError):
+                    world().disk.remove_tree(folder)  # of a run that was not started, so that the next one can use it
             elif isinstance(error, EvedropError):
                 # Tables and theory are slow to import, and a run that ends well needs neither.
                 from evedrop.results.ending import note_end  # noqa: PLC0415
@@ -165,12 +166,6 @@ def _now(held: HeldFolder) -> Path:
         return held.now
     except FileNotFoundError:
         return held.first
-
-
-def _forget(folder: Path) -> None:
-    """Remove the folder of a run that was not started, so that the next run can use it."""
-    with contextlib.suppress(OSError):
-        world().disk.remove_tree(folder)
 
 
 def follow_to_end(children: Children, stop: ThreadEvent, on_event: OnEvent) -> int:
