@@ -73,7 +73,8 @@ def test_a_process_has_its_files_in_the_private_folder(tmp_path: Path) -> None:
         return Process()
 
     host = HostProcesses(tmp_path, start, sent.append)
-    given = replace(brief_of_eve(state_file="/launcher/eve.state"), last_word="/launcher/eve.last-word")
+    eve = brief_of_eve(state_file="/launcher/eve.state", outages=[(3, 5, True)])
+    given = replace(eve, last_word="/launcher/eve.last-word")
     word = LastWord(Cause.NO_CONNECTION, "why")
     word.leave(tmp_path / "eve.last-word")  # of an earlier start
     host.obey(StartProcess(7, given.entries, {"TMPDIR": "/launcher", "A": "1"}))

@@ -16,7 +16,15 @@ import pytest
 from evedrop.errors import BriefError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
-from evedrop.live.protocol.brief import EavesdropperPart, RecorderPart, RouterPart, SensorPart, has_part, read_brief
+from evedrop.live.protocol.brief import (
+    EavesdropperPart,
+    RecorderPart,
+    RouterPart,
+    SensorPart,
+    has_part,
+    read_brief,
+    with_files_in,
+)
 from evedrop.live.protocol.json_tables import plain
 from evedrop.model.checks import as_toml
 from evedrop.model.eavesdroppers import STRATEGIES
@@ -79,6 +87,15 @@ def test_the_entries_of_a_brief_are_those_of_its_file() -> None:
     brief = BRIEF
     assert brief.entries == json.loads(brief.text)
     assert brief.entries["process"] == brief.process
+
+
+def test_a_process_has_its_own_files_in_a_folder(tmp_path: Path) -> None:
+    """Its last word; and the state that it keeps, if it is a receiver that goes away."""
+    assert with_files_in(BRIEF, tmp_path) == replace(BRIEF, last_word=str(tmp_path / "eve.last-word"))
+    away = replace(BRIEF, part=replace(BRIEF.part, outages=[(3, 5, True)]))
+    assert with_files_in(away, tmp_path).part == replace(away.part, state_file=str(tmp_path / "eve.state"))
+    router = made(briefed())["router"]
+    assert with_files_in(router, tmp_path).part == router.part
 
 
 def test_a_brief_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:

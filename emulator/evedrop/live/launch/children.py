@@ -21,7 +21,7 @@ from evedrop.live.launch.starter import (
     end_all,
     start_process,
 )
-from evedrop.live.protocol.brief import AnyBrief, ReceiverPart, RoutingPart
+from evedrop.live.protocol.brief import AnyBrief, RoutingPart, with_files_in
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 from evedrop.live.protocol.launcher_events import (
     Alive,
@@ -118,11 +118,7 @@ class Children:
         check_zenoh_runtime()
         self._briefs[brief.process] = brief
         self._listening.discard(brief.process)
-        if isinstance(brief.part, ReceiverPart) and brief.part.outages:
-            state_file = str((self._private / f"{brief.process}.state").absolute())
-            brief = replace(brief, part=replace(brief.part, state_file=state_file))
-        last_word = last_word_file(self._private, brief.process)
-        brief = replace(brief, last_word=str(last_word))
+        brief = with_files_in(brief, self._private)
         environment = {
             **(lock_step_environment(brief.role) if self._lock_step else {}),
             **own_environment(),
@@ -131,7 +127,7 @@ class Children:
         if isinstance(brief.part, RoutingPart):
             environment["TMPDIR"] = str(self._private)  # their password files are removed with the briefs
         try:
-            world().disk.remove(last_word, missing_ok=True)  # of an earlier start
+            world().disk.remove(last_word_file(self._private, brief.process), missing_ok=True)  # of an earlier start
             path = brief.write(self._private)
             log_file = self._folder.now / "logs" / f"{brief.process}.log"
             with world().disk.writer(log_file, "ab" if again else "wb") as log:

@@ -39,7 +39,7 @@ from evedrop.live.launch.starter import (
     preloaded_without_recorder,
 )
 from evedrop.live.network.launcher_pipe import input_lines
-from evedrop.live.protocol.brief import AnyBrief, ImportingPart, ReceiverPart, brief_from, read_brief
+from evedrop.live.protocol.brief import ImportingPart, brief_from, read_brief, with_files_in
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 from evedrop.system.environment import own_environment
 from evedrop.system.fields import NotNegative, Slot
@@ -261,16 +261,16 @@ class SshHost:
             if stop.is_set():
                 raise Interrupted("interrupted before the run began; nothing was started")
             if self._lost.is_set():
-                raise UsageError(f"{self._named}: {self._reason()}; {self._remedy()}")
+                raise UsageError(f"host {self.name}: {self._reason()}; {self._remedy()}")
             if world().monotonic() > deadline:
                 raise UsageError(
-                    f"{self._named}: evedrop did not answer there within {ANSWER_SECONDS:.0f} s ({self._reason()}); "
+                    f"host {self.name}: evedrop did not answer there within {ANSWER_SECONDS:.0f} s ({self._reason()}); "
                     f"{self._remedy()}"
                 )
         if self._version != own_version():
             raise UsageError(
-                f"{self._named}: evedrop {self._version} is installed there, and {own_version()} here; install the same version, "
-                "since their messages and digests may differ"
+                f"host {self.name}: evedrop {self._version} is installed there, and {own_version()} here; install the same "
+                "version, since their messages and digests may differ"
             )
 
     def start(self, number: int, path: Path, log: IO[bytes], environment: Mapping[str, str]) -> HostedProcess:
@@ -358,10 +358,6 @@ class SshHost:
     def _ending(self) -> str:
         """Why the host can be used no more."""
         return f"the connection with host {self.name} ended: {self._reason()}"
-
-    @property
-    def _named(self) -> str:
-        return f"host {self.name}"
 
     def _reason(self) -> str:
         """What this machine lacks, or the last line that ssh printed, or its exit status."""
@@ -548,7 +544,7 @@ class HostProcesses:
         end_all(self._processes.values())
 
     def _begin(self, order: StartProcess) -> None:
-        number, brief = order.number, self._with_local_files(brief_from(order.brief))
+        number, brief = order.number, with_files_in(brief_from(order.brief), self._private)
         if Path(brief.process).name != brief.process:
             raise ValueError(f"{brief.process} is not the name of a process")
         environment = {**own_environment(), **order.environment}
@@ -570,14 +566,6 @@ class HostProcesses:
         if events is not None:
             events.close()  # the launcher waits for no router on another host
         world().thread(self._follow, number, brief.process, lines, name=f"log of {brief.process}").start()
-
-    def _with_local_files(self, brief: AnyBrief) -> AnyBrief:
-        """The same brief with the files of the process in the private folder of this host."""
-        brief = replace(brief, last_word=str(last_word_file(self._private, brief.process)))
-        if not isinstance(brief.part, ReceiverPart) or brief.part.state_file is None:
-            return brief
-        state_file = str((self._private / f"{brief.process}.state").absolute())
-        return replace(brief, part=replace(brief.part, state_file=state_file))
 
     def _follow(self, number: int, name: str, log: IO[bytes]) -> None:
         """Send what a process writes to its log, and how it ended."""

@@ -28,6 +28,7 @@ from msgspec import Meta
 from evedrop.errors import BriefError, NotRegistered
 from evedrop.live.protocol.json_tables import plain, read
 from evedrop.live.protocol.keys import KINDS
+from evedrop.live.protocol.last_word import last_word_file
 from evedrop.model.acknowledgements import ATTACKS, AckChannelSpec
 from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.detection import Chart
@@ -610,6 +611,15 @@ AnyBrief = Brief[Part]
 def has_part(brief: AnyBrief, kind: type[P]) -> TypeGuard[Brief[P]]:
     """Whether a brief has this kind of part, which says its role."""
     return isinstance(brief.part, kind)
+
+
+def with_files_in(brief: AnyBrief, folder: Path) -> AnyBrief:
+    """The same brief with its process's own files in a folder: its last word and, if it goes away, its state meanwhile."""
+    brief = replace(brief, last_word=str(last_word_file(folder, brief.process)))
+    if not isinstance(brief.part, ReceiverPart) or not brief.part.outages:
+        return brief
+    state_file = str((folder / f"{brief.process}.state").absolute())
+    return replace(brief, part=replace(brief.part, state_file=state_file))
 
 
 def read_brief(path: Path, role: str | None = None) -> AnyBrief:
