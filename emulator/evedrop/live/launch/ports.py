@@ -19,8 +19,6 @@ from evedrop.system.output import warn
 from evedrop.system.ports import free_port
 from evedrop.system.world import world
 
-_EXAMPLE = "give one such as tls/router.lan:7447"
-
 
 @dataclass(frozen=True)
 class RouterEndpoint:
@@ -126,11 +124,11 @@ def router_endpoint(
     return RouterEndpoint(here, there)
 
 
-def _endpoint(option: str, text: str) -> Endpoint:
+def _endpoint(option: str, text: str, example: str = "tls/router.lan:7447") -> Endpoint:
     try:
         return Endpoint.of(text)
     except ValueError as error:
-        raise UsageError(f"{option} {error}; {_EXAMPLE}") from error
+        raise UsageError(f"{option} {error}; give one such as {example}") from error
 
 
 def socket_endpoints(folder: Path) -> RouterEndpoints:
@@ -168,10 +166,7 @@ def warn_if_exposed(endpoints: RouterEndpoints) -> None:
 def _loopback_endpoint(listen: str | None, option: str, protocol: str) -> RouterEndpoint:
     if listen is None:
         return router_endpoint(f"{protocol}/127.0.0.1:{free_port()}")
-    try:
-        endpoint = Endpoint.of(listen)
-    except ValueError as error:
-        raise UsageError(f"{option} {error}; give one such as tls/127.0.0.1:17460") from error
+    endpoint = _endpoint(option, listen, "tls/127.0.0.1:17460")
     if not endpoint.loopback:
         raise UsageError(
             f"{option} {listen} is not a loopback endpoint; give one such as tls/127.0.0.1:17460, or start the processes by "
