@@ -52,6 +52,7 @@ class Verifier:
         else:
             self._leaving[name, k] = belief
 
+    @np.errstate(over="ignore", invalid="ignore")  # a receiver may have made its numbers up
     def report(self, name: str, report: Report) -> None:
         """Check a receiver's next report. Raises Contradiction if the report contradicts itself."""
         slots = report.slots
@@ -90,18 +91,16 @@ class Verifier:
     def _add_to_block(self, name: str, slots: ReceiverSlots) -> None:
         """Add slots of one block to the sums of tr P of the recorded trials, and to the sum over all trials."""
         before = self._block_sums.get(name, (np.zeros(self._recorded), 0.0))
-        with np.errstate(over="ignore", invalid="ignore"):  # a receiver may have made these numbers up
-            traces = kernels.traces(slots.P)
-            self._block_sums[name] = (before[0] + traces.sum(axis=0), before[1] + float(_sums_of(slots)[:, 0].sum()))
+        traces = kernels.traces(slots.P)
+        self._block_sums[name] = (before[0] + traces.sum(axis=0), before[1] + float(_sums_of(slots)[:, 0].sum()))
 
     def _check_block_sums(self, name: str, report: Report, start: int, stop: int) -> None:
         """Check that the sums of tr P of a block's trials are those of the recorded trials, and of all trials together."""
         of_recorded, of_all = self._block_sums.pop(name)
         claimed = report.trace_sums[start]
         sums = np.append(of_recorded, of_all)
-        with np.errstate(over="ignore", invalid="ignore"):
-            stated = np.append(claimed[: self._recorded], claimed.sum())
-            wrong = ~(np.abs(stated - sums) <= _ROUNDING * np.maximum(np.abs(sums), np.abs(stated)))
+        stated = np.append(claimed[: self._recorded], claimed.sum())
+        wrong = ~(np.abs(stated - sums) <= _ROUNDING * np.maximum(np.abs(sums), np.abs(stated)))
         if wrong.any():
             place = int(np.argmax(wrong))
             which = "all trials" if place == self._recorded else f"trial {self._first_trial + place}"
@@ -116,17 +115,16 @@ class Verifier:
         traces = kernels.traces(slots.P)
         trials, claimed = slots.x_hat.shape[2], _sums_of(slots)
         others = trials - traces.shape[1]
-        with np.errstate(over="ignore", invalid="ignore"):  # a receiver may have made these numbers up
-            sums_ = kernels.sums(traces)
-            size = np.stack([np.sqrt(trials * np.abs(claimed[:, 1])), np.abs(claimed[:, 1])], axis=1)
-            left = claimed - sums_
-            if others == 0:
-                wrong = (np.abs(left) > _ROUNDING * np.maximum(size, np.abs(sums_))).any(axis=1)
-            else:
-                # For any numbers: |sum| ≤ √(count · sum of squares). The remaining sum of squares is known within rounding.
-                squares = left[:, 1] + _ROUNDING * size[:, 1]
-                room = np.sqrt(others * np.maximum(squares, 0.0)) + _ROUNDING * size[:, 0]
-                wrong = (squares < 0.0) | (np.abs(left[:, 0]) > room)
+        sums_ = kernels.sums(traces)
+        size = np.stack([np.sqrt(trials * np.abs(claimed[:, 1])), np.abs(claimed[:, 1])], axis=1)
+        left = claimed - sums_
+        if others == 0:
+            wrong = (np.abs(left) > _ROUNDING * np.maximum(size, np.abs(sums_))).any(axis=1)
+        else:
+            # For any numbers: |sum| ≤ √(count · sum of squares). The remaining sum of squares is known within rounding.
+            squares = left[:, 1] + _ROUNDING * size[:, 1]
+            room = np.sqrt(others * np.maximum(squares, 0.0)) + _ROUNDING * size[:, 0]
+            wrong = (squares < 0.0) | (np.abs(left[:, 0]) > room)
         if wrong.any():
             row = int(np.argmax(wrong))
             sums = [f"{value:.17g}" for value in (*claimed[row], *sums_[row])]
@@ -144,11 +142,8 @@ class Verifier:
             ("P", left.P[..., : self._recorded], slots.P[-1]),
         ):
             if on_leaving.tobytes() != np.ascontiguousarray(reported).tobytes():
-                place = (
-                    tuple(int(i) for i in np.argwhere(on_leaving != reported)[0])
-                    if (on_leaving != reported).any()
-                    else (0,)
-                )
+                differing = np.argwhere(on_leaving != reported)
+                place = tuple(differing[0].tolist()) if len(differing) else (0,)
                 raise Contradiction(
                     name,
                     f"before slot {end}, with which it goes away, its {quantity} of trial {self._first_trial + place[-1]} is "
