@@ -102,7 +102,7 @@ def test_a_subscription_drops_what_names_another_key(stage: Stage, capfd: pytest
         subscription = session.subscribe(key)
         stage.put(key, [*foreign(stage.keys, key), enclosed(key, GOOD)])
         assert subscription.recv() == GOOD
-        assert session.dropped == len(foreign(stage.keys, key))
+        assert session.dropped.count == len(foreign(stage.keys, key))
     errors = capfd.readouterr().err
     assert f"eve: dropped a message that came on {key} and names {stage.keys.control('smart')} (number 1)" in errors
 
@@ -115,7 +115,7 @@ def test_a_callback_subscription_drops_what_names_another_key(stage: Stage) -> N
         stage.put(key, [*foreign(stage.keys, key), enclosed(key, GOOD)])
         assert heard.get(timeout=LIMIT) == GOOD
         assert heard.empty()
-        assert session.dropped == len(foreign(stage.keys, key))
+        assert session.dropped.count == len(foreign(stage.keys, key))
 
 
 def test_commands_that_name_another_process_are_dropped(stage: Stage) -> None:
@@ -124,7 +124,7 @@ def test_commands_that_name_another_process_are_dropped(stage: Stage) -> None:
     with Session(stage.eve) as session:
         stage.put(key, [enclosed(other, EndRun().pack()), enclosed(key, Start().pack())])
         assert session.command() == Start()
-        assert session.dropped == 1
+        assert session.dropped.count == 1
 
 
 def test_a_question_that_names_another_key_is_not_answered(stage: Stage) -> None:
@@ -137,7 +137,7 @@ def test_a_question_that_names_another_key_is_not_answered(stage: Stage) -> None
         for message in foreign(stage.keys, key):
             assert list(stage.router.get(key, payload=message, timeout=2.0)) == []
         assert asked.empty()
-        assert session.dropped == len(foreign(stage.keys, key))
+        assert session.dropped.count == len(foreign(stage.keys, key))
         asking = threading.Thread(target=lambda: list(stage.router.get(key, payload=enclosed(key, GOOD))))
         asking.start()
         question = asked.get(timeout=LIMIT)
@@ -172,7 +172,7 @@ def test_a_malformed_message_of_its_own_key_is_an_error(stage: Stage) -> None:
         stage.put(key, [enclosed(key, b"\xc1")])
         with pytest.raises(MalformedMessage, match=f"malformed message on {key}"):
             Reader(key, subscription.recv())
-        assert session.dropped == 0
+        assert session.dropped.count == 0
 
 
 @pytest.mark.thorough

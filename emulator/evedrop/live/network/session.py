@@ -179,7 +179,6 @@ class Session:
         self.allowance = allowance(brief.flow.largest_report, brief.flow.window, brief.flow.batch)
         """How many unread bytes of one sender may wait."""
         self._room = _WINDOWS * (brief.flow.window + 8)
-        self._dropped = Dropped(brief.process, self._mistaken)
         self._watchdog = ConnectionWatchdog(brief) if brief.role not in ("router", "relay", "recorder") else None
         self._wait = WaitReporter(brief.process, brief.router, clock)
         if config is None or listen is None:
@@ -190,6 +189,8 @@ class Session:
             self.connection = Connection(listening(listen, brief.identity, config), None)
             if brief.ends_with_stdin:
                 emit(RouterListens(brief.process))
+        self.dropped = Dropped(brief.process, self.connection.renew)
+        """Counts the messages that this process has dropped because they arrived under another key than they name."""
         self._publishers: dict[str, Publisher] = {}
         self._replays: list[ReplayBuffer] = []
         self._commands: Queue[bytes] = world().queue()
@@ -237,22 +238,13 @@ class Session:
         if self._watchdog is not None:
             self._watchdog.changed(connected)
 
-    def _mistaken(self) -> None:
-        """Handle a message that arrived under another key: the connection confuses the two keys."""
-        self.connection.renew()
-
-    @property
-    def dropped(self) -> int:
-        """How many messages this process has dropped because they arrived under another key than they name."""
-        return self._dropped.count
-
     def subscribe(self, key: str) -> Subscription:
         """Subscribe to one exact key; read its messages in order with `recv`."""
-        return self.connection.declare(Subscription(key, self._dropped, self.status, self._room))
+        return self.connection.declare(Subscription(key, self.dropped, self.status, self._room))
 
     def subscribe_with(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Subscribe to one exact key; `receive` is called on a thread of Zenoh's and must only hand the bytes on."""
-        self.connection.declare(CallbackSubscription(key, self._dropped, receive))
+        self.connection.declare(CallbackSubscription(key, self.dropped, receive))
 
     def publisher(self, key: str) -> Callable[[bytes], None]:
         """A publisher for one exact key."""
@@ -273,7 +265,7 @@ class Session:
 
     def asked(self, key: str, receive: Callable[[Question], None]) -> None:
         """Answer questions at one exact key; a thread of Zenoh's calls `receive`, which must only hand the question on."""
-        self.connection.declare(Questions(key, self._dropped, receive))
+        self.connection.declare(Questions(key, self.dropped, receive))
 
     def watch(self, process: str, changed: Callable[[bool], None]) -> None:
         """Call `changed` with true when a process appears, with false when it leaves; it must only hand that on."""
@@ -358,7 +350,7 @@ class Session:
         self._recorder_watchdog.release()
         publisher = self._reporting
         if publisher is not None:
-            publisher(EndReport(self.dropped).pack())
+            publisher(EndReport(self.dropped.count).pack())
         else:
             self.connection.disappear()
 

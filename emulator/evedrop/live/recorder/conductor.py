@@ -110,7 +110,7 @@ class Conductor:
     @property
     def dropped(self) -> dict[str, int]:
         """Process → how many messages it dropped because they name another key, as far as it has confirmed its end."""
-        counts = {**self.misdelivered, RECORDER: self._session.dropped}
+        counts = {**self.misdelivered, RECORDER: self._session.dropped.count}
         return {name: count for name, count in counts.items() if count}
 
     @property
@@ -132,7 +132,7 @@ class Conductor:
                 names = names or self.missing
                 do = "start it, or look at its log" if len(names) == 1 else "start them, or look at their logs"
                 raise RunError(f"{', '.join(names)} did not appear within {self._session.patience:.0f} s; {do}")
-            self._note(self._next())
+            self._next()
         self._session.ready()
         self._router = self._session.router_id
 
@@ -146,11 +146,7 @@ class Conductor:
         Raises Interrupted if the run was told to end.
         """
         self._stop.check()
-        item = self._next()
-        if item is None or not isinstance(item[1], bytes):
-            self._note(item)
-            return None
-        return item[0], item[1]
+        return self._next()
 
     def fail_cut_off(self, names: Collection[str], patience: float) -> NoReturn:
         """Raise RunError: these processes have been missing for `patience` seconds. Raises Interrupted if told to end now."""
@@ -198,7 +194,7 @@ class Conductor:
                         told.add(name)
             if self._stop.asked:
                 break
-            self._hear_out(self._next())
+            self._hear_out()
         # The relay after the router: the router's messages pass through it.
         for name in (ROUTER, RELAY):
             if name in self.present:
@@ -224,15 +220,16 @@ class Conductor:
             if self._clock.monotonic() - sent > _END_SECONDS:
                 sent = self._clock.monotonic()
                 self.send_to(name, EndRun())
-            self._hear_out(self._next())
+            self._hear_out()
 
-    def _hear_out(self, item: tuple[str, bytes | bool] | None) -> None:
-        """Note which processes are present, and which confirm that the run is over; ignore all other messages."""
-        if item is not None and isinstance(item[1], bytes):
-            report = EndReport.read(Reader(self.keys[item[0]], item[1]))
+    def _hear_out(self) -> None:
+        """Take the next message: note who confirms that the run is over, and ignore all else."""
+        message = self._next()
+        if message is not None:
+            source, payload = message
+            report = EndReport.read(Reader(self.keys[source], payload))
             if report is not None:
-                self.misdelivered[item[0]] = report.misdelivered
-        self._note(item)
+                self.misdelivered[source] = report.misdelivered
 
     def abandon(self, why: str) -> None:
         """Tell all processes that the run has been given up."""
@@ -250,11 +247,16 @@ class Conductor:
         """Whether a process has opened its session; it may still wait for others."""
         return self._session.reaches(self._session.keys.control(name))
 
-    def _next(self) -> tuple[str, bytes | bool] | None:
+    def _next(self) -> tuple[str, bytes] | None:
+        """The next message with its sender, or None if there was none for a moment, or news of who is present."""
         try:
-            return self._mailbox.get(timeout=_POLL_SECONDS)
+            name, item = self._mailbox.get(timeout=_POLL_SECONDS)
         except Empty:
             return None
+        if isinstance(item, bytes):
+            return name, item
+        self._note(name, item)
+        return None
 
     def wait_longer(self, seconds: float) -> None:
         """Give processes that are missing more time to come back."""
@@ -266,10 +268,7 @@ class Conductor:
         now = self._clock.monotonic()
         self.lost = {name: now if lost > at - _LOST_TOGETHER_SECONDS else lost for name, lost in self.lost.items()}
 
-    def _note(self, item: tuple[str, bytes | bool] | None) -> None:
-        if item is None or not isinstance(item[1], bool):
-            return
-        name, there = item[0], item[1]
+    def _note(self, name: str, there: bool) -> None:
         self.present[name] = there
         if there:
             at = self.lost.pop(name, None)
