@@ -32,6 +32,7 @@ EXCEPTIONS = {
     "emulator/evedrop/live/network/connection.py _received self._subscribers.get": PROCESS,
     "emulator/evedrop/live/network/connection.py _received self._subscriber.recv": PROCESS,
     "emulator/evedrop/live/network/connection.py __iter__ self.recv": PROCESS,
+    "emulator/evedrop/live/network/process_session.py take self._subscription.recv": PROCESS,
     "emulator/evedrop/live/network/router.py _go_round self._changed.wait": WORK,
     "emulator/evedrop/live/network/router.py _acknowledged self.sent.get": PROCESS,
     "emulator/evedrop/live/network/router.py next self._orders.get": PROCESS,
@@ -48,10 +49,7 @@ EXCEPTIONS = {
     "emulator/evedrop/studies/scenario_tests.py carry_out process.wait": "the process has closed its output, or is killed",
     "emulator/evedrop/wire/send_queue.py _wait self._bell.acquire": WORK,
     "emulator/evedrop/wire/queries.py _run self._heard.get": WORK,
-    "peers/closed_loop.py of self._subscription.recv": PROCESS,
-    "peers/controller.py steer subscription.recv": PROCESS,
     "peers/sensor.py wait self._mailbox.get": PROCESS,
-    "peers/sensor.py wait self._subscription.recv": PROCESS,
 }
 """File, function and call → why it needs no limit."""
 CONTEXT = {"TAKEN", "_NO_MODULES", "_OF_COMMAND"}
