@@ -33,7 +33,7 @@ from evedrop.live.protocol.launcher_events import (
 )
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.results.folder import HeldFolder
-from evedrop.scenario.progress_events import OnEvent, ProgressEvent, RunEnded, Started
+from evedrop.scenario.progress_events import OnEvent, ProgressEvent, RunEnded
 from evedrop.system.environment import SINGLE_THREADED, check_zenoh_runtime, lock_step_environment, own_environment
 from evedrop.system.processes import wait_for
 from evedrop.system.signals import INTERRUPTED
@@ -91,8 +91,6 @@ class Children:
         self._events: Queue[ProgressEvent | ProcessExit] = world().queue()
         self.silent_seconds = 0.0
         """How many seconds the recorder has been silent for."""
-        self.started = False
-        """Whether the conductor has started the run."""
         self.over = False
         """Whether the run is over, and all processes have been told to leave."""
         self._finishing = False
@@ -232,8 +230,6 @@ class Children:
             return event
         self.silent_seconds = 0.0
         match event:
-            case Started():
-                self.started = True
             case RouterListens(process):
                 self._listening.add(process)
             case ProcessRequest(ProcessAction.START) if not all(self.listens(name) for name in (ROUTER, RELAY)):

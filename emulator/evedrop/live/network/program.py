@@ -50,7 +50,7 @@ class ProgramStates:
 
     def __init__(self, entry: ProgramPart, newest: bool, patience: float, clock: Clock = SYSTEM_CLOCK) -> None:
         """Raises BriefError if there is no router at the endpoint, or if the endpoint cannot be listened on."""
-        self._entry, self._newest = entry, newest
+        self._entry = entry
         self._patience = max(patience, LEAST_SECONDS)
         self._clock = clock
         self._heard: deque[bytes] = deque(maxlen=1 if newest else _MOST_WAITING + 1)
