@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 from evedrop.errors import NoAnswer, UsageError
 from evedrop.live.launch.ports import RouterEndpoints, Routers, identities_of
@@ -162,7 +162,10 @@ def briefs_of(
     model = Model(*matrices, mu_d, header, public.singular_noise, scenario.encoding.state_probabilities)
     leaks, channel, chart = scenario.leaks, ack_channel_of(scenario), chart_of(scenario)
     identities = identities_of(run, endpoints, tuple(users))
-    loop, flow = LoopBriefs(scenario), flow_of(scenario, ahead)
+    table, monitor, flow = scenario.controller, monitor_of(scenario), flow_of(scenario, ahead)
+    wiring = None if table is None else Wiring(table.acts_on, scenario.legitimate.knows_input)
+    disturbances = None if scenario.driven is None else encoded(disturbances_of(scenario))
+    controller = _controller_part(scenario, disturbances)
     states = None if public.source == "zenoh" else states_of(scenario)
     limits = sizes_of(scenario, flow.batch, flow.message).of_kinds
 
@@ -201,7 +204,7 @@ def briefs_of(
         users=routers.at_router,
         leaks=leaks,
         acknowledgements=channel,
-        controller=loop.wiring,
+        controller=wiring,
         zid=routers.zid,
         limits=limits,
         modules=scenario.modules,  # even if no link names a class: an operator can set another link model
@@ -209,7 +212,7 @@ def briefs_of(
     made = [brief(ROUTER, link_keys, router)]
     if endpoints.relay is not None and routers.zid is not None:
         listen = str(endpoints.relay.listen)
-        relay = RelayPart(routers.at_relay, scenario.receivers, listen, routers.zid, loop.wiring, limits)
+        relay = RelayPart(routers.at_relay, scenario.receivers, listen, routers.zid, wiring, limits)
         made.append(brief(RELAY, {}, relay))
     sensor = SensorPart(
         scheme=spec,
@@ -222,19 +225,23 @@ def briefs_of(
         leaks=leaks,
         chart=chart,
         plant=scenario.driven,
-        disturbances=loop.disturbances,
-        controller=loop.of_sensor,
+        disturbances=disturbances,
+        controller=None if table is None else SensorLoopPart(table.period, table.acts_on),
         modules=modules(scheme=spec),
-        monitor=loop.monitor,
+        monitor=monitor,
         states=None if states is None else encoded(states),
         program=_program_of(public),
     )
-    made.append(brief(SENSOR, {**loop.sensor_keys(keys), **keys.secret(scheme.secret_streams)}, sensor))
+    made.append(
+        brief(
+            SENSOR, {**_sensor_keys(scenario, keys, monitor is not None), **keys.secret(scheme.secret_streams)}, sensor
+        )
+    )
     legitimate = LegitimatePart(
         scheme=spec,
         window=scenario.window(LEGITIMATE),
         outages=_outages(scenario, LEGITIMATE),
-        controller=loop.of_legitimate,
+        controller=_estimator_loop(scenario),
         modules=modules(scheme=spec),
     )
     made.append(brief(LEGITIMATE, keys.secret(scheme.estimator_streams), legitimate))
@@ -249,18 +256,18 @@ def briefs_of(
         classes=_answers(scenario),
     )
     made.append(brief(RECORDER, {}, recorder))
-    if loop.of_controller is not None:
-        made.append(brief(CONTROLLER, {}, loop.of_controller))
-    for name, table in scenario.eavesdroppers.items():
+    if controller is not None:
+        made.append(brief(CONTROLLER, {}, controller))
+    for name, listener in scenario.eavesdroppers.items():
         eavesdropper = EavesdropperPart(
-            strategy=table.strategy,
-            parameters=table.parameters,
+            strategy=listener.strategy,
+            parameters=listener.parameters,
             window=scenario.window(name),
             outages=_outages(scenario, name),
             noise_covariance=None if scheme.noise_distribution is None else scheme.noise_distribution.given,
-            modules=modules(strategy=table.strategy, parameters=table.parameters),
+            modules=modules(strategy=listener.strategy, parameters=listener.parameters),
         )
-        made.append(brief(name, keys.eavesdropper(name, table.strategy, table.parameters), eavesdropper))
+        made.append(brief(name, keys.eavesdropper(name, listener.strategy, listener.parameters), eavesdropper))
     return {made_brief.process: made_brief for made_brief in made}
 
 
@@ -332,42 +339,24 @@ def expect_no_launcher_needed(scenario: Scenario) -> None:
             )
 
 
-@final
-class LoopBriefs:
-    """A closed loop's parts of a scenario's briefs; each is None if the scenario lacks the plant or controller for it."""
+def _sensor_keys(scenario: Scenario, keys: StreamKeys, monitored: bool) -> dict[str, bytes]:
+    """Stream → key, for the sensor's own streams, without those of the secret; monitored: whether there is a detector."""
+    measurement = {"measurement": keys.measurement} if scenario.measures else {}
+    monitors = {"watermark": keys.watermark, "spoofing": keys.spoofing} if monitored else {}
+    return {"process": keys.process, **measurement, **monitors}
 
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
-        self.disturbances = None if scenario.driven is None else encoded(disturbances_of(scenario))
-        """Of the plant, for sensor and controller."""
-        table = scenario.controller
-        self.wiring = None if table is None else Wiring(table.acts_on, scenario.legitimate.knows_input)
-        """The controller's connections, for the router."""
-        self.of_sensor = None if table is None else SensorLoopPart(table.period, table.acts_on)
-        """For the sensor: the slots in which it waits for inputs, and whether it sends the state to the controller."""
-        self.monitor = monitor_of(scenario)
-        """Watermark, detector and attack, for the sensor."""
 
-    def sensor_keys(self, keys: StreamKeys) -> dict[str, bytes]:
-        """Stream → key, for the sensor's own streams, without those of the secret."""
-        measurement = {"measurement": keys.measurement} if self._scenario.measures else {}
-        monitors = {} if self.monitor is None else {"watermark": keys.watermark, "spoofing": keys.spoofing}
-        return {"process": keys.process, **measurement, **monitors}
+def _estimator_loop(scenario: Scenario) -> EstimatorLoopPart | None:
+    """When the legitimate estimator sends its estimate, and the plant if it knows the inputs; None if neither."""
+    table, told = scenario.controller, scenario.legitimate.knows_input
+    if table is None or (table.acts_on == "truth" and not told):
+        return None
+    return EstimatorLoopPart(table.period, table.acts_on, scenario.driven if told else None)
 
-    @property
-    def of_legitimate(self) -> EstimatorLoopPart | None:
-        """For the legitimate estimator: when it sends its estimate, and the plant if it knows the inputs; None if neither."""
-        wiring, loop, driven = self.wiring, self.of_sensor, self._scenario.driven
-        if wiring is None or loop is None or (wiring.on_truth and not wiring.knows_input):
-            return None
-        plant = driven if wiring.knows_input else None
-        return EstimatorLoopPart(loop.period, loop.acts_on, plant)
 
-    @property
-    def of_controller(self) -> ControllerPart | None:
-        """The controller's part: its strategy, assignment and disturbances."""
-        scenario = self._scenario
-        assignment, table = scenario.assignment, scenario.controller
-        if assignment is None or table is None or self.disturbances is None:
-            return None
-        return ControllerPart(table.strategy, assignment, table.acts_on, self.disturbances)
+def _controller_part(scenario: Scenario, disturbances: str | None) -> ControllerPart | None:
+    """The controller's part: its strategy, assignment and disturbances; None without a controller."""
+    assignment, table = scenario.assignment, scenario.controller
+    if assignment is None or table is None or disturbances is None:
+        return None
+    return ControllerPart(table.strategy, assignment, table.acts_on, disturbances)
