@@ -414,23 +414,6 @@ def _on_host(table: HostTable, word: str) -> str:
     return f"{folder}exec {shlex.join([*table.command, word])}"
 
 
-@final
-class SshStarter:
-    """Starts each process on its host, and those without one by another starter."""
-
-    def __init__(self, plan: HostsPlan, hosts: Mapping[str, SshHost], here: Starter) -> None:
-        self._plan, self._hosts, self._here = plan, hosts, here
-        # A process here has a process id, which is smaller.
-        self._numbers = itertools.count(2**32)
-
-    def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
-        """Start the process of a brief. Raises OSError, and RunError if the connection with its host is lost."""
-        host = self._plan.host_of(brief.stem)
-        if host is None:
-            return self._here(role, brief, log, environment)
-        return self._hosts[host].start(next(self._numbers), brief, log, environment)
-
-
 @contextmanager
 def ssh_starter(
     plan: HostsPlan,
@@ -458,7 +441,15 @@ def ssh_starter(
         deadline = world().monotonic() + ANSWER_SECONDS
         for host in hosts.values():
             host.wait_until_ready(deadline, stop)
-        yield SshStarter(plan, hosts, here)
+        numbers = itertools.count(2**32)  # a process here has a process id, which is smaller
+
+        def start(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
+            host = plan.host_of(brief.stem)
+            if host is None:
+                return here(role, brief, log, environment)
+            return hosts[host].start(next(numbers), brief, log, environment)
+
+        yield start
 
 
 _LAST_LINES_SECONDS = 1.0  # for the last lines of a process that has ended, whose own children may hold its log open
@@ -474,13 +465,18 @@ def serve_launcher() -> None:
     this.keep_files_private()
     this.keep_events_apart(launched=True)
     with this.raise_on_signals(), private_folder() as private, preloaded_without_recorder() as start:
-        host, silence = HostProcesses(private, start, this.send_event), _Silence()
+        host = HostProcesses(private, start, this.send_event)
+        # The launcher's host may be gone, and the connection seem open, perhaps before anything came.
+        silence, silent_seconds = Alarm(this.interrupt), SILENCE_SECONDS
+        silence.set(silent_seconds)
         try:
             host.greet()
             for line in input_lines():
                 try:
                     order = order_in(line)
-                    silence.heard(order)
+                    if isinstance(order, LauncherHeartbeat):
+                        silent_seconds = order.silence
+                    silence.set(silent_seconds or None)
                     host.obey(order)
                 except ValueError as error:
                     raise RunError(
@@ -489,22 +485,6 @@ def serve_launcher() -> None:
                     ) from error
         finally:
             host.end()
-
-
-@final
-class _Silence:
-    """Ends this program when the launcher has been silent for long: its host may be gone, and the connection seem open."""
-
-    def __init__(self) -> None:
-        self._alarm = Alarm(world().process.interrupt)
-        self._seconds = SILENCE_SECONDS
-        self._alarm.set(self._seconds)  # the connection may die before anything came
-
-    def heard(self, order: Order) -> None:
-        """Note that an order came. A heartbeat says how long the launcher may be silent from now on."""
-        if isinstance(order, LauncherHeartbeat):
-            self._seconds = order.silence
-        self._alarm.set(self._seconds or None)
 
 
 @final
@@ -522,13 +502,12 @@ class HostProcesses:
 
     def greet(self) -> None:
         """Say that the program runs, on a line of its own: the login shell may have printed one without its end."""
-        with self._sending, contextlib.suppress(OSError):
-            self._send(b"\n" + line_of(Greeting(own_version())))
+        self.answer(Greeting(own_version()), b"\n")
 
-    def answer(self, message: Answer) -> None:
-        """Send a message to the launcher; harmless if it is gone."""
+    def answer(self, message: Greeting | Answer, before: bytes = b"") -> None:
+        """Send a message to the launcher, with what must come before it; harmless if it is gone."""
         with self._sending, contextlib.suppress(OSError):
-            self._send(line_of(message))
+            self._send(before + line_of(message))
 
     def obey(self, order: Order) -> None:
         """Start a process, or send a signal to one. Raises ValueError for an unusable brief, and a name that no file can have."""
