@@ -88,7 +88,7 @@ class RunMetrics:
         """folder: of the results; on_event: gets all events after this object."""
         self._scenario, self._folder, self._on_event = scenario, folder, on_event
         self._lock = world().lock()
-        self._progress: RunProgress | None = None
+        self._progress = RunProgress(0, 0.0, "slots/s", {})
         self._running = self._held = False
         self._losses: Counter[str] = Counter()
 
@@ -122,23 +122,16 @@ class RunMetrics:
         yield GaugeMetricFamily("evedrop_running", "Whether all processes have appeared.", float(running))
         yield GaugeMetricFamily("evedrop_held", "Whether the operator holds the run.", float(held))
         yield GaugeMetricFamily("evedrop_slots_planned", "The scenario's number of slots.", self._scenario.slots)
-        done, rate, recent = (
-            (0, 0.0, {}) if progress is None else (progress.done, progress.rate, progress.squared_errors)
-        )
         summary = _summary(folder)
-        done = max(done, int(summary.get("slots", 0)))  # the last slots are in no events
+        done = max(progress.done, int(summary.get("slots", 0)))  # the last slots are in no events
         yield CounterMetricFamily("evedrop_slots", "Slots that are complete.", done)
-        yield GaugeMetricFamily("evedrop_slots_per_second", "The rate of slots at present.", rate)
+        yield GaugeMetricFamily("evedrop_slots_per_second", "The rate of slots at present.", progress.rate)
         errors = GaugeMetricFamily(
             "evedrop_recent_squared_error", "Mean over trials and the latest slots.", labels=["receiver"]
         )
-        for name, value in recent.items():
-            errors.add_metric([name], value)
-        yield errors
+        yield _by_name(errors, progress.squared_errors)
         lost = CounterMetricFamily("evedrop_lost_connections", "Connections lost, by process.", labels=["process"])
-        for name, count in losses.items():
-            lost.add_metric([name], count)
-        yield lost
+        yield _by_name(lost, losses)
         yield from self._metrics(summary, CounterMetricFamily, GaugeMetricFamily)
 
     def _metrics(self, summary: Mapping[str, Any], counter: Any, gauge: Any) -> Iterator[Any]:
@@ -155,15 +148,20 @@ class RunMetrics:
             if kind.only_in_mode is not None:
                 continue
             family = gauge(f"evedrop_{metric}", f"{metric} so far, as in the summary.", labels=["receiver"])
-            for name, metrics in summary.get("peers", {}).items():
-                if isinstance(value := metrics.get(metric), (int, float)):
-                    family.add_metric([name], value)
-            yield family
+            values = {name: metrics.get(metric) for name, metrics in summary.get("peers", {}).items()}
+            yield _by_name(family, {name: value for name, value in values.items() if isinstance(value, (int, float))})
         for name in self._scenario.applications:
             metrics = summary.get(name) or {}
             for metric in APPLICATIONS[name].served_metrics:
                 if isinstance(value := metrics.get(metric), (int, float)):
                     yield gauge(f"evedrop_{metric}", f"{metric} of {name} so far.", value)
+
+
+def _by_name(family: Any, values: Mapping[str, float]) -> Any:
+    """A family of metrics with one label, a name, with a value for each name."""
+    for name, value in values.items():
+        family.add_metric([name], value)
+    return family
 
 
 def _summary(folder: Path) -> Mapping[str, Any]:
