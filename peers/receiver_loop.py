@@ -141,7 +141,7 @@ class ReceiverReplies:
     def acknowledge_again(self, k: int, delivery: Reader) -> None:
         """Handle a delivery of slot k that has arrived again: the first acknowledgement may have been lost."""
         if self._acknowledge is not None:
-            self._acknowledge(_acknowledged(delivery, k, self._trials))
+            self._acknowledge(acknowledgement(k, delivery.flags("gamma", (1, self._trials))[0]))
 
     @property
     def awaited(self) -> bool:
@@ -170,11 +170,6 @@ class ReceiverReplies:
             with suppress(MalformedMessage):  # its slots are over: nobody waits for this process to refuse it
                 if not is_barrier(message):
                     self.acknowledge_again(message.integer("k"), message)
-
-
-def _acknowledged(delivery: Reader, k: int, trials: int) -> bytes:
-    """The acknowledgement of a delivery of a single slot."""
-    return acknowledgement(k, delivery.flags("gamma", (1, trials))[0])
 
 
 def _save(brief: Brief[ReceiverPart], belief: Belief) -> None:

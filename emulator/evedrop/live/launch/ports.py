@@ -51,11 +51,6 @@ class RouterEndpoints:
     relay: RouterEndpoint | None = None
     """The relay's endpoint, in a run with two routers."""
 
-    @property
-    def far(self) -> RouterEndpoint:
-        """The endpoint that all processes but the sensor connect to."""
-        return self.relay or self.router
-
     def check(self, relayed: bool) -> None:
         """Raise UsageError unless there is an endpoint for each of the scenario's routers; relayed: whether it has two."""
         if relayed and self.relay is None:
@@ -205,7 +200,11 @@ class Routers:
 
     def endpoint(self, process: str) -> str:
         """The endpoint that a process connects to."""
-        return str((self.endpoints.router if process in self.at_router else self.endpoints.far).connect)
+        return str(
+            (
+                self.endpoints.router if process in self.at_router else self.endpoints.relay or self.endpoints.router
+            ).connect
+        )
 
     def password(self, process: str) -> str:
         """The password of a process."""

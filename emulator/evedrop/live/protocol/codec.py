@@ -72,7 +72,8 @@ class Reader:
         self.key = key
         self._parts = parts
         self._payload = payload
-        self._fields = self._unpacked() if fields is None else fields
+        self.fields = self._unpacked() if fields is None else fields
+        """All fields, as they were sent: nothing about them is checked yet."""
 
     def _unpacked(self) -> Mapping[Any, Any]:
         count = None if len(self._payload) <= _SMALL_BYTES else _counter(self._parts)
@@ -90,25 +91,20 @@ class Reader:
         """The error for this message, with what was found in it and what was expected."""
         return MalformedMessage(self.key, got, expected, self._payload, writer_of(self.key))
 
-    @property
-    def fields(self) -> Mapping[Any, Any]:
-        """All fields, as they were sent: nothing about them is checked yet."""
-        return self._fields
-
     def has(self, name: str) -> bool:
         """Whether an optional field is present."""
-        return name in self._fields
+        return name in self.fields
 
     def read(self, kind: type[S]) -> S:
         """All fields, as an object of this kind, whose declaration says what they may be."""
         try:
-            return msgspec.convert(self._fields, kind)
+            return msgspec.convert(self.fields, kind)
         except msgspec.ValidationError as error:
             raise self.malformed(str(error), f"the fields of {kind.__name__}") from error
 
     def integer(self, name: str, least: int = 0, most: int | None = None) -> int:
         """An integer field, from `least` to `most`."""
-        value = self._fields.get(name)
+        value = self.fields.get(name)
         if type(value) is not int or not least <= value <= (_LARGEST if most is None else most):
             bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
             raise self.malformed(f"{name} = {shown(value)}", f"an integer {name} {bounds}")
@@ -116,7 +112,7 @@ class Reader:
 
     def text(self, name: str) -> str:
         """A string field."""
-        value = self._fields.get(name)
+        value = self.fields.get(name)
         if not isinstance(value, str):
             raise self.malformed(f"{name} = {shown(value)}", f"a string {name}")
         return value
@@ -130,7 +126,7 @@ class Reader:
 
     def array(self, name: str, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
         """A binary field as a read-only array of this type and shape."""
-        value = self._fields.get(name)
+        value = self.fields.get(name)
         kind = np.dtype(dtype)
         expected = kind.itemsize
         for length in shape:
@@ -165,14 +161,14 @@ class Reader:
 
     def map(self, name: str) -> Mapping[Any, Any]:
         """A map field."""
-        value = self._fields.get(name)
+        value = self.fields.get(name)
         if not isinstance(value, dict):
             raise self.malformed(f"{name} = {shown(value)}", f"a map {name}")
         return value
 
     def maps(self, name: str) -> list[Reader]:
         """A list of maps, each as a reader of its own."""
-        value = self._fields.get(name)
+        value = self.fields.get(name)
         if not isinstance(value, list) or not all(isinstance(element, dict) for element in value):
             raise self.malformed(f"{name} = {shown(value)}", f"a list {name} of maps")
         return [Reader(self.key, self._payload, element) for element in value]
