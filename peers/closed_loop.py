@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import final
 
-from evedrop.live.network.process_session import InOrder, ProcessSession, ReplayBuffer
+from evedrop.live.network.process_session import InOrder, ReplayBuffer
+from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, EstimatorLoopPart, SensorLoopPart
 from evedrop.live.protocol.telemetry import known, read_decided
 from evedrop.model.plant import InputAwareEstimator
@@ -12,7 +13,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Flags, Receiver
 
 
-def kept_decisive(session: ProcessSession, key: str, brief: AnyBrief, period: int) -> ReplayBuffer:
+def kept_decisive(session: Session, key: str, brief: AnyBrief, period: int) -> ReplayBuffer:
     """A replay buffer for messages of decision slots: each may be needed until the next decision slot."""
     return session.replaying_publisher(key, brief.flow.window + 1 + period, back=period)
 
@@ -21,7 +22,7 @@ def kept_decisive(session: ProcessSession, key: str, brief: AnyBrief, period: in
 class Decided:
     """Receives the controller's decisions, one in every `period` slots."""
 
-    def __init__(self, session: ProcessSession, period: int, shape: tuple[int, int], patience: float) -> None:
+    def __init__(self, session: Session, period: int, shape: tuple[int, int], patience: float) -> None:
         self._period, self._shape = period, shape
         self._messages = InOrder(session, session.keys.input, patience)
         self._now: tuple[Floats, Flags]
@@ -40,7 +41,7 @@ class Steered:
     inputs: how many the controller decides.
     """
 
-    def __init__(self, brief: AnyBrief, inputs: int, loop: SensorLoopPart, session: ProcessSession) -> None:
+    def __init__(self, brief: AnyBrief, inputs: int, loop: SensorLoopPart, session: Session) -> None:
         self._period = loop.period
         self._decided = Decided(session, loop.period, (inputs, brief.trials), brief.flow.longest_outage)
         on_truth = loop.acts_on == "truth"
@@ -61,7 +62,7 @@ class Steered:
 class Consultation:
     """The closed loop at the legitimate estimator: sends its estimate, and may receive the inputs."""
 
-    def __init__(self, brief: AnyBrief, loop: EstimatorLoopPart, session: ProcessSession, receiver: Receiver) -> None:
+    def __init__(self, brief: AnyBrief, loop: EstimatorLoopPart, session: Session, receiver: Receiver) -> None:
         self._period = loop.period
         self._put = (
             kept_decisive(session, session.keys.estimate, brief, self._period) if loop.acts_on == "estimate" else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from evedrop.live.network.process_session import InOrder, ProcessSession
+from evedrop.live.network.process_session import InOrder
 from evedrop.live.network.reporting import DecisionReporter
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief, ControllerPart, decoded
@@ -15,7 +15,7 @@ from evedrop.names import CONTROLLER
 from evedrop.peers.closed_loop import kept_decisive
 
 
-def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
+def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], Session] = Session) -> None:
     """Run the controller of a brief; connect: opens its session."""
     part, process = brief.part, brief.model.process
     assignment = part.assignment

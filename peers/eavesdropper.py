@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief, EavesdropperPart
 from evedrop.model.eavesdroppers import STRATEGIES
@@ -14,7 +13,7 @@ from evedrop.scenario.conformance.checked import checked_eavesdropper
 from evedrop.scenario.conformance.problems import Problem
 
 
-def eavesdrop(brief: Brief[EavesdropperPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
+def eavesdrop(brief: Brief[EavesdropperPart], connect: Callable[[AnyBrief], Session] = Session) -> None:
     """Run the eavesdropper of a brief; connect: opens its session."""
     strategy, parameters = brief.part.strategy, brief.part.parameters
     model, distribution = brief.model, brief.part.noise_distribution

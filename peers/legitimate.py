@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief, LegitimatePart
 from evedrop.model.plant import InputAwareEstimator
@@ -16,7 +15,7 @@ from evedrop.scenario.conformance.checked import checked_estimator
 from evedrop.scenario.conformance.problems import Problem
 
 
-def estimate(brief: Brief[LegitimatePart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
+def estimate(brief: Brief[LegitimatePart], connect: Callable[[AnyBrief], Session] = Session) -> None:
     """Run the legitimate estimator of a brief; connect: opens its session."""
     scheme = scheme_of(brief.model.process, brief.part.scheme)
     estimator = scheme.estimator(brief.stream_keys, brief.batch)

@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from evedrop.errors import MalformedMessage
-from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession
+from evedrop.live.network.process_session import GapDetector, Pending
 from evedrop.live.network.reporting import BeliefReporter
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief, ReceiverPart
@@ -28,8 +28,8 @@ def follow(
     brief: Brief[ReceiverPart],
     receiver: Receiver,
     acknowledges: bool = False,
-    consult: Callable[[ProcessSession], Consultation] | None = None,
-    connect: Callable[[AnyBrief], ProcessSession] = Session,
+    consult: Callable[[Session], Consultation] | None = None,
+    connect: Callable[[AnyBrief], Session] = Session,
     betrayed: int | None = None,
 ) -> None:
     """Run a receiver over all slots of its brief, except those in which it is away.
@@ -56,7 +56,7 @@ class ReceiverLoop:
         brief: Brief[ReceiverPart],
         core: ReceiverCore,
         replies: ReceiverReplies,
-        session: ProcessSession,
+        session: Session,
         betrayed: int | None,
     ) -> None:
         name, key = brief.process, session.keys.downlink(brief.process)
@@ -132,7 +132,7 @@ class ReceiverReplies:
     """A receiver's messages to processes other than the recorder: acknowledgements, and its estimate to a controller."""
 
     def __init__(
-        self, brief: AnyBrief, session: ProcessSession, acknowledges: bool, consultation: Consultation | None
+        self, brief: AnyBrief, session: Session, acknowledges: bool, consultation: Consultation | None
     ) -> None:
         self._trials = brief.trials
         self._acknowledge = session.publisher(session.keys.acknowledged) if acknowledges else None

@@ -9,7 +9,7 @@ from queue import Empty
 from typing import final
 
 from evedrop.errors import RunError
-from evedrop.live.network.process_session import InOrder, Mailbox, ProcessSession, ReplayBuffer
+from evedrop.live.network.process_session import InOrder, Mailbox, ReplayBuffer
 from evedrop.live.network.program import ProgramStates
 from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.session import Session
@@ -46,7 +46,7 @@ class Window:
 
     def __init__(
         self,
-        session: ProcessSession,
+        session: Session,
         followers: tuple[str, ...],
         window: int,
         sent: ReplayBuffer,
@@ -121,7 +121,7 @@ class Barriers:
     def __init__(
         self,
         brief: Brief[SensorPart],
-        session: ProcessSession,
+        session: Session,
         window: Window,
         telemetry: Callable[[int, bytes], None],
         flush: Callable[[], None],
@@ -168,7 +168,7 @@ class SensorLoop:
         brief: Brief[SensorPart],
         scheme: Scheme,
         core: SensorCore,
-        session: ProcessSession,
+        session: Session,
         program: ProgramStates | None = None,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
@@ -283,7 +283,7 @@ def _core_of(brief: Brief[SensorPart], scheme: Scheme, program: ProgramStates | 
 
 def sense(
     brief: Brief[SensorPart],
-    connect: Callable[[AnyBrief], ProcessSession] = Session,
+    connect: Callable[[AnyBrief], Session] = Session,
     listen: Callable[[ProgramPart, bool, float], ProgramStates] = ProgramStates,
     clock: Clock = SYSTEM_CLOCK,
 ) -> None:

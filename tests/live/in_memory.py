@@ -26,8 +26,8 @@ class Stage:
     commands: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
     """The conductor's commands, as its classes pack them."""
 
-    def session(self, brief: AnyBrief) -> FakeSession:
-        """In the place of `Session`."""
+    def session(self, brief: AnyBrief) -> Any:
+        """In the place of a `Session`: what the work of a process uses of it."""
         return FakeSession(self, RunKeys(brief.run), brief)
 
     def fill(self, key: str, messages: list[bytes]) -> None:

@@ -114,7 +114,7 @@ class Run:
         self.reported = dict.fromkeys((self.keys.journal, *map(self.keys.telemetry, ("sensor", *self.receivers))), 0)
         self.done, self.held = 0, -1
 
-    def session(self, brief: AnyBrief) -> Connected:
+    def session(self, brief: AnyBrief) -> Any:
         """A process's session, with commands of its own."""
         stage = replace(self.stage, commands=self.commands[brief.process])
         return Connected(stage, self.keys, brief)

@@ -1,4 +1,4 @@
-"""The part of a session that the work of a process uses: messages to take, and messages to send. Tests pass one in memory.
+"""What the work of a process uses with its session: messages to take, and messages to send.
 
 A mailbox holds at most as many bytes from each sender as a run can have in flight. All messages of a key that have arrived and
 are not handled yet are taken at once. Messages that may be lost with a connection are kept, and sent again when the conductor
@@ -11,75 +11,19 @@ Source: docs/protocol.md, lost connections.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
-from types import TracebackType
-from typing import Protocol, Self, final
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, final
 
 from evedrop.errors import Gap, MalformedMessage
+from evedrop.live.network.connection import Subscription
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.commands import ControlCommand, StatusReporter
-from evedrop.live.protocol.keys import RunKeys, writer_of
+from evedrop.live.protocol.keys import writer_of
 from evedrop.system.threads import Queue
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 from evedrop.system.world import world
 
-
-class Received(Protocol):
-    """The messages of one key, in order."""
-
-    def recv(self) -> bytes:
-        """Wait for the next message."""
-
-    def take(self, most: int) -> list[bytes]:
-        """Wait for the next message; then it, and those that have arrived after it, up to `most` in all."""
-
-    def __iter__(self) -> Iterator[bytes]: ...
-
-
-class ProcessSession(Protocol):
-    """A process's session; `Session` says what each method does."""
-
-    keys: RunKeys
-    status: StatusReporter
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
-
-    def subscribe(self, key: str) -> Received:
-        """Subscribe to a key."""
-
-    def subscribe_with(self, key: str, receive: Callable[[bytes], None]) -> None:
-        """Subscribe to a key, with a function that takes its messages."""
-
-    def publisher(self, key: str) -> Callable[[bytes], None]:
-        """A publisher for a key."""
-
-    def replaying_publisher(
-        self,
-        key: str,
-        span: int | None = None,
-        head: Callable[[int, int, int], bytes] | None = None,
-        back: int = 0,
-    ) -> ReplayBuffer:
-        """A publisher whose messages can be sent again."""
-
-    def ready(self) -> None:
-        """Wait for the readers, then appear."""
-
-    def appear(self) -> None:
-        """Show that this process is present."""
-
-    def wait_for(self, kind: type[ControlCommand]) -> None:
-        """Wait for a command."""
-
-    def command(self, receivers: Collection[str] | None = None) -> ControlCommand:
-        """Wait for the next command."""
-
-    def commanded(self, receivers: Collection[str] | None = None) -> ControlCommand | None:
-        """The next command, or None."""
+if TYPE_CHECKING:
+    from evedrop.live.network.session import Session
 
 
 _AHEAD = 64  # messages
@@ -89,7 +33,7 @@ _AHEAD = 64  # messages
 class Pending:
     """Reads packets, or deliveries, and the barriers between them from a subscription, as many messages ahead as have arrived."""
 
-    def __init__(self, subscription: Received, key: str) -> None:
+    def __init__(self, subscription: Subscription, key: str) -> None:
         self._subscription, self._key = subscription, key
         self._messages: deque[Reader] = deque()
 
@@ -251,7 +195,7 @@ class GapDetector:
 class InOrder:
     """Reads the messages of one key, each when its slot is due."""
 
-    def __init__(self, session: ProcessSession, key: str, patience: float) -> None:
+    def __init__(self, session: Session, key: str, patience: float) -> None:
         """patience: as in `GapDetector`."""
         self._subscription, self._key = session.subscribe(key), key
         self._gaps = GapDetector(key, patience)

@@ -29,7 +29,7 @@ import numpy as np
 from evedrop.errors import EvedropError, MalformedMessage
 from evedrop.live.network.access import Grant, access_control, at_relay, at_router, grants, until_all_left, users_file
 from evedrop.live.network.connecting import connected
-from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession
+from evedrop.live.network.process_session import GapDetector, Pending
 from evedrop.live.network.session import ATTEMPT, Session, client_config, router_config
 from evedrop.live.protocol.brief import AnyBrief, Brief, RelayPart, RouterPart, RoutingPart
 from evedrop.live.protocol.codec import Reader
@@ -147,7 +147,7 @@ class Downlink:
 class AckLink:
     """The link of the acknowledgements, from the legitimate estimator to the sensor, and the attack on it."""
 
-    def __init__(self, brief: AnyBrief, session: ProcessSession, spec: AckChannelSpec) -> None:
+    def __init__(self, brief: AnyBrief, session: Session, spec: AckChannelSpec) -> None:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
         self._channel = AckChannel.from_spec(spec, key, brief.batch)
         self._jammer = spec.jammer
@@ -202,7 +202,7 @@ def route(brief: Brief[RouterPart]) -> None:
 class RouterLoop:
     """The router's work on an open session."""
 
-    def __init__(self, brief: Brief[RouterPart], session: ProcessSession) -> None:
+    def __init__(self, brief: Brief[RouterPart], session: Session) -> None:
         self._brief, self._session = brief, session
         self._packets = packet_format(len(brief.model.A), brief.trials, brief.model.header)
         self._betrayed = frozenset(brief.part.leaks.values())
@@ -409,7 +409,7 @@ class Commands:
 
     def __init__(
         self,
-        session: ProcessSession,
+        session: Session,
         receivers: Collection[str],
         knock: Callable[[], None],
         waiting: Iterable[Queue[bytes | None]],
