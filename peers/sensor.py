@@ -30,7 +30,7 @@ from evedrop.names import RECORDER, SENSOR
 from evedrop.peers.closed_loop import Steered
 from evedrop.scenario.conformance.checked import checked_encoder
 from evedrop.scenario.conformance.problems import Problem
-from evedrop.system.waiting import SYSTEM_CLOCK, Clock
+from evedrop.system.world import world
 
 _PROGRESS_BYTES = 16 * 2**20  # for one follower: far more than are ever under way
 _SETTLE_SECONDS = 2.0
@@ -44,21 +44,14 @@ class Window:
     sent: the sensor's sent messages, which are forgotten as these processes progress.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        followers: tuple[str, ...],
-        window: int,
-        sent: ReplayBuffer,
-        clock: Clock = SYSTEM_CLOCK,
-    ) -> None:
-        self._window, self._sent, self._status, self._clock = window, sent, session.status, clock
+    def __init__(self, session: Session, followers: tuple[str, ...], window: int, sent: ReplayBuffer) -> None:
+        self._window, self._sent, self._status = window, sent, session.status
         self._done = dict.fromkeys(followers, 0)
         self._absent: Collection[str] = ()
         self.limit = window
         """The first slot that may not be sent yet."""
         self._keys = {name: session.keys.progress(name) for name in followers}
-        self._mailbox = Mailbox(self._keys, _PROGRESS_BYTES, clock)
+        self._mailbox = Mailbox(self._keys, _PROGRESS_BYTES)
         for name, key in self._keys.items():
             session.subscribe_with(key, partial(self._mailbox.put, name))
 
@@ -78,10 +71,10 @@ class Window:
 
     def settle(self, k: int, seconds: float) -> None:
         """Wait until all slots below k are done, for some seconds at most."""
-        deadline = self._clock.monotonic() + seconds
+        deadline = world().monotonic() + seconds
         with contextlib.suppress(Empty):
             while min(self._done[name] for name in self._followed) < k:
-                self._take(*self._mailbox.get(max(0.0, deadline - self._clock.monotonic())), k)
+                self._take(*self._mailbox.get(max(0.0, deadline - world().monotonic())), k)
 
     def _take(self, name: str, payload: bytes | bool, k: int) -> None:
         """Take a progress message; all slots of it are below k or k itself."""
@@ -170,11 +163,10 @@ class SensorLoop:
         core: SensorCore,
         session: Session,
         program: ProgramStates | None = None,
-        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
-        """program: from which the core takes the states, if from any. clock: by which slots are due."""
+        """program: from which the core takes the states, if from any."""
         part = brief.part
-        self._program, self._clock = program, clock
+        self._program = program
         self._brief, self._session, self._core = brief, session, core
         self._send = session.replaying_publisher(session.keys.uplink, head=resend, back=part.history)
         self._window = Window(session, (*part.receivers, RECORDER), brief.flow.window, self._send)
@@ -195,7 +187,7 @@ class SensorLoop:
 
     def carry_on(self) -> None:
         """Send all slots."""
-        self._start = self._clock.monotonic()
+        self._start = world().monotonic()
         k = 0
         while k < self._brief.slots:
             self._wait(k)
@@ -241,17 +233,17 @@ class SensorLoop:
         pace = self._brief.part.pace
         # With a pace, a hold may be requested at any moment before the slot is due; each slot has at most one barrier.
         while not (wanted := self._barriers.wanted(k)) and pace and (left := self._left(k)) > 0.0:
-            self._clock.sleep(min(left, _POLL_SECONDS))
+            world().sleep(min(left, _POLL_SECONDS))
         if wanted:
             self._send(k, barrier(k))
-            began = self._clock.monotonic()
+            began = world().monotonic()
             self._barriers.wait_at(k)
-            self._start += self._clock.monotonic() - began
-            self._clock.sleep(max(0.0, self._left(k)) if pace else 0.0)
+            self._start += world().monotonic() - began
+            world().sleep(max(0.0, self._left(k)) if pace else 0.0)
 
     def _left(self, k: int) -> float:
         """The seconds until slot k is due."""
-        return self._start + k * self._brief.part.pace - self._clock.monotonic()
+        return self._start + k * self._brief.part.pace - world().monotonic()
 
 
 def _core_of(brief: Brief[SensorPart], scheme: Scheme, program: ProgramStates | None) -> SensorCore:
@@ -285,18 +277,17 @@ def sense(
     brief: Brief[SensorPart],
     connect: Callable[[AnyBrief], Session] = Session,
     listen: Callable[[ProgramPart, bool, float], ProgramStates] = ProgramStates,
-    clock: Clock = SYSTEM_CLOCK,
 ) -> None:
     """Run the sensor of a brief.
 
-    connect: opens its session. listen: takes the states of a program, if the brief names one. clock: by which slots are due.
+    connect: opens its session. listen: takes the states of a program, if the brief names one.
     """
     scheme = scheme_of(brief.model.process, brief.part.scheme)
     entry = brief.part.program
     patience = brief.flow.longest_outage
     source = None if entry is None else listen(entry, bool(brief.part.pace), patience)
     with source or contextlib.nullcontext() as program, connect(brief) as session:
-        loop = SensorLoop(brief, scheme, _core_of(brief, scheme, program), session, program, clock)
+        loop = SensorLoop(brief, scheme, _core_of(brief, scheme, program), session, program)
         session.ready()
         session.wait_for(Start)
         loop.carry_on()

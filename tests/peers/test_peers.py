@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, BinaryIO, cast
 
 import msgpack
@@ -30,9 +31,7 @@ from evedrop.peers.eavesdropper import eavesdrop
 from evedrop.peers.legitimate import estimate
 from evedrop.peers.receiver_loop import _save
 from evedrop.peers.sensor import Window, sense
-from evedrop.system.threads import Queue
 from tests.builders import listener, part_of, scenario_of
-from tests.clock import T, TestClock
 from tests.conftest import LIMIT
 from tests.live.in_memory import Stage
 from tests.messages import delivered, read_packet
@@ -350,14 +349,14 @@ class WouldWaitError(Exception):
     """The sensor would have to wait for a message."""
 
 
-class Impatient(TestClock):
-    """A clock that says so instead of waiting."""
+class Impatient(SimpleQueue[Any]):
+    """A queue that says so instead of waiting."""
 
-    def next(self, queue: Queue[T], timeout: float | None) -> T:
+    def get(self, block: bool = True, timeout: float | None = None) -> Any:
         """The next item that is there."""
-        if queue.empty():
+        if self.empty():
             raise WouldWaitError
-        return super().next(queue, timeout)
+        return super().get(block, timeout)
 
 
 @pytest.mark.parametrize("slowest", ["a", "b", "recorder"])
@@ -365,7 +364,8 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(slowest: str, stage: Stag
     """It sends slot k exactly if k < window + the lowest progress; no process's progress replaces another's."""
     followers = ("a", "b", "recorder")
     session = stage.session(briefs()["sensor"])
-    window = Window(session, followers, 10, ReplayBuffer(print), Impatient())
+    window = Window(session, followers, 10, ReplayBuffer(print))
+    window._mailbox._queue = Impatient()
 
     def reaches(limit: int) -> None:
         window.wait(limit - 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,16 @@ from evedrop.model.process import Floats
 from evedrop.peers.sensor import sense
 from evedrop.scenario.loading import checked
 from tests.builders import MARGINAL, process_table
-from tests.clock import TestClock
+from tests.clock import TestClock, clock_at_start, time_of_a_test
 from tests.conftest import LIMIT, wait_until
 from tests.live.in_memory import Stage
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _time_of_the_tests() -> Iterator[None]:
+    """The programs go by a clock of these tests."""
+    with time_of_a_test():
+        yield
 
 
 class LateProgram:
@@ -46,7 +54,7 @@ class LateProgram:
 
 def test_slots_after_a_late_state_are_due_that_much_later() -> None:
     """They do not hurry to make up for it: each takes its state a pace after the slot before."""
-    clock, stage = TestClock(), Stage()
+    clock, stage = clock_at_start(), Stage()
     program = LateProgram(clock)
     asked: list[bool] = []
 
@@ -67,9 +75,7 @@ def test_slots_after_a_late_state_are_due_that_much_later() -> None:
     made = briefs_of(checked(tables, "file"), endpoints_at("tcp/127.0.0.1:1"), RecorderTask(Path("nowhere"), False))[
         "sensor"
     ]
-    thread = threading.Thread(
-        target=sense, args=(replace(made, flow=Flow(12, 4)), stage.session, opened, clock), daemon=True
-    )
+    thread = threading.Thread(target=sense, args=(replace(made, flow=Flow(12, 4)), stage.session, opened), daemon=True)
     thread.start()
     stage.commands.put(Start().pack())
     wait_until(lambda: len(program.taken) == 8, "all slots have a state")

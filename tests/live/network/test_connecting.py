@@ -22,7 +22,7 @@ from evedrop.live.network.control_file import Control
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.system.ports import free_port
-from tests.clock import TestClock
+from tests.clock import time_of_a_test
 from tests.live.network.bench import small_network
 
 
@@ -32,8 +32,8 @@ def test_a_process_says_that_it_waits_for_its_router(tmp_path: Path, capfd: pyte
     brief = briefs_of(small_network(), endpoints_at(endpoint), RecorderTask(tmp_path, False), ends_with_stdin=False)[
         "eve"
     ]
-    with pytest.raises(RunError, match="no router answered"):
-        Session(replace(brief, patience=10), clock=TestClock())
+    with time_of_a_test(), pytest.raises(RunError, match="no router answered"):
+        Session(replace(brief, patience=10))
     lines = capfd.readouterr().err.splitlines()
     line = rf"evedrop: eve: waiting for the router at {endpoint}: no answer yet \((3|6|9) s; Connection refused\)"
     assert [bool(re.fullmatch(line, text)) for text in lines] == [True] * len(lines)
@@ -87,17 +87,17 @@ def test_a_connection_that_ends_before_there_is_a_certificate_is_no_refusal(tmp_
             small_network(), endpoints_at(endpoint), RecorderTask(tmp_path, False), ends_with_stdin=False
         )["eve"]
         assert brief.identity is not None
-        with pytest.raises(RunError, match=r"no router answered at .* within 10 s"):
-            Session(replace(brief, patience=10), clock=TestClock())
+        with time_of_a_test(), pytest.raises(RunError, match=r"no router answered at .* within 10 s"):
+            Session(replace(brief, patience=10))
 
 
 @pytest.mark.parametrize("error", [ssl.SSLEOFError, ssl.SSLZeroReturnError, ConnectionResetError, BrokenPipeError])
 @pytest.mark.parametrize("secure", [True, False])
 def test_a_connection_that_ends_is_a_refusal_only_unencrypted(error: type[OSError], secure: bool) -> None:
     """With each of the errors by which versions of Python and of OpenSSL report it."""
-    clock = TestClock()
-    failures = Failures(clock, secure)
-    for _ in range(8):
-        failures.add_attempt(error("the connection has been closed"), 0.1)
-        clock.sleep(1.0)
-    assert failures.refused is not secure
+    failures = Failures(secure)
+    with time_of_a_test() as clock:
+        for _ in range(8):
+            failures.add_attempt(error("the connection has been closed"), 0.1)
+            clock.sleep(1.0)
+        assert failures.refused is not secure

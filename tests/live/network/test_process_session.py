@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from types import SimpleNamespace
 
 import msgpack
@@ -11,7 +12,14 @@ from hypothesis import strategies as st
 
 from evedrop.errors import Gap
 from evedrop.live.network.process_session import GapDetector, InOrder, ReplayBuffer
-from tests.clock import TestClock
+from tests.clock import clock_at_start, time_of_a_test
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _time_of_the_tests() -> Iterator[None]:
+    """The programs go by a clock of these tests."""
+    with time_of_a_test():
+        yield
 
 
 def slot_message(k: int) -> bytes:
@@ -145,8 +153,7 @@ KEY = "evedrop/r/uplink"
 
 def test_a_slot_that_is_missing_is_waited_for() -> None:
     """For the patience, from the first later slot on, and not longer; earlier slots do not count."""
-    clock = TestClock()
-    gap = GapDetector(KEY, 5.0, clock)
+    clock, gap = clock_at_start(), GapDetector(KEY, 5.0)
     gap.missed(7, 6)
     clock.now += 100.0
     for _ in range(5):
@@ -162,8 +169,7 @@ def test_a_slot_that_is_missing_is_waited_for() -> None:
 
 def test_another_slot_that_is_missing_is_waited_for_as_long() -> None:
     """The time of the slot before it does not count."""
-    clock = TestClock()
-    gap = GapDetector(KEY, 5.0, clock)
+    clock, gap = clock_at_start(), GapDetector(KEY, 5.0)
     for _ in range(4):
         gap.missed(0, 3)
         clock.now += 1.0
@@ -176,8 +182,7 @@ def test_another_slot_that_is_missing_is_waited_for_as_long() -> None:
 
 def test_time_in_which_nothing_ran_hardly_counts() -> None:
     """A process that was suspended finds later messages at once, and the missing one may come yet."""
-    clock = TestClock()
-    gap = GapDetector(KEY, 30.0, clock)
+    clock, gap = clock_at_start(), GapDetector(KEY, 30.0)
     for _ in range(5):
         gap.missed(7, 9)
         clock.now += 3600.0
@@ -187,7 +192,7 @@ def test_time_in_which_nothing_ran_hardly_counts() -> None:
 
 def test_the_message_of_the_slot_that_is_due_is_taken() -> None:
     """Those of earlier and later slots that come before it are left out."""
-    clock, coming = TestClock(), iter([3, 6, 5])
+    clock, coming = clock_at_start(), iter([3, 6, 5])
 
     def received() -> bytes:
         clock.now += 3.0
@@ -195,7 +200,6 @@ def test_the_message_of_the_slot_that_is_due_is_taken() -> None:
 
     session = SimpleNamespace(subscribe=lambda _: SimpleNamespace(recv=received))
     messages = InOrder(session, KEY, 5.0)  # type: ignore[arg-type]
-    messages._gaps = GapDetector(KEY, 5.0, clock)
     assert messages.take(5).integer("k") == 5
     with pytest.raises(Gap):
         messages.take(6)

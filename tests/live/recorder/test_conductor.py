@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -11,8 +11,15 @@ from evedrop.live.protocol.commands import Abandon, Start
 from evedrop.live.protocol.notices import EndReport, Progress
 from evedrop.live.recorder.conductor import Conductor, Stop
 from evedrop.names import RECORDER
-from tests.clock import TestClock
+from tests.clock import TestClock, clock_at_start, time_of_a_test
 from tests.live.recorder.test_conductor_ending import Network
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _time_of_the_tests() -> Iterator[None]:
+    """The recorder goes by a clock of these tests."""
+    with time_of_a_test():
+        yield
 
 
 class Told(Network):
@@ -22,7 +29,7 @@ class Told(Network):
 
     def __init__(self, *absent: str) -> None:
         super().__init__()
-        self.clock = TestClock()
+        self.clock = clock_at_start()
         self.absent = absent
         self.sent: list[tuple[str, bytes, float]] = []
         self.opened = False
@@ -44,7 +51,7 @@ class Told(Network):
 
 def conducted(network: Told, *, relayed: bool = False, stop: Stop | None = None) -> Conductor:
     """A conductor of a run of two receivers."""
-    return Conductor(network, ("legitimate", "smart"), stop or Stop(), relayed, network.clock)  # type: ignore[arg-type]
+    return Conductor(network, ("legitimate", "smart"), stop or Stop(), relayed)  # type: ignore[arg-type]
 
 
 def test_a_run_begins_when_all_are_there() -> None:
@@ -95,12 +102,12 @@ def test_a_signal_ends_the_waiting_for_processes() -> None:
 def test_a_signal_is_waited_for_as_long_as_is_said() -> None:
     """A launcher that leaves a moment later is an interruption, too; one that leaves after the patience is not."""
     for leaves, interrupted in ((1.5, True), (2.5, False)):
-        clock = TestClock()
+        clock = clock_at_start()
 
         def gone(clock: TestClock = clock, leaves: float = leaves) -> bool:
             return clock.now >= 1000.0 + leaves
 
-        stop = Stop(gone, clock)
+        stop = Stop(gone)
         if interrupted:
             with pytest.raises(Interrupted):
                 stop.check(2.0)
@@ -177,6 +184,6 @@ def test_another_router_is_noticed_once() -> None:
 def test_who_is_cut_off_for_too_long_is_named() -> None:
     """Unless a signal explains it."""
     with pytest.raises(RunError, match=r"^sensor, smart cut off from the network for 7\.5 s; look at the logs$"):
-        conducted(Told(), stop=Stop(clock=TestClock())).fail_cut_off(["sensor", "smart"], 7.5)
+        conducted(Told(), stop=Stop()).fail_cut_off(["sensor", "smart"], 7.5)
     with pytest.raises(Interrupted):
         conducted(Told(), stop=Stop(lambda: True)).fail_cut_off(["sensor"], 7.5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -11,10 +11,17 @@ from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.notices import EndReport
 from evedrop.live.recorder.conductor import Conductor, Stop
-from tests.clock import TestClock
+from tests.clock import clock_at_start, time_of_a_test
 
 RUN = "r"
 NAMES = ("router", "relay", "sensor", "legitimate", "smart")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _time_of_the_tests() -> Iterator[None]:
+    """The recorder goes by a clock of these tests."""
+    with time_of_a_test():
+        yield
 
 
 class Network:
@@ -87,8 +94,8 @@ def network() -> Network:
 
 def ended(network: Network, patience: float = 30.0, *missing: str) -> tuple[Conductor, float]:
     """The conductor of a run that has told its end, and the seconds that this took; missing: processes that are cut off."""
-    clock = TestClock()
-    conductor = Conductor(network, ("legitimate", "smart"), network.stop, relayed=True, clock=clock)  # type: ignore[arg-type]
+    clock = clock_at_start()
+    conductor = Conductor(network, ("legitimate", "smart"), network.stop, relayed=True)  # type: ignore[arg-type]
     conductor.assemble()
     for name in missing:
         network.watches[name](False)

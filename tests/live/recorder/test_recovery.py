@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -12,9 +13,15 @@ from evedrop.live.protocol.commands import Again, ControlCommand
 from evedrop.live.recorder.conductor import Conductor, Stop
 from evedrop.live.recorder.recovery import Recovery, patience_of
 from evedrop.scenario.progress_events import ProgressEvent
-from evedrop.system.waiting import SYSTEM_CLOCK, Clock
-from tests.clock import TestClock
+from tests.clock import TestClock, clock_at_start, time_of_a_test
 from tests.live.recorder.test_conductor_ending import Network
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _time_of_the_tests() -> Iterator[None]:
+    """The recorder goes by a clock of these tests."""
+    with time_of_a_test():
+        yield
 
 
 class Conducted:
@@ -35,7 +42,7 @@ class Conducted:
         """How often the time limit of a hold began again."""
         self.another_router = False
         self.unreached: list[str] = []
-        self.clock: Clock = SYSTEM_CLOCK
+        self.clock = clock_at_start()
 
     @property
     def missing(self) -> list[str]:
@@ -115,7 +122,7 @@ def test_an_outage_that_is_open_at_the_end_lasts_to_the_last_slot_of_a_complete_
 ) -> None:
     """A process that has reported all slots holds up nothing; otherwise the run did not go on."""
     conducted = Conducted()
-    recovery = recovery_of(conducted, TestClock(), 30.0)
+    recovery = recovery_of(conducted, clock_at_start(), 30.0)
     recovery.poll(10)
     conducted.lose("smart")
     recovery.poll(10)
@@ -128,7 +135,7 @@ def test_an_outage_that_is_open_at_the_end_lasts_to_the_last_slot_of_a_complete_
 @pytest.mark.parametrize("again", [False, True])
 def test_an_outage_after_which_the_run_did_not_go_on_is_open(lost: str, told: str, again: bool) -> None:
     """The process returns, but the run fails before it joins another slot. A second loss belongs to the same outage."""
-    conducted, clock = Conducted(), TestClock()
+    conducted, clock = Conducted(), clock_at_start()
     recovery = recovery_of(conducted, clock, 30.0)
     recovery.poll(10)
     conducted.lose(lost)
@@ -154,13 +161,12 @@ def recovery_of(conducted: Conducted, clock: TestClock, longest_outage: float, p
         Flow(32, 8, longest_outage),
         pace,
         lambda _: None,
-        clock,
     )
 
 
 def test_time_in_which_the_recorder_did_not_run_does_not_count() -> None:
     """It could not hear that those who were lost are back."""
-    conducted, clock = Conducted(), TestClock()
+    conducted, clock = Conducted(), clock_at_start()
     recovery = recovery_of(conducted, clock, 3.0)
     recovery.poll(10)
     conducted.lose("smart")
@@ -173,7 +179,7 @@ def test_time_in_which_the_recorder_did_not_run_does_not_count() -> None:
 @pytest.mark.parametrize("awaits_belief", [False, True])
 def test_a_held_run_that_waits_for_a_belief_asks_for_it_again(awaits_belief: bool) -> None:
     """The message may have been lost without a connection, as one that came on a key that it does not name."""
-    conducted, clock = Conducted(), TestClock()
+    conducted, clock = Conducted(), clock_at_start()
     recovery = recovery_of(conducted, clock, 30.0)
     recovery.poll(10)
     conducted.at, conducted.awaits_belief = 10, awaits_belief
@@ -187,7 +193,7 @@ def test_a_held_run_that_waits_for_a_belief_asks_for_it_again(awaits_belief: boo
 
 def test_a_round_waits_for_processes_that_are_back_and_cannot_be_told_yet() -> None:
     """A token that is back may be faster than the subscription behind it; after some seconds the round begins all the same."""
-    conducted, clock = Conducted(), TestClock()
+    conducted, clock = Conducted(), clock_at_start()
     recovery = recovery_of(conducted, clock, 30.0)
     recovery.poll(10)
     for there_after in (1.0, 9.0):
@@ -211,7 +217,7 @@ def test_a_round_waits_for_processes_that_are_back_and_cannot_be_told_yet() -> N
 def test_a_round_repeats_the_commands_that_may_have_been_lost(done: int) -> None:
     """The start of a run of which nothing is joined yet, what the operator ordered, and how far the recorder is."""
     conducted = Conducted()
-    recovery = recovery_of(conducted, TestClock(), 30.0)
+    recovery = recovery_of(conducted, clock_at_start(), 30.0)
     if done:
         recovery.poll(done)
     conducted.lose("sensor")
@@ -231,7 +237,7 @@ def test_a_round_that_is_lost_is_repeated_before_a_process_counts_as_silent(
     longest_outage: float, pace: float, lost: bool, gap: float
 ) -> None:
     """Also in a run whose slots were joined at long intervals before; with three rounds after an outage."""
-    conducted, clock = Conducted(), TestClock()
+    conducted, clock = Conducted(), clock_at_start()
     recovery = recovery_of(conducted, clock, longest_outage, pace)
     recovery.poll(8)
     clock.now += gap
@@ -253,7 +259,7 @@ def test_a_process_is_reached_when_its_commands_have_a_reader() -> None:
     """Its token alone is not enough; one that is away is not waited for."""
     network = Network()
     network.unread = {network.keys.control("smart"), network.keys.control("sensor")}
-    conductor = Conductor(network, ("legitimate", "smart"), Stop(), clock=TestClock())  # type: ignore[arg-type]
+    conductor = Conductor(network, ("legitimate", "smart"), Stop())  # type: ignore[arg-type]
     conductor.assemble()
     assert conductor.unreached == ["sensor", "smart"]
     network.watches["sensor"](False)

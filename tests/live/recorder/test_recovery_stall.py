@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import pytest
 
@@ -10,10 +10,17 @@ from evedrop.errors import Silence
 from evedrop.live.protocol.commands import ProcessStatus
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.recorder.recovery import Stall, patience_of, silent_of
-from tests.clock import TestClock
+from tests.clock import clock_at_start, time_of_a_test
 
 KEYS = RunKeys("r")
 WINDOW = 100
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _time_of_the_tests() -> Iterator[None]:
+    """The recorder goes by a clock of these tests."""
+    with time_of_a_test():
+        yield
 
 
 def at(slot: int, *waits: str) -> ProcessStatus:
@@ -122,11 +129,11 @@ class Run:
     """A run that stands still, watched."""
 
     def __init__(self, patience: float) -> None:
-        self.clock = TestClock()
+        self.clock = clock_at_start()
         self.asked = 0
         self.answers: dict[str, ProcessStatus] = {}
         self.places = {"sensor": 60, "router": 60, "eve": 50}
-        self.stall = Stall(patience, 10, self.ask, "router", self.clock)
+        self.stall = Stall(patience, 10, self.ask, "router")
 
     def ask(self) -> None:
         """Everybody is asked, and answers."""

@@ -24,7 +24,6 @@ from evedrop.live.protocol.brief import AnyBrief, Identity
 from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.system.environment import check_zenoh_runtime
 from evedrop.system.lacks import lack_of
-from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 from evedrop.system.world import world
 
 
@@ -67,18 +66,18 @@ Credentials = AnyBrief | Control
 class WaitReporter:
     """Reports every few seconds on standard error that a process waits for its router."""
 
-    def __init__(self, process: str, router: str, clock: Clock = SYSTEM_CLOCK) -> None:
-        self._process, self._router, self._clock = process, router, clock
+    def __init__(self, process: str, router: str) -> None:
+        self._process, self._router = process, router
         self.begin()
 
     def begin(self, again: bool = False) -> None:
         """Start the clock. again: because a connection was lost."""
-        self._began = self._told_at = self._clock.monotonic()
+        self._began = self._told_at = world().monotonic()
         self._what = "lost the connection; waiting again" if again else "waiting"
 
     def poll(self, why: object) -> None:
         """Report that the process still waits, if a report is due; why: the result of the last attempt."""
-        now = self._clock.monotonic()
+        now = world().monotonic()
         if now - self._told_at >= _WAITING_SECONDS:
             self._told_at = now
             sys.stderr.write(
@@ -101,28 +100,24 @@ def _reason(error: OSError | zenoh.ZError) -> object:
 
 
 def connected(
-    entry: Credentials,
-    config: ZenohConfig,
-    patience: float,
-    meanwhile: Callable[[], None] = lambda: None,
-    clock: Clock = SYSTEM_CLOCK,
+    entry: Credentials, config: ZenohConfig, patience: float, meanwhile: Callable[[], None] = lambda: None
 ) -> zenoh.Session:
     """Open a session with the router; config: for one attempt; `meanwhile` is called before each attempt.
 
     Raises BriefError for an error that waiting cannot mend, RunError if no router has answered after `patience` seconds.
     """
     endpoint = endpoint_of(entry.router, entry.identity)
-    began = clock.monotonic()
-    failures, wait = Failures(clock, endpoint.secure), WaitReporter(entry.user, entry.router, clock)
+    began = world().monotonic()
+    failures, wait = Failures(endpoint.secure), WaitReporter(entry.user, entry.router)
     pause, longest = _AGAIN_SECONDS
     while True:
         meanwhile()
-        tried = clock.monotonic()
+        tried = world().monotonic()
         try:
             _knock(endpoint, entry)
             return open_session(config)
         except (OSError, zenoh.ZError) as error:
-            failures.add_attempt(error, clock.monotonic() - tried)
+            failures.add_attempt(error, world().monotonic() - tried)
             why = _reason(error)
             if failures.unknown_seconds > _UNKNOWN_HOST_SECONDS and isinstance(endpoint, Endpoint):
                 raise BriefError(
@@ -130,19 +125,19 @@ def connected(
                     "briefs again with --connect and a name or address that this host knows"
                 ) from error
             if failures.refused and cut_off(endpoint):
-                failures = Failures(clock, endpoint.secure)
+                failures = Failures(endpoint.secure)
             if failures.refused:
                 raise BriefError(
                     f"{entry.router} does not let this brief in, which is of run {entry.run}: the router there is of another "
                     "run, or another program listens there; start the router of this run, or give the brief of that one"
                 ) from error
-            if clock.monotonic() - began > patience:
+            if world().monotonic() - began > patience:
                 raise NoRouter(
                     f"no router answered at {entry.router} within {patience:.0f} s ({why}); start it there, and check that no "
                     "firewall is in between"
                 ) from error
             wait.poll(why)
-        clock.sleep(pause)
+        world().sleep(pause)
         pause = min(longest, pause * 1.5)
 
 
@@ -150,16 +145,16 @@ def connected(
 class Failures:
     """The results of the attempts so far."""
 
-    def __init__(self, clock: Clock, secure: bool = False) -> None:
+    def __init__(self, secure: bool = False) -> None:
         """secure: whether a router shows its certificate before it can refuse anybody."""
-        self._clock, self._secure = clock, secure
+        self._secure = secure
         self._unknown: float | None = None
         self._refused: float | None = None
         self._refusals = 0
 
     def add_attempt(self, error: Exception, seconds: float) -> None:
         """Add an attempt that failed after `seconds`."""
-        now = self._clock.monotonic()
+        now = world().monotonic()
         unknown = isinstance(error, socket.gaierror)
         self._unknown = (self._unknown or now) if unknown else None
         # A listener that hangs up refuses us; one that is slow, or not there, may still answer. Under TLS a connection that ends
@@ -176,7 +171,7 @@ class Failures:
     @property
     def unknown_seconds(self) -> float:
         """For how long the host's name has been unknown."""
-        return 0.0 if self._unknown is None else self._clock.monotonic() - self._unknown
+        return 0.0 if self._unknown is None else world().monotonic() - self._unknown
 
     @property
     def refused(self) -> bool:
@@ -184,7 +179,7 @@ class Failures:
         return (
             self._refused is not None
             and self._refusals >= _REFUSALS
-            and self._clock.monotonic() - self._refused > _REFUSED_SECONDS
+            and world().monotonic() - self._refused > _REFUSED_SECONDS
         )
 
 

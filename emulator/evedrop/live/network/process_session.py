@@ -19,7 +19,6 @@ from evedrop.live.network.connection import Subscription
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.keys import writer_of
 from evedrop.system.threads import Queue
-from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 from evedrop.system.world import world
 
 if TYPE_CHECKING:
@@ -72,9 +71,9 @@ def allowance(largest: int, window: int, batch: int) -> int:
 class Mailbox:
     """A queue of messages by sender; filled by threads of Zenoh's, read by one."""
 
-    def __init__(self, keys: Mapping[str, str], most: int, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(self, keys: Mapping[str, str], most: int) -> None:
         """keys: sender → the key on which it sends; most: how many bytes of one sender may wait."""
-        self._keys, self._most, self._clock = keys, most, clock
+        self._keys, self._most = keys, most
         self._queue: Queue[tuple[str, bytes | bool]] = world().queue()
         self._waiting = dict.fromkeys(keys, 0)
         self._lock = world().lock()
@@ -107,7 +106,7 @@ class Mailbox:
                 last,
                 writer_of(key),
             )
-        sender, item = self._clock.next(self._queue, timeout)
+        sender, item = self._queue.get(timeout=timeout)
         if isinstance(item, bytes):
             with self._lock:
                 self._waiting[sender] -= len(item) + _OVERHEAD_BYTES
@@ -168,18 +167,18 @@ class ReplayBuffer:
 class GapDetector:
     """Handles messages of slots that are not due: ignores earlier slots, and for later ones waits for the missing slot."""
 
-    def __init__(self, key: str, patience: float, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(self, key: str, patience: float) -> None:
         """patience: for how many seconds later slots may arrive while the due one does not.
 
         Time in which this process did not run hardly counts: the message may already be here, unread.
         """
-        self._key, self._patience, self._clock = key, patience, clock
+        self._key, self._patience = key, patience
         self._step = max(1.0, patience / 4.0)
         self._slot, self._last, self._missing = -1, 0.0, 0.0
 
     def missed(self, due: int, slot: int) -> None:
         """Slot `slot` arrived when `due` was expected. Raises Gap if slot `due` has been missing for too long."""
-        now = self._clock.monotonic()
+        now = world().monotonic()
         if slot < due:
             return
         if self._slot != due:

@@ -16,7 +16,6 @@ from evedrop.live.protocol.brief import ProgramPart
 from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.live.protocol.state_message import MOST_BYTES, read_state
 from evedrop.model.process import Floats
-from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 from evedrop.system.world import world
 
 LEAST_SECONDS = 5.0
@@ -48,11 +47,10 @@ class ProgramStates:
     patience: seconds for which the program may be silent.
     """
 
-    def __init__(self, entry: ProgramPart, newest: bool, patience: float, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(self, entry: ProgramPart, newest: bool, patience: float) -> None:
         """Raises BriefError if there is no router at the endpoint, or if the endpoint cannot be listened on."""
         self._entry = entry
         self._patience = max(patience, LEAST_SECONDS)
-        self._clock = clock
         self._heard: deque[bytes] = deque(maxlen=1 if newest else _MOST_WAITING + 1)
         self._changed = world().condition()
         self._waited = 0.0
@@ -94,10 +92,10 @@ class ProgramStates:
 
         Raises RunError if the program is silent for too long, sends what is not a state, or sends faster than slots go by.
         """
-        k, began = slots.start, self._clock.monotonic()
+        k, began = slots.start, world().monotonic()
         with self._changed:
             there = self._changed.wait_for(lambda: self._heard, self._patience)
-            self._waited = self._clock.monotonic() - began
+            self._waited = world().monotonic() - began
             if len(self._heard) > _MOST_WAITING:
                 raise RunError(
                     f"{self._about}: more than {_MOST_WAITING} states wait at slot {k}: the program sends faster than the run "

@@ -57,7 +57,6 @@ from evedrop.live.protocol.launcher_events import RouterListens
 from evedrop.live.protocol.notices import EndReport, RefusalNotice
 from evedrop.names import RECORDER, ROUTER
 from evedrop.system.threads import Queue
-from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 from evedrop.system.world import world
 
 READY_SECONDS = 30.0
@@ -163,7 +162,6 @@ class Session:
         config: ZenohConfig | None = None,
         listen: str | None = None,
         meanwhile: Callable[[], None] = lambda: None,
-        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         """config, listen: a router's configuration, and its address; meanwhile: called while waiting for the router."""
         world().zenoh.init_log_from_env_or(_LOGGED)
@@ -180,10 +178,10 @@ class Session:
         """How many unread bytes of one sender may wait."""
         self._room = _WINDOWS * (brief.flow.window + 8)
         self._watchdog = ConnectionWatchdog(brief) if brief.role not in ("router", "relay", "recorder") else None
-        self._wait = WaitReporter(brief.process, brief.router, clock)
+        self._wait = WaitReporter(brief.process, brief.router)
         if config is None or listen is None:
             once = _once(client_config(brief))
-            first = connected(brief, once, self.patience, meanwhile, clock)
+            first = connected(brief, once, self.patience, meanwhile)
             self.connection = Connection(first, lambda: self._wait.attempt(lambda: open_session(once)), self._changed)
         else:
             self.connection = Connection(listening(listen, brief.identity, config), None)

@@ -18,7 +18,6 @@ from evedrop.live.protocol.notices import EndReport, Progress
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS
 from evedrop.system.threads import Queue
-from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 from evedrop.system.world import world
 
 _ABANDON_SECONDS = 2.0  # for processes to leave when told to
@@ -33,9 +32,9 @@ _ROUTERS_SECONDS = 5.0  # for a router to confirm
 class Stop:
     """Set by a signal: the run must end now."""
 
-    def __init__(self, orphaned: Callable[[], bool] = lambda: False, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(self, orphaned: Callable[[], bool] = lambda: False) -> None:
         """orphaned: whether the launcher is gone, which ends the run, too."""
-        self._orphaned, self._clock = orphaned, clock
+        self._orphaned = orphaned
         self.wanted = False
 
     def want(self) -> None:
@@ -49,9 +48,9 @@ class Stop:
 
     def check(self, patience: float = 0.0) -> None:
         """Raise Interrupted if the run was told to end, or is told within `patience` seconds."""
-        deadline = self._clock.monotonic() + patience
-        while not self.asked and self._clock.monotonic() < deadline:
-            self._clock.sleep(0.01)
+        deadline = world().monotonic() + patience
+        while not self.asked and world().monotonic() < deadline:
+            world().sleep(0.01)
         if self.asked:
             raise Interrupted
 
@@ -60,17 +59,9 @@ class Stop:
 class Conductor:
     """Conducts a run; passes on telemetry and journal as (source, payload), and handles all other messages itself."""
 
-    def __init__(
-        self,
-        session: Session,
-        reporters: tuple[str, ...],
-        stop: Stop,
-        relayed: bool = False,
-        clock: Clock = SYSTEM_CLOCK,
-    ) -> None:
+    def __init__(self, session: Session, reporters: tuple[str, ...], stop: Stop, relayed: bool = False) -> None:
         """reporters: the processes that report besides router and sensor: the receivers, and a controller."""
-        self._session, self._clock = session, clock
-        self._stop = stop
+        self._session, self._stop = session, stop
         self.present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
         """Process → whether it is on the network."""
         self.hub = RELAY if relayed else ROUTER
@@ -81,7 +72,7 @@ class Conductor:
         keys = session.keys
         self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
         self.keys.update({name: keys.telemetry(name) for name in reporters})
-        self._mailbox = Mailbox(self.keys, session.allowance, clock)
+        self._mailbox = Mailbox(self.keys, session.allowance)
         for source, key in self.keys.items():
             session.subscribe_with(key, partial(self._mailbox.put, source))
         for name in self.present:
@@ -123,10 +114,10 @@ class Conductor:
 
     def assemble(self) -> None:
         """Wait for every process. Raises RunError, naming the missing ones, after the brief's patience."""
-        deadline = self._clock.monotonic() + self._session.patience
+        deadline = world().monotonic() + self._session.patience
         while self.missing:
             self._stop.check()
-            if self._clock.monotonic() > deadline:
+            if world().monotonic() > deadline:
                 # Do not name processes that wait for another one themselves.
                 names = [name for name in self.missing if not self._reaches(name)]
                 names = names or self.missing
@@ -180,14 +171,14 @@ class Conductor:
         """
         others = [name for name in self.present if name not in {ROUTER, RELAY} and name not in self.absent]
         told: set[str] = set()
-        deadline = self._clock.monotonic() + patience
+        deadline = world().monotonic() + patience
         sent = 0.0
-        while self._clock.monotonic() < deadline:
+        while world().monotonic() < deadline:
             left = [name for name in others if not self._has_ended(name, told)]
             if not left and self.present[ROUTER]:
                 break
-            if self._clock.monotonic() - sent > _END_SECONDS:
-                sent = self._clock.monotonic()
+            if world().monotonic() - sent > _END_SECONDS:
+                sent = world().monotonic()
                 for name in left:
                     if self.present[name]:
                         self.send_to(name, EndRun())
@@ -204,21 +195,21 @@ class Conductor:
         """Whether a process has left for good: it confirmed its end, or it vanished when told to end and did not return."""
         if self.present[name]:
             return False
-        gone = self._clock.monotonic() - self.lost.get(name, -math.inf)
+        gone = world().monotonic() - self.lost.get(name, -math.inf)
         return name in self.misdelivered or (name in told and gone > _RETURN_SECONDS)
 
     def _end_router(self, name: str) -> None:
         """Tell a router that the run is over until it confirms it: the router by a message, the relay by its token."""
-        deadline = self._clock.monotonic() + _ROUTERS_SECONDS
+        deadline = world().monotonic() + _ROUTERS_SECONDS
         sent, cut_off = 0.0, -math.inf
-        while self._clock.monotonic() < deadline and name not in self.misdelivered:
+        while world().monotonic() < deadline and name not in self.misdelivered:
             # All tokens vanish with the connection, and return one after the other.
             if not (self._session.linked() and self.present[ROUTER]):
-                cut_off = self._clock.monotonic()
-            elif name == RELAY and not self.present[name] and self._clock.monotonic() - cut_off > _RETURN_SECONDS:
+                cut_off = world().monotonic()
+            elif name == RELAY and not self.present[name] and world().monotonic() - cut_off > _RETURN_SECONDS:
                 return
-            if self._clock.monotonic() - sent > _END_SECONDS:
-                sent = self._clock.monotonic()
+            if world().monotonic() - sent > _END_SECONDS:
+                sent = world().monotonic()
                 self.send_to(name, EndRun())
             self._hear_out()
 
@@ -239,9 +230,9 @@ class Conductor:
             told = [name for name in names if name in self._commands]
             for name in told:
                 self.send_to(name, Abandon(why))
-            deadline = self._clock.monotonic() + _ABANDON_SECONDS
-            while any(self._reaches(name) for name in told) and self._clock.monotonic() < deadline:
-                self._clock.sleep(0.01)
+            deadline = world().monotonic() + _ABANDON_SECONDS
+            while any(self._reaches(name) for name in told) and world().monotonic() < deadline:
+                world().sleep(0.01)
 
     def _reaches(self, name: str) -> bool:
         """Whether a process has opened its session; it may still wait for others."""
@@ -265,7 +256,7 @@ class Conductor:
 
     def _restart_time_of_others(self, at: float) -> None:
         """A router that was lost at some time is back: those that were lost with it can connect from now on only."""
-        now = self._clock.monotonic()
+        now = world().monotonic()
         self.lost = {name: now if lost > at - _LOST_TOGETHER_SECONDS else lost for name, lost in self.lost.items()}
 
     def _note(self, name: str, there: bool) -> None:
@@ -275,4 +266,4 @@ class Conductor:
             if name in {ROUTER, RELAY} and at is not None:
                 self._restart_time_of_others(at)
         else:
-            self.lost.setdefault(name, self._clock.monotonic())
+            self.lost.setdefault(name, world().monotonic())

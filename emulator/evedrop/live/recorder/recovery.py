@@ -27,7 +27,7 @@ from evedrop.live.recorder.conductor import Conductor
 from evedrop.live.recorder.steering import STEP_SECONDS, Steering
 from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.scenario.progress_events import ConnectionOutage, OnEvent
-from evedrop.system.waiting import SYSTEM_CLOCK, Clock
+from evedrop.system.world import world
 
 LEAST_SECONDS = 5.0
 """The least of these: a busy machine may not let a process work for some seconds."""
@@ -46,16 +46,13 @@ def patience_of(longest_outage: float, pace: float, batch: int, program: bool = 
 class Stall:
     """Notices that a run stands still, and ends it when the process that it waits for has done nothing for too long."""
 
-    def __init__(
-        self, patience: float, batch: int, ask: Callable[[], None], router: str, clock: Clock = SYSTEM_CLOCK
-    ) -> None:
+    def __init__(self, patience: float, batch: int, ask: Callable[[], None], router: str) -> None:
         """patience: as in `patience_of`; batch: slots of a report; ask: requests the status of every process.
 
         router: the router or relay through which all answers come.
         """
         self._patience, self._batch, self._ask, self._router = patience, batch, ask, router
-        self._clock = clock
-        self._polled = self._clock.monotonic()
+        self._polled = world().monotonic()
         self._done = 0
         self._stalled = self._asked = 0.0
         """Seconds since slots were last joined, and the value of that count when the processes were last asked."""
@@ -82,7 +79,7 @@ class Stall:
         whose reports are not needed to join slots. held: the run is held, and no process has anything to do; missing: some
         process is not on the network, which is handled elsewhere.
         """
-        now = self._clock.monotonic()
+        now = world().monotonic()
         if done > self._done or held:
             self._done, self._polled, self._stalled, self._asked = done, now, 0.0, 0.0
             self._answers, self._moved = {}, {}
@@ -182,16 +179,7 @@ _REACH_SECONDS = 2.0  # for which a round waits for processes that are back to s
 class Recovery:
     """Notices lost connections and begins rounds of resending. say: sends events to the launcher."""
 
-    def __init__(
-        self,
-        conductor: Conductor,
-        steering: Steering,
-        flow: Flow,
-        pace: float,
-        say: OnEvent,
-        clock: Clock = SYSTEM_CLOCK,
-    ) -> None:
-        self._clock = clock
+    def __init__(self, conductor: Conductor, steering: Steering, flow: Flow, pace: float, say: OnEvent) -> None:
         self._conductor, self._steering, self._flow, self._say = conductor, steering, flow, say
         self._batch_seconds = pace * flow.batch
         self._patience = patience_of(flow.longest_outage, pace, flow.batch)
@@ -205,20 +193,20 @@ class Recovery:
         self._done = 0
         self._target = 0
         """Slots below this may have been under way when a connection was lost."""
-        self._moved = self._joined = self._clock.monotonic()
+        self._moved = self._joined = world().monotonic()
         self._longest = 0.0
         self._wait = 0.0
         self._number = 0
         self.outages: list[ConnectionOutage] = []
         """All outages so far."""
-        self._polled = self._clock.monotonic()
+        self._polled = world().monotonic()
 
     def poll(self, done: int) -> None:
         """Handle lost connections, given that all slots below `done` are joined.
 
         Raises RunError if a process has been missing for too long. Time in which the recorder itself did not run does not count.
         """
-        now = self._clock.monotonic()
+        now = world().monotonic()
         self._conductor.wait_longer(max(0.0, now - self._polled - STEP_SECONDS))
         self._polled = now
         if done > self._done:
@@ -313,7 +301,7 @@ class Recovery:
 
         complete: whether these are all slots, so that none was waited for: the outages lasted to the end.
         """
-        now, until = self._clock.monotonic(), done if complete else None
+        now, until = world().monotonic(), done if complete else None
         missing = {} if RECORDER in self._back else self._missing  # which nobody sees without its connection
         missing = next(({name: missing[name]} for name in (RELAY, ROUTER) if name in missing), missing)
         opened = {**missing, **self._back}  # one that was lost again before the run went on has been away since then
