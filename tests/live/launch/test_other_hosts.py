@@ -48,7 +48,7 @@ def connect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connect:
     """Begin a connection; the script says these lines, keeps all that it is told, and ends with its standard input."""
     monkeypatch.setenv("PATH", str(tmp_path / "bin"), prepend=":")
 
-    def begin(*lines: str, beat_seconds: float = 30.0, warning: str = "", **table: Any) -> SshHost:
+    def begin(*lines: str, warning: str = "", **table: Any) -> SshHost:
         (tmp_path / "bin").mkdir()
         (tmp_path / "told").touch()
         (tmp_path / "said").write_text("".join(f"{line}\n" for line in lines))
@@ -57,7 +57,7 @@ def connect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connect:
             f"#!/bin/sh\nprintf '{warning}' >&2\ncat '{tmp_path}/said'\nexec cat 3>&1 >'{tmp_path}/told'\n"
         )
         script.chmod(0o700)
-        return SshHost("beta", HostTable(address="beta.lan", processes=("smart",), **table), None, 30.0, beat_seconds)
+        return SshHost("beta", HostTable(address="beta.lan", processes=("smart",), **table), None, 30.0)
 
     return begin
 
@@ -186,9 +186,12 @@ def test_a_host_whose_program_does_not_begin_is_not_still_connecting(connect: Co
     host.close(time.monotonic() + LIMIT)
 
 
-def test_a_host_is_told_that_the_launcher_lives(connect: Connect, tmp_path: Path) -> None:
+def test_a_host_is_told_that_the_launcher_lives(
+    connect: Connect, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """From time to time; the order says how long it may wait for the next."""
-    host = connect(GREETING, beat_seconds=0.01)
+    monkeypatch.setattr(other_hosts, "_BEAT_SECONDS", 0.01)
+    host = connect(GREETING)
     ready(host)
     wait_until(lambda: len((tmp_path / "told").read_bytes().splitlines()) > 2, "three heartbeats")
     host.close(time.monotonic() + LIMIT)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from evedrop.live.network import connection
 from evedrop.live.network.connection import VARIABLE, HeartbeatFile
 from tests.conftest import wait_until
 
@@ -24,7 +25,8 @@ def test_the_file_is_touched_as_long_as_there_is_a_connection(tmp_path: Path, mo
         wait_until(lambda: len(looks) > seen + times, "more looks at the connection")
 
     monkeypatch.setenv(VARIABLE, str(file))
-    heart = HeartbeatFile(look, seconds=0.001)
+    monkeypatch.setattr(connection, "_BEAT_SECONDS", 0.001)
+    heart = HeartbeatFile(look)
     heart.start()
     look_again()
     assert not file.exists()
@@ -54,7 +56,8 @@ def test_a_file_that_cannot_be_written_ends_nothing(tmp_path: Path, monkeypatch:
         return True
 
     monkeypatch.setenv(VARIABLE, str(tmp_path / "nowhere" / "heartbeat"))
-    heart = HeartbeatFile(look, seconds=0.001)
+    monkeypatch.setattr(connection, "_BEAT_SECONDS", 0.001)
+    heart = HeartbeatFile(look)
     heart.start()
     wait_until(lambda: len(looks) > 3, "more looks at the connection")
     heart.stop()

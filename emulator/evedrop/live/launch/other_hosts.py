@@ -218,19 +218,12 @@ class HostedProcess(ReportedProcess):
 class SshHost:
     """A host, and the connection with it."""
 
-    def __init__(
-        self,
-        name: str,
-        table: HostTable,
-        config: Path | None,
-        longest_outage: float,
-        beat_seconds: float = _BEAT_SECONDS,
-    ) -> None:
-        """Begin to connect. Raises UsageError if there is no ssh.
+    def __init__(self, name: str, table: HostTable, config: Path | None, longest_outage: float) -> None:
+        """Begin to connect; longest_outage: seconds for which a process of the run may be cut off.
 
-        longest_outage: seconds for which a process of the run may be cut off. beat_seconds: between two heartbeats.
+        Raises UsageError if there is no ssh.
         """
-        self.name, self._table, self._beat_seconds = name, table, beat_seconds
+        self.name, self._table = name, table
         self._trial = shlex.join(trial_command(table, config))
         self._sending, self._guard = world().lock(), world().lock()
         self._processes: dict[int, HostedProcess] = {}
@@ -251,7 +244,7 @@ class SshHost:
 
     def _beat(self) -> None:
         """Tell the host from time to time that this launcher is still there."""
-        while not self._lost.wait(self._beat_seconds if self._answered.is_set() else _POLL_SECONDS):
+        while not self._lost.wait(_BEAT_SECONDS if self._answered.is_set() else _POLL_SECONDS):
             if self._answered.is_set():
                 self.send(LauncherHeartbeat(SILENCE_SECONDS))
 

@@ -473,10 +473,9 @@ _BEAT_SECONDS = 2.0
 class HeartbeatFile:
     """Touches the file that the environment names, if it names one, until `stop`."""
 
-    def __init__(self, connected: Callable[[], bool], seconds: float = _BEAT_SECONDS) -> None:
-        """connected: whether the process is on its network; seconds: between two checks."""
+    def __init__(self, connected: Callable[[], bool]) -> None:
+        """connected: whether the process is on its network."""
         self._connected = connected
-        self._seconds = seconds
         self._over = world().event()
         self._thread: Thread | None = None
 
@@ -498,4 +497,4 @@ class HeartbeatFile:
             if self._connected():
                 with suppress(OSError):  # the process then counts as unhealthy, but continues
                     path.touch()
-            self._over.wait(self._seconds)
+            self._over.wait(_BEAT_SECONDS)

@@ -17,11 +17,12 @@ from evedrop.live.protocol.brief import Brief, RecorderPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import ProcessStatus, ReportStatus, is_process_status, read_process_status
 from evedrop.live.protocol.notices import RefusalNotice
-from evedrop.live.protocol.requests import StatusRequest
+from evedrop.live.protocol.requests import LinkStatus, RunStatus, StatusRequest
 from evedrop.live.recorder.conductor import Conductor
 from evedrop.live.recorder.recorded_run import RecordedRun
 from evedrop.live.recorder.recovery import Recovery, Stall, patience_of
-from evedrop.live.recorder.steering import Steering, status_of
+from evedrop.live.recorder.steering import Steering
+from evedrop.model.metrics.built_in import LinkAccount
 from evedrop.names import CONTROLLER, OPERATOR
 from evedrop.scenario.progress_events import Started
 from evedrop.system.threads import Queue
@@ -121,16 +122,25 @@ class Direction:
 
     def _answer(self, question: Question) -> None:
         """Take a question from the operator; a malformed one is refused and does not harm the run."""
-        order, run = Order.of(question), self._run
+        order = Order.of(question)
         if order is None:
             return
         if isinstance(order.request, StatusRequest):
-            scenario, rate = run.score.scenario, run.progress.rate(self._joiner.done)
-            tally = run.score.run_tally
-            order.answer(
-                Answer(status=status_of(scenario, self._joiner.done, rate, self._steering, self._conductor, tally))
-            )
+            order.answer(Answer(status=self._status()))
         elif self._brief.part.shard:
             order.refuse("this run is in shards, which cannot be steered; run it with --set shards=1 to steer it")
         else:
             self._steering.take_order(order, self._joiner.done)
+
+    def _status(self) -> RunStatus:
+        run, steering = self._run, self._steering
+        accounts = {name: LinkAccount.of(tally) for name, tally in run.score.run_tally.tallies.items()}
+        return RunStatus(
+            slot=self._joiner.done,
+            slots=run.score.scenario.slots,
+            slots_per_second=0.0 if steering.paused else run.progress.rate(self._joiner.done),
+            state="paused" if steering.paused else "running" if steering.at is None else "held",
+            processes=self._conductor.present,
+            links={name: LinkStatus.of(account.offered, account.delivered) for name, account in accounts.items()},
+            events=steering.events,
+        )

@@ -60,7 +60,8 @@ class Joiner:
         self._links = {name: _Queue(LinkSlots) for name in windows}
         self._reports = {name: _Queue(ReceiverSlots) for name in windows}
         self._accounts, self._seconds = _Counts[Mapping[str, Account]](), _Counts[float]()
-        self._done = 0
+        self.done = 0
+        """The first slot that has not been returned."""
         self.digests = {name: DigestLog() for name in windows}
         """Receiver or controller → first slot of a block → its digests, (R, 16)."""
         if period is not None:
@@ -69,14 +70,9 @@ class Joiner:
         """Receiver → sum of tr P of each trial over all finished blocks, (R,); only if not all trials are recorded."""
 
     @property
-    def done(self) -> int:
-        """The first slot that has not been returned."""
-        return self._done
-
-    @property
     def settled(self) -> int:
         """The first slot that has not been returned, or that a controller has not reported: all earlier reports are here."""
-        return self._done if self._period is None else min(self._done, self._decided)
+        return self.done if self._period is None else min(self.done, self._decided)
 
     @property
     def sent(self) -> int:
@@ -100,7 +96,7 @@ class Joiner:
 
     def complete(self, slots: int) -> bool:
         """Whether this many slots have been returned and, if there is a controller, it has reported them, too."""
-        return self._done == slots and (self._period is None or self._decided == slots)
+        return self.done == slots and (self._period is None or self._decided == slots)
 
     def add_decisions(self, telemetry: Reader) -> None:
         """Take the controller's telemetry."""
@@ -138,19 +134,19 @@ class Joiner:
 
     def take_accounts(self) -> list[Mapping[str, Account]]:
         """The next accounts of the links all of whose slots have been returned."""
-        return self._accounts.take(self._done)
+        return self._accounts.take(self.done)
 
     def take_seconds(self) -> list[float]:
         """The seconds of the next decisions whose first slot has been returned."""
-        return self._seconds.take(self._done)
+        return self._seconds.take(self.done)
 
     def take_slots(self) -> Slots | None:
         """The next slots that all processes have reported, or None."""
         links, reports = self._links.values(), self._reports.values()
-        count = min(self._truth.end, *(queue.end for queue in links), *(queue.end for queue in reports)) - self._done
+        count = min(self._truth.end, *(queue.end for queue in links), *(queue.end for queue in reports)) - self.done
         if count == 0:
             return None
-        self._done += count
+        self.done += count
         return Slots(
             self._truth.take(count),
             {name: reports.take(count) for name, reports in self._reports.items()},

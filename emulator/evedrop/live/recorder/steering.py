@@ -19,17 +19,15 @@ from evedrop.live.network.operator import Order
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.protocol.commands import Go, Hold, LinkChange
 from evedrop.live.protocol.launcher_events import ProcessRequest
-from evedrop.live.protocol.requests import LinkRequest, LinkStatus, PauseRequest, ResumeRequest, RunStatus, StepRequest
+from evedrop.live.protocol.requests import LinkRequest, PauseRequest, ResumeRequest, StepRequest
 from evedrop.live.recorder.conductor import Conductor
 from evedrop.model.checks import LAST_SLOT
-from evedrop.model.metrics.built_in import LinkAccount
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR, ProcessAction
 from evedrop.scenario.events.event import Act
 from evedrop.scenario.loading import with_event
 from evedrop.scenario.progress_events import Held, OnEvent, RunEvent
 from evedrop.scenario.tables import Scenario
-from evedrop.score.run_tally import RunTally
 from evedrop.system.world import world
 
 STEP_SECONDS = 1.0
@@ -308,19 +306,3 @@ class Steering:
         self._go()
         if self._asked:
             self._conductor.send_to(SENSOR, Hold())
-
-
-def status_of(
-    scenario: Scenario, done: int, rate: float, steering: Steering, conductor: Conductor, run_tally: RunTally
-) -> RunStatus:
-    """The status of a run; done: how many slots are scored; rate: slots per second."""
-    accounts = {name: LinkAccount.of(tally) for name, tally in run_tally.tallies.items()}
-    return RunStatus(
-        slot=done,
-        slots=scenario.slots,
-        slots_per_second=0.0 if steering.paused else rate,
-        state="paused" if steering.paused else "running" if steering.at is None else "held",
-        processes=conductor.present,
-        links={name: LinkStatus.of(account.offered, account.delivered) for name, account in accounts.items()},
-        events=steering.events,
-    )
