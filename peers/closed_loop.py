@@ -24,7 +24,8 @@ class Decided:
 
     def __init__(self, session: Session, period: int, shape: tuple[int, int], patience: float) -> None:
         self._period, self._shape = period, shape
-        self._messages = InOrder(session, session.keys.input, patience)
+        key = session.keys.input
+        self._messages = InOrder(session.subscribe(key), key, patience)
         self._now: tuple[Floats, Flags]
 
     def of(self, k: int) -> tuple[Floats, Flags]:

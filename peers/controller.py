@@ -24,7 +24,7 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], Session] =
     on_truth = part.acts_on == "truth"
     with connect(brief) as session:
         key, name = (session.keys.state, "x") if on_truth else (session.keys.estimate, "x_hat")
-        known = InOrder(session, key, brief.flow.longest_outage)
+        known = InOrder(session.subscribe(key), key, brief.flow.longest_outage)
         put = kept_decisive(session, session.keys.input, brief, assignment.period)
         # The recorder joins slots without the controller's reports, so all kept reports are sent again.
         kept = brief.flow.window + 1 + assignment.period

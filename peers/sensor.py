@@ -173,7 +173,8 @@ class SensorLoop:
         self._back = None
         """The acknowledgements, each awaited before the next slot is sent, if the scheme needs them."""
         if scheme.needs_acknowledgements:
-            self._back = InOrder(session, session.keys.acknowledgements, brief.flow.longest_outage)
+            key = session.keys.acknowledgements
+            self._back = InOrder(session.subscribe(key), key, brief.flow.longest_outage)
         self._steered = None
         if part.plant is not None and part.controller is not None:
             self._steered = Steered(brief, part.plant.inputs, part.controller, session)

@@ -198,8 +198,7 @@ def test_the_message_of_the_slot_that_is_due_is_taken() -> None:
         clock.now += 3.0
         return slot_message(next(coming, 8))
 
-    session = SimpleNamespace(subscribe=lambda _: SimpleNamespace(recv=received))
-    messages = InOrder(session, KEY, 5.0)  # type: ignore[arg-type]
+    messages = InOrder(SimpleNamespace(recv=received), KEY, 5.0)  # type: ignore[arg-type]
     assert messages.take(5).integer("k") == 5
     with pytest.raises(Gap):
         messages.take(6)

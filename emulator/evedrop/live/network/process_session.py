@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, final
+from typing import final
 
 from evedrop.errors import Gap, MalformedMessage
 from evedrop.live.network.connection import Subscription
@@ -20,10 +20,6 @@ from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.keys import writer_of
 from evedrop.system.threads import Queue
 from evedrop.system.world import world
-
-if TYPE_CHECKING:
-    from evedrop.live.network.session import Session
-
 
 _AHEAD = 64  # messages
 
@@ -194,9 +190,9 @@ class GapDetector:
 class InOrder:
     """Reads the messages of one key, each when its slot is due."""
 
-    def __init__(self, session: Session, key: str, patience: float) -> None:
+    def __init__(self, subscription: Subscription, key: str, patience: float) -> None:
         """patience: as in `GapDetector`."""
-        self._subscription, self._key = session.subscribe(key), key
+        self._subscription, self._key = subscription, key
         self._gaps = GapDetector(key, patience)
 
     def take(self, due: int) -> Reader:
