@@ -246,27 +246,25 @@ def _services(scenario: Scenario) -> list[_Service]:
 def _service(service: _Service, services: Sequence[_Service]) -> str:
     """A service as YAML."""
     base = "process" if service.process == ROUTER else "far-client" if service.far else "client"
-    command = f"[{service.role}, /brief/brief.json"
-    lines = [f"  {_key(service.name)}:", f"    <<: *{base}"]
-    if service.process == RECORDER:
-        lines += [
-            f'    command: {command}, --serve, "0.0.0.0:17450"]',
-            "    stop_grace_period: 1m # to write the results",
-        ]
-        lines += [
-            f'    volumes: ["{service.name}:/brief:ro", "./runs:/runs"]',
-            f"    networks: [{service.network}, to-view]",
-        ]
-    else:
-        lines += [f"    command: {command}]", f'    volumes: ["{service.name}:/brief:ro"]']
-        lines += [f"    networks: [{', '.join(_networks(service, services))}]"]
+    recorder = service.process == RECORDER
+    serve, results = (', --serve, "0.0.0.0:17450"', ', "./runs:/runs"') if recorder else ("", "")
+    lines = [
+        f"  {_key(service.name)}:",
+        f"    <<: *{base}",
+        f"    command: [{service.role}, /brief/brief.json{serve}]",
+        *(["    stop_grace_period: 1m # to write the results"] if recorder else []),
+        f'    volumes: ["{service.name}:/brief:ro"{results}]',
+        f"    networks: [{', '.join(_networks(service, services))}]",
+    ]
     return "\n" + "\n".join(lines) + "\n"
 
 
 def _networks(service: _Service, services: Sequence[_Service]) -> Iterator[str]:
-    """The networks of a process that is not the recorder: its own, and those of the processes that connect to it."""
+    """The networks of a process: its own, those of the processes that connect to it, and the recorder's view's."""
     if service.process != ROUTER:
         yield service.network
+    if service.process == RECORDER:
+        yield "to-view"
     if service.process in {ROUTER, RELAY}:
         far = service.process == RELAY
         yield from (
