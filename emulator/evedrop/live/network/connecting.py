@@ -272,9 +272,9 @@ def _maker_at(endpoint: Endpoint) -> str:
         return "an unknown authority"
 
 
-def listening(listen: str, identity: Identity | None, config: ZenohConfig) -> zenoh.Session:
-    """Open a router's session. Raises BriefError if it cannot listen at the address in its brief."""
-    endpoint = endpoint_of(listen, identity)
+def listening(identity: Identity | None, config: ZenohConfig) -> zenoh.Session:
+    """Open a router's session. Raises BriefError if it cannot listen at the endpoint in its configuration."""
+    endpoint = endpoint_of(config["listen"]["endpoints"][0], identity)
     try:
         endpoint.try_to_listen()
         return open_session(config)

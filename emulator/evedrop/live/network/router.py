@@ -392,7 +392,7 @@ def _opened(brief: Brief[RoutingPart], table: list[Grant]) -> Session:
     listen = brief.part.listen if isinstance(brief.part, RelayPart) else brief.router
     with users_file(brief.part.users) as users:
         config = router_config(brief, str(users), access, listen)
-        return Session(brief, _linked(brief, config) if isinstance(brief.part, RelayPart) else config, listen)
+        return Session(brief, _linked(brief, config) if isinstance(brief.part, RelayPart) else config)
 
 
 class ReplayRequested(Exception):

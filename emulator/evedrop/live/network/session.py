@@ -157,13 +157,9 @@ class Session:
     """A process's session on the network; use it as a context manager, or its threads outlive the program."""
 
     def __init__(
-        self,
-        brief: AnyBrief,
-        config: ZenohConfig | None = None,
-        listen: str | None = None,
-        meanwhile: Callable[[], None] = lambda: None,
+        self, brief: AnyBrief, config: ZenohConfig | None = None, meanwhile: Callable[[], None] = lambda: None
     ) -> None:
-        """config, listen: a router's configuration, and its address; meanwhile: called while waiting for the router."""
+        """config: a router's configuration; meanwhile: called while waiting for the router."""
         world().zenoh.init_log_from_env_or(_LOGGED)
         if brief.ends_with_stdin:
             when_launcher_is_gone(lambda: world().process.exit(3))
@@ -179,12 +175,12 @@ class Session:
         self._room = _WINDOWS * (brief.flow.window + 8)
         self._watchdog = ConnectionWatchdog(brief) if brief.role not in ("router", "relay", "recorder") else None
         self._wait = WaitReporter(brief.process, brief.router)
-        if config is None or listen is None:
+        if config is None:
             once = _once(client_config(brief))
             first = connected(brief, once, self.patience, meanwhile)
             self.connection = Connection(first, lambda: self._wait.attempt(lambda: open_session(once)), self._changed)
         else:
-            self.connection = Connection(listening(listen, brief.identity, config), None)
+            self.connection = Connection(listening(brief.identity, config), None)
             if brief.ends_with_stdin:
                 emit(RouterListens(brief.process))
         self.dropped = Dropped(brief.process, self.connection.renew)
