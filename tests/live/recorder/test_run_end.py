@@ -56,8 +56,7 @@ def test_nobody_waits_for_a_recorder_that_failed(error: Exception, words: str, m
     monkeypatch.setattr(recorder, "Session", lambda *_, **__: nullcontext())
     monkeypatch.setattr(recorder, "Conductor", lambda *_: SimpleNamespace(missing=[], abandon=told.append))
     monkeypatch.setattr(recorder, "Direction", FailingDirection)
-    course = SimpleNamespace(end=lambda: None)
-    score = SimpleNamespace(scenario=SimpleNamespace(digested=(), relayed=False), course=course)
+    score = SimpleNamespace(scenario=SimpleNamespace(digested=(), relayed=False), end=lambda: None)
     run, brief = SimpleNamespace(score=score), SimpleNamespace(part=SimpleNamespace(recording=False))
     with pytest.raises(type(error)):
         recorder._conduct(run, brief, SimpleNamespace(check=None), None, RunEnd(), by_hand=True)  # type: ignore[arg-type]

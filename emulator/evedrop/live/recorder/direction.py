@@ -55,8 +55,8 @@ class Direction:
         program = scenario.process.source == "zenoh"
         patience = patience_of(flow.longest_outage, scenario.pace, flow.batch, program)
         self._stall = Stall(patience, flow.batch, lambda: conductor.send_to_all(ReportStatus()), conductor.hub)
-        course = run.score.course
-        course.events, course.outages = self._steering.events, self._recovery.outages  # which grow
+        score = run.score
+        score.events, score.outages = self._steering.events, self._recovery.outages  # which grow
 
     def start(self) -> None:
         """Wait for all processes, and let the sensor begin. Raises RunError if some do not appear, Interrupted."""

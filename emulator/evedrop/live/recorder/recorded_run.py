@@ -34,7 +34,7 @@ class RecordedRun:
 
     def start(self) -> None:
         """Note that the first slot begins."""
-        self.score.course.start()
+        self.score.start()
         self.progress.start()
 
     def amend(self, scenario: Scenario) -> None:

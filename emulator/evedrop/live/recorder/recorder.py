@@ -99,7 +99,7 @@ def _conduct(
     by_hand: bool,
 ) -> None:
     """Conduct the run to its end. Raises RunError if it fails, Interrupted if it was told to end."""
-    scenario, course = run.score.scenario, run.score.course
+    scenario = run.score.scenario
     with Session(brief, meanwhile=stop.check) as session:
         conductor = Conductor(session, scenario.digested, stop, scenario.relayed)
         if brief.part.recording:
@@ -122,7 +122,7 @@ def _conduct(
             raise
         finally:
             direction.dismiss()
-            course.end()
+            run.score.end()
         emit(SlotsDone())
         try:
             conductor.end(brief.flow.longest_outage)
@@ -130,7 +130,7 @@ def _conduct(
             end.blame([], error)
             raise
         finally:
-            course.misdelivered = conductor.dropped
+            run.score.misdelivered = conductor.dropped
 
 
 def _serve(web_address: WebAddress, folder: Path) -> Viewer:

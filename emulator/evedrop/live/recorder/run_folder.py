@@ -127,7 +127,7 @@ class RunFolder:
         return f"slot {self._score.joiner.done}"
 
     def _so_far(self) -> Summary | None:
-        self._score.course.end()
+        self._score.end()
         with suppress(NoAnswer):  # reported at the end
             return self._score.summary(self.now, "")
         return None

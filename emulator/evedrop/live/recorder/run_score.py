@@ -6,7 +6,6 @@ Source: docs/results.md, summary.json.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import final
 
@@ -21,21 +20,21 @@ from evedrop.system.world import world
 
 
 @final
-@dataclass
-class Course:
-    """How a run goes, apart from its numbers."""
+class RunScore:
+    """The score of a run so far, and its summary."""
 
-    started: float = field(init=False)
-    """When all processes were there, in seconds; before that, when the recorder began."""
-    ended: float = field(init=False)
-    """When it had come as far as the summary says."""
-    events: Sequence[RunEvent] = ()
-    outages: Sequence[ConnectionOutage] = ()
-    misdelivered: Mapping[str, int] = field(default_factory=dict)
-    """Process → messages with other processes' keys, which it dropped."""
-
-    def __post_init__(self) -> None:
-        self.start()
+    def __init__(self, scenario: Scenario, run_tally: RunTally, joiner: Joiner) -> None:
+        self.scenario = scenario
+        """With the operator's changes; it is the same for the slots so far."""
+        self.started = self.ended = world().monotonic()
+        """When all processes were there, or before that, when the recorder began; and when it had come as far as the summary."""
+        self.events: Sequence[RunEvent] = ()
+        self.outages: Sequence[ConnectionOutage] = ()
+        self.misdelivered: Mapping[str, int] = {}
+        """Process → messages with other processes' keys, which it dropped."""
+        self.run_tally = run_tally
+        """The tallies of the slots so far."""
+        self.joiner = joiner
 
     def start(self) -> None:
         """Note that all processes are there."""
@@ -44,19 +43,6 @@ class Course:
     def end(self) -> None:
         """Note that this is the end of the run so far."""
         self.ended = world().monotonic()
-
-
-@final
-class RunScore:
-    """The score of a run so far, and its summary."""
-
-    def __init__(self, scenario: Scenario, run_tally: RunTally, joiner: Joiner) -> None:
-        self.scenario = scenario
-        """With the operator's changes; it is the same for the slots so far."""
-        self.course = Course()
-        self.run_tally = run_tally
-        """The tallies of the slots so far."""
-        self.joiner = joiner
 
     @property
     def all_joined(self) -> bool:
@@ -72,14 +58,13 @@ class RunScore:
             for name, sums in self.joiner.trace_sums.items():
                 self.run_tally.tallies[name].know_traces(sums)
         digests = {name: digest_of(self.scenario, name, blocks) for name, blocks in self.joiner.digests.items()}
-        course = self.course
         outcome = RunOutcome(
-            course.ended - course.started,
+            self.ended - self.started,
             how,
             replay_of(folder, self.scenario),
-            events=course.events,
-            outages=course.outages,
+            events=self.events,
+            outages=self.outages,
             accused=accused,
-            misdelivered=course.misdelivered,
+            misdelivered=self.misdelivered,
         )
         return summary_of(self.scenario, self.run_tally, digests, outcome)
