@@ -28,6 +28,14 @@ def wait_for_thread(thread: Thread, seconds: float = THREAD_SECONDS) -> None:
         )
 
 
+def wait_until(holds: Callable[[], bool], seconds: float, step: float) -> bool:
+    """Look every `step` seconds whether something holds, for `seconds` at most; returns whether it does."""
+    deadline = world().monotonic() + seconds
+    while not (held := holds()) and world().monotonic() < deadline:
+        world().sleep(step)
+    return held
+
+
 @final
 class Alarm:
     """Does something once some time has passed, on a thread of its own, unless it is set again or put off before.

@@ -38,6 +38,7 @@ from evedrop.system.environment import SINGLE_THREADED, check_zenoh_runtime, loc
 from evedrop.system.processes import wait_for
 from evedrop.system.signals import INTERRUPTED
 from evedrop.system.threads import Queue
+from evedrop.system.waiting import wait_until
 from evedrop.system.world import world
 
 ROUTER_RESTARTS = 3  # how often routers that were ended by a signal are restarted in a run
@@ -355,12 +356,10 @@ class Children:
         place = self._briefs[name].router
         hub = RELAY if RELAY in self._processes and name != SENSOR else ROUTER
         others = [process for process, brief in self._briefs.items() if brief.router == place and process not in _HUBS]
-        deadline = world().monotonic() + (_GONE_SECONDS if len(others) > 1 and not suspects else 0.0)
-        while world().monotonic() < deadline:
-            if all(self._lost_router(process) for process in others):
-                return hub
-            world().sleep(0.05)
-        return None
+        if len(others) < 2 or suspects:
+            return None
+        lost = wait_until(lambda: all(self._lost_router(process) for process in others), _GONE_SECONDS, 0.05)
+        return hub if lost else None
 
     def _lack(self, ended: ProcessExit) -> str:
         """What the log of a process says that the machine lacked, as the end of a sentence; empty if nothing."""

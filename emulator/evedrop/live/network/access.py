@@ -23,7 +23,7 @@ from pathlib import Path
 from evedrop.live.protocol.brief import Wiring
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig, reader_of, reads, writer_of
 from evedrop.names import CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, RELAY, ROUTER, SENSOR
-from evedrop.system.world import world
+from evedrop.system.waiting import wait_until
 
 
 @dataclass(frozen=True)
@@ -194,6 +194,4 @@ def until_all_left(present: Mapping[str, bool], linked: Callable[[], bool] = lam
 
     Two routers that close their link at the same time fail in Zenoh 1.10, so one must leave first.
     """
-    deadline = world().monotonic() + _FAREWELL_SECONDS
-    while (any(present.values()) or linked()) and world().monotonic() < deadline:
-        world().sleep(0.005)
+    wait_until(lambda: not (any(present.values()) or linked()), _FAREWELL_SECONDS, 0.005)

@@ -57,6 +57,7 @@ from evedrop.live.protocol.launcher_events import RouterListens
 from evedrop.live.protocol.notices import EndReport, RefusalNotice
 from evedrop.names import RECORDER, ROUTER
 from evedrop.system.threads import Queue
+from evedrop.system.waiting import wait_until
 from evedrop.system.world import world
 
 READY_SECONDS = 30.0
@@ -356,9 +357,7 @@ class Session:
         """Send messages again as asked; on a thread of its own, since the working thread may be waiting for the effect."""
         while True:
             asked = self._rounds.get()
-            deadline = world().monotonic() + _HEARD_SECONDS
-            while self._unread() and world().monotonic() < deadline:
-                world().sleep(_POLL_SECONDS)
+            wait_until(lambda: not self._unread(), _HEARD_SECONDS, _POLL_SECONDS)
             for replay in self._replays:
                 replay.again(asked.round, asked.slot)
 

@@ -18,6 +18,7 @@ from evedrop.live.protocol.notices import EndReport, Progress
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS
 from evedrop.system.threads import Queue
+from evedrop.system.waiting import wait_until
 from evedrop.system.world import world
 
 _ABANDON_SECONDS = 2.0  # for processes to leave when told to
@@ -48,10 +49,7 @@ class Stop:
 
     def check(self, patience: float = 0.0) -> None:
         """Raise Interrupted if the run was told to end, or is told within `patience` seconds."""
-        deadline = world().monotonic() + patience
-        while not self.asked and world().monotonic() < deadline:
-            world().sleep(0.01)
-        if self.asked:
+        if wait_until(lambda: self.asked, patience, 0.01):
             raise Interrupted
 
 
@@ -230,9 +228,10 @@ class Conductor:
             told = [name for name in names if name in self._commands]
             for name in told:
                 self.send_to(name, Abandon(why))
-            deadline = world().monotonic() + _ABANDON_SECONDS
-            while any(self._reaches(name) for name in told) and world().monotonic() < deadline:
-                world().sleep(0.01)
+            wait_until(partial(self._none_reached, told), _ABANDON_SECONDS, 0.01)
+
+    def _none_reached(self, names: Collection[str]) -> bool:
+        return not any(self._reaches(name) for name in names)
 
     def _reaches(self, name: str) -> bool:
         """Whether a process has opened its session; it may still wait for others."""
