@@ -79,9 +79,8 @@ class Verifier:
     def _check_digests(self, name: str, report: Report, start: int, stop: int) -> None:
         digests = self._digests[name].finished()
         claimed = report.digests[start][: self._recorded]
-        wrong = (digests != claimed).any(axis=1)
-        if wrong.any():
-            r = int(np.argmax(wrong))
+        if place := _first((digests != claimed).any(axis=1)):
+            (r,) = place
             raise Contradiction(
                 name,
                 f"its digest of slots {start} to {stop - 1} of trial {self._first_trial + r} is {claimed[r].tobytes().hex()}, "
@@ -100,10 +99,8 @@ class Verifier:
         claimed = report.trace_sums[start]
         sums = np.append(of_recorded, of_all)
         stated = np.append(claimed[: self._recorded], claimed.sum())
-        wrong = ~(np.abs(stated - sums) <= _ROUNDING * np.maximum(np.abs(sums), np.abs(stated)))
-        if wrong.any():
-            place = int(np.argmax(wrong))
-            which = "all trials" if place == self._recorded else f"trial {self._first_trial + place}"
+        if place := _first(~(np.abs(stated - sums) <= _ROUNDING * np.maximum(np.abs(sums), np.abs(stated)))):
+            which = "all trials" if place == (self._recorded,) else f"trial {self._first_trial + place[0]}"
             raise Contradiction(
                 name,
                 f"its sum of tr P over slots {start} to {stop - 1} of {which} is {stated[place]:.17g}, and what it reported of "
@@ -125,8 +122,8 @@ class Verifier:
             squares = left[:, 1] + _ROUNDING * size[:, 1]
             room = np.sqrt(others * np.maximum(squares, 0.0)) + _ROUNDING * size[:, 0]
             wrong = (squares < 0.0) | (np.abs(left[:, 0]) > room)
-        if wrong.any():
-            row = int(np.argmax(wrong))
+        if place := _first(wrong):
+            (row,) = place
             sums = [f"{value:.17g}" for value in (*claimed[row], *sums_[row])]
             raise Contradiction(
                 name,
@@ -142,8 +139,7 @@ class Verifier:
             ("P", left.P[..., : self._recorded], slots.P[-1]),
         ):
             if on_leaving.tobytes() != np.ascontiguousarray(reported).tobytes():
-                differing = np.argwhere(on_leaving != reported)
-                place = tuple(differing[0].tolist()) if len(differing) else (0,)
+                place = _first(on_leaving != reported) or (0,)
                 raise Contradiction(
                     name,
                     f"before slot {end}, with which it goes away, its {quantity} of trial {self._first_trial + place[-1]} is "
@@ -159,9 +155,8 @@ class Verifier:
 
     def _check_received(self, name: str, receiver: ReceiverSlots, link: LinkSlots) -> None:
         received = receiver.action != int(Action.LOST)
-        wrong = received != link.delivered
-        if wrong.any():
-            row, r = (int(i) for i in np.argwhere(wrong)[0])
+        if place := _first(received != link.delivered):
+            row, r = place
             says = "that it received the packet" if received[row, r] else "that it received nothing"
             journal = "that it was delivered" if link.delivered[row, r] else "that it was not delivered"
             raise Contradiction(
@@ -172,9 +167,8 @@ class Verifier:
             )
         if receiver.late is None or link.late is None:
             return
-        wrong = receiver.late != link.late
-        if wrong.any():
-            row, r = (int(i) for i in np.argwhere(wrong)[0])
+        if place := _first(receiver.late != link.late):
+            row, r = place
             raise Contradiction(
                 name,
                 f"in slot {link.first + row}, trial {self._first_trial + r}, it says that {int(receiver.late[row, r])} late "
@@ -185,15 +179,19 @@ class Verifier:
     def _check_sent(self, sent: Flags, link: LinkSlots) -> None:
         """Check the sensor's report of the packets that it sent, (c, R), against the journal."""
         silent = np.count_nonzero(~sent, axis=1)
-        wrong = (silent != link.unsent) | (link.delivered & ~sent).any(axis=1)
-        if wrong.any():
-            row = int(np.argmax(wrong))
+        if place := _first((silent != link.unsent) | (link.delivered & ~sent).any(axis=1)):
+            (row,) = place
             raise Contradiction(
                 SENSOR,
                 f"in slot {link.first + row} it says that {int(silent[row])} trials sent nothing, but the journal says "
                 f"{int(link.unsent[row])}, or that a packet of one of them was delivered",
                 ROUTER,
             )
+
+
+def _first(wrong: Flags) -> tuple[int, ...] | None:
+    """The first place where something is wrong; None if nothing is."""
+    return tuple(np.argwhere(wrong)[0].tolist()) if wrong.any() else None
 
 
 def _sums_of(slots: ReceiverSlots) -> Floats:
