@@ -292,8 +292,7 @@ class HoldingTime:
 
     def reached(self, k: int, threshold: int) -> Flags:
         """Whether h_k ≥ threshold, (R,)."""
-        flags: Flags = k - self._slot >= threshold
-        return flags
+        return k - self._slot >= threshold
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:
         """Add the acknowledgements (R,) of slot k; slots may come in any order."""

@@ -50,8 +50,7 @@ class Chart:
 
     def alarms(self, S: Statistic) -> Flags:
         """Whether the alarm is raised, (R,)."""
-        flags: Flags = self.threshold <= S
-        return flags
+        return self.threshold <= S
 
     def run_length(self, rate: float) -> float:
         """Mean number of packets until the alarm from S = 0, if each is acknowledged with this probability. Exact.
@@ -159,8 +158,7 @@ def probability_of_change(p: Floats, hazard: float, changed: Floats, same: Float
     """
     before = p + (1.0 - p) * hazard
     after = before * changed
-    posterior: Floats = after / (after + (1.0 - before) * same)
-    return posterior
+    return after / (after + (1.0 - before) * same)
 
 
 @final
@@ -201,5 +199,4 @@ class ShiryaevTest:
 
     def alarms(self, p: Floats) -> Flags:
         """Whether the alarm is raised, (R,)."""
-        flags: Flags = 1.0 - p <= self.risk
-        return flags
+        return 1.0 - p <= self.risk

@@ -156,8 +156,7 @@ class ModulatedCovariance:
         odds = self._whole if self._slots_at is None else SlotOdds.of(self._slots_at(slot.k))
         weights = chain.stationary[:, None, None]
         if states is None or slot.before is None:
-            first: Floats = odds.of_part("initial", quality) * weights * self._process.initial_covariance
-            return first
+            return odds.of_part("initial", quality) * weights * self._process.initial_covariance
         mixed = states.sum(axis=0)[None] * weights if slot.fresh else _mixed(chain, states)
         source = odds.of_part("predicted", quality) * self._process.Q
         if odds.misleads:
@@ -166,8 +165,7 @@ class ModulatedCovariance:
             source = source + np.where(misled > 0.0, misled * (2.0 * (A @ slot.before @ A.T)), 0.0)
         if slot.remaining is not None:
             source = source + odds.of_part("leaked", quality) * slot.remaining
-        kept: Floats = odds.of_part("propagated", quality) * (A @ mixed @ A.T) + weights * source
-        return kept
+        return odds.of_part("propagated", quality) * (A @ mixed @ A.T) + weights * source
 
 
 def _mixed(chain: Chain, states: Floats) -> Floats:
@@ -206,8 +204,7 @@ class SlotOdds:
 
     def of_part(self, name: str, quality: Floats) -> Floats:
         """The probability of an outcome in every state, (states, 1, 1), for the qualities of the states."""
-        odds: Floats = (self.base[name] + self.slope[name] * quality)[:, None, None]
-        return odds
+        return (self.base[name] + self.slope[name] * quality)[:, None, None]
 
     def at(self, quality: Floats) -> dict[str, Floats]:
         """The probabilities in every state, (states,) each, for the qualities of the states."""
@@ -266,8 +263,7 @@ def limit_states(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> Flo
     if np.max(np.abs(np.linalg.eigvals(operator))) >= 1.0 - 1e-12:
         return None
     source = _limit_sources(process, chain, outcomes).reshape(-1)
-    solution: Floats = np.linalg.solve(np.eye(len(operator)) - operator, source).reshape(states, n, n)
-    return solution
+    return np.linalg.solve(np.eye(len(operator)) - operator, source).reshape(states, n, n)
 
 
 def _limit_sources(process: Process, chain: Chain, outcomes: list[Outcomes]) -> Floats:
@@ -287,8 +283,7 @@ def _limit_step(process: Process, chain: Chain, outcomes_at: OutcomesAt, states:
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
     mixed = _mixed(chain, states)
     kept = np.array([outcome.propagated for outcome in outcomes])[:, None, None]
-    stepped: Floats = kept * (process.A @ mixed @ process.A.T) + _limit_sources(process, chain, outcomes)
-    return stepped
+    return kept * (process.A @ mixed @ process.A.T) + _limit_sources(process, chain, outcomes)
 
 
 def tail_outcomes(chain: Chain, outcomes_at: OutcomesAt) -> Outcomes:

@@ -70,13 +70,11 @@ class DitheredQuantiser:
         half, steps = 2.0 ** (self._bits - 1), self.steps(k)[:, None]
         # A step of 0 is that of a state that is known: it is 0.
         scaled = np.floor(x / np.where(steps > 0.0, steps, 1.0) + self._dither.at(k))
-        levels: NDArray[np.int64] = (np.minimum(np.maximum(scaled, -half), half - 1.0) + half).astype(np.int64)
-        return levels
+        return (np.minimum(np.maximum(scaled, -half), half - 1.0) + half).astype(np.int64)
 
     def centres(self, k: int, levels: NDArray[np.int64]) -> Floats:
         """The numbers in the middle of the levels, (n, R)."""
-        centres_: Floats = (levels - 2.0 ** (self._bits - 1) + 0.5) * self.steps(k)[:, None]
-        return centres_
+        return (levels - 2.0 ** (self._bits - 1) + 0.5) * self.steps(k)[:, None]
 
     def levels_of(self, k: int, centres: Floats) -> NDArray[np.int64]:
         """The levels whose middles these are, (n, R)."""
@@ -88,8 +86,7 @@ class DitheredQuantiser:
 
     def read(self, k: int, levels: NDArray[np.int64]) -> Floats:
         """The state as it is read from levels, (n, R)."""
-        states: Floats = self.centres(k, levels) - self._dither.at(k) * self.steps(k)[:, None]
-        return states
+        return self.centres(k, levels) - self._dither.at(k) * self.steps(k)[:, None]
 
 
 @final
@@ -153,8 +150,7 @@ class Mask:
         points = np.rint(np.ldexp(np.minimum(np.maximum(values, -H), H), shift)).astype(np.int64)
         points = np.minimum(points, _HALF - 1)
         turned = (points + _HALF + sign * self._pad(k)) & (2 * _HALF - 1)
-        masked: Floats = np.ldexp((turned - _HALF).astype(np.float64), -shift)
-        return masked
+        return np.ldexp((turned - _HALF).astype(np.float64), -shift)
 
     def _pad(self, k: int) -> NDArray[np.int64]:
         return self._pads.at(k)

@@ -36,8 +36,7 @@ def triangular_solutions(L: Floats, z: Floats) -> Floats:
 def squares(X: Floats) -> Floats:
     """X Xᵀ of every trial, (n, n, R)."""
     factors = X.transpose(2, 0, 1).copy()
-    squared: Floats = product(factors, factors.swapaxes(1, 2).copy()).transpose(1, 2, 0)
-    return squared
+    return product(factors, factors.swapaxes(1, 2).copy()).transpose(1, 2, 0)
 
 
 NONE = -1

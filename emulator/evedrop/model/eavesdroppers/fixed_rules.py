@@ -114,8 +114,7 @@ class Suspicious(PacketTaker):
 
     def _tossed(self, slots: range) -> Flags:
         coins = self._coins.uniforms(slots)[:, 0, :]
-        used: Flags = coins < np.where(self._schedule.block(slots), self._use_innovation, self._use_state)
-        return used
+        return coins < np.where(self._schedule.block(slots), self._use_innovation, self._use_state)
 
 
 class Selective(PacketReader):

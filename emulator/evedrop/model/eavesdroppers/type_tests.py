@@ -81,8 +81,7 @@ class Likelihood(PacketReader):
         diagonal = np.where(P.diagonal > 0.0, seen.diagonal, _NO_VARIANCE)
         for row, D, state in zip(white, diagonal, self._leaks.at(k).state_diagonal, strict=True):
             evidence = evidence + row * row - log(D / state)
-        flags: Flags = evidence > -2.0 * float(log(np.array([odds]))[0])
-        return flags
+        return evidence > -2.0 * float(log(np.array([odds]))[0])
 
 
 class PowerTest(PacketReader):
@@ -121,5 +120,4 @@ class PowerTest(PacketReader):
         ratios = zip(noise.state_diagonal, states.state_diagonal, strict=True)
         for first, second in ratios:
             evidence = evidence + log(np.array([first / second]))
-        flags: Flags = evidence > 0.0
-        return flags
+        return evidence > 0.0

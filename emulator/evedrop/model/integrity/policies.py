@@ -61,8 +61,7 @@ class WatermarkPolicy(ABC):
 
     def alarms(self, statistic: Floats) -> Flags:
         """Whether the alarm is raised, (…)."""
-        flags: Flags = statistic >= self.threshold
-        return flags
+        return statistic >= self.threshold
 
 
 THRESHOLD = "threshold"
@@ -152,8 +151,7 @@ class Parsimonious(WatermarkPolicy):
 
     def marks(self, statistic: Floats) -> Flags:
         """Between the thresholds."""
-        flags: Flags = (statistic >= self._lower) & ~self.alarms(statistic)
-        return flags
+        return (statistic >= self._lower) & ~self.alarms(statistic)
 
     def expected_delay(self, divergence: float) -> float | None:
         """Not known in closed form."""

@@ -62,8 +62,7 @@ def log(x: Floats) -> Floats:
     w = z * z
     tail = w * polynomial(_LOG_EVEN, w) + z * polynomial(_LOG_ODD, w)
     half_square = 0.5 * f * f
-    result: Floats = power * _LN2_HIGH - ((half_square - (s * (half_square + tail) + power * _LN2_LOW)) - f)
-    return result
+    return power * _LN2_HIGH - ((half_square - (s * (half_square + tail) + power * _LN2_LOW)) - f)
 
 
 _EXP = (
@@ -89,8 +88,7 @@ def exp(x: Floats) -> Floats:
     t = r * r
     c = r - t * polynomial(_EXP, t)
     value = np.ldexp(1.0 - ((low - (r * c) / (2.0 - c)) - high), power.astype(np.int64))
-    result: Floats = np.where(x < _EXP_LEAST, 0.0, np.where(x > _EXP_MOST, np.inf, value))
-    return result
+    return np.where(x < _EXP_LEAST, 0.0, np.where(x > _EXP_MOST, np.inf, value))
 
 
 # Wichura (1988), "Algorithm AS 241: The percentage points of the normal distribution", PPND16.

@@ -57,8 +57,7 @@ REASONS = tuple(fate.name.lower() for fate in Fate if fate not in (Fate.DELIVERE
 
 def fates_of(lost: Flags) -> Codes:
     """`Fate` codes from flags of losses."""
-    codes: Codes = lost.view(np.uint8)
-    return codes
+    return lost.view(np.uint8)
 
 
 class LossModel(ABC):

@@ -143,8 +143,7 @@ class ThresholdCodeEncoder(MixedEncoder):
 
     def plain(self, k: int) -> Flags:  # noqa: ARG002 - the belief says it
         """Whether the state is sent, (R,)."""
-        flags: Flags = self._belief > self._threshold
-        return flags
+        return self._belief > self._threshold
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:
         """An acknowledgement of a state makes b the fraction of forged ones; that of a coded packet adds to b."""

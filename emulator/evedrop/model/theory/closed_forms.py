@@ -120,16 +120,14 @@ class QuantisationError:
 
     def covariances(self, process: Process, slots: int) -> Floats:
         """R_k for k = 0 … slots−1, (slots, n, n); inf from where Σ_k overflows."""
-        covariances: Floats = self._of(state_covariances(process, slots))
-        return covariances
+        return self._of(state_covariances(process, slots))
 
     def limit(self, process: Process) -> Floats:
         """The limit of R_k, (n, n); its diagonal is inf unless A forgets."""
         return self._of(limit(process, NOBODY))
 
     def _of(self, sigma: Floats) -> Floats:
-        covariances: Floats = np.where(np.eye(sigma.shape[-1], dtype=np.bool_), self.fraction * sigma, 0.0)
-        return covariances
+        return np.where(np.eye(sigma.shape[-1], dtype=np.bool_), self.fraction * sigma, 0.0)
 
 
 def twin_track_bound(process: Process, slots: int) -> Floats:
@@ -598,8 +596,7 @@ class ClearStatesForm(ClosedForm):
         else:
             unseen = _orthogonal_to(_invariant_hull(A.T, axes[:, ~self.hidden]))
             growing = unstable_part(A, unseen, 1.0 - MARGINAL if self.mu_d == 1.0 else 1.0 + MARGINAL)
-        basis: Floats = np.linalg.qr(units[:, None] * growing)[0]
-        return basis
+        return np.linalg.qr(units[:, None] * growing)[0]
 
     @property
     def growth(self) -> Growth:

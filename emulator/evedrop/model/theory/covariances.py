@@ -433,8 +433,7 @@ def powers_of(A: Floats, length: int) -> Floats:
 
 
 def _congruences(powers: Floats, P: Floats) -> Floats:
-    result: Floats = (powers @ P) @ powers.transpose(0, 2, 1)
-    return result
+    return (powers @ P) @ powers.transpose(0, 2, 1)
 
 
 def _unbounded_from_overflow(covariances: Floats) -> Floats:
@@ -474,8 +473,7 @@ def unstable_part(A: Floats, within: Floats, least: float) -> Floats:
     M = within.T @ A @ within
     modulus = modulus_in(M)
     _, Z, count = schur(M, sort=lambda real, imaginary: modulus(real, imaginary) >= least)
-    part: Floats = within @ Z[:, :count]
-    return part
+    return within @ Z[:, :count]
 
 
 def growth(process: Process, outcomes: Outcomes) -> Growth:

@@ -73,8 +73,7 @@ def traces_of(process: Process, mu: float, adversary: Adversary, mu_d: float) ->
 def points_between(low: float, high: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """Points of (low, high], dense near low, where there may be a pole."""
     steps = np.concatenate([np.geomspace(_NEAREST, 0.02, 60), np.linspace(0.02, 1.0, 99)[1:]])
-    points: np.ndarray[tuple[int], np.dtype[np.float64]] = low + steps * (high - low)
-    return points
+    return low + steps * (high - low)
 
 
 _XTOL = 1e-13

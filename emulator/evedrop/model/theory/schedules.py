@@ -139,8 +139,7 @@ def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Flo
         ends[index, index + 1], ends[index + slots - 1, index + 1] = 0.0, 1.0
         traces = recursion.traces(ends)
         by_slot = np.vstack([np.zeros(slots), traces[slots - 1 :] - traces[: slots - 1]])
-        gradient: Floats = by_slot.T @ member
-        return gradient
+        return by_slot.T @ member
 
     def loss(of: Floats) -> float:
         ours, theirs = (each.traces(schedule(of)[None])[0] for each in (problem.legitimate, problem.eavesdropper))
@@ -187,8 +186,7 @@ def _repaired(problem: ScheduleProblem, mu_d: Floats) -> Floats:
             high = float(fractions[0])
             break
         low, high = float(fractions[first - 1]), float(fractions[first])
-    repaired: Floats = mu_d + high * way
-    return repaired
+    return mu_d + high * way
 
 
 _POINTS, _REFINEMENTS = 33, 8  # the least feasible μ_d of a block is found to 33⁻⁸
