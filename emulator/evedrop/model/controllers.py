@@ -135,8 +135,8 @@ def riccati(assignment: Assignment) -> tuple[Floats, Floats]:
     H = np.zeros((n + m, n + m))
     H[:n, :n] = np.diag(assignment.state_weights)
     H[n:, n:] = weight_r - product(weight_r, part)
-    P = _riccati(F, product(product(G_u, inverse(both)), _transposed(G_u)), H)
-    carried = product(_transposed(G_u), P)
+    P = _riccati(F, product(product(G_u, inverse(both)), G_u.T), H)
+    carried = product(G_u.T, P)
     K = product(inverse(both + product(carried, G_u)), product(carried, F))
     K[:, n:] -= part
     return K, P
@@ -164,18 +164,14 @@ def _riccati(F: Floats, G: Floats, H: Floats) -> Floats:
         except ValueError as error:
             raise ValueError("the Riccati equation has no solution") from error
         FW = product(F, W)
-        more = product(product(product(_transposed(F), H), W), F)
-        G = G + product(product(FW, G), _transposed(F))
+        more = product(product(product(F.T, H), W), F)
+        G = G + product(product(FW, G), F.T)
         H, F = H + more, product(FW, F)
         if not np.isfinite(H).all():
             break
         if has_settled(more, np.diag(H), _SETTLED):
-            return 0.5 * (H + _transposed(H))
+            return 0.5 * (H + H.T)
     raise ValueError("the Riccati equation has no solution")
-
-
-def _transposed(M: Floats) -> Floats:
-    return np.ascontiguousarray(M.T)
 
 
 @final

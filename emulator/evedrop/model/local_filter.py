@@ -62,15 +62,15 @@ class Steps:
         if self.settled and self._last is not None:
             return self._last
         C, P = self._C, self._predicted
-        PCt = product(P, _transposed(C))
+        PCt = product(P, C.T)
         S = product(C, PCt) + self._V
         K = product(PCt, inverse(S))
         rest = np.eye(len(P)) - product(K, C)
         # Joseph's form remains a covariance however small it gets.
-        after = product(product(rest, P), _transposed(rest)) + product(product(K, self._V), _transposed(K))
+        after = product(product(rest, P), rest.T) + product(product(K, self._V), K.T)
         after = 0.5 * (after + after.T)
-        predicted = product(product(self._A, after), _transposed(self._A)) + self._W
-        innovation = product(product(K, S), _transposed(K))
+        predicted = product(product(self._A, after), self._A.T) + self._W
+        innovation = product(product(K, S), K.T)
         step = FilterStep(
             K,
             after,
@@ -160,7 +160,3 @@ def _measured(plant: Plant) -> tuple[Floats, Floats]:
     if plant.output_matrix is None or plant.measurement_noise is None:
         raise ValueError("the plant's states are not measured")
     return plant.output_matrix, plant.measurement_noise
-
-
-def _transposed(M: Floats) -> Floats:
-    return np.ascontiguousarray(M.T)

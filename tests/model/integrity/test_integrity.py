@@ -141,7 +141,7 @@ def test_a_replay_is_seen_only_with_a_watermark() -> None:
     assert not np.isfinite(simulated(0.0 * ONE, 200, 200, replay, [(40, 200)]).first_alarms(8.0)).any()
     assert np.isfinite(simulated(0.5 * ONE, 200, 200, replay, [(40, 200)]).first_alarms(8.0)).mean() > 0.95
     feed = SENSOR_ATTACKS["replay"].read({"recorded": 3}).feed(b"", Batch(20, 1))
-    heard = [float(feed.take(k, np.array([[float(k)]]), 5 <= k < 12)[0, 0]) for k in range(14)]
+    heard = [float(feed(k, np.array([[float(k)]]), 5 <= k < 12)[0, 0]) for k in range(14)]
     assert heard == [0, 1, 2, 3, 4, 2, 3, 4, 2, 3, 4, 2, 12, 13]
 
 
@@ -149,7 +149,7 @@ def test_a_replay_is_seen_only_with_a_watermark() -> None:
 def test_replaced_measurements_are_stationary_from_slot_0_on(k: int) -> None:
     """The values z of 4000 trials have the variance 0.1 / (1 − 0.8²) to 6 standard errors; the noise w_a alone has 0.1."""
     feed = SENSOR_ATTACKS["replace"].read({"matrix": [[0.8]], "noise": [[0.1]]}).feed(b"k" * 32, Batch(20, 4000))
-    z = [feed.take(slot, np.zeros((1, 4000)), True) for slot in range(k + 1)][k]
+    z = [feed(slot, np.zeros((1, 4000)), True) for slot in range(k + 1)][k]
     expected = 0.1 / (1.0 - 0.8**2)
     assert float(np.mean(z**2)) == pytest.approx(expected, abs=6.0 * expected * np.sqrt(2.0 / 4000))
 

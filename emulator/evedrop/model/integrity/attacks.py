@@ -7,7 +7,7 @@ reports again what it measured in the slots before the attack, over and over.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, Self, final
@@ -20,13 +20,11 @@ from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.process import Floats, product
 from evedrop.model.streams import Ahead, Batch, BlockReader
 
+MeasurementFeed = Callable[[int, Floats, bool], Floats]
+"""(slot k, the measurements that were made, (p, R), whether the attack is on) → those that the filter gets, (p, R).
 
-class MeasurementFeed(ABC):
-    """What a batch's sensors report, slot by slot, in order from slot 0 on."""
-
-    @abstractmethod
-    def take(self, k: int, y: Floats, on: bool) -> Floats:
-        """The measurements that the filter gets in slot k, (p, R), from those that were made, y (p, R); on: during the attack."""
+Slots come in order from slot 0 on.
+"""
 
 
 class SensorAttack(ABC):
@@ -142,11 +140,11 @@ class Replacement(SensorAttack):
 
     def feed(self, key: bytes, batch: Batch) -> MeasurementFeed:
         """The values z of every trial."""
-        return _Stationary(self, key, batch)
+        return _Stationary(self, key, batch).take
 
 
 @final
-class _Stationary(MeasurementFeed):
+class _Stationary:
     def __init__(self, attack: Replacement, key: bytes, batch: Batch) -> None:
         self._A = attack.A
         first = semidefinite_factor(stationary(attack.A, attack.noise))
@@ -228,11 +226,11 @@ class Replay(SensorAttack):
     def feed(self, key: bytes, batch: Batch) -> MeasurementFeed:
         """The recording of every trial."""
         del key, batch
-        return _Recording(self.recorded)
+        return _Recording(self.recorded).take
 
 
 @final
-class _Recording(MeasurementFeed):
+class _Recording:
     """The slot k of the attack repeats slot k − recorded, so both are at the same place, k modulo `recorded`."""
 
     def __init__(self, recorded: int) -> None:

@@ -91,7 +91,7 @@ class WatermarkedLoop:
 
 def spread(M: Floats, covariance: Floats) -> Floats:
     """M Σ Mᵀ, symmetric."""
-    result = product(product(M, covariance), _transposed(M))
+    result = product(product(M, covariance), M.T)
     return 0.5 * (result + result.T)
 
 
@@ -107,7 +107,3 @@ def stationary(F: Floats, noise: Floats) -> Floats:
         if has_settled(more, np.diag(X), _SETTLED):
             return X
     raise ValueError("there is no stationary distribution")
-
-
-def _transposed(M: Floats) -> Floats:
-    return np.ascontiguousarray(M.T)

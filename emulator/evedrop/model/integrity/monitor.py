@@ -114,7 +114,7 @@ class MonitorPlan:
         if self.attack is None:
             return None
         feed = SENSOR_ATTACKS[self.attack].read(self.attack_data).feed(key, batch)
-        return lambda k, y: feed.take(k, y, any(start <= k < stop for start, stop in self.spans))
+        return lambda k, y: feed(k, y, any(start <= k < stop for start, stop in self.spans))
 
 
 def assumed(loop: WatermarkedLoop, attack: SensorAttack | None, watermark: Floats) -> Floats:

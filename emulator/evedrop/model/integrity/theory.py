@@ -29,7 +29,7 @@ def loop_of(assignment: Assignment) -> WatermarkedLoop:
     L, weight = riccati(assignment)
     n = process.n
     B = plant.input_matrix
-    cost = np.diag(assignment.input_weights) + spread(np.ascontiguousarray(B.T), weight[:n, :n])
+    cost = np.diag(assignment.input_weights) + spread(B.T, weight[:n, :n])
     return WatermarkedLoop(process.A, B, plant.output_matrix, step.gain, step.expected, L[:, :n], cost)
 
 

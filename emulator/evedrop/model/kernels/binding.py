@@ -12,7 +12,8 @@ import shutil
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 MODULE = "evedrop.model.kernels._compiled"
@@ -64,16 +65,13 @@ def compile_kernels(folder: Path) -> Path:
     return target
 
 
-class _environment:  # noqa: N801 - reads as a function
+@contextmanager
+def _environment(changes: Mapping[str, str]) -> Iterator[None]:
     """Changes environment variables for a while."""
-
-    def __init__(self, changes: Mapping[str, str]) -> None:
-        self._changes = changes
-
-    def __enter__(self) -> None:
-        self._before = dict(os.environ)
-        os.environ.update(self._changes)
-
-    def __exit__(self, *_: object) -> None:
+    before = dict(os.environ)
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
         os.environ.clear()
-        os.environ.update(self._before)
+        os.environ.update(before)

@@ -278,7 +278,6 @@ def traces(P: Floats) -> Floats:
     return trace
 
 
-@np.errstate(over="ignore", invalid="ignore")
 @np.errstate(over="ignore", invalid="ignore")  # as in C: the square of a large error is infinite
 def sums(values: Floats) -> Floats:
     """Sums over trials of values (c, R), and of their squares, (c, 2), in the order of `numpy.sum`."""
