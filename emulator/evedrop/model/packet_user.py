@@ -1,7 +1,8 @@
-"""Receivers that use a packet as the state or ignore it: the paper's class of eavesdroppers."""
+"""Receivers that use a packet as the state or ignore it: the paper's class of eavesdroppers; or read a state from each."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -62,6 +63,22 @@ class PacketUser(Receiver):
         action = _actions(gamma, self.uses_block(slots))
         beliefs = update.beliefs(self.process, slots.start, belief, action, z)
         return beliefs, beliefs.last
+
+
+class StateReader(Receiver):
+    """Reads the state from every packet that it receives."""
+
+    @abstractmethod
+    def read(self, k: int, heard: Reception) -> Floats:
+        """The states of slot k as they are read from its packets, (n, R); without meaning where none was received."""
+
+    def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
+        """The state where a packet arrives: the codes 0 and 1 of `Action` are γ itself."""
+        return gamma.astype(np.uint8)
+
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
+        """(A x̂, A P Aᵀ + Q) if lost, otherwise (the state, 0)."""
+        return update.belief(self.process, k, belief, self.act(k, heard.gamma), self.read(k, heard))
 
 
 def _actions(gamma: Flags, uses: Flags | None) -> Codes:

@@ -5,7 +5,6 @@ With L = A, for comparison, an eavesdropper that lost the reference learns the s
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import final
@@ -16,7 +15,7 @@ from evedrop.model.process import Floats, product
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.reference_code import NONE, Content, ReferenceCode, ReferenceReceiver, singular_warnings
 from evedrop.model.reference_form import ReferenceForm
-from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.schemes.scheme import Encoder, Packet, PublicScheme
 from evedrop.model.streams import Batch
 from evedrop.model.theory.closed_forms import LostReference, ReceiverConditions, growth_by_coin
 from evedrop.model.theory.covariances import Outcomes
@@ -51,30 +50,22 @@ class AcknowledgedEncoder(Encoder):
         self._slot = np.where(acknowledged, k, self._slot)
 
 
-class _AcknowledgedReferences(Scheme):
+class ReferenceScheme(PublicScheme):
     """Subtracts a reference that the legitimate estimator has, as its acknowledgements show."""
 
-    sent_words = ("coded state",)
     best_reader = "reference"
     needs_acknowledgements = True
     reads_packets = True
 
-    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
-        """The references; nothing is secret."""
-        return NoInnovations(
-            self.process,
-            batch.trials,
-            lambda: self._encoder(batch.trials),
-            lambda: self.estimator(keys, batch),
-        )
-
-    @abstractmethod
-    def _encoder(self, trials: int) -> Encoder:
-        """The sensor's side."""
-
     def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
         """A receiver that keeps the references it may have acknowledged."""
         return ReferenceReceiver(self.process, batch.trials)
+
+
+class _AcknowledgedReferences(ReferenceScheme):
+    """Subtracts the reference whenever there is one."""
+
+    sent_words = ("coded state",)
 
     def outcomes(self, mu: float) -> Outcomes:
         """A state with every packet, whichever acknowledgements arrive."""
@@ -108,9 +99,9 @@ class Acknowledged(_AcknowledgedReferences):
         """That of a singular A."""
         return singular_warnings(self.process)
 
-    def _encoder(self, trials: int) -> Encoder:
+    def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:  # noqa: ARG002 - there is no secret
         """Carries the reference by L."""
-        return AcknowledgedEncoder(ReferenceCode(self.process), self.process.n, trials)
+        return AcknowledgedEncoder(ReferenceCode(self.process), self.process.n, batch.trials)
 
 
 @final
@@ -139,6 +130,6 @@ class OpenLoop(_AcknowledgedReferences):
     lost_reference = _AcknowledgedReferences.lost_reference
     header = ("slot t of the reference; −1: no reference", "0: z is the state; 2: z is the state minus A^{k−t} x_t")
 
-    def _encoder(self, trials: int) -> Encoder:
+    def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:  # noqa: ARG002 - there is no secret
         """Carries the reference by A."""
-        return OpenLoopEncoder(ReferenceCode(self.process, open_loop=True), self.process.n, trials)
+        return OpenLoopEncoder(ReferenceCode(self.process, open_loop=True), self.process.n, batch.trials)

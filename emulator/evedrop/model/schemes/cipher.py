@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from evedrop.model import update
 from evedrop.model.number_codes import Mask
+from evedrop.model.packet_user import StateReader
 from evedrop.model.process import MARGINAL, Floats, Process
-from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
+from evedrop.model.receiver import Flags, Reception, select
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import Outcomes, state_covariances
@@ -32,24 +32,18 @@ def encrypted_packets(heard: Reception) -> Flags:
     return heard.gamma if heard.header is None else heard.gamma & (heard.header[0] == 1)
 
 
-class CipherEstimator(Receiver):
+class CipherEstimator(StateReader):
     """Unmasks the packets that are masked, and has the state from every packet."""
 
     def __init__(self, process: Process, trials: int, mask: Mask) -> None:
         super().__init__(process, trials)
         self._mask = mask
 
-    def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
-        """The state where a packet arrives: the codes 0 and 1 of `Action` are γ itself."""
-        return gamma.astype(np.uint8)
-
-    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """(A x̂, A P Aᵀ + Q) if lost, otherwise (the state, 0)."""
-        action = self.act(k, heard.gamma)
+    def read(self, k: int, heard: Reception) -> Floats:
+        """Masked or unmasked, as the header says."""
         encrypted = encrypted_packets(heard)
         masked = np.where(encrypted, heard.z, 0.0)
-        z = select(encrypted, lambda: self._mask.reveal(k, masked), lambda: heard.z)
-        return update.belief(self.process, k, belief, action, z)
+        return select(encrypted, lambda: self._mask.reveal(k, masked), lambda: heard.z)
 
 
 class Cipher(Scheme):

@@ -12,14 +12,14 @@ from typing import Any, final
 
 import numpy as np
 
-from evedrop.model import update
-from evedrop.model.acknowledgements import HoldingTime
 from evedrop.model.checks import MOST_SLOTS, number_mistakes, whole_number_mistakes
 from evedrop.model.number_codes import MOST_BITS, DitheredQuantiser, LevelPad, Mask
+from evedrop.model.packet_user import StateReader
 from evedrop.model.process import Floats, Process
-from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
+from evedrop.model.receiver import Belief, Flags, Reception, select
 from evedrop.model.schemes.cipher import CipherEstimator, encrypted_packets
-from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
+from evedrop.model.schemes.scheme import NoInnovations, Packet, PacketBlock, Scheme, Shared
+from evedrop.model.schemes.silent import HoldingTimeEncoder
 from evedrop.model.streams import Ahead, Batch, BlockReader
 from evedrop.model.theory.closed_forms import (
     ChainForm,
@@ -31,20 +31,12 @@ from evedrop.model.theory.closed_forms import (
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, Outcomes
 
 
-def encrypted_by_header(packets: PacketBlock) -> Flags:
-    """Whether the first number of each packet's header is 1, (c, R)."""
-    assert packets.header is not None  # noqa: S101 - every packet of such a scheme has one
-    flags: Flags = packets.header[:, 0] == 1
-    return flags
-
-
-class EncryptedScheduleEncoder(Encoder):
+class EncryptedScheduleEncoder(HoldingTimeEncoder):
     """z_k = x_k, masked from `threshold` slots after the last acknowledged slot on; the header tells whether."""
 
     def __init__(self, threshold: int, trials: int, mask: Mask) -> None:
-        self._threshold = threshold
-        self._held = HoldingTime(trials)
-        self._mask = mask
+        super().__init__(trials)
+        self._threshold, self._mask = threshold, mask
 
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - the state alone is sent
         """The packet of slot k."""
@@ -52,25 +44,34 @@ class EncryptedScheduleEncoder(Encoder):
         z = select(encrypted, lambda: self._mask.hide(k, x), lambda: x)
         return Packet(z, np.zeros(x.shape[1], np.bool_), encrypted.astype(np.int64)[None])
 
-    def acknowledged(self, k: int, acknowledged: Flags) -> None:
-        """Send unencrypted again where slot k is acknowledged."""
-        self._held.acknowledged(k, acknowledged)
 
-
-def selective_form(scheme: Scheme, threshold: float, conditions: ReceiverConditions) -> ChainForm | None:
+def _selective_form(scheme: _EncryptsByHoldingTime, conditions: ReceiverConditions) -> ChainForm | None:
     """That of a reader of the unencrypted packets; None if the chain, with a state for each holding time, is too long."""
-    received, acknowledged = conditions.received, conditions.acknowledged
+    received, acknowledged, threshold = conditions.received, conditions.acknowledged, scheme.threshold
     if received is None or acknowledged is None or conditions.hijack is not None or threshold > LARGEST_OPERATOR:
         return None
     chain = encrypted_schedule(threshold, received, acknowledged)
     return ChainForm(scheme.process, conditions.slots, chain, scheme.quantisation)
 
 
-def _selective_form(scheme: EncryptedSchedule, conditions: ReceiverConditions) -> ChainForm | None:
-    return selective_form(scheme, scheme.threshold, conditions)
+class _EncryptsByHoldingTime(Scheme):
+    """Encrypts from a holding time of `threshold` on; the header tells."""
+
+    sent_words = ("state",)
+    best_reader = "selective"
+    needs_acknowledgements = True
+    header = ("1 if encrypted, 0 if unencrypted",)
+    secret_words = (0, 1)
+    threshold: float
+
+    def encrypted(self, packets: PacketBlock) -> Flags:
+        """Those whose header says so, (c, R)."""
+        assert packets.header is not None  # noqa: S101 - every packet of such a scheme has one
+        flags: Flags = packets.header[:, 0] == 1
+        return flags
 
 
-class EncryptedSchedule(Scheme):
+class EncryptedSchedule(_EncryptsByHoldingTime):
     """Encrypts from `threshold` slots after the last acknowledged slot until the next acknowledgement; with 1, always.
 
     For a sensor that can afford to encrypt only some packets. Where acknowledgements are blocked it encrypts all of them,
@@ -79,15 +80,10 @@ class EncryptedSchedule(Scheme):
     Source: after Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics/schemes.md, schedules by holding time.
     """
 
-    sent_words = ("state",)
-    best_reader = "selective"
     closed_forms = MappingProxyType({"selective": _selective_form})
     parameters = MappingProxyType({"threshold": 2})
     secret_streams = ("mask",)
     estimator_streams = ("mask",)
-    needs_acknowledgements = True
-    header = ("1 if encrypted, 0 if unencrypted",)
-    secret_words = (0, 1)
 
     def __init__(self, process: Process, threshold: int) -> None:
         super().__init__(process)
@@ -108,10 +104,6 @@ class EncryptedSchedule(Scheme):
             lambda: CipherEstimator(self.process, batch.trials, mask),
         )
 
-    def encrypted(self, packets: PacketBlock) -> Flags:
-        """Those whose header says so, (c, R)."""
-        return encrypted_by_header(packets)
-
     def outcomes(self, mu: float) -> Outcomes:
         """A state with every packet."""
         return Outcomes.plain(mu)
@@ -128,7 +120,7 @@ def _overload(r: float) -> float:
 
 
 @final
-class QuantisedScheduleEncoder(Encoder):
+class QuantisedScheduleEncoder(HoldingTimeEncoder):
     """Sends the number that is read from the level of x_k; from the threshold on, the middle of the masked level.
 
     The header tells which.
@@ -137,9 +129,9 @@ class QuantisedScheduleEncoder(Encoder):
     """
 
     def __init__(self, threshold: float, batch: Batch, quantiser: DitheredQuantiser, pad: LevelPad, key: bytes) -> None:
+        super().__init__(batch.trials)
         self._least, self._most = math.floor(threshold), math.ceil(threshold)
         early = 1.0 - (threshold - self._least)
-        self._held = HoldingTime(batch.trials)
         self._quantiser, self._pad = quantiser, pad
         reader = BlockReader(key, batch, 1)
         self._early = Ahead(reader.ahead, lambda slots: reader.uniforms(slots)[:, 0, :] < early)
@@ -152,30 +144,24 @@ class QuantisedScheduleEncoder(Encoder):
         z = np.where(encrypted, masked, self._quantiser.read(k, levels))
         return Packet(z, np.zeros(x.shape[1], np.bool_), encrypted.astype(np.int64)[None])
 
-    def acknowledged(self, k: int, acknowledged: Flags) -> None:
-        """Send unencrypted again where slot k is acknowledged."""
-        self._held.acknowledged(k, acknowledged)
-
 
 @final
-class QuantisedScheduleEstimator(Receiver):
+class QuantisedScheduleEstimator(StateReader):
     """Reads every packet; the value read has the error of the quantiser, of covariance R_k = diag(Δ²)/12."""
 
     def __init__(self, process: Process, trials: int, quantiser: DitheredQuantiser, pad: LevelPad) -> None:
         super().__init__(process, trials)
         self._quantiser, self._pad = quantiser, pad
 
-    def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
-        """The state where a packet arrives: the codes 0 and 1 of `Action` are γ itself."""
-        return gamma.astype(np.uint8)
+    def read(self, k: int, heard: Reception) -> Floats:
+        """The value of the level, masked or unmasked, as the header says."""
+        encrypted = encrypted_packets(heard)
+        masked = self._quantiser.levels_of(k, np.where(encrypted, heard.z, 0.0))
+        return np.where(encrypted, self._quantiser.read(k, self._pad.reveal(k, masked)), heard.z)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, otherwise (the value read, R_k)."""
-        action = self.act(k, heard.gamma)
-        encrypted = encrypted_packets(heard)
-        masked = self._quantiser.levels_of(k, np.where(encrypted, heard.z, 0.0))
-        z = np.where(encrypted, self._quantiser.read(k, self._pad.reveal(k, masked)), heard.z)
-        after = update.belief(self.process, k, belief, action, z)
+        after = super().step(k, belief, heard)
         steps = self._quantiser.steps(k)
         error = np.diag(steps * steps / 12.0)
         return after._replace(P=after.P + np.where(heard.gamma, error[:, :, None], 0.0))
@@ -189,11 +175,7 @@ def _always_read(scheme: QuantisedSchedule, conditions: ReceiverConditions) -> C
     return ChainForm(scheme.process, conditions.slots, always_sent(received), scheme.quantisation)
 
 
-def _quantised_selective_form(scheme: QuantisedSchedule, conditions: ReceiverConditions) -> ChainForm | None:
-    return selective_form(scheme, scheme.threshold, conditions)
-
-
-class QuantisedSchedule(Scheme):
+class QuantisedSchedule(_EncryptsByHoldingTime):
     """Quantises the state with subtractive dither, and encrypts as `encrypted-schedule` does, from a threshold θ on.
 
     θ need not be whole: at a holding time of ⌊θ⌋ a coin decides, so that any energy budget between that of unencrypted packets
@@ -202,17 +184,12 @@ class QuantisedSchedule(Scheme):
     Source: Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics/schemes.md, quantised packets.
     """
 
-    sent_words = ("state",)
-    best_reader = "selective"
-    closed_forms = MappingProxyType({"legitimate": _always_read, "selective": _quantised_selective_form})
+    closed_forms = MappingProxyType({"legitimate": _always_read, "selective": _selective_form})
     meets_energy_budget = True
     parameters = MappingProxyType({"threshold": 1.5, "bits": 8, "standard_deviations": 6.0})
     secret_streams = ("dither", "mask", "threshold")
     estimator_streams = ("dither", "mask")
-    needs_acknowledgements = True
     reads_packets = True
-    header = ("1 if encrypted, 0 if unencrypted",)
-    secret_words = (0, 1)
 
     def __init__(self, process: Process, threshold: float, bits: int, standard_deviations: float) -> None:
         super().__init__(process)
@@ -254,27 +231,16 @@ class QuantisedSchedule(Scheme):
         """The error of the value read."""
         return QuantisationError.of(self._width, self._standard_deviations)
 
-    def encrypted(self, packets: PacketBlock) -> Flags:
-        """Those whose header says so, (c, R)."""
-        return encrypted_by_header(packets)
-
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """The quantiser and the pads."""
-        quantiser, pad = self._shared_parts(keys, batch)
+        quantiser = DitheredQuantiser(self.process, self._width, self._standard_deviations, keys["dither"], batch)
+        pad = LevelPad(self.process.n, self._width, keys["mask"], batch)
         return NoInnovations(
             self.process,
             batch.trials,
             lambda: QuantisedScheduleEncoder(self.threshold, batch, quantiser, pad, keys["threshold"]),
             lambda: QuantisedScheduleEstimator(self.process, batch.trials, quantiser, pad),
         )
-
-    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:
-        """The legitimate estimator's side alone, which needs no coin."""
-        return QuantisedScheduleEstimator(self.process, batch.trials, *self._shared_parts(keys, batch))
-
-    def _shared_parts(self, keys: Mapping[str, bytes], batch: Batch) -> tuple[DitheredQuantiser, LevelPad]:
-        quantiser = DitheredQuantiser(self.process, self._width, self._standard_deviations, keys["dither"], batch)
-        return quantiser, LevelPad(self.process.n, self._width, keys["mask"], batch)
 
     def outcomes(self, mu: float) -> None:
         """None: a packet that is read leaves the error of the quantiser."""

@@ -118,10 +118,7 @@ class Innovation(Scheme):
     secret_words = (1, 1)
 
     def __init__(self, process: Process, state_probability: float | Sequence[float]) -> None:
-        if isinstance(state_probability, Sequence):
-            super().__init__(process, tuple(map(float, state_probability)))
-        else:
-            super().__init__(process, state_probability)
+        super().__init__(process, state_probability)
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -16,19 +16,13 @@ import numpy as np
 
 from evedrop.model.checks import as_toml, is_number, probability_mistakes
 from evedrop.model.process import Floats, Process
-from evedrop.model.receiver import Flags, Receiver
-from evedrop.model.reference_code import NONE, Content, ReferenceCode, ReferenceReceiver, singular_warnings
-from evedrop.model.schemes.acknowledged import AcknowledgedEncoder
-from evedrop.model.schemes.scheme import NoInnovations, Packet, Scheme, Shared
+from evedrop.model.receiver import Flags
+from evedrop.model.reference_code import NONE, Content, ReferenceCode, singular_warnings
+from evedrop.model.schemes.acknowledged import AcknowledgedEncoder, ReferenceScheme
+from evedrop.model.schemes.scheme import Encoder, Packet
 from evedrop.model.streams import Ahead, Batch, BlockReader
 from evedrop.model.theory.closed_forms import LostReference, growth_by_coin, growth_by_phases, most_coded
 from evedrop.model.theory.covariances import radius
-
-MIXED_HEADER = (
-    "slot t of the reference; −1: no reference",
-    "0: z is the state; 1: z is the state minus L_{t,k} x_t",
-)
-"""The header of these schemes. A packet with the state names the reference too, so that receivers follow it."""
 
 
 class MixedEncoder(AcknowledgedEncoder):
@@ -47,6 +41,20 @@ class MixedEncoder(AcknowledgedEncoder):
         return packet._replace(z=np.where(self._sent_plain, x, packet.z), header=np.array([self._slot, content]))
 
 
+class _MixedCode(ReferenceScheme):
+    """Subtracts the reference in some slots. A packet with the state names the reference too, so that receivers follow it."""
+
+    sent_words = ("packet",)
+    header = ("slot t of the reference; −1: no reference", "0: z is the state; 1: z is the state minus L_{t,k} x_t")
+
+    def warnings(self) -> list[str]:
+        """That of a singular A."""
+        return singular_warnings(self.process)
+
+    def outcomes(self, mu: float) -> None:
+        """None: the information in a packet depends on the acknowledgements before it."""
+
+
 @final
 class RandomCodeEncoder(MixedEncoder):
     """Sends the state where the uniform number of the stream `schedule` is below α."""
@@ -61,7 +69,7 @@ class RandomCodeEncoder(MixedEncoder):
         return self._plain.at(k)
 
 
-class RandomCode(Scheme):
+class RandomCode(_MixedCode):
     """With probability α the state, otherwise the state minus a reference, as `acknowledged` sends it.
 
     A flipped acknowledgement leaves sensor and estimator with different references; the next state that it receives, if its
@@ -72,11 +80,6 @@ class RandomCode(Scheme):
 
     parameters = MappingProxyType({"plain_probability": 0.3})
     secret_streams = ("schedule",)
-    sent_words = ("packet",)
-    best_reader = "reference"
-    needs_acknowledgements = True
-    reads_packets = True
-    header = MIXED_HEADER
 
     def __init__(self, process: Process, plain_probability: float) -> None:
         super().__init__(process)
@@ -91,27 +94,9 @@ class RandomCode(Scheme):
             return [("plain_probability", why)]
         return probability_mistakes(given, "plain_probability")
 
-    def warnings(self) -> list[str]:
-        """That of a singular A."""
-        return singular_warnings(self.process)
-
-    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
-        """The references and the sensor's coin."""
-        return NoInnovations(
-            self.process,
-            batch.trials,
-            lambda: RandomCodeEncoder(
-                ReferenceCode(self.process), self.process.n, batch, keys["schedule"], self._alpha
-            ),
-            lambda: self.estimator(keys, batch),
-        )
-
-    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
-        """The filter of the state and the reference."""
-        return ReferenceReceiver(self.process, batch.trials)
-
-    def outcomes(self, mu: float) -> None:
-        """None: the information in a packet depends on the acknowledgements before it."""
+    def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:
+        """The sensor's side, with its coin."""
+        return RandomCodeEncoder(ReferenceCode(self.process), self.process.n, batch, keys["schedule"], self._alpha)
 
     def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:  # noqa: ARG002 - only states count
         """An unencrypted state ends the growth: ρ²(1 − αμ) a slot."""
@@ -152,7 +137,7 @@ class ThresholdCodeEncoder(MixedEncoder):
         self._belief = np.where(acknowledged, after, self._belief)
 
 
-class ThresholdCode(Scheme):
+class ThresholdCode(_MixedCode):
     """The state where the belief that the estimator has lost the reference exceeds θ, else the state minus the reference.
 
     The sensor computes its belief from the link's quality and the probability of flips as it is told them.
@@ -161,11 +146,6 @@ class ThresholdCode(Scheme):
     """
 
     parameters = MappingProxyType({"lost_belief": 0.1, "assumed_quality": 0.8, "assumed_flip": 0.1})
-    sent_words = ("packet",)
-    best_reader = "reference"
-    needs_acknowledgements = True
-    reads_packets = True
-    header = MIXED_HEADER
 
     def __init__(self, process: Process, lost_belief: float, assumed_quality: float, assumed_flip: float) -> None:
         super().__init__(process)
@@ -182,27 +162,10 @@ class ThresholdCode(Scheme):
             mistakes.append(("lost_belief", why))
         return mistakes
 
-    def warnings(self) -> list[str]:
-        """That of a singular A."""
-        return singular_warnings(self.process)
-
-    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
-        """The references; nothing is secret."""
-        return NoInnovations(
-            self.process,
-            batch.trials,
-            lambda: ThresholdCodeEncoder(
-                ReferenceCode(self.process), self.process.n, batch.trials, self._threshold, self._forged
-            ),
-            lambda: self.estimator(keys, batch),
-        )
-
-    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
-        """The filter of the state and the reference."""
-        return ReferenceReceiver(self.process, batch.trials)
-
-    def outcomes(self, mu: float) -> None:
-        """None: the information in a packet depends on the acknowledgements before it."""
+    def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:  # noqa: ARG002 - there is no secret
+        """The sensor's side."""
+        code = ReferenceCode(self.process)
+        return ThresholdCodeEncoder(code, self.process.n, batch.trials, self._threshold, self._forged)
 
     def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:
         """The sensor sends states until one is acknowledged, then m acknowledged coded packets until b exceeds θ again."""

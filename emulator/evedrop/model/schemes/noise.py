@@ -106,10 +106,7 @@ class Noise(Scheme):
     secret_words = (1, 0)
 
     def __init__(self, process: Process, state_probability: float | Sequence[float], noise_covariance: Any) -> None:
-        if isinstance(state_probability, Sequence):
-            super().__init__(process, tuple(map(float, state_probability)))
-        else:
-            super().__init__(process, state_probability)
+        super().__init__(process, state_probability)
         self._distribution = NoiseDistribution(noise_covariance)
 
     @property
@@ -136,10 +133,6 @@ class Noise(Scheme):
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """Schedule and noise."""
         return NoiseShared(self, keys, batch)
-
-    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:
-        """The legitimate estimator's side, from the key of the schedule."""
-        return NoiseShared(self, keys, batch).estimator()
 
     def outcomes(self, mu: float) -> Outcomes:
         """A state with probability μμ_d: E P → (1−μμ_d) S(μμ_d)."""

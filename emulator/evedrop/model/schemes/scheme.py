@@ -208,10 +208,13 @@ class Scheme(ABC):
             if name not in vars(cls):
                 setattr(cls, name, getattr(Scheme, name))
 
-    def __init__(self, process: Process, state_probability: StateProbability = 1.0) -> None:
+    def __init__(self, process: Process, state_probability: float | Sequence[float] = 1.0) -> None:
         self.process = process
-        self.mu_d = state_probability
-        self.state_probability = mean_of(state_probability)
+        if isinstance(state_probability, Sequence):
+            self.mu_d = tuple(map(float, state_probability))
+        else:
+            self.mu_d = state_probability
+        self.state_probability = mean_of(self.mu_d)
         """Probability that the packet of a slot k ≥ 1 contains the state, which is public: μ_d; 1 without such a parameter.
 
         Its mean over the slots if it differs from slot to slot.
@@ -362,3 +365,24 @@ class Scheme(ABC):
         """The outcomes at a receiver that uses packets with P(b=1 | ν); None if there is no closed form."""
         del mu_e, use_state, use_innovation
         return None
+
+
+class PublicScheme(Scheme):
+    """A scheme without innovations whose receivers need no secret: a subclass writes `encoder` and `estimator`."""
+
+    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
+        """Both sides, made each by itself."""
+        return NoInnovations(
+            self.process,
+            batch.trials,
+            lambda: self.encoder(keys, batch),
+            lambda: self.estimator(keys, batch),
+        )
+
+    @abstractmethod
+    def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:
+        """The sensor's side."""
+
+    @abstractmethod
+    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:
+        """The legitimate estimator's side, which reads as every receiver can."""

@@ -19,7 +19,7 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schedule import Schedule
 from evedrop.model.schemes.plain import PlainEstimator
-from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.schemes.scheme import Encoder, Packet, PublicScheme
 from evedrop.model.streams import Batch
 from evedrop.model.theory.closed_forms import ChainForm, ReceiverConditions, hijacked_schedule, scheduled
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, Outcomes
@@ -37,7 +37,18 @@ class WithholdingEncoder(Encoder):
         return Packet(x, np.zeros(x.shape[1], np.bool_), sent=~self._schedule.at(k))
 
 
-class Withholding(Scheme):
+class _Silent(PublicScheme):
+    """Sends the state, or nothing: a receiver of a packet has the state."""
+
+    sent_words = ("state",)
+    may_be_silent = True
+
+    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
+        """A receiver that uses every packet."""
+        return PlainEstimator(self.process, batch.trials)
+
+
+class Withholding(_Silent):
     """Sends in slot 0 and then with probability p = `state_probability`, by a coin that only the sensor needs.
 
     A receiver of a packet has the state, so receivers differ only in their rates. There is no secret: the estimator needs none,
@@ -48,8 +59,6 @@ class Withholding(Scheme):
 
     parameters = MappingProxyType({"state_probability": 0.6})
     secret_streams = ("schedule",)
-    sent_words = ("state",)
-    may_be_silent = True
 
     def __init__(self, process: Process, state_probability: float) -> None:
         super().__init__(process, state_probability)
@@ -63,16 +72,9 @@ class Withholding(Scheme):
             return [("state_probability", why)]
         return probability_mistakes(given, "state_probability")
 
-    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
-        """The sensor's schedule, and nothing for the estimator."""
-        schedule = Schedule(keys["schedule"], self.state_probability, batch)
-        return NoInnovations(
-            self.process, batch.trials, lambda: WithholdingEncoder(schedule), lambda: self.estimator({}, batch)
-        )
-
-    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
-        """A receiver that uses every packet."""
-        return PlainEstimator(self.process, batch.trials)
+    def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:
+        """The sensor's side, with the schedule."""
+        return WithholdingEncoder(Schedule(keys["schedule"], self.state_probability, batch))
 
     def outcomes(self, mu: float) -> Outcomes:
         """A state with probability μp: E P → (1−μp) S(μp)."""
@@ -88,20 +90,27 @@ class Withholding(Scheme):
         return Outcomes.eavesdropper(mu_e, self.state_probability, use_state, 0.0)
 
 
-class ScheduledEncoder(Encoder):
+class HoldingTimeEncoder(Encoder):
+    """Follows the holding time; a subclass writes the packets."""
+
+    def __init__(self, trials: int) -> None:
+        self._held = HoldingTime(trials)
+
+    def acknowledged(self, k: int, acknowledged: Flags) -> None:
+        """Begin a new holding time where slot k is acknowledged."""
+        self._held.acknowledged(k, acknowledged)
+
+
+class ScheduledEncoder(HoldingTimeEncoder):
     """z_k = x_k from `threshold` slots after the last acknowledged slot on; silence before that."""
 
     def __init__(self, threshold: int, trials: int) -> None:
+        super().__init__(trials)
         self._threshold = threshold
-        self._held = HoldingTime(trials)
 
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - the state alone is sent
         """The packet of slot k."""
         return Packet(x, np.zeros(x.shape[1], np.bool_), sent=self._held.reached(k, self._threshold))
-
-    def acknowledged(self, k: int, acknowledged: Flags) -> None:
-        """Begin a new silence where slot k is acknowledged."""
-        self._held.acknowledged(k, acknowledged)
 
 
 def _chain_form(scheme: Scheduled, conditions: ReceiverConditions) -> ChainForm | None:
@@ -118,7 +127,7 @@ def _chain_form(scheme: Scheduled, conditions: ReceiverConditions) -> ChainForm 
     return ChainForm(process, conditions.slots, chain)
 
 
-class Scheduled(Scheme):
+class Scheduled(_Silent):
     """Sends from `threshold` slots after the last acknowledged slot until the next acknowledgement; with 1, always.
 
     There is no secret. An eavesdropper that misses the only packet after a silence knows nothing new until after the next
@@ -131,8 +140,6 @@ class Scheduled(Scheme):
     sends_by_holding_time = True
     parameters = MappingProxyType({"threshold": 4})
     needs_acknowledgements = True
-    sent_words = ("state",)
-    may_be_silent = True
 
     def __init__(self, process: Process, threshold: int) -> None:
         super().__init__(process)
@@ -143,18 +150,9 @@ class Scheduled(Scheme):
         """A threshold is a number of slots."""
         return whole_number_mistakes(given, "threshold", 1, MOST_SLOTS)
 
-    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
-        """Nothing."""
-        return NoInnovations(
-            self.process,
-            batch.trials,
-            lambda: ScheduledEncoder(self.threshold, batch.trials),
-            lambda: self.estimator(keys, batch),
-        )
-
-    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
-        """A receiver that uses every packet."""
-        return PlainEstimator(self.process, batch.trials)
+    def encoder(self, keys: Mapping[str, bytes], batch: Batch) -> Encoder:  # noqa: ARG002 - there is no secret
+        """The sensor's side."""
+        return ScheduledEncoder(self.threshold, batch.trials)
 
     def outcomes(self, mu: float) -> None:  # noqa: ARG002 - its slots differ behind any link
         """None, because its slots differ: see `closed_forms`."""

@@ -7,10 +7,10 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model import update
 from evedrop.model.kernels.elementary import cholesky
+from evedrop.model.packet_user import StateReader
 from evedrop.model.process import Floats, Process, product
-from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
+from evedrop.model.receiver import Belief, Flags, Reception, select
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.streams import Ahead, Batch, BlockReader
 from evedrop.model.theory.closed_forms import twin_track_bound
@@ -63,7 +63,7 @@ class TwinTrackEncoder(Encoder):
         return Packet(z, np.zeros(x.shape[1], np.bool_))
 
 
-class TwinTrackEstimator(Receiver):
+class TwinTrackEstimator(StateReader):
     """Knows x_0 before the first packet, and the track of every packet."""
 
     def __init__(self, process: Process, trials: int, tracks: TwinTracks) -> None:
@@ -78,15 +78,9 @@ class TwinTrackEstimator(Receiver):
             x_hat, P = self.process.predict(x_hat), self.process.diffuse(self.process.carry(P))
         return Belief(x_hat, P, np.zeros(self.trials, np.uint8))
 
-    def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
-        """The state where a packet arrives: the codes 0 and 1 of `Action` are γ itself."""
-        return gamma.astype(np.uint8)
-
-    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """(A x̂, A P Aᵀ + Q) if lost, otherwise (z, 0) or (z − d_k, 0)."""
-        action = self.act(k, heard.gamma)
-        z = select(self._tracks.on_twin(k), lambda: heard.z - self._tracks.distance(k), lambda: heard.z)
-        return update.belief(self.process, k, belief, action, z)
+    def read(self, k: int, heard: Reception) -> Floats:
+        """Z or z − d_k."""
+        return select(self._tracks.on_twin(k), lambda: heard.z - self._tracks.distance(k), lambda: heard.z)
 
 
 class TwinTrack(Scheme):
