@@ -71,13 +71,13 @@ class Chain:
         mean = float(self.stationary @ self.quality)
         centred = self.quality - mean
         fading = self.transitions - self.stationary
-        sums: dict[int, tuple[Floats, Floats]] = {}
+        sums: dict[int, tuple[Floats, Floats, Floats]] = {}
         w, at, total = np.zeros(len(centred)), parts[0].slots.start, 0.0
         for slots, passes in parts:
             count = len(slots)
             if count not in sums:
-                sums[count] = _power_and_sum(fading, count)
-            power, partial = sums[count]
+                sums[count] = _power_and_sums(fading, count, np.eye(len(fading)))
+            power, partial, _ = sums[count]
             w = w @ np.linalg.matrix_power(fading, slots.start - at)
             own = passes**2 * count_variance(self.transitions, self.stationary, self.quality, count)
             total += own + passes * (1.0 - passes) * count * mean + 2.0 * passes * float(w @ partial @ centred)
@@ -96,31 +96,24 @@ def count_variance(transitions: Floats, stationary: Floats, quality: Floats, slo
     centred = quality - mean
     # Without the stationary part the chain's powers decay, and no large numbers are subtracted from each other.
     fading = transitions - stationary
-    own = np.eye(len(stationary))
-    power, partial, total = own - np.outer(np.ones(len(stationary)), stationary), np.zeros_like(own), np.zeros_like(own)
-    count = 0
-    for bit in f"{slots:b}":
-        # power = Tⁿ, partial = Σ_{j<n} T^j, total = Σ_{j<n} (n−j) T^j, of the chain without its stationary part
-        total = total + count * partial + power @ total
-        partial = partial + power @ partial
-        power = power @ power
-        count *= 2
-        if bit == "1":
-            partial = partial + power
-            total = total + partial
-            power = power @ fading
-            count += 1
+    none = np.eye(len(stationary)) - np.outer(np.ones(len(stationary)), stationary)
+    _, _, total = _power_and_sums(fading, slots, none)
     together = float((stationary * centred) @ (2.0 * total @ centred)) - slots * float(stationary @ (centred * centred))
     return max(0.0, together) + slots * float(stationary @ (quality * (1.0 - quality)))
 
 
-def _power_and_sum(matrix: Floats, count: int) -> tuple[Floats, Floats]:
-    """The power `count` of a matrix, and the sum of its powers below that one, by doubling."""
-    power, partial = np.eye(len(matrix)), np.zeros_like(matrix)
+def _power_and_sums(matrix: Floats, count: int, none: Floats) -> tuple[Floats, Floats, Floats]:
+    """Tⁿ, Σ_{j<n} T^j and Σ_{j<n} (n−j) T^j of a matrix T with n = `count`, by doubling; none: T⁰."""
+    power, partial, total = none, np.zeros_like(matrix), np.zeros_like(matrix)
+    done = 0
     for bit in f"{count:b}":
+        total = total + done * partial + power @ total
         partial = partial + power @ partial
         power = power @ power
+        done *= 2
         if bit == "1":
             partial = partial + power
+            total = total + partial
             power = power @ matrix
-    return power, partial
+            done += 1
+    return power, partial, total
