@@ -124,7 +124,7 @@ class PartialDigests:
 def _room(n: int, trials: int) -> Beliefs:
     """Room for the beliefs of as many slots as are held."""
     slots = max(1, min(BLOCK_SLOTS, _HELD_BYTES // (trials * (8 * (n + n * n) + 1))))
-    return Beliefs(np.empty((slots, n, trials)), np.empty((slots, n, n, trials)), np.empty((slots, trials), np.uint8))
+    return Beliefs.empty((slots, n, trials))
 
 
 @final

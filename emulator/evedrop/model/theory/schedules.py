@@ -7,6 +7,7 @@ once, from several starts.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from operator import itemgetter
@@ -177,16 +178,23 @@ def _repaired(problem: ScheduleProblem, mu_d: Floats) -> Floats:
     way = np.where(mu_d > 0.0, 1.0 - mu_d, 0.0)
     if not math.isfinite(problem.sum_of(mu_d + way)):
         way = 1.0 - mu_d
-    low, high = 0.0, 1.0
+    least = _least_of(lambda fractions: problem.sums(mu_d + fractions[:, None] * way), 1.0)
+    return mu_d + least * way
+
+
+def _least_of(sums: Callable[[Floats], Floats], high: float) -> float:
+    """The least number from 0 to `high` from which on the sum is finite, to 33⁻⁸ of it; at `high` it is.
+
+    sums: gives the sums for several numbers.
+    """
+    low = 0.0
     for _ in range(_REFINEMENTS):
-        fractions = np.linspace(low, high, _POINTS)
-        keeps = np.isfinite(problem.sums(mu_d + fractions[:, None] * way))
-        first = int(np.argmax(keeps))  # the last one keeps it: the whole way, or the end of the step before
+        tried = np.linspace(low, high, _POINTS)
+        first = int(np.argmax(np.isfinite(sums(tried))))  # that of the last one is finite
         if first == 0:
-            high = float(fractions[0])
-            break
-        low, high = float(fractions[first - 1]), float(fractions[first])
-    return mu_d + high * way
+            return float(tried[0])
+        low, high = float(tried[first - 1]), float(tried[first])
+    return high
 
 
 _POINTS, _REFINEMENTS = 33, 8  # the least feasible μ_d of a block is found to 33⁻⁸
@@ -396,15 +404,7 @@ def _improved_by_pairs(problem: ScheduleProblem, mu_d: Floats, blocks: list[slic
 
 
 def _least_feasible(problem: ScheduleProblem, mu_d: Floats, block: slice) -> float:
-    low, high = 0.0, float(mu_d[block.start])
-    for _ in range(_REFINEMENTS):
-        tried = np.linspace(low, high, _POINTS)
-        feasible = np.isfinite(problem.sums(_with(mu_d, block, tried)))
-        first = int(np.argmax(feasible))  # the last one is feasible, or was
-        if first == 0:
-            return float(tried[0])
-        low, high = float(tried[first - 1]), float(tried[first])
-    return high
+    return _least_of(lambda tried: problem.sums(_with(mu_d, block, tried)), float(mu_d[block.start]))
 
 
 def _with(mu_d: Floats, block: slice, tried: Floats) -> Floats:
