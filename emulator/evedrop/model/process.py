@@ -33,6 +33,7 @@ MOST_STATES = 64
 """The most states of a process: some computations before a run take a time that grows with n³ or faster."""
 _SLOTS_AT_ONCE = 1024  # whose factors are passed over
 _ALLOWS_SINGULAR = "; or singular_noise = true, which allows a Q without variance in some directions"
+_REACHED = 1e-12  # a smaller singular value of what noise reaches, relative to the largest, is rounding
 _SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that is not mere rounding
 
 
@@ -260,7 +261,7 @@ def mistakes_of(
             return mistakes
         return [*mistakes, ("Q", "has an eigenvalue below 0; expected a covariance")]
     if any(name == "Q" and "positive definite" in sentence for name, sentence in mistakes):
-        reached = _reachable(A, Q)
+        reached = invariant_hull(A, Q, _REACHED).shape[1]
         if reached < A.shape[0]:
             mistakes.append(
                 ("Q", f"the pair (A, √Q) is not controllable: the noise reaches {reached} of {A.shape[0]} directions; "
@@ -303,21 +304,27 @@ def _covariance_mistakes(M: Floats) -> list[str]:
     return []
 
 
-def _reachable(A: Floats, Q: Floats) -> int:
-    """Rank of [Q, A Q, …], from an orthonormal basis extended one power at a time (powers of A itself overflow)."""
+def invariant_hull(A: Floats, columns: Floats, least: float) -> Floats:
+    """An orthonormal basis, (n, s), of the smallest invariant subspace of A that contains these columns.
+
+    It is extended one power at a time, because powers of A itself overflow. least: a singular value that is smaller, relative to
+    the largest, is taken for 0.
+    """
     scale = max(1.0, float(np.abs(A).max()))
-    basis = _range(Q)
-    while 0 < basis.shape[1] < A.shape[0]:
-        grown = _range(np.hstack([basis, (A / scale) @ basis]))
+    basis = _range(columns, least)
+    while 0 < basis.shape[1] < len(A):
+        grown = _range(np.hstack([basis, (A / scale) @ basis]), least)
         if grown.shape[1] == basis.shape[1]:
             break
         basis = grown
-    return int(basis.shape[1])
+    return basis
 
 
-def _range(M: Floats) -> Floats:
-    u, s, _ = np.linalg.svd(M)
-    return u[:, : int(np.sum(s > 1e-12 * max(s[0], 1e-300)))]
+def _range(columns: Floats, least: float) -> Floats:
+    if not columns.shape[1]:
+        return columns
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(u[:, s > least * max(s[0], 1e-300)])
 
 
 SLOTS_AT_ONCE = 2**14

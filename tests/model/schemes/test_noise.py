@@ -22,7 +22,7 @@ from evedrop.model.schedule import PACKETS, NoiseDistribution
 from evedrop.model.schemes.noise import Noise
 from evedrop.model.schemes.plain import Plain
 from evedrop.model.streams import Batch
-from evedrop.model.theory.closed_forms import NoiseTaken, ReceiverConditions, TakesNoise
+from evedrop.model.theory.closed_forms import ReceiverConditions, TakesNoise
 from evedrop.model.theory.covariances import NOBODY, Outcomes, limit, state_covariances, theoretical_covariances
 from evedrop.model.theory.leak import Leaks
 from tests.builders import UNSTABLE
@@ -78,15 +78,15 @@ def test_blocks_of_packets_are_those_of_single_slots(given: Any) -> None:
         assert np.array_equal(block.nu, [packet.nu for packet in single[first:]])
 
 
-def taken_by(scheme: Noise, strategy: str, mu_e: float, **parameters: float) -> NoiseTaken:
-    """The noise that a strategy takes for states, by the closed form that the scheme states for it."""
-    form = scheme.closed_forms[strategy](scheme, ReceiverConditions(8, False, mu_e, uses_of(strategy, parameters)))
+def taken_by(scheme: Noise, strategy: str, mu_e: float, slots: int, **parameters: float) -> TakesNoise:
+    """The closed form that the scheme states for a strategy that takes noise for states."""
+    form = scheme.closed_forms[strategy](scheme, ReceiverConditions(slots, False, mu_e, uses_of(strategy, parameters)))
     assert isinstance(form, TakesNoise)
     assert form.growth is None
     assert not form.infinite_variance
-    assert form.traces.tolist() == np.trace(form.taken.covariances(8), axis1=1, axis2=2).tolist()
-    assert form.limit == np.trace(form.taken.limit)
-    return form.taken
+    assert form.traces.tolist() == np.trace(form.covariances, axis1=1, axis2=2).tolist()
+    assert form.limit == np.trace(form.limit_covariance)
+    return form
 
 
 @DISTRIBUTIONS
@@ -102,8 +102,7 @@ def test_errors_are_the_closed_forms(given: Any) -> None:
     for name in gamma:
         outcomes = forms.get(name)
         if outcomes is None:
-            taken = taken_by(scheme, name, 0.8, **(some if name == "suspicious" else {}))
-            expected = taken.covariances(slots)
+            expected = taken_by(scheme, name, 0.8, slots, **(some if name == "suspicious" else {})).covariances
         else:
             expected = theoretical_covariances(STABLE, outcomes, slots)
         errors = played.squared_error(name)
@@ -124,9 +123,9 @@ def test_noise_may_begin_later() -> None:
     played = play(scheme, batch, gamma, made)
     assert not any(packet.nu.any() for packet in played.packets[:6])
     assert all(0.68 < packet.nu.mean() < 0.72 for packet in played.packets[6:])
-    taken = taken_by(scheme, "naive", 0.8)
+    taken = taken_by(scheme, "naive", 0.8, 12)
     errors = played.squared_error("naive")
-    apart = np.abs(errors.mean(axis=1) - np.trace(taken.covariances(12), axis1=1, axis2=2))
+    apart = np.abs(errors.mean(axis=1) - np.trace(taken.covariances, axis1=1, axis2=2))
     assert (apart < 5.0 * errors.std(axis=1) / np.sqrt(20_000) + 1e-15).all()
     actions = np.array([belief.action for belief in played.beliefs["power-test"]])
     assert not (actions[:6] == Action.DISCARDED).any()
@@ -138,8 +137,8 @@ def test_the_error_of_taking_noise_is_that_of_all_courses(given: Any) -> None:
     """Enumerated over five slots: lost or ignored, state, noise taken, with the covariance of each course by itself."""
     mu_e, mu_d = 0.7, 0.6
     p_d, p_r, p_i = 1.0 - mu_e, mu_e * mu_d, mu_e * (1.0 - mu_d)
-    taken = NoiseTaken(STABLE, NoiseDistribution(given), mu_d, mu_e, (1.0, 1.0))
-    covariances, A, Q = taken.covariances(5), STABLE.A, STABLE.Q
+    taken = TakesNoise(STABLE, NoiseDistribution(given), mu_d, mu_e, (1.0, 1.0), 2000)
+    covariances, A, Q = taken.covariances, STABLE.A, STABLE.Q
     total = np.zeros((2, 2))
     for course in words((0, 1, 2), repeat=4):
         for first in (False, True):  # whether the packet of slot 0, always the state, is used
@@ -151,18 +150,18 @@ def test_the_error_of_taking_noise_is_that_of_all_courses(given: Any) -> None:
                 weight *= (p_d, p_r, p_i)[event]
             total += weight * P
     np.testing.assert_allclose(covariances[4], total, rtol=1e-12)
-    np.testing.assert_allclose(taken.covariances(2000)[-1], taken.limit, rtol=1e-9)
+    np.testing.assert_allclose(covariances[-1], taken.limit_covariance, rtol=1e-9)
 
 
 def test_limits_of_taking_noise() -> None:
     """Unbounded where the process is unstable; that of smart if no noise is taken; beyond double precision all slots are inf."""
-    unstable = NoiseTaken(UNSTABLE, NoiseDistribution(PACKETS), 0.6, 0.7, (1.0, 1.0))
-    assert np.isinf(unstable.limit).all()
-    covariances = unstable.covariances(1200)
+    unstable = TakesNoise(UNSTABLE, NoiseDistribution(PACKETS), 0.6, 0.7, (1.0, 1.0), 1200)
+    assert np.isinf(unstable.limit_covariance).all()
+    covariances = unstable.covariances
     assert np.isfinite(covariances[1000]).all()
     assert np.isinf(covariances[-1]).all()
-    never = NoiseTaken(STABLE, NoiseDistribution(PACKETS), 0.6, 0.7, (1.0, 0.0))
-    assert np.array_equal(never.limit, limit(STABLE, Outcomes.eavesdropper(0.7, 0.6, 1.0, 0.0)))
+    never = TakesNoise(STABLE, NoiseDistribution(PACKETS), 0.6, 0.7, (1.0, 0.0), 1)
+    assert np.array_equal(never.limit_covariance, limit(STABLE, Outcomes.eavesdropper(0.7, 0.6, 1.0, 0.0)))
     assert Plain.closed_forms == {}
     make = Noise.closed_forms["naive"]
     assert make(Noise(STABLE, 0.4, PACKETS), ReceiverConditions(5, False, 0.7, uses_of("bayesian", {}))) is None
@@ -191,8 +190,8 @@ def test_the_published_recursions_are_these() -> None:
         used = (1.0 - mu) * P + mu * (open_loop + P)
         eve = (1.0 - losses) * used + losses * (A @ eve @ A.T + W)
     np.testing.assert_allclose(limit(network, scheme.outcomes(1.0 - losses)) + P, legitimate, rtol=1e-9)
-    taken = taken_by(scheme, "naive", 1.0 - losses)
-    np.testing.assert_allclose(taken.limit + P, eve, rtol=1e-9)
+    taken = taken_by(scheme, "naive", 1.0 - losses, 8)
+    np.testing.assert_allclose(taken.limit_covariance + P, eve, rtol=1e-9)
     assert (np.trace(open_loop), np.trace(P)) == pytest.approx((0.0388, 0.0109), abs=5e-5)
 
 

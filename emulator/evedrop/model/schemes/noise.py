@@ -17,7 +17,7 @@ from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schedule import PACKETS, NoiseDistribution, Schedule
 from evedrop.model.schemes.scheme import Encoder, PacketBlock, Scheme, Shared
 from evedrop.model.streams import Ahead, Batch, BlockReader
-from evedrop.model.theory.closed_forms import NoiseTaken, ReceiverConditions, TakesNoise
+from evedrop.model.theory.closed_forms import ReceiverConditions, TakesNoise
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.leaked_bits import RevealedBits
 
@@ -82,9 +82,7 @@ def _takes_noise(scheme: Noise, conditions: ReceiverConditions) -> TakesNoise | 
     received, uses = conditions.received, conditions.uses
     if received is None or uses is None:
         return None
-    return TakesNoise(
-        NoiseTaken(scheme.process, scheme.noise_distribution, scheme.mu_d, received, uses), conditions.slots
-    )
+    return TakesNoise(scheme.process, scheme.noise_distribution, scheme.mu_d, received, uses, conditions.slots)
 
 
 class Noise(Scheme):

@@ -21,7 +21,7 @@ import numpy as np
 from evedrop.model.acknowledgements import HeedRule
 from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
-from evedrop.model.process import MARGINAL, Floats, Process
+from evedrop.model.process import MARGINAL, Floats, Process, invariant_hull
 from evedrop.model.receiver import Flags
 from evedrop.model.schedule import NoiseDistribution, StateProbability, in_slot, mean_of
 from evedrop.model.theory.covariances import (
@@ -461,8 +461,11 @@ class ChainForm(ClosedForm):
 
 @final
 @dataclass(frozen=True)
-class NoiseTaken:
-    """E P_k = p_d (A E P_{k−1} Aᵀ + Q) + p_i (Σ_k + N_k): noise that is used as the state leaves the error x_k − n_k."""
+class TakesNoise(ClosedForm):
+    """That of a receiver that mistakes noise packets for states, behind a link of independent losses.
+
+    E P_k = p_d (A E P_{k−1} Aᵀ + Q) + p_i (Σ_k + N_k): noise that is used as the state leaves the error x_k − n_k.
+    """
 
     process: Process
     distribution: NoiseDistribution
@@ -471,19 +474,21 @@ class NoiseTaken:
     """Quality of the receiver's link."""
     uses: tuple[float, float]
     """The probabilities that it uses a state, and noise."""
+    slots: int
 
     @property
     def outcomes(self) -> Outcomes:
         """Those of a slot, on average over the slots; `misled` is the probability p_i that noise is used."""
         return Outcomes.eavesdropper(self.mu_e, mean_of(self.mu_d), *self.uses)
 
-    def covariances(self, slots: int) -> Floats:
-        """E P_k for k = 0 … slots−1, (slots, n, n); inf from where it overflows."""
+    @property
+    def covariances(self) -> Floats:
+        """E P_k of all slots, (slots, n, n); inf from where it overflows."""
         A, N = self.process.A, self.distribution.covariance
-        sigma = state_covariances(self.process, slots)
+        sigma = state_covariances(self.process, self.slots)
         covariances = np.empty_like(sigma)
         with np.errstate(over="ignore", invalid="ignore"):
-            for k in range(slots):
+            for k in range(self.slots):
                 outcomes = Outcomes.eavesdropper(self.mu_e, in_slot(self.mu_d, k), *self.uses)
                 if k == 0:
                     covariances[k] = outcomes.initial * self.process.initial_covariance
@@ -500,7 +505,7 @@ class NoiseTaken:
         return covariances
 
     @property
-    def limit(self) -> Floats:
+    def limit_covariance(self) -> Floats:
         """The limit of E P_k with the mean of μ_d, (n, n); all inf for ρ ≥ 1, if noise is ever used."""
         outcomes, N = self.outcomes, self.distribution.covariance
         if outcomes.misled == 0.0:
@@ -511,30 +516,21 @@ class NoiseTaken:
         source = outcomes.predicted * self.process.Q + outcomes.misled * (sigma + (sigma if N is None else N))
         return lyapunov(replace(self.process, Q=source), outcomes.propagated)
 
-
-@final
-@dataclass(frozen=True)
-class TakesNoise(ClosedForm):
-    """That of a receiver that mistakes noise packets for states, behind a link of independent losses."""
-
-    taken: NoiseTaken
-    slots: int
-
     @cached_property
     def traces(self) -> Floats:
         """The traces of all slots, (slots,)."""
-        traces: Floats = np.trace(self.taken.covariances(self.slots), axis1=1, axis2=2)
+        traces: Floats = np.trace(self.covariances, axis1=1, axis2=2)
         return traces
 
     @cached_property
     def limit(self) -> float:
         """Trace of the limit; inf if it is unbounded."""
-        return float(np.trace(self.taken.limit))
+        return float(np.trace(self.limit_covariance))
 
     @property
     def infinite_variance(self) -> bool:
         """Whether the variance of tr P over trials has no bound: not where noise is used, which leaves an error like x itself."""
-        return has_infinite_variance(self.taken.process, self.taken.outcomes)
+        return has_infinite_variance(self.process, self.outcomes)
 
 
 _LARGEST = 1e150  # whose square is a double
@@ -592,9 +588,9 @@ class ClearStatesForm(ClosedForm):
         A = self.process.A * units / units[:, None]
         if self.mu_d == 0.0:
             # After slot 0, e_k = A^k e_0, and e_0 is in the encrypted states.
-            growing = unstable_part(A, _invariant_hull(A, axes[:, self.hidden]), 1.0 + MARGINAL)
+            growing = unstable_part(A, invariant_hull(A, axes[:, self.hidden], _RANK), 1.0 + MARGINAL)
         else:
-            unseen = _orthogonal_to(_invariant_hull(A.T, axes[:, ~self.hidden]))
+            unseen = _orthogonal_to(invariant_hull(A.T, axes[:, ~self.hidden], _RANK))
             growing = unstable_part(A, unseen, 1.0 - MARGINAL if self.mu_d == 1.0 else 1.0 + MARGINAL)
         return np.linalg.qr(units[:, None] * growing)[0]
 
@@ -635,29 +631,10 @@ class ClearStatesForm(ClosedForm):
         return factor
 
 
-def _invariant_hull(A: Floats, columns: Floats) -> Floats:
-    """An orthonormal basis, (n, s), of the smallest invariant subspace of A that contains these columns."""
-    scale = max(1.0, float(np.abs(A).max()))
-    basis = _range(columns)
-    while 0 < basis.shape[1] < len(A):
-        grown = _range(np.hstack([basis, (A / scale) @ basis]))
-        if grown.shape[1] == basis.shape[1]:
-            break
-        basis = grown
-    return basis
-
-
 def _orthogonal_to(basis: Floats) -> Floats:
     """An orthonormal basis of the orthogonal complement, (n, n − s), of one with s columns."""
     u, _, _ = np.linalg.svd(basis, full_matrices=True) if basis.shape[1] else (np.eye(len(basis)), None, None)
     return np.asarray(u[:, basis.shape[1] :])
-
-
-def _range(columns: Floats) -> Floats:
-    if not columns.shape[1]:
-        return columns
-    u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(u[:, s > _RANK * s[0]])
 
 
 _LARGEST_EXPONENT = 700.0  # of a double
