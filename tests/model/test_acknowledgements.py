@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.stats import binomtest
 
-from evedrop.model.acknowledgements import ACTS, ATTACKS, AckChannel, AckFate, rates_of
+from evedrop.model.acknowledgements import ACTS, ATTACKS, AckChannel, AckChannelSpec, AckFate, rates_of
 from evedrop.model.detection import Chart, CusumBatch, chart_for
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
@@ -45,7 +45,7 @@ def test_rates_are_those_of_the_arrivals(attack: str) -> None:
     """Counted over a million packets, each rate lies within binomial bounds at 1e-6 confidence."""
     mu, mu_e, quality, slots, trials = 0.8, 0.6, 0.7, 100, 10_000
     batch = Batch(slots, trials)
-    channel = AckChannel(attack, quality, KEY, batch, flip=0.2, overheard=mu_e)
+    channel = AckChannel(AckChannelSpec(quality, attack, None, None, 0.2, mu_e), KEY, batch)
     gamma, gamma_e = coins(mu, slots, trials, 1), coins(mu_e, slots, trials, 2)
     arrived = np.array([channel.arrived(k, None, gamma[k], gamma_e[k]) for k in range(slots)])
     rates = rates_of(attack, mu, mu_e, quality, 0.2)
@@ -64,7 +64,8 @@ def test_rates_are_those_of_the_arrivals(attack: str) -> None:
 def test_a_fate_says_why_an_acknowledgement_came_or_not(attack: str, spans: list[tuple[int, int]] | None) -> None:
     """The sensor gets those that arrived or were forged; the attacker's acts are those of its attack, while that lasts."""
     slots, trials, quality = 40, 500, 0.7
-    channels = [AckChannel(attack, quality, KEY, Batch(slots, trials), spans, 0.2, 0.6) for _ in range(2)]
+    spec = AckChannelSpec(quality, attack, None, spans, 0.2, 0.6)
+    channels = [AckChannel(spec, KEY, Batch(slots, trials)) for _ in range(2)]
     gamma, gamma_e, sent = (coins(0.7, slots, trials, seed) for seed in (1, 2, 3))
     seen = set()
     for k in range(slots):
@@ -89,7 +90,8 @@ def test_what_was_not_sent_is_not_acknowledged() -> None:
     """Not even where it is forged; and a trial's channel is the same alone and among others, slots in any order."""
     gamma = np.zeros(50, bool)
     sent = np.arange(50) % 2 == 0
-    among, alone = AckChannel("forge", 0.5, KEY, Batch(20, 50, 7)), AckChannel("forge", 0.5, KEY, Batch(20, 1, 7 + 12))
+    spec = AckChannelSpec(0.5, "forge", None, None)
+    among, alone = AckChannel(spec, KEY, Batch(20, 50, 7)), AckChannel(spec, KEY, Batch(20, 1, 7 + 12))
     for k in (3, 0, 19, 3):
         arrived = among.arrived(k, sent, gamma, gamma)
         assert not arrived[~sent].any()
@@ -102,7 +104,7 @@ def test_attacks_on_state_secrecy_codes_cost_what_theory_says(attack: str) -> No
     mu, mu_e, slots, trials = 0.8, 0.7, 6, 20_000
     batch = Batch(slots, trials)
     quality = 0.6 if attack == "hijack" else 0.9  # above μ_e a hijacked sensor has a memory, and theory another form
-    channel = AckChannel(attack, quality, KEY, batch, overheard=mu_e)
+    channel = AckChannel(AckChannelSpec(quality, attack, None, None, 0.0, mu_e), KEY, batch)
     eve = STRATEGIES["reference"](Knowledge(UNSTABLE, 1.0, {}, {}), batch)
     played = play(
         Acknowledged(UNSTABLE),

@@ -11,7 +11,7 @@ import pytest
 
 from evedrop import montecarlo
 from evedrop.errors import ScenarioError
-from evedrop.model.acknowledgements import AckChannel, rates_of
+from evedrop.model.acknowledgements import AckChannel, AckChannelSpec, rates_of
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Process
@@ -37,7 +37,7 @@ THRESHOLD = {"scheme": "threshold-code", "lost_belief": 0.1, "assumed_quality": 
 
 def arrived(attack: str, quality: float = 1.0, flip: float = 0.0, spans: Any = None) -> np.ndarray:
     """The acknowledgements of slots in which every other packet is received, (slots, trials)."""
-    channel = AckChannel(attack, quality, KEY, Batch(SLOTS, TRIALS), spans, flip)
+    channel = AckChannel(AckChannelSpec(quality, attack, None, spans, flip), KEY, Batch(SLOTS, TRIALS))
     gamma = np.arange(TRIALS) % 2 == 0
     return np.array([channel.arrived(k, None, gamma, gamma) for k in range(SLOTS)])
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evedrop.model.acknowledgements import AckChannel, HeedRule, heed_rule_of, rates_of
+from evedrop.model.acknowledgements import AckChannel, AckChannelSpec, HeedRule, heed_rule_of, rates_of
 from evedrop.model.process import Process
 from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory.closed_forms import Hears, hijacked_schedule, scheduled
@@ -85,7 +85,7 @@ def test_acknowledgements_are_heeded_by_misses(alpha: float, overheard: float) -
     """Trial by trial: after few misses all, after many none; silent slots do not count, and asking twice counts once."""
     gamma, gamma_e, sent = (coins(quality, 60, 300, seed) for seed, quality in ((1, 0.8), (2, overheard), (3, 0.6)))
     channel, heed_rule = (
-        AckChannel("hijack", alpha, KEY, Batch(60, 300), overheard=overheard),
+        AckChannel(AckChannelSpec(alpha, "hijack", None, None, 0.0, overheard), KEY, Batch(60, 300)),
         HeedRule.of(alpha, overheard),
     )
     assert heed_rule is not None
@@ -105,8 +105,8 @@ def test_without_lost_acknowledgements_it_is_the_honest_sensor() -> None:
     """To the bit, whatever the jammer hears; and outside of the attack's slots in any case."""
     gamma, gamma_e = coins(0.8, 30, 200, 1), coins(0.6, 30, 200, 2)
     for alpha, spans in ((1.0, None), (0.7, [(0, 10)])):
-        honest = AckChannel("none", alpha, KEY, Batch(30, 200))
-        hijacked = AckChannel("hijack", alpha, KEY, Batch(30, 200), spans, overheard=0.6)
+        honest = AckChannel(AckChannelSpec(alpha, "none", None, None), KEY, Batch(30, 200))
+        hijacked = AckChannel(AckChannelSpec(alpha, "hijack", None, spans, 0.0, 0.6), KEY, Batch(30, 200))
         same = [
             np.array_equal(
                 honest.arrived(k, None, gamma[k], gamma_e[k]), hijacked.arrived(k, None, gamma[k], gamma_e[k])

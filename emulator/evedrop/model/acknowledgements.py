@@ -156,45 +156,31 @@ class AckChannelSpec:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a number from 0 to 1")
 
     @property
+    def heed_rule(self) -> HeedRule | None:
+        """What the sensor heeds under the attack; None if it heeds all that reach it."""
+        return heed_rule_of(self.attack, self.quality, self.overheard)
+
+    @property
     def memory(self) -> int:
         """How many packets before its own decide on an acknowledgement: those that the jammer may have missed in a row."""
-        heed_rule = heed_rule_of(self.attack, self.quality, self.overheard)
-        return 0 if heed_rule is None else heed_rule.patience
+        return 0 if self.heed_rule is None else self.heed_rule.patience
 
 
 @final
 class AckChannel:
-    """Acknowledgements from legitimate estimator to sensor: each that is on the air arrives with probability `quality`.
+    """Acknowledgements from legitimate estimator to sensor: each that is on the air arrives with probability `quality`."""
 
-    spans: slots [from, to) in which the attack is on; None: in all slots. flip: the probability of a flip; overheard: that the
-    jammer hears a packet.
-    """
-
-    def __init__(
-        self,
-        attack: str,
-        quality: float,
-        key: bytes,
-        batch: Batch,
-        spans: Sequence[Sequence[int]] | None = None,
-        flip: float = 0.0,
-        overheard: float = 1.0,
-    ) -> None:
-        self._attack = ATTACKS[attack]
-        self._spans = spans
+    def __init__(self, spec: AckChannelSpec, key: bytes, batch: Batch) -> None:
+        self._attack = ATTACKS[spec.attack]
+        self._spans = spec.spans
         # The first of two words is that of a reader of one.
         reader = BlockReader(key, batch, 2)
-        self._heed_rule = heed_rule_of(attack, quality, overheard)
+        self._heed_rule = spec.heed_rule
         fraction = 0.0 if self._heed_rule is None else self._heed_rule.fraction
-        words, limits = [0, 1, 0], np.array([quality, flip, fraction])[:, None]
+        words, limits = [0, 1, 0], np.array([spec.quality, spec.flip, fraction])[:, None]
         self._drawn = Ahead(reader.ahead, lambda slots: reader.uniforms(slots)[:, words] < limits)
         self._missed: NDArray[np.int64] = np.zeros(batch.trials, np.int64)
         self._counted = -1
-
-    @classmethod
-    def from_spec(cls, spec: AckChannelSpec, key: bytes, batch: Batch) -> AckChannel:
-        """The channel that a specification describes."""
-        return cls(spec.attack, spec.quality, key, batch, spec.spans, spec.flip, spec.overheard)
 
     def arrived(self, k: int, sent: Flags | None, gamma: Flags, gamma_e: Flags) -> Flags:
         """The acknowledgements of slot k that reach the sensor, (R,).

@@ -96,9 +96,7 @@ class ExactSimulation:
         )
         ack_channel = ack_channel_of(scenario)
         self._jammer = None if ack_channel is None else ack_channel.jammer
-        self._ack_channel = (
-            None if ack_channel is None else AckChannel.from_spec(ack_channel, keys.acknowledgements, batch)
-        )
+        self._ack_channel = None if ack_channel is None else AckChannel(ack_channel, keys.acknowledgements, batch)
         self._control_loop = None
         if scenario.controller is not None and scenario.assignment is not None:
             controller = ControllerCore(scenario.controller.strategy, scenario.assignment, disturbances, batch.trials)

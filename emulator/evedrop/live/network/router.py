@@ -149,7 +149,7 @@ class AckLink:
 
     def __init__(self, brief: AnyBrief, session: Session, spec: AckChannelSpec) -> None:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
-        self._channel = AckChannel.from_spec(spec, key, brief.batch)
+        self._channel = AckChannel(spec, key, brief.batch)
         self._jammer = spec.jammer
         self._trials, self._status = brief.trials, session.status
         self._key = session.keys.acknowledged

@@ -102,7 +102,7 @@ class AckFates:
         """unknown_links: as in `open_recording`."""
         spec = ack_channel_of(scenario) if _acknowledges(scenario, unknown_links) else None
         key = StreamKeys(root_of_seed(scenario.seed), b"").acknowledgements
-        self._channel = None if spec is None else AckChannel.from_spec(spec, key, Batch(scenario.slots, 1, trial))
+        self._channel = None if spec is None else AckChannel(spec, key, Batch(scenario.slots, 1, trial))
         self._jammer = LEGITIMATE if spec is None or spec.jammer is None else spec.jammer
 
     def take(self, first: int, sent: Flags | None, actions: Mapping[str, Codes]) -> Codes | None:

@@ -12,7 +12,7 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.acknowledgements import AckChannel, rates_of
+from evedrop.model.acknowledgements import AckChannel, AckChannelSpec, rates_of
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Reception
 from evedrop.model.reference_code import ReferenceCode, ReferenceReceiver
@@ -215,7 +215,9 @@ def _batch_traces(
 ) -> Floats:
     root = root_of_seed(2022)
     encoder = policy.encoder(ReferenceCode(process, open_loop), process.n, batch, stream_key(root, "schedule"))
-    channel = AckChannel("flip", 1.0, stream_key(root, "link/acknowledgements"), batch, flip=FLIP)
+    channel = AckChannel(
+        AckChannelSpec(1.0, "flip", None, None, FLIP), stream_key(root, "link/acknowledgements"), batch
+    )
     links = [
         deliveries(
             link_of({"model": "bernoulli", "quality": quality}, stream_key(root, f"link/{i}"), batch), batch.slots
