@@ -74,6 +74,12 @@ class Action(IntEnum):
     """The packet was received and not used."""
 
 
+def read_actions(gamma: Flags, state: Flags) -> Codes:
+    """`Action` codes, (R,), of a receiver that reads each packet that it hears (R,): as the state (R,), or as an innovation."""
+    read = np.where(state, np.uint8(Action.STATE), np.uint8(Action.INNOVATION))
+    return np.where(gamma, read, np.uint8(Action.LOST))
+
+
 class Reception(NamedTuple):
     """What a receiver heard in a slot, for R trials."""
 

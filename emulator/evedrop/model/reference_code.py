@@ -206,9 +206,8 @@ Slots = NDArray[np.int64]
 
 ROUNDING_OF_REFERENCES = 2.0**-44
 """The standard deviation of the rounding of a packet with a reference, relative to the numbers that it is computed from."""
-_NEGLIGIBLE = (
-    1e-75  # of the noise: the square of such a standard deviation is lost in rounding, and its own square in underflow
-)
+NEGLIGIBLE = 1e-75
+"""Of the noise: the square of such a standard deviation is lost in rounding, and its own square in underflow."""
 
 
 class Content(IntEnum):
@@ -273,7 +272,7 @@ class ReferenceReceiver(Receiver):
         self._code = ReferenceCode(process, open_loop)
         self._noise: list[Floats] = [np.zeros_like(process.Q), process.noise_factor]
         self._singular = is_singular(process)
-        self._negligible = _NEGLIGIBLE * float(np.abs(process.noise_factor).max())
+        self._negligible = NEGLIGIBLE * float(np.abs(process.noise_factor).max())
 
     def prior(self, first: int = 0) -> Belief:
         """x̂ = 0, P = Σ, as the estimate of the slot before, or before slot 0 of slot 0 itself; no reference."""

@@ -12,7 +12,7 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats, product
 from evedrop.model.receiver import Action, Belief, Flags, Reception
-from evedrop.model.reference_code import ReferenceReceiver, initial_factor, squares, triangular_solutions
+from evedrop.model.reference_code import NEGLIGIBLE, ReferenceReceiver, initial_factor, squares, triangular_solutions
 from evedrop.model.schemes.partial_encryption import UNENCRYPTED_INNOVATION
 from evedrop.model.streams import Batch
 
@@ -46,11 +46,6 @@ class Reference(PacketReader):
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """Reads with the reference that the header names."""
         return self._reader.step(k, belief, heard)
-
-
-_NEGLIGIBLE = (
-    1e-75  # of the noise: the square of such a standard deviation is lost in rounding, and its own square in underflow
-)
 
 
 class ClearStates(PacketReader):
@@ -100,7 +95,7 @@ class ClearStates(PacketReader):
         n, noise = self.process.n, self.process.noise_factor
         moved = product(self.process.A, X.reshape(n, -1)).reshape(X.shape)
         joint = np.concatenate([moved, np.where(innovation, 0.0, noise[:, :, None])], axis=1)
-        joint = np.where(np.abs(joint) < _NEGLIGIBLE * np.abs(noise).max(), 0.0, joint)
+        joint = np.where(np.abs(joint) < NEGLIGIBLE * np.abs(noise).max(), 0.0, joint)
         factors = kernels.triangular_factors(joint.transpose(2, 0, 1).copy())
         return self.process.predict(belief.x_hat), factors.transpose(1, 2, 0).copy()
 

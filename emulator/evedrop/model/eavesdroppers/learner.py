@@ -16,7 +16,16 @@ import numpy as np
 from evedrop.model.checks import as_toml
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.kernels.elementary import cholesky, exp, log
-from evedrop.model.kernels.factored import Entry, Factor, Factors, covariance, orthogonalised, squared_length
+from evedrop.model.kernels.factored import (
+    Entry,
+    Factor,
+    Factors,
+    covariance,
+    orthogonalised,
+    parts_of_joint,
+    squared_length,
+    whitened,
+)
 from evedrop.model.kernels.mixtures import Mixture, opened, pruned, summed
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags
@@ -104,16 +113,16 @@ def weighed(theta: Parameters, sigma: Factors, of: Mixture, gamma: Flags, z: Flo
     joint = orthogonalised(
         _beside(carried, noise) + _beside(of.spread.unit(), _zero(len(z))), [*of.diagonal, *of_noise]
     )
-    predicted, gain, spread = _parts(joint)
+    predicted, gain, spread = parts_of_joint(joint)
     informed = orthogonalised(_beside(carried, remaining.unit()), [*of.diagonal, *of_remaining])
-    mean = np.clip(_times(theta.A, of.mean), -_LARGEST, _LARGEST)
-    away, alone = z[:, None, :] - mean, squared_length(sigma, list(z))
+    mean = np.clip(multiplied(theta.A, of.mean), -_LARGEST, _LARGEST)
+    away, alone = z[:, None, :] - mean, squared_length(sigma, z)
     ratios = np.where(gamma, of.weight * _likely(away, predicted, alone, sigma), 0.0)
     ratio = summed(ratios)
     state = _state_probability(theta.mu_d, ratio, gamma)
     fraction = np.divide(ratios, ratio, out=np.zeros(ratios.shape), where=ratio > 0.0) * state
-    before = of.mean + _entries(gain, _whitened(predicted, away))
-    mean = np.where(gamma, mean + _entries(told, _whitened(sigma, z))[:, None, :], mean)
+    before = of.mean + _entries(gain, whitened(predicted, away))
+    mean = np.where(gamma, mean + _entries(told, whitened(sigma, z))[:, None, :], mean)
     after = Mixture(
         of.weight * (1.0 - state), mean, *(np.where(gamma, *pair) for pair in zip(informed, predicted, strict=True))
     )
@@ -127,13 +136,13 @@ def _leak(theta: Parameters, sigma: Factors) -> tuple[Factors, list[list[Floats]
     """Σ_k, the matrix QΣ_k⁻¹ U_k as entries, and M_k, from Σ_{k−1}; see `evedrop.model.theory.leak`."""
     noise = theta.noise.unit()
     rows = _beside(_carried(theta.A, sigma), noise) + _beside(_zero(len(noise)), noise)
-    new, told, remaining = _parts(orthogonalised(rows, [*sigma.diagonal, *theta.noise.diagonal]))
+    new, told, remaining = parts_of_joint(orthogonalised(rows, [*sigma.diagonal, *theta.noise.diagonal]))
     return Factors(new.lower, np.minimum(new.diagonal, _LARGEST * _LARGEST)), told, remaining
 
 
 def _likely(away: Floats, predicted: Factors, alone: Floats, sigma: Factors) -> Floats:
     """N(z; m_j, P_j) / N(z; 0, Σ_k), (C, R); away: z − m_j, (n, C, R); alone: zᵀ Σ_k⁻¹ z, (R,)."""
-    exponent = alone - squared_length(predicted, list(away)) + _log_determinant(sigma) - _log_determinant(predicted)
+    exponent = alone - squared_length(predicted, away) + _log_determinant(sigma) - _log_determinant(predicted)
     return exp(np.clip(0.5 * exponent, _IMPOSSIBLE, _CERTAIN))
 
 
@@ -163,30 +172,6 @@ def _carried(A: Floats, P: Factors) -> list[list[Entry]]:
     return product
 
 
-def _parts(joint: Factors) -> tuple[Factors, list[list[Floats]], Factors]:
-    """The factors of (2n, 2n) matrices in parts: those of the first block, the block of U below it, those of the remainder."""
-    n = len(joint.diagonal) // 2
-    starts = [i * (i - 1) // 2 for i in range(2 * n)]
-    below = [list(joint.lower[start : start + n]) for start in starts[n:]]
-    last = [joint.lower[start + n : start + n + i] for i, start in enumerate(starts[n:])]
-    return (
-        Factors(joint.lower[: starts[n]], joint.diagonal[:n]),
-        below,
-        Factors(np.concatenate(last), joint.diagonal[n:]),
-    )
-
-
-def _whitened(P: Factors, z: Floats) -> Floats:
-    """U⁻¹ z, (n, …)."""
-    whitened: list[Floats] = []
-    for row, value in zip(P.unit(), z, strict=True):
-        rest = value
-        for factor, earlier in zip(row, whitened, strict=False):
-            rest = rest - factor * earlier
-        whitened.append(rest)
-    return np.stack(whitened)
-
-
 def _beside(left: list[list[Entry]], right: list[list[Entry]]) -> list[list[Entry]]:
     """The rows of [left right]."""
     return [[*row, *other] for row, other in zip(left, right, strict=True)]
@@ -202,16 +187,8 @@ def _over(values: Floats, weight: Floats) -> Floats:
     return np.broadcast_to(values[:, None, :], (len(values), *weight.shape))
 
 
-def _times(A: Floats, x: Floats) -> Floats:
-    """A x of the components of every trial: A (n, n, R), x (n, C, R)."""
-    product: Floats = A[:, 0, None, :] * x[0]
-    for j in range(1, len(x)):
-        product = product + A[:, j, None, :] * x[j]
-    return product
-
-
-def _entries(M: list[list[Floats]], x: Floats) -> Floats:
-    """M x, from the entries of M, each of the shape that x has after its first axis."""
+def _entries(M: list[list[Floats]], x: list[Floats]) -> Floats:
+    """M x, from the entries of M and x, each of one shape."""
     totals = []
     for row in M:
         total = row[0] * x[0]
@@ -287,9 +264,8 @@ def knowing_mistakes(given: Mapping[str, Any]) -> list[tuple[str, str]]:
 CAPACITY = 6
 """The most components of a trial's posterior."""
 _EARLY = 4  # packets whose mean square is the scale of all
-_FARTHEST = (
-    4.0  # times the largest packet: no state and no standard deviation is taken to be larger, because A may be wrong
-)
+# Times the largest packet: no state and no standard deviation is taken to be larger, because A may be wrong.
+_FARTHEST = 4.0
 
 
 class LearnerPosterior(NamedTuple):
@@ -544,7 +520,7 @@ def applied_factors(P: Factors, M: Floats) -> Floats:
 
 
 def multiplied(M: Floats, N: Floats) -> Floats:
-    """M N of every trial, (n, n, R)."""
+    """M N of every trial, (n, m, R), from M (n, n, R) and N (n, m, R)."""
     result: Floats = M[:, 0, None] * N[0]
     for j in range(1, len(N)):
         result = result + M[:, j, None] * N[j]

@@ -28,7 +28,7 @@ from evedrop.model.eavesdroppers.learner import (
 from evedrop.model.kernels.factored import covariance
 from evedrop.model.kernels.mixtures import moments as moments_of
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Codes, Flags, Reception
+from evedrop.model.receiver import Belief, Codes, Flags, Reception, read_actions
 from evedrop.model.streams import Batch
 
 PASSES = 8
@@ -169,9 +169,7 @@ class LearningEm(Learner):
             learned = climbed(self.known, first, memory.gamma, memory.z, so_far)
         else:
             learned, state = self._small_step(k, learned, gamma, z, age)
-        action = np.where(
-            gamma, np.where(state > 0.5, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0)
-        )
+        action = read_actions(gamma, state > 0.5)
         return self._belief_of(action, memory._replace(learned=learned, largest=np.maximum(memory.largest, np.abs(z))))
 
     def learned(self, belief: Belief) -> Mapping[str, Floats]:

@@ -34,7 +34,7 @@ from evedrop.model.kernels.factored import Factors, covariance
 from evedrop.model.kernels.mixtures import moments as moments_of
 from evedrop.model.kernels.mixtures import summed
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Codes, Flags, Reception
+from evedrop.model.receiver import Belief, Codes, Flags, Reception, read_actions
 from evedrop.model.streams import Batch, BlockReader
 
 _SPREAD = 0.3  # standard deviation of the first particles' entries of A
@@ -191,9 +191,7 @@ class LearningParticle(Learner):
         portion = self._portion(weight)
         state = summed(portion * self._narrow(after.state))
         cloud = self._renewed(k, Cloud(after.posterior, theta, moments, weight), portion, scale)
-        action = np.where(
-            gamma, np.where(state > 0.5, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0)
-        )
+        action = read_actions(gamma, state > 0.5)
         return self._belief_of(cloud, action, scale, np.maximum(largest, np.abs(z)))
 
     def learned(self, belief: Belief) -> Mapping[str, Floats]:

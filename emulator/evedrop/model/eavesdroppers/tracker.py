@@ -13,10 +13,20 @@ from numpy.typing import NDArray
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky, exp, log
-from evedrop.model.kernels.factored import Factor, Factors, covariance, grown, orthogonalised, solved, squared_length
+from evedrop.model.kernels.factored import (
+    Factor,
+    Factors,
+    covariance,
+    grown,
+    orthogonalised,
+    parts_of_joint,
+    solved,
+    squared_length,
+    whitened,
+)
 from evedrop.model.kernels.mixtures import Mixture, merge, pruned, summed, with_a_place
 from evedrop.model.process import Floats, Process, product
-from evedrop.model.receiver import Action, Belief, Flags, Reception
+from evedrop.model.receiver import Belief, Flags, Reception, read_actions
 from evedrop.model.streams import Batch
 
 
@@ -131,8 +141,7 @@ class Tracker(PacketReader):
         total = summed(tracks.weight)
         # Until a state is betrayed, every history exists twice, bit for bit, with the last track as x and as its twin.
         told_apart = total[: self.trials] != total[self.trials :]
-        read = np.where(told_apart, np.uint8(Action.STATE), np.uint8(Action.INNOVATION))
-        action = np.where(heard.gamma, read, np.uint8(Action.LOST))
+        action = read_actions(heard.gamma, told_apart)
         return Belief(*_moments(tracks, total), action, _stored(tracks))
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
@@ -203,28 +212,21 @@ def _split(of: Mixture, gamma: Flags, distance: Floats, noise: Factors) -> Mixtu
     U, V = of.spread.unit(), noise.unit()
     rows = [[*u, *v] for u, v in zip(U, V, strict=True)] + [[*u, *[0.0] * n] for u in U]
     joint = orthogonalised(rows, [*of.diagonal, *noise.diagonal])
-    unit, white = joint.unit(), np.empty_like(of.mean)
-    evidence = squared_length(noise, list(distance)) + np.zeros_like(of.weight)
-    for i in range(n):
-        rest = distance[i] - of.mean[i]
-        for j in range(i):
-            rest = rest - unit[i][j] * white[j]
-        white[i] = rest
-        evidence = evidence - rest * rest / joint.diagonal[i] - log(joint.diagonal[i] / noise.diagonal[i])
+    seen, gain, rest = parts_of_joint(joint)
+    white = whitened(seen, distance[:, None] - of.mean)
+    evidence = squared_length(noise, distance) + np.zeros_like(of.weight)
+    for away, D, own in zip(white, seen.diagonal, noise.diagonal, strict=True):
+        evidence = evidence - away * away / D - log(D / own)
     evidence = np.where(gamma & (of.weight > 0.0), 0.5 * evidence, 0.0)
     most = evidence.max(axis=0)
     most = _twice(np.maximum(np.maximum(most[:R], most[R:]), 0.0))
     mean = np.empty_like(of.mean)
-    for i in range(n):
+    for i, row in enumerate(gain):
         moved = of.mean[i]
-        for j in range(n):
-            moved = moved + unit[n + i][j] * white[j]
+        for factor, away in zip(row, white, strict=True):
+            moved = moved + factor * away
         mean[i] = -moved
-    starts = [(n + i) * (n + i - 1) // 2 + n for i in range(n)]
-    below = [joint.lower[start : start + i] for i, start in enumerate(starts)]
-    other = Mixture(
-        np.where(gamma, of.weight * exp(evidence - most), 0.0), mean, np.concatenate(below), joint.diagonal[n:]
-    )
+    other = Mixture(np.where(gamma, of.weight * exp(evidence - most), 0.0), mean, *rest)
     same = of._replace(weight=of.weight * exp(-most))
     # The history of the last track is now that of the other one.
     return Mixture(*(np.concatenate([a, np.roll(b, R, axis=-1)], axis=-2) for a, b in zip(same, other, strict=True)))

@@ -12,14 +12,13 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.kernels.elementary import cholesky, log
 from evedrop.model.kernels.factored import Factor, Factors, covariance, grown, squared_length
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Flags, Reception
+from evedrop.model.receiver import Action, Belief, Flags, Reception, read_actions
 from evedrop.model.schedule import PACKETS, NoiseDistribution, in_slot
 from evedrop.model.streams import Batch
 from evedrop.model.theory.leak import Leaks
 
-_NO_VARIANCE = (
-    1e-300  # a packet in the range of a singular covariance is the state, unless it is 20 standard deviations away
-)
+# A packet in the range of a singular covariance is the state, unless it is 20 standard deviations away.
+_NO_VARIANCE = 1e-300
 
 
 class Likelihood(PacketReader):
@@ -67,7 +66,7 @@ class Likelihood(PacketReader):
             x_hat = np.where(innovation, x_hat + leak.innovation(white), x_hat)
             P = Factors(*(np.where(innovation, *pair) for pair in zip(informed, predicted, strict=True)))
         P = Factors(np.where(state, 0.0, P.lower), np.where(state, 0.0, P.diagonal))
-        action = np.where(gamma, np.where(state, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0))
+        action = read_actions(gamma, state)
         estimate = np.where(state, received, stairs.outward(x_hat))
         return Belief(estimate, stairs.outward_covariance(covariance(P)), action, P)
 
@@ -77,7 +76,7 @@ class Likelihood(PacketReader):
             return np.full(self.trials, mu_d == 1.0)
         odds = mu_d / (1.0 - mu_d)
         seen = P.rounded(self._leaks.rounding(range(k, k + 1))[0])
-        evidence = -squared_length(seen, list(d))
+        evidence = -squared_length(seen, d)
         diagonal = np.where(P.diagonal > 0.0, seen.diagonal, _NO_VARIANCE)
         for row, D, state in zip(white, diagonal, self._leaks.at(k).state_diagonal, strict=True):
             evidence = evidence + row * row - log(D / state)

@@ -145,17 +145,36 @@ def _dot(left: Sequence[Entry], right: Sequence[Entry]) -> Entry:
     return total
 
 
-def squared_length(P: Factors, d: Sequence[Floats]) -> Floats:
-    """dᵀ P⁻¹ d of d, n arrays of the batch's shape; P positive definite."""
+def whitened(P: Factors, d: Sequence[Floats] | Floats) -> list[Floats]:
+    """U⁻¹ d of d, n arrays of the batch's shape."""
     e: list[Floats] = []
-    total: Entry = 0.0
-    for row, value, D in zip(P.unit(), d, P.diagonal, strict=True):
+    for row, value in zip(P.unit(), d, strict=True):
         rest = value
         for factor, earlier in zip(row, e, strict=False):
             rest = rest - factor * earlier
         e.append(rest)
+    return e
+
+
+def squared_length(P: Factors, d: Sequence[Floats] | Floats) -> Floats:
+    """dᵀ P⁻¹ d of d, n arrays of the batch's shape; P positive definite."""
+    total: Entry = 0.0
+    for rest, D in zip(whitened(P, d), P.diagonal, strict=True):
         total = total + rest * rest / D
     return np.asarray(total)
+
+
+def parts_of_joint(joint: Factors) -> tuple[Factors, list[list[Floats]], Factors]:
+    """The factors of (2n, 2n) matrices in parts: those of the first block, the block of U below it, those of the remainder."""
+    n = len(joint.diagonal) // 2
+    starts = [i * (i - 1) // 2 for i in range(2 * n)]
+    below = [list(joint.lower[start : start + n]) for start in starts[n:]]
+    last = [joint.lower[start + n : start + n + i] for i, start in enumerate(starts[n:])]
+    return (
+        Factors(joint.lower[: starts[n]], joint.diagonal[:n]),
+        below,
+        Factors(np.concatenate(last), joint.diagonal[n:]),
+    )
 
 
 def covariance(P: Factors) -> Floats:

@@ -221,7 +221,7 @@ def _weighed(
     mean = product(model.A, some.mean)
     predicted, informed = grown(model.A, some.spread, model.noise, leak.remaining_factor)
     seen = predicted.rounded(rounding)
-    squared = squared_length(seen, list(_taken(z, trial) - mean))
+    squared = squared_length(seen, _taken(z, trial) - mean)
     alone = _taken(_squared(white), trial)
     ratios = np.zeros(of.weight.shape)
     ratios.reshape(-1)[there] = _weighed_ratios(

@@ -23,9 +23,8 @@ from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.theory.covariances import block_length
 
-_AS_GOOD_AS_INFINITE = (
-    1e60  # a standard deviation of the state relative to the noise's, with which a packet reveals nothing
-)
+# A standard deviation of the state relative to the noise's, with which a packet reveals nothing.
+_AS_GOOD_AS_INFINITE = 1e60
 _LARGEST_GROWTH = 1e80  # within a block: the square of such a standard deviation that grows by it is still a double
 
 
