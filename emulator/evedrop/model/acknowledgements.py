@@ -276,7 +276,7 @@ class HoldingTime:
     def __init__(self, trials: int) -> None:
         self._slot: NDArray[np.int64] = np.full(trials, _NEVER, np.int64)
 
-    def reached(self, k: int, threshold: int) -> Flags:
+    def reached(self, k: int, threshold: float) -> Flags:
         """Whether h_k ≥ threshold, (R,)."""
         return k - self._slot >= threshold
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ class RecordedLoss(LossModel):
 
     parameters = MappingProxyType({"outcomes": "1101", "once": True, "random_start": True})
     optional = frozenset({"once", "random_start"})
-    recorded = "outcomes"
+    recorded: ClassVar[str | None] = "outcomes"
     uniforms_per_slot = 1
 
     def __init__(self, outcomes: str, once: bool = False, random_start: bool = False) -> None:

@@ -34,7 +34,7 @@ from evedrop.model.theory.covariances import LARGEST_OPERATOR, Outcomes
 class EncryptedScheduleEncoder(HoldingTimeEncoder):
     """z_k = x_k, masked from `threshold` slots after the last acknowledged slot on; the header tells whether."""
 
-    def __init__(self, threshold: int, trials: int, mask: Mask) -> None:
+    def __init__(self, threshold: float, trials: int, mask: Mask) -> None:
         super().__init__(trials)
         self._threshold, self._mask = threshold, mask
 
