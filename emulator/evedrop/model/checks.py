@@ -5,12 +5,26 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 _SHOWN = 80  # characters of a value that messages repeat
 MOST_SLOTS = 1_000_000
 LAST_SLOT = 2**62
 """The largest number of a slot: others can be added to it without leaving 64 bits."""
+
+
+class Parametrised:
+    """A class that a scenario names, with its parameters there."""
+
+    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    """The entries that the scenario gives it, each with an example."""
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """Mistakes in parameters, all of them known but some perhaps missing: (entry, value found and expected)."""
+        del given
+        return []
 
 
 def toml_of(value: Any) -> str:

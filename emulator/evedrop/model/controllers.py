@@ -27,7 +27,7 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
-from evedrop.model.checks import expect_shapes
+from evedrop.model.checks import Parametrised, expect_shapes
 from evedrop.model.kernels.elementary import has_settled, inverse
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Limits, Process, product
@@ -70,13 +70,12 @@ class Assignment:
             raise ValueError(f"slot_seconds is {self.slot_seconds}, expected 0 or more")
 
 
-class Controller(ABC):
+class Controller(Parametrised, ABC):
     """A control strategy. Each file of this folder defines one, registered by its name in a scenario.
 
     `parameters` are the entries of the scenario's `[controller]` for this strategy, each with an example.
     """
 
-    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     optional: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     """Defaults of the `parameters` that may be left out."""
 
@@ -85,12 +84,6 @@ class Controller(ABC):
         self.trials = trials
         self.failed: Flags = np.zeros(trials, np.bool_)
         """Whether the last decision failed, (R,), so that the previous inputs were held."""
-
-    @classmethod
-    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """Mistakes in parameters, all of them known but some perhaps missing: (entry, value found and expected)."""
-        del given
-        return []
 
     @classmethod
     @abstractmethod
@@ -174,6 +167,13 @@ def _riccati(F: Floats, G: Floats, H: Floats) -> Floats:
     raise ValueError("the Riccati equation has no solution")
 
 
+def _free_inputs(assignment: Assignment) -> list[tuple[str, str]]:
+    """An objection to weights that leave an input free, so that there are no best inputs."""
+    if np.all(assignment.input_weights + assignment.rate_weights > 0.0):
+        return []
+    return [("input_weights", "leave an input without weight; expected input_weights, or rate_weights, above 0")]
+
+
 @final
 class Lqr(Controller):
     """Clips inputs first to the limits of their change, then to their own limits."""
@@ -181,19 +181,14 @@ class Lqr(Controller):
     def __init__(self, assignment: Assignment, trials: int) -> None:
         super().__init__(assignment, trials)
         self._gain = -gain(assignment)
-        plant = assignment.plant
-        self._lower, self._upper = plant.input_lower[:, None], plant.input_upper[:, None]
-        self._rate = assignment.rate_limits[:, None]
-        self._u = np.zeros((plant.inputs, trials))
+        self._plant, self._rate = assignment.plant, assignment.rate_limits[:, None]
+        self._u = np.zeros((assignment.plant.inputs, trials))
 
     @classmethod
     def objections(cls, assignment: Assignment) -> list[tuple[str, str]]:
         """Weights that leave an input free, and states that no input can keep from growing."""
-        both = assignment.input_weights + assignment.rate_weights
-        if not np.all(both > 0.0):
-            return [
-                ("input_weights", "leave an input without weight; expected input_weights, or rate_weights, above 0")
-            ]
+        if free := _free_inputs(assignment):
+            return free
         try:
             gain(assignment)
         except ValueError:
@@ -210,7 +205,7 @@ class Lqr(Controller):
         """−K [x̂; u′], clipped."""
         u = product(self._gain, np.concatenate([x_hat, self._u]))
         u = np.minimum(np.maximum(u, self._u - self._rate), self._u + self._rate)
-        self._u = np.minimum(np.maximum(u, self._lower), self._upper)
+        self._u = self._plant.limited(u)
         return self._u
 
 
@@ -285,11 +280,7 @@ class Mpc(Controller):
         if why is not None:
             remedy = "expected pip install --force-reinstall osqp first, or the strategy lqr"
             return [("strategy", f"is mpc, whose solver is broken ({why}); {remedy}")]
-        if not np.all(assignment.input_weights + assignment.rate_weights > 0.0):
-            return [
-                ("input_weights", "leave an input without weight; expected input_weights, or rate_weights, above 0")
-            ]
-        return []
+        return _free_inputs(assignment)
 
     def decide(self, k: int, x_hat: Floats, d: Floats) -> Floats:  # noqa: ARG002 - every decision alike
         """The first of the best inputs of the horizon, for each trial by its own solver."""

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from evedrop.model.checks import is_number, number_mistakes
+from evedrop.model.checks import Parametrised, is_number, number_mistakes
 from evedrop.model.kernels.elementary import exp, log
 from evedrop.model.process import Floats
 from evedrop.model.registry import Registry
@@ -27,14 +27,13 @@ def length_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, st
     return [mistake for name in names for mistake in number_mistakes(given, name, 0.0, LONGEST)]
 
 
-class DelayModel(ABC):
+class DelayModel(Parametrised, ABC):
     """Decides delays from random numbers, for all trials at once, slot by slot.
 
     Each file of this folder defines one model, whose name in a scenario is the file's name. `parameters` are the entries
     that the scenario gives it, each with an example; lengths of time are in slots.
     """
 
-    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     optional: ClassVar[frozenset[str]] = frozenset()
     recorded: ClassVar[str | None] = None
     """The parameter that gets the contents of the recording `file`; None if there is none. Only for built-in models."""
@@ -42,12 +41,6 @@ class DelayModel(ABC):
     """The parameters that are lengths of time, and may therefore be given in seconds."""
     normal: ClassVar[bool] = False
     """Whether it needs standard normal numbers; otherwise it gets uniform ones."""
-
-    @classmethod
-    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """Mistakes in parameters, all of them known but some perhaps missing: (entry, value found and expected)."""
-        del given
-        return []
 
     @abstractmethod
     def delays(self, first: int, numbers: Floats) -> Floats:

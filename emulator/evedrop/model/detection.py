@@ -7,6 +7,7 @@ probability that a change has already happened.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -111,13 +112,8 @@ def chart_for(normal: float, attacked: float, mean_packets: float) -> Chart:
         low, high = high, 2 * high
         if high > _HIGHEST:
             raise ValueError(f"no chart of {_HIGHEST} states has its false alarms {mean_packets:g} packets apart")
-    while high - low > 1:
-        middle = (low + high) // 2
-        if chart(middle).run_length(normal) < mean_packets:
-            low = middle
-        else:
-            high = middle
-    return chart(high)
+    enough = bisect_left(range(low + 1, high), mean_packets, key=lambda threshold: chart(threshold).run_length(normal))
+    return chart(low + 1 + enough)
 
 
 def _whole(up: float, down: float) -> tuple[int, int]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
 
+from evedrop.model.checks import Parametrised
 from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver
@@ -39,14 +39,13 @@ class Knowledge:
         return self.state_probability if self.state_probabilities is None else self.state_probabilities
 
 
-class Eavesdropper(Receiver):
+class Eavesdropper(Parametrised, Receiver):
     """A strategy: how an eavesdropper reads packets.
 
     Each file of this folder defines one strategy. `parameters` are the entries that a scenario must give it, each with an
     example; `Knowledge.parameters` has the values given.
     """
 
-    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     pools_links: ClassVar[bool] = False
     """Whether it has several links instead of one; it hears what any of them delivers."""
     only_against: ClassVar[tuple[str | tuple[str, ...], str] | None] = None
@@ -62,12 +61,6 @@ class Eavesdropper(Receiver):
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge.process, batch.trials)
-
-    @classmethod
-    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """Mistakes in parameters, all of them known but some perhaps missing: (entry, value found and expected)."""
-        del given
-        return []
 
     @classmethod
     def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from evedrop.model.checks import probability_mistakes
+from evedrop.model.checks import Parametrised, probability_mistakes
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.links.chain import Chain, count_variance
 from evedrop.model.links.counts import Counted, Spectrum, Thinned
@@ -60,26 +60,19 @@ def fates_of(lost: Flags) -> Codes:
     return lost.view(np.uint8)
 
 
-class LossModel(ABC):
+class LossModel(Parametrised, ABC):
     """Decides fates from uniform numbers, for all trials at once, slot by slot.
 
     A file of this folder has one model, or a few that are related; `__init__.py` gives each its name in a scenario.
     `parameters` are the entries that the scenario gives it, each with an example.
     """
 
-    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     optional: ClassVar[frozenset[str]] = frozenset()
     recorded: ClassVar[str | None] = None
     """The parameter that gets the contents of the recording `file`; None if there is none. Only for built-in models."""
     ways: tuple[Way, Way] | None = None
     """Where sender and receiver are in every slot; None if losses do not depend on that."""
     uniforms_per_slot: int = 1
-
-    @classmethod
-    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """Mistakes in parameters, all of them known but some perhaps missing: (entry, value found and expected)."""
-        del given
-        return []
 
     @property
     @abstractmethod

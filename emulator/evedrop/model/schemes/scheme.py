@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.model.checks import Parametrised
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver, complete, needed
 from evedrop.model.schedule import NoiseDistribution, StateProbability, in_slot, mean_of
@@ -157,7 +158,7 @@ class NoInnovations(Shared):
         return self._estimator()
 
 
-class Scheme(ABC):
+class Scheme(Parametrised, ABC):
     """One way to fill packets. The keys of `secret_streams` are the secret; everything else about a scheme is public.
 
     Each file of this folder defines one scheme, whose name in a scenario is the file's name with - for _. `parameters` are
@@ -166,7 +167,6 @@ class Scheme(ABC):
     Source: docs/schemes.md.
     """
 
-    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     secret_streams: ClassVar[tuple[str, ...]] = ()
     """The streams that the sensor draws from."""
     estimator_streams: ClassVar[tuple[str, ...]] = ()
@@ -232,12 +232,6 @@ class Scheme(ABC):
     def decides_initial_state(cls) -> bool:
         """Whether the secret decides x_0, so that no filter at the sensor can."""
         return cls.initial_state is not Scheme.initial_state
-
-    @classmethod
-    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """Mistakes in parameters, all of them known but some perhaps missing: (entry, value found and expected)."""
-        del given
-        return []
 
     @classmethod
     def mistakes_with(cls, process: Process, given: Mapping[str, Any]) -> list[tuple[str, str]]:
