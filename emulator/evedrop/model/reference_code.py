@@ -17,6 +17,7 @@ from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.process import Floats, Process, StateFactors, product
 from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception
+from evedrop.model.schedule import state_factors
 from evedrop.model.staircase import is_nonsingular, is_singular
 from evedrop.model.theory.horizon import TOLERANCE, UNIT_ROUNDOFF
 
@@ -197,8 +198,7 @@ def initial_factor(process: Process, first: int) -> Floats:
     """A factor of the state's covariance in slot `first`, (n, n), lower triangular."""
     if not first:
         return cholesky(process.initial_covariance)
-    carried = np.concatenate([StateFactors(process).carried(first), process.noise_factor], axis=1)
-    factor: Floats = kernels.triangular_factors(carried[None])[0]
+    factor: Floats = state_factors(process)(range(first, first + 1))[0]
     return factor
 
 

@@ -6,6 +6,7 @@ are secret.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, final
@@ -96,26 +97,25 @@ class NoiseDistribution:
         """N, (n, n); None if it is Σ_k. Raises ValueError or TypeError if it is not a matrix of numbers."""
         return None if isinstance(self.given, str) and self.given == PACKETS else np.array(self.given, np.float64)
 
-    def factors(self, process: Process) -> NoiseFactors:
-        """The factors of N_k. Raises ValueError if N is not positive definite."""
+    def factors(self, process: Process) -> Callable[[range], Floats]:
+        """Gives the lower triangular factors of N_k in consecutive slots, at least one, (c, n, n); slots in order are fastest.
+
+        That of slot 0, which is never noise, has no meaning. Raises ValueError if N is not positive definite.
+        """
         N = self.covariance
-        return NoiseFactors(process, None if N is None else cholesky(N))
+        if N is None:
+            return state_factors(process)
+        constant = cholesky(N)
+        return lambda slots: np.broadcast_to(constant, (len(slots), *constant.shape))
 
 
-@final
-class NoiseFactors:
-    """The lower triangular factors of N_k.
+def state_factors(process: Process) -> Callable[[range], Floats]:
+    """Gives lower triangular factors of Σ_k in consecutive slots k ≥ 1, at least one, (c, n, n); slots in order are fastest."""
+    states = StateFactors(process)
 
-    constant: that of N, (n, n); None if N_k = Σ_k. Slots in order are fastest.
-    """
-
-    def __init__(self, process: Process, constant: Floats | None) -> None:
-        self._states, self._noise, self._constant = StateFactors(process), process.noise_factor, constant
-
-    def block(self, slots: range) -> Floats:
-        """The factors of consecutive slots, at least one, (c, n, n); that of slot 0, which is never noise, has no meaning."""
-        if self._constant is not None:
-            return np.broadcast_to(self._constant, (len(slots), *self._constant.shape))
-        carried = self._states.block(slots)
-        noise = np.broadcast_to(self._noise, carried.shape)
+    def block(slots: range) -> Floats:
+        carried = states.block(slots)
+        noise = np.broadcast_to(process.noise_factor, carried.shape)
         return kernels.triangular_factors(np.concatenate([carried, noise], axis=2))
+
+    return block

@@ -333,7 +333,7 @@ class EavesdropperPart:
             with _using("model"):
                 Staircase(brief.model.process)
         with _using("part.noise_covariance"):
-            if noise is not None and noise.factors(brief.model.process).block(range(1, 2)).shape[1:] != (n, n):
+            if noise is not None and noise.factors(brief.model.process)(range(1, 2)).shape[1:] != (n, n):
                 raise ValueError(f"it does not have {n} states, as the model does")
 
     def _expect_parameters(self, kind: type[Eavesdropper]) -> None:

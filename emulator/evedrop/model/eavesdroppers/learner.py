@@ -482,18 +482,7 @@ def factored(M: Floats, least: Floats) -> Factors:
 
 def divided(M: Floats, P: Factors) -> Floats:
     """M P⁻¹ of every trial, (n, n, R): row by row, by substitution forwards and backwards."""
-    n, U = len(M), P.unit()
-    quotient = np.empty_like(M)
-    for r, row in enumerate(M):
-        y: list[Floats] = []
-        for i in range(n):
-            rest = row[i]
-            for j in range(i):
-                rest = rest - U[i][j] * y[j]
-            y.append(rest)
-        for i, value in enumerate(y):
-            quotient[r, i] = value / P.diagonal[i]
-    return backwards(quotient, P)
+    return backwards(np.array([np.stack(whitened(P, row)) / P.diagonal for row in M]), P)
 
 
 def backwards(M: Floats, P: Factors) -> Floats:

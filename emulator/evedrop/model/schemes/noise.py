@@ -31,7 +31,7 @@ class NoiseEncoder(Encoder):
     ) -> None:
         self._schedule = schedule
         factors, reader = distribution.factors(process), BlockReader(key, batch, process.n)
-        self._noise = Ahead(reader.ahead, lambda slots: product(factors.block(slots), reader.normals(slots)))
+        self._noise = Ahead(reader.ahead, lambda slots: product(factors(slots), reader.normals(slots)))
 
     def encode_block(self, slots: range, x: Floats, predicted: Floats) -> PacketBlock:  # noqa: ARG002 - no innovation
         """The packets of consecutive slots."""

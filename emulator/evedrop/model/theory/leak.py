@@ -20,7 +20,7 @@ from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.kernels.mixtures import Leak
 from evedrop.model.process import MARGINAL, Floats, Process, StateFactors, modulus_in, product
-from evedrop.model.schedule import PACKETS, NoiseDistribution
+from evedrop.model.schedule import NoiseDistribution, state_factors
 from evedrop.model.staircase import Staircase
 from evedrop.model.streams import Ahead
 
@@ -121,7 +121,7 @@ class Leaks:
         process = self.stairs.process
         self._states = StateFactors(process)
         self._alone = None if distribution is None else self.stairs.inward_distribution(distribution).factors(process)
-        self._sizes = None if distribution is None else NoiseDistribution(PACKETS).factors(process)
+        self._sizes = None if distribution is None else state_factors(process)
         self._noise = process.noise_factor
         count = max(1, min(_SLOTS_AT_ONCE, _NUMBERS_AT_ONCE // (4 * process.n * process.n)))
         self._factors = Ahead(lambda slots: range(slots.start, max(slots.stop, slots.start + count)), self._computed)
@@ -143,12 +143,12 @@ class Leaks:
         n = len(self._noise)
         if not self.stairs.singular:
             return np.zeros((len(slots), n))
-        return self.stairs.rounding(self.block(slots)[:, :n, :n] if self._sizes is None else self._sizes.block(slots))
+        return self.stairs.rounding(self.block(slots)[:, :n, :n] if self._sizes is None else self._sizes(slots))
 
     def _computed(self, slots: range) -> Floats:
         if self._alone is None:
             return _triangularised(self._states.block(slots), self._noise, self._noise)
         n = len(self._noise)
         joint = np.zeros((len(slots), 2 * n, 2 * n))
-        joint[:, :n, :n], joint[:, n:, n:] = self._alone.block(slots), self._noise
+        joint[:, :n, :n], joint[:, n:, n:] = self._alone(slots), self._noise
         return joint
