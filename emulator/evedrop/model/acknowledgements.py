@@ -22,33 +22,13 @@ Attack = Callable[[Flags, Flags, Flags], Flags]
 """(γ of the legitimate estimator, γᵉ of the jammer, whether the attacker flips) → the acknowledgements on the air, all (R,)."""
 
 
-def _none(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - what the jammer hears does not matter
-    return gamma
-
-
-def _block_all(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
-    return np.zeros_like(gamma)
-
-
-def _block_critical(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
-    return gamma & gamma_e
-
-
-def _forge(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
-    return np.ones_like(gamma)
-
-
-def _flip(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
-    return gamma ^ flips
-
-
 ATTACKS: Mapping[str, Attack] = {
-    "none": _none,
-    "all": _block_all,
-    "critical": _block_critical,
-    "forge": _forge,
-    "flip": _flip,
-    "hijack": _none,
+    "none": lambda gamma, _heard, _flips: gamma,
+    "all": lambda gamma, _heard, _flips: np.zeros_like(gamma),
+    "critical": lambda gamma, gamma_e, _flips: gamma & gamma_e,
+    "forge": lambda gamma, _heard, _flips: np.ones_like(gamma),
+    "flip": lambda gamma, _heard, flips: gamma ^ flips,
+    "hijack": lambda gamma, _heard, _flips: gamma,
 }
 """critical blocks acknowledgements where γ = 1 and γᵉ = 0; forge sends one in the estimator's name where γ = 0; flip does either.
 

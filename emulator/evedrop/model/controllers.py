@@ -192,13 +192,9 @@ class Lqr(Controller):
         try:
             gain(assignment)
         except ValueError:
-            return [
-                (
-                    "state_weights",
-                    "weigh a state that no input can keep from growing: there is no such regulator; expected an "
-                    "input_matrix that reaches it, or weights of 0 there and on every state that it moves",
-                )
-            ]
+            why = "weigh a state that no input can keep from growing: there is no such regulator; expected an "
+            why += "input_matrix that reaches it, or weights of 0 there and on every state that it moves"
+            return [("state_weights", why)]
         return []
 
     def decide(self, k: int, x_hat: Floats, d: Floats) -> Floats:  # noqa: ARG002 - every decision alike
@@ -270,12 +266,8 @@ class Mpc(Controller):
     def objections(cls, assignment: Assignment) -> list[tuple[str, str]]:
         """A missing or broken solver, and inputs without weight, for which no best inputs exist."""
         if find_spec("osqp") is None:
-            return [
-                (
-                    "strategy",
-                    "is mpc, whose solver is not installed; expected pip install '.[microgrid]' in the checkout first",
-                )
-            ]
+            remedy = "expected pip install '.[microgrid]' in the checkout first"
+            return [("strategy", f"is mpc, whose solver is not installed; {remedy}")]
         why = _broken()
         if why is not None:
             remedy = "expected pip install --force-reinstall osqp first, or the strategy lqr"

@@ -149,11 +149,8 @@ class Mask:
         # A state beyond 16 standard deviations is clipped to the range, not wrapped.
         points = np.rint(np.ldexp(np.minimum(np.maximum(values, -H), H), shift)).astype(np.int64)
         points = np.minimum(points, _HALF - 1)
-        turned = (points + _HALF + sign * self._pad(k)) & (2 * _HALF - 1)
+        turned = (points + _HALF + sign * self._pads.at(k)) & (2 * _HALF - 1)
         return np.ldexp((turned - _HALF).astype(np.float64), -shift)
-
-    def _pad(self, k: int) -> NDArray[np.int64]:
-        return self._pads.at(k)
 
     def _exponent(self, k: int) -> NDArray[np.int32]:
         """The exponents of H in slot k, (n,); those of the last two slots are cached."""

@@ -390,10 +390,7 @@ class ReferenceReceiver(Receiver):
         open_loop = memory.by == Content.OPEN_LOOP
         for j in range(int(s.min()) + 1, k + 1):
             moved, carried = s < j, np.where(new, t < j, s < j)
-            x, X = (
-                np.where(moved, self._times(self.process.A, x), x),
-                np.where(moved, self._times(self.process.A, X), X),
-            )
+            x, X = (np.where(moved, self._times(self.process.A, part), part) for part in (x, X))
             r, R = (np.where(carried, self._carried(j, part, open_loop), part) for part in (r, R))
             begins = later & (t == j)
             if begins.any():

@@ -458,9 +458,9 @@ class Moments(NamedTuple):
         if "A" not in knows:
             A = np.clip(A + divided(self.cross, self.information), -_LARGEST_MOMENT, _LARGEST_MOMENT)
         moments = self.about(A - theta.A)
-        noise = (
-            theta.noise if "Q" in knows else factored(moments.square / (self.transitions + 1.0), _LEAST_MOMENT * scale)
-        )
+        noise = theta.noise
+        if "Q" not in knows:
+            noise = factored(moments.square / (self.transitions + 1.0), _LEAST_MOMENT * scale)
         return moments, Parameters(A, *noise, theta.mu_d if "mu_d" in knows else self.states / self.packets)
 
 

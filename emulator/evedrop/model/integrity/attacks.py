@@ -193,12 +193,8 @@ class Replay(SensorAttack):
         recorded = given[RECORDED]
         if recorded <= first:
             return []
-        return [
-            (
-                RECORDED,
-                f"is {recorded}, but the attack begins in slot {first}; expected at most as many slots as pass before it",
-            )
-        ]
+        wanted = "expected at most as many slots as pass before it"
+        return [(RECORDED, f"is {recorded}, but the attack begins in slot {first}; {wanted}")]
 
     @classmethod
     def of(cls, given: Mapping[str, Any], loop: WatermarkedLoop, watermark: Floats) -> Replay:

@@ -48,14 +48,12 @@ class Chain:
         at = parts[0].slots.start
         for slots, w in parts:
             row = row @ np.linalg.matrix_power(self.transitions, slots.start - at)
-            steps = powers.setdefault(id(w), [])
+            if id(w) not in powers:
+                powers[id(w)] = [(1.0 + self.quality * (w[:, None] - 1.0))[:, :, None] * self.transitions]
+            steps = powers[id(w)]
             for bit in range(len(slots).bit_length()):
                 if bit == len(steps):
-                    steps.append(
-                        np.matmul(steps[-1], steps[-1])
-                        if steps
-                        else (1.0 + self.quality * (w[:, None] - 1.0))[:, :, None] * self.transitions
-                    )
+                    steps.append(np.matmul(steps[-1], steps[-1]))
                 if len(slots) >> bit & 1:
                     row = np.einsum("zs,zst->zt", row, steps[bit])
             at = slots.stop

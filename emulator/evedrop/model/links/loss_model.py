@@ -193,8 +193,6 @@ class Pooled(LossModel):
     Each of the models is checked by itself, so there is nothing to check here.
     """
 
-    parameters: ClassVar[Mapping[str, Any]] = {}
-
     def __init__(self, models: Sequence[LossModel]) -> None:
         self._models = models
         self.uniforms_per_slot = sum(model.uniforms_per_slot for model in models)

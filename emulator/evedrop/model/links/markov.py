@@ -131,11 +131,9 @@ class Markov(LossModel):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A square matrix of probabilities whose rows sum to 1, one recurrent class, and a loss for each state."""
-        mistakes = (
-            [("transitions", sentence) for sentence in _matrix_mistakes(given["transitions"])]
-            if "transitions" in given
-            else []
-        )
+        mistakes = []
+        if "transitions" in given:
+            mistakes = [("transitions", sentence) for sentence in _matrix_mistakes(given["transitions"])]
         if "loss" in given:
             loss, rows = given["loss"], given.get("transitions")
             right = isinstance(loss, list) and all(is_probability(value) for value in loss)

@@ -88,12 +88,9 @@ class LinkDistribution:
     @property
     def alike(self) -> Chain | None:
         """A single state, if all fates are independent and identically distributed and no packet is late, as in the paper."""
-        unchanging = len(self.segments) == 1 and not self.outages and self.window == 0
-        return (
-            self.last
-            if unchanging and self.segments[0].quality_at is None and self.segments[0].chain.independent
-            else None
-        )
+        first = self.segments[0]
+        unchanging = len(self.segments) == 1 and first.quality_at is None and not self.outages and self.window == 0
+        return self.last if unchanging and first.chain.independent else None
 
 
 def distribution_of(schedule: LinkSchedule) -> LinkDistribution | None:
