@@ -16,20 +16,20 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge, KnowsSchedule, PacketReader
 from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.kernels.factored import Factor, Factors
 from evedrop.model.kernels.mixtures import Mixture
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Reception, cleared, select
-from evedrop.model.schedule import Schedule, equal_slots, in_slot
+from evedrop.model.schedule import equal_slots, in_slot
 from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 from evedrop.model.theory.leak import Leaks
 
 
-class Genie(PacketReader):
+class Genie(KnowsSchedule, PacketReader):
     """Exact MMSE given the schedule: an innovation reduces the noise from Q to Q − QΣ_k⁻¹Q.
 
     Its belief is correct, and its mean error is a lower bound for every eavesdropper behind the same link.
@@ -42,13 +42,7 @@ class Genie(PacketReader):
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
-        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.mu_d, batch)
         self._leaks = Leaks(knowledge.process)
-
-    @classmethod
-    def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003 - alike for all
-        """The schedule."""
-        return ("schedule",)
 
     @classmethod
     def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:  # noqa: ARG003 - it has none

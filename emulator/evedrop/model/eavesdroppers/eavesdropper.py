@@ -13,7 +13,7 @@ from evedrop.model.checks import Parametrised
 from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver
-from evedrop.model.schedule import NoiseDistribution, StateProbability
+from evedrop.model.schedule import NoiseDistribution, Schedule, StateProbability
 from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 
@@ -93,6 +93,19 @@ class Eavesdropper(Parametrised, Receiver):
         """The belief after slot k once that slot's true state x (n, R) is known as well."""
         n, trials = x.shape
         return Belief(x, np.zeros((n, n, trials)), belief.action)
+
+
+class KnowsSchedule(Eavesdropper):
+    """Knows which packets contain the state."""
+
+    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
+        super().__init__(knowledge, batch)
+        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.mu_d, batch)
+
+    @classmethod
+    def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003 - alike for all
+        """The schedule."""
+        return ("schedule",)
 
 
 class PacketTaker(PacketUser, Eavesdropper):

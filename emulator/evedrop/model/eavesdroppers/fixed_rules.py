@@ -15,9 +15,8 @@ import numpy as np
 
 from evedrop.model import update
 from evedrop.model.checks import probability_mistakes
-from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader, PacketTaker
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge, KnowsSchedule, PacketReader, PacketTaker
 from evedrop.model.receiver import Action, Belief, Flags, Reception
-from evedrop.model.schedule import Schedule
 from evedrop.model.streams import Ahead, Batch, BlockReader
 
 
@@ -53,20 +52,11 @@ class Naive(PacketTaker):
         return None
 
 
-class Smart(PacketTaker):
+class Smart(KnowsSchedule, PacketTaker):
     """b_k = 1 − ν_k; it knows the schedule. Its reported covariance is the actual one.
 
     Source: the paper, smart eavesdropper.
     """
-
-    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
-        super().__init__(knowledge, batch)
-        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.mu_d, batch)
-
-    @classmethod
-    def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:  # noqa: ARG003 - alike for all
-        """The schedule."""
-        return ("schedule",)
 
     @classmethod
     def use_probabilities(cls, parameters: Mapping[str, Any]) -> tuple[float, float]:  # noqa: ARG003 - it has none
@@ -78,7 +68,7 @@ class Smart(PacketTaker):
         return ~self._schedule.block(slots)
 
 
-class Suspicious(PacketTaker):
+class Suspicious(KnowsSchedule, PacketTaker):
     """Uses a state with probability `use_state` (μ_b), an innovation with `use_innovation` (μ̄_b), by its own coin.
 
     Source: the paper, suspicious eavesdropper.
@@ -88,7 +78,6 @@ class Suspicious(PacketTaker):
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
-        self._schedule = Schedule(knowledge.keys["schedule"], knowledge.mu_d, batch)
         self._use_state, self._use_innovation = self.use_probabilities(knowledge.parameters)
         self._coins = BlockReader(knowledge.keys["coin"], batch, 1)
         self._used = Ahead(self._coins.ahead, self._tossed)
