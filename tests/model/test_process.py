@@ -118,14 +118,16 @@ def test_factors_are_of_the_covariances(process: Process) -> None:
     factors = StateFactors(process)
     covariances = state_covariances(process, 30)
     for k in (1, 2, 3, 29, 5, 1, 12):
-        F = factors.carried(k)
+        F = factors.block(range(k, k + 1))[0]
         expected = process.A @ covariances[k - 1] @ process.A.T
         assert np.allclose(F @ F.T, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
-        assert np.array_equal(F, StateFactors(process).carried(k))
+        assert np.array_equal(F, StateFactors(process).block(range(k, k + 1))[0])
     for slots in (range(3), range(3, 12), range(4, 6), range(20, 30), range(1)):
         block = factors.block(slots)
         for row, k in enumerate(slots):
-            assert np.array_equal(block[row], StateFactors(process).carried(k) if k else np.zeros(process.A.shape))
+            assert np.array_equal(
+                block[row], StateFactors(process).block(range(k, k + 1))[0] if k else np.zeros(process.A.shape)
+            )
 
 
 def test_factors_hold_where_cholesky_fails() -> None:
@@ -141,7 +143,7 @@ def test_factors_hold_where_cholesky_fails() -> None:
         exact = times(times(A_, exact), transposed)
         if k < 60:
             exact = [[exact[i][j] + Q_[i][j] for j in range(2)] for i in range(2)]
-    F = [[Fraction(v) for v in row] for row in StateFactors(UNSTABLE).carried(60).tolist()]
+    F = [[Fraction(v) for v in row] for row in StateFactors(UNSTABLE).block(range(60, 61))[0].tolist()]
     result = times(F, [list(row) for row in zip(*F, strict=True)])
     for i in range(2):
         for j in range(2):

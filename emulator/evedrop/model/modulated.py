@@ -21,6 +21,7 @@ from evedrop.model.slot.link_distribution import LinkDistribution, Segment
 from evedrop.model.theory.covariances import (
     LARGEST_OPERATOR,
     NOBODY,
+    BlockByBlock,
     Outcomes,
     OutcomesAt,
     SlotOutcomes,
@@ -52,15 +53,12 @@ class ModulatedCovariance:
         self._settled: Floats | None = None
         self._window: deque[_Slot] = deque(maxlen=link.window)
         self._before: Floats | None = None
-        self._traces: Floats = np.empty(0)
+        self._traces = BlockByBlock(np.empty(0), self._further)
         self._blocks: dict[int, LinearBlock] = {}
 
     def next_traces(self, slots: int) -> Floats:
         """The trace of the expectation in the next slots, (slots,); inf once it overflows."""
-        while len(self._traces) < slots:
-            self._traces = np.concatenate([self._traces, self._further()])
-        traces, self._traces = self._traces[:slots], self._traces[slots:]
-        return traces
+        return self._traces.next(slots)
 
     def _further(self) -> Floats:
         """The traces of some more slots: a block of them, or single slots up to the place where a block may begin.

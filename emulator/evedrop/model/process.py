@@ -209,13 +209,11 @@ class StateFactors:
         self._k = 1
         self._carried = self._initial
 
-    def carried(self, k: int) -> Floats:
-        """A L_{k−1}, (n, n), for k ≥ 1: a factor of the encoding noise's covariance A Σ_{k−1} Aᵀ."""
-        factor: Floats = self.block(range(k, k + 1))[0]
-        return factor
-
     def block(self, slots: range) -> Floats:
-        """The same for consecutive slots, at least one, (c, n, n); 0 for slot 0. Slots in order are fastest."""
+        """A L_{k−1} of consecutive slots, at least one, (c, n, n); 0 for slot 0. Slots in order are fastest.
+
+        It is a factor of the encoding noise's covariance A Σ_{k−1} Aᵀ.
+        """
         first = max(slots.start, 1)
         if first < self._k:
             self._k, self._carried = 1, self._initial

@@ -319,7 +319,7 @@ def test_how_often_the_last_state_is_certain() -> None:
             if k:
                 w = process.noise_factor @ random.standard_normal((2, 600))
                 x = process.A @ x + w
-                chi = carried.carried(k) @ random.standard_normal((2, 600))
+                chi = carried.block(range(k, k + 1))[0] @ random.standard_normal((2, 600))
                 z = np.where(random.random(600) < 0.3, x, w + chi)
             belief = eve.step(k, belief or eve.prior(), Reception(random.random(600) < 0.9, z))
             above += ((belief.x_hat - x) ** 2).sum(axis=0) - np.trace(belief.P)

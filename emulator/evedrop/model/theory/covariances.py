@@ -180,6 +180,27 @@ def misled_covariances(process: Process, slots: int) -> Floats:
 
 
 @final
+class BlockByBlock:
+    """Numbers of slots from 0 on that are made a block at a time, and read any number of slots at a time."""
+
+    def __init__(self, first: Floats, following: Callable[[], Floats]) -> None:
+        """first, following: the first block, (c, …), and what makes the next one."""
+        self._block, self._following, self._next = first, following, 0
+
+    def next(self, slots: int) -> Floats:
+        """Those of the next slots, (slots, …)."""
+        parts = [self._block[:0]]
+        while slots > 0:
+            if self._next == len(self._block):
+                self._block, self._next = self._following(), 0
+            part = self._block[self._next : self._next + slots]
+            self._next += len(part)
+            slots -= len(part)
+            parts.append(part)
+        return np.concatenate(parts)
+
+
+@final
 class TheoreticalCovariance:
     """E P_k of a receiver, a number of slots at a time from k = 0.
 
@@ -208,13 +229,14 @@ class TheoreticalCovariance:
         with np.errstate(over="ignore", invalid="ignore"):
             self._block: Floats = outcomes.initial * process.initial_covariance[None]
         self._sigma: Floats = process.initial_covariance
-        self._next = 0
+        self._own = BlockByBlock(self._block, self._advanced)
+        """The expectation in the coordinates Zᵀx."""
         self._settled = False
         """Whether all further blocks are equal to this one, because it ends with the value that it began after."""
 
     def next(self, slots: int) -> Floats:
         """The expectation in the next slots, (slots, n, n)."""
-        covariances = self._next_own(slots)
+        covariances = self._own.next(slots)
         if self._Z is None:
             return covariances
         with np.errstate(over="ignore", invalid="ignore"):
@@ -223,33 +245,21 @@ class TheoreticalCovariance:
     def next_traces(self, slots: int) -> Floats:
         """The trace of the expectation in the next slots, (slots,)."""
         with np.errstate(over="ignore"):
-            traces: Floats = np.trace(self._next_own(slots), axis1=1, axis2=2)
+            traces: Floats = np.trace(self._own.next(slots), axis1=1, axis2=2)
         return traces
 
-    def _next_own(self, slots: int) -> Floats:
-        """The expectation in the next slots, (slots, n, n), in the coordinates Zᵀx."""
-        parts = []
-        while slots > 0:
-            if self._next == len(self._block):
-                self._advance()
-            part = self._block[self._next : self._next + slots]
-            self._next += len(part)
-            slots -= len(part)
-            parts.append(part)
-        return np.concatenate(parts) if parts else np.empty((0, *self._sigma.shape))
+    def _advanced(self) -> Floats:
+        if not self._settled:
+            self._block = self._following(self._block[-1])
+        return self._block
 
-    def _advance(self) -> None:
-        E = self._block[-1]
-        self._next = 0
-        if self._settled:
-            return
+    def _following(self, E: Floats) -> Floats:
+        """The block after a slot with this expectation."""
         if not np.isfinite(E[0, 0]):
-            self._block = np.full(self._powers.shape, np.inf)
-            return
+            return np.full(self._powers.shape, np.inf)
         with np.errstate(over="ignore", invalid="ignore"):
             if self._remaining is not None:
-                self._block = _unbounded_from_overflow(self._slot_by_slot(E, self._remaining))
-                return
+                return _unbounded_from_overflow(self._slot_by_slot(E, self._remaining))
             block = _congruences(self._kept_powers, E) + self._diffusion
             if self._outcomes.misled:
                 grown = _congruences(self._powers, self._sigma)
@@ -257,7 +267,7 @@ class TheoreticalCovariance:
                 self._sigma = grown[-1] + self._spread[-1]
             else:
                 self._settled = np.array_equal(block[-1], E)
-        self._block = _unbounded_from_overflow(block)
+        return _unbounded_from_overflow(block)
 
     def _slot_by_slot(self, E: Floats, remaining: RemainingCovariances) -> Floats:
         block, outcomes, A = np.empty(self._powers.shape), self._outcomes, self._process.A

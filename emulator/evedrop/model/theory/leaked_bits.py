@@ -21,7 +21,7 @@ import numpy as np
 from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.process import Floats, Process, product
-from evedrop.model.theory.covariances import block_length
+from evedrop.model.theory.covariances import BlockByBlock, block_length
 
 # A standard deviation of the state relative to the noise's, with which a packet reveals nothing.
 _AS_GOOD_AS_INFINITE = 1e60
@@ -41,21 +41,15 @@ class LeakedBits:
     def __init__(self, process: Process) -> None:
         self._model = (np.float64(process.A).tobytes(), np.float64(process.noise_factor).tobytes(), process.n)
         self._carried = product(process.A, cholesky(process.initial_covariance)).tobytes()
-        self._block: Floats = np.zeros(1)
-        self._next = 0
+        self._bits = BlockByBlock(np.zeros(1), self._following)
 
     def next(self, slots: int) -> Floats:
         """The bits of the next slots, (slots,)."""
-        parts = [np.zeros(0)]
-        while slots > 0:
-            if self._next == len(self._block):
-                self._block, self._carried = _next_block(*self._model, self._carried)
-                self._next = 0
-            part = self._block[self._next : self._next + slots]
-            self._next += len(part)
-            slots -= len(part)
-            parts.append(part)
-        return np.concatenate(parts)
+        return self._bits.next(slots)
+
+    def _following(self) -> Floats:
+        block, self._carried = _next_block(*self._model, self._carried)
+        return block
 
 
 @lru_cache(maxsize=64)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory.closed_forms import SensorChain, scheduled
 from evedrop.model.theory.json_values import JsonFields
+from evedrop.model.theory.ratio import edge
 
 _TOLERANCE = 1e-11
 _LAZY = 0.5  # how much of the old values an iteration keeps: it then converges for periodic chains, too
@@ -93,13 +94,7 @@ def least_weight(process: Process, mu: float, mu_e: float, price: float, states:
     def sends(weight: float) -> bool:
         return best_policy(process, mu, mu_e, weight, states, price).ever_sends
 
-    if not sends(1.0):
-        return None
-    low, high = 0.0, 1.0
-    while high - low > _WEIGHT:
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if sends(middle) else (middle, high)
-    return high
+    return edge(1.0, 0.0, sends, _WEIGHT) if sends(1.0) else None
 
 
 def policy_chains(send: NDArray[np.bool_], mu: float, mu_e: float) -> tuple[SensorChain, SensorChain, Floats]:

@@ -135,7 +135,7 @@ def largest_ratio(
     most = max(map(ratio, points))
     at = max(mu_d for mu_d in points if ratio(mu_d) >= most * (1.0 - _ROUNDING))
     if math.isinf(most):
-        at = _edge(at, min((mu_d for mu_d in points if mu_d > at), default=at), lambda mu_d: math.isinf(ratio(mu_d)))
+        at = edge(at, min((mu_d for mu_d in points if mu_d > at), default=at), lambda mu_d: math.isinf(ratio(mu_d)))
     attained = at - low > ATTAINED * (1.0 - low)
     at = at if attained else low
     return LargestRatio(most, at, attained, cost_of(process, mu, at))
@@ -218,9 +218,9 @@ def large_enough(
     begin = low if holds(points[0]) else None
     for a, b in pairwise(points):
         if begin is None and holds(b):
-            begin = _edge(b, a, holds)
+            begin = edge(b, a, holds)
         elif begin is not None and not holds(b):
-            intervals.append((begin, _edge(a, b, holds)))
+            intervals.append((begin, edge(a, b, holds)))
             begin = None
     return tuple(intervals if begin is None else [*intervals, (begin, 1.0)])
 
@@ -279,9 +279,9 @@ def _logarithm(ratio: float) -> float:
     return math.log(min(max(ratio, 1e-300), 1e300))
 
 
-def _edge(inside: float, outside: float, holds: Callable[[float], bool]) -> float:
-    """The last μ_d from `inside`, where something holds, towards `outside`, where it does not, at which it holds."""
-    while abs(outside - inside) > _XTOL:
+def edge(inside: float, outside: float, holds: Callable[[float], bool], within: float = _XTOL) -> float:
+    """The last number from `inside`, where something holds, towards `outside`, where it does not, at which it holds."""
+    while abs(outside - inside) > within:
         middle = 0.5 * (inside + outside)
         if holds(middle):
             inside = middle
