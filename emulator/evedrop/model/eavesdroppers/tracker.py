@@ -198,7 +198,8 @@ class Tracker(PacketReader):
             merge(of, full)
         order = np.argsort(of.weight == 0.0, axis=0, kind="stable")
         count = int((of.weight > 0.0).sum(axis=0).max(initial=0))
-        return Mixture(*(np.take_along_axis(part, _upon(order, part), axis=-2)[..., :count, :] for part in of))
+        orders = (np.broadcast_to(order, part.shape) for part in of)
+        return Mixture(*(np.take_along_axis(*both, axis=-2)[..., :count, :] for both in zip(of, orders, strict=True)))
 
 
 def _split(of: Mixture, gamma: Flags, distance: Floats, noise: Factors) -> Mixture:
@@ -253,11 +254,6 @@ def _nothing(n: int) -> Factor:
 def _twice(part: NDArray[Any]) -> NDArray[Any]:
     """(…, R) → (…, 2R)."""
     return np.concatenate([part, part], axis=-1)
-
-
-def _upon(order: NDArray[np.intp], part: Floats) -> NDArray[np.intp]:
-    """An order of histories (C, 2R) for one of their arrays, (C, 2R) or (…, C, 2R)."""
-    return np.broadcast_to(order, part.shape)
 
 
 def _stored(tracks: FollowedTracks) -> tuple[Floats, ...]:

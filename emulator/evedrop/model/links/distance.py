@@ -191,7 +191,7 @@ class Distance(LossModel):
         """The same for so few slots that intermediate results fit into the cache."""
         slots = range(first, first + len(uniforms))
         needed = self._needed(np.arange(slots.start, slots.stop, dtype=np.float64))
-        power, self._fade = _held(slots, self._fading_block, uniforms[:, 0], self._fade, _exponential)
+        power, self._fade = _held(slots, self._fading_block, uniforms[:, 0], self._fade, lambda u: -log(1.0 - u))
         if self._standard_deviation:
             gain, self._shadow = _held(slots, self._shadowing_block, uniforms[:, 1], self._shadow, self._gain)
             power = power * gain
@@ -208,11 +208,6 @@ class Distance(LossModel):
         square = along * along + across * across
         far = log(np.where(square > self._nearest, square, self._nearest) / self._nearest)
         return exp(self._margin + self._exponent * (0.5 * far))
-
-
-def _exponential(u: Floats) -> Floats:
-    """Exponential numbers with mean 1."""
-    return -log(1.0 - u)
 
 
 def _held(

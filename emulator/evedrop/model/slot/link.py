@@ -234,27 +234,25 @@ class Link:
         """The fates of the packets of the next slots in every trial."""
         if not self._changes:
             return self._unchanged(slots)
-        marks = sorted({change.at for change in self._changes if slots.start < change.at < slots.stop})
-        bounds = [slots.start, *marks, slots.stop]
-        parts = []
-        for start, stop in pairwise(bounds):
-            for change in self._changes:
-                if change.at == start:
-                    self._apply(change)
-            parts.append(self._unchanged(range(start, stop)))
+        parts = [self._unchanged(some) for some in self._stretches(slots)]
         return parts[0] if len(parts) == 1 else _joined(parts)
 
     def skip(self, stop: int) -> None:
         """Go on with slot `stop`, as if all earlier ones had been read: few are, unless later losses depend on them."""
-        starts = sorted({0, *(change.at for change in self._changes if 0 < change.at < stop)})
-        for start, end in pairwise([*starts, stop]):
+        for some in self._stretches(range(stop)):
+            if self._state.loss.memoryless and not self._state.settings.get("rate"):
+                continue
+            for start in range(0, len(some), _READ_AT_ONCE):
+                self._unchanged(some[start : start + _READ_AT_ONCE])
+
+    def _stretches(self, slots: range) -> Iterator[range]:
+        """Consecutive slots in stretches of constant settings; the changes at the beginning of each are applied before it."""
+        marks = sorted({change.at for change in self._changes if slots.start < change.at < slots.stop})
+        for start, stop in pairwise([slots.start, *marks, slots.stop]):
             for change in self._changes:
                 if change.at == start:
                     self._apply(change)
-            if self._state.loss.memoryless and not self._state.settings.get("rate"):
-                continue
-            for first in range(start, end, _READ_AT_ONCE):
-                self._unchanged(range(first, min(first + _READ_AT_ONCE, end)))
+            yield range(start, stop)
 
     def _apply(self, change: Change) -> None:
         if change.settings is not None:
@@ -269,7 +267,7 @@ class Link:
         settings, shape = self._state.settings, (len(slots), self.batch.trials)
         codes = self._state.loss.fates(slots.start, self._loss_uniforms(slots))
         befalls = settings.get("reorder") or settings.get("duplicate") or settings.get("corrupt")
-        chances = self._uniforms("fate", slots, 3) if befalls else None
+        chances = self._reader("fate", 3).uniforms(slots) if befalls else None
         if chances is not None and settings.get("corrupt"):
             codes = np.where((codes == 0) & (chances[:, 0] < settings["corrupt"]), np.uint8(Fate.CORRUPTED), codes)
         delays = self._delays(slots, chances)
@@ -334,16 +332,13 @@ class Link:
     def _loss_uniforms(self, slots: range) -> Floats:
         """Uniform numbers of this link's own stream, or in some slots of the stream to which its losses are tied."""
         width = self._state.loss.uniforms_per_slot
-        own = self._uniforms("link", slots, width)
+        own = self._reader("link", width).uniforms(slots)
         if self.schedule.correlation is None:
             return own
         other, strength = self.schedule.correlation
-        mixed = self._uniforms("mix", slots, 1)
+        mixed = self._reader("mix", 1).uniforms(slots)
         theirs = self._reader_of(f"link/{other}", width).uniforms(slots)
         return np.where(mixed < strength, theirs, own)
-
-    def _uniforms(self, stream: str, slots: range, width: int) -> Floats:
-        return self._reader(stream, width).uniforms(slots)
 
     def _reader(self, stream: str, width: int) -> StreamReader:
         return self._reader_of(f"{stream}/{self.receiver}", width)
