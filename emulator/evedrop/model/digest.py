@@ -75,7 +75,8 @@ class InputLog:
         self._u[row], self._failed[row] = u, failed
         if row + 1 != BLOCK_SLOTS and k + 1 != self._slots:
             return None
-        return k - row, _digests(self._failed[: row + 1], self._u[: row + 1], None)
+        records = _records(self._failed[: row + 1], self._u[: row + 1], None)
+        return k - row, _joined(xxh3_128_digest(record) for _, of_trials in records for record in of_trials)
 
 
 @final
@@ -146,17 +147,15 @@ class BlockDigests:
         return {self._blocks.start(slots.start): self._part.finished()}
 
 
-def _digests(marks: Flags, a: Floats, P: Floats | None) -> Digests:
-    """The digest of every trial, (R, 16), over marks (c, R), numbers (c, m, R) and covariances (c, n, n, R), slot by slot."""
-    return _joined(xxh3_128_digest(record) for _, records in _records(marks, a, P) for record in records)
-
-
 def _joined(digests: Iterable[bytes]) -> Digests:
     return np.frombuffer(b"".join(digests), np.uint8).reshape(-1, DIGEST_BYTES)
 
 
 def _records(marks: Flags, a: Floats, P: Floats | None) -> Iterator[tuple[int, list[memoryview]]]:
-    """Each tile of trials: its first trial, and the bytes of every trial to be digested; the next tile overwrites them."""
+    """Each tile of trials: its first trial, and the bytes of every trial to be digested; the next tile overwrites them.
+
+    They are made, slot by slot, of marks (c, R), numbers (c, m, R) and covariances (c, n, n, R).
+    """
     slots, trials = marks.shape
     n = 0 if P is None else P.shape[1]
     size = 1 + 8 * (a.shape[1] + n * (n + 1) // 2)

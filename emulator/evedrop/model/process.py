@@ -9,7 +9,6 @@ Source: docs/mathematics/model.md, model.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import final
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.kernels.current import kernels
-from evedrop.model.kernels.elementary import cholesky, semidefinite_factor
+from evedrop.model.kernels.elementary import cholesky, is_semidefinite, semidefinite_factor
 from evedrop.model.kernels.reference import carry
 from evedrop.model.streams import Ahead, Batch, BlockReader
 
@@ -254,10 +253,9 @@ def mistakes_of(
         mistakes += [(name, sentence) for sentence in _covariance_mistakes(M)]
     if singular_noise:
         mistakes = [entry for entry in mistakes if entry[0] != "Q" or "positive definite" not in entry[1]]
-        with suppress(ValueError):
-            semidefinite_factor(Q)
-            return mistakes
-        return [*mistakes, ("Q", "has an eigenvalue below 0; expected a covariance")]
+        return (
+            mistakes if is_semidefinite(Q) else [*mistakes, ("Q", "has an eigenvalue below 0; expected a covariance")]
+        )
     if any(name == "Q" and "positive definite" in sentence for name, sentence in mistakes):
         reached = invariant_hull(A, Q, _REACHED).shape[1]
         if reached < A.shape[0]:
@@ -265,8 +263,7 @@ def mistakes_of(
                 ("Q", f"the pair (A, √Q) is not controllable: the noise reaches {reached} of {A.shape[0]} directions; "
                  "expected process noise that moves every state, such as Q = 1e-3 times the identity")
             )  # fmt: skip
-        with suppress(ValueError):  # an eigenvalue is below 0
-            semidefinite_factor(Q)
+        if is_semidefinite(Q):
             mistakes = [
                 (name, f"{sentence}{_ALLOWS_SINGULAR}" if name == "Q" else sentence) for name, sentence in mistakes
             ]

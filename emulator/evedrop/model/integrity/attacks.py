@@ -16,7 +16,7 @@ import numpy as np
 
 from evedrop.model.checks import MOST_SLOTS
 from evedrop.model.integrity.loop import Source, WatermarkedLoop, spread, stationary
-from evedrop.model.kernels.elementary import semidefinite_factor
+from evedrop.model.kernels.elementary import is_semidefinite, semidefinite_factor
 from evedrop.model.process import Floats, product
 from evedrop.model.streams import Ahead, Batch, BlockReader
 
@@ -107,7 +107,7 @@ class Replacement(SensorAttack):
         if rows is None:
             return []
         noise = np.array(rows, np.float64)
-        if not np.array_equal(noise, noise.T) or not _is_covariance(noise):
+        if not np.array_equal(noise, noise.T) or not is_semidefinite(noise):
             return [(NOISE, "is not symmetric with eigenvalues of 0 or more; expected a covariance, such as [[0.1]]")]
         return []
 
@@ -119,7 +119,7 @@ class Replacement(SensorAttack):
             return cls(A, np.array(given[NOISE], np.float64))
         Y = loop.measurement(watermark)
         noise = Y - spread(A, Y)
-        if not _is_covariance(noise):
+        if not is_semidefinite(noise):
             raise ValueError("with this matrix z cannot have the covariance of y")
         return cls(A, noise)
 
@@ -163,14 +163,6 @@ class _Stationary:
     def take(self, k: int, y: Floats, on: bool) -> Floats:
         self._z = product(self._A, self._z) + self._noise.at(k)
         return self._z if on else y
-
-
-def _is_covariance(M: Floats) -> bool:
-    try:
-        semidefinite_factor(M)
-    except ValueError:
-        return False
-    return True
 
 
 RECORDED = "recorded"

@@ -194,6 +194,15 @@ def semidefinite_factor(M: Floats) -> Floats:
     return np.array(rows)
 
 
+def is_semidefinite(M: Floats) -> bool:
+    """Whether M, (n, n) symmetric, is positive semidefinite, as a covariance is."""
+    try:
+        semidefinite_factor(M)
+    except ValueError:
+        return False
+    return True
+
+
 _SMALL, _SCALE = 2.0**-485, 2.0**600  # below the first, squares lose digits to underflow
 
 

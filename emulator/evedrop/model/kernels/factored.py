@@ -48,13 +48,13 @@ class Factors(NamedTuple):
     @classmethod
     def alike(cls, factor: Factor, shape: tuple[int, ...]) -> Factors:
         """The factors of equal matrices."""
-        lower = [value for i, row in enumerate(factor.unit) for value in row[:i]]
-        columns = ((len(values), *(1 for _ in shape)) for values in (lower, factor.diagonal))
+
+        def repeated(values: list[float]) -> Floats:
+            column = np.array(values).reshape(-1, *(1 for _ in shape))
+            return np.broadcast_to(column, (len(values), *shape)).copy()
+
         return cls(
-            *(
-                np.broadcast_to(np.array(values).reshape(column), (len(values), *shape)).copy()
-                for values, column in zip((lower, factor.diagonal), columns, strict=True)
-            )
+            repeated([value for i, row in enumerate(factor.unit) for value in row[:i]]), repeated(factor.diagonal)
         )
 
     def rounded(self, rounding: Floats) -> Factors:
