@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.process import Floats, Process
-from evedrop.model.streams import Ahead, Batch, BlockReader
+from evedrop.model.streams import Ahead, Batch, BlockReader, Recurrence
 
 
 @final
@@ -24,18 +24,13 @@ class StateVariances:
     """
 
     def __init__(self, process: Process) -> None:
-        self._process = process
-        self._k = 0
-        self._sigma: Floats = process.initial_covariance[:, :, None]
+        first = process.initial_covariance[:, :, None]
+        self._sigma = Recurrence(first, lambda sigma: process.diffuse(process.carry(sigma)))
 
     def at(self, k: int) -> Floats:
         """The variances in slot k, (n,)."""
-        if k < self._k:
-            self._k, self._sigma = 0, self._process.initial_covariance[:, :, None]
-        while self._k < k:
-            self._sigma = self._process.diffuse(self._process.carry(self._sigma))
-            self._k += 1
-        return np.array([self._sigma[i, i, 0] for i in range(self._process.n)])
+        sigma = self._sigma.at(k)
+        return np.array([sigma[i, i, 0] for i in range(len(sigma))])
 
 
 MOST_BITS = 32

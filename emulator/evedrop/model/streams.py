@@ -26,6 +26,7 @@ from evedrop.model.kernels.current import kernels
 Words = NDArray[np.uint64]
 Floats = NDArray[np.float64]
 Made = TypeVar("Made", bound=np.generic)
+Value = TypeVar("Value")
 
 MOST_SLOTS = 100_000_000
 """The most slots of a run."""
@@ -274,3 +275,21 @@ class Ahead(Generic[Made]):
         else:
             self._values = self._make(wanted)
         self._slots = wanted
+
+
+@final
+class Recurrence(Generic[Value]):
+    """Values of the slots from 0 on, each made from the one before; slots in order are quick, any other order is correct."""
+
+    def __init__(self, first: Value, following: Callable[[Value], Value]) -> None:
+        self._first, self._following = first, following
+        self._k, self._value = 0, first
+
+    def at(self, k: int) -> Value:
+        """That of slot k."""
+        if k < self._k:
+            self._k, self._value = 0, self._first
+        while self._k < k:
+            self._value = self._following(self._value)
+            self._k += 1
+        return self._value

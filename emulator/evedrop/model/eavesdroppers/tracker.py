@@ -27,7 +27,7 @@ from evedrop.model.kernels.factored import (
 from evedrop.model.kernels.mixtures import Mixture, merge, pruned, summed, with_a_place
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Belief, Flags, Reception, read_actions
-from evedrop.model.streams import Batch
+from evedrop.model.streams import Batch, Recurrence
 
 
 @final
@@ -53,22 +53,18 @@ class Twins:
     """`Apart` of any slot; asking for slots in order is quick."""
 
     def __init__(self, process: Process) -> None:
-        self._A, self._noise = process.A, process.noise_factor
-        self._first = cholesky(process.initial_covariance), np.zeros((process.n, process.n))
-        self._k = 0
-        self._start, self._late = self._first
+        A, noise = process.A, process.noise_factor
+
+        def following(factors: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+            start, late = factors
+            joint = np.concatenate([product(A, late), noise], axis=1)
+            return product(A, start), kernels.triangular_factors(joint[None])[0]
+
+        self._factors = Recurrence((cholesky(process.initial_covariance), np.zeros(A.shape)), following)
 
     def at(self, k: int) -> Apart:
         """The distance in slot k."""
-        if k < self._k:
-            self._k, (self._start, self._late) = 0, self._first
-        while self._k < k:
-            self._start = product(self._A, self._start)
-            self._late = kernels.triangular_factors(
-                np.concatenate([product(self._A, self._late), self._noise], axis=1)[None]
-            )[0]
-            self._k += 1
-        return Apart(self._start, self._late)
+        return Apart(*self._factors.at(k))
 
 
 CAPACITY = 8

@@ -12,7 +12,7 @@ from evedrop.model.packet_user import StateReader
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Belief, Flags, Reception, select
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
-from evedrop.model.streams import Ahead, Batch, BlockReader
+from evedrop.model.streams import Ahead, Batch, BlockReader, Recurrence
 from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.model.theory.covariances import Outcomes
 
@@ -31,20 +31,13 @@ class TwinTracks:
         factor = cholesky(process.initial_covariance)
         self.initial: Floats = product(factor, normals[: process.n])
         """x_0, (n, R)."""
-        self._process = process
-        self._apart: Floats = product(factor, normals[process.n :]) - self.initial
-        self._k, self._distance = 0, self._apart
+        self._distance = Recurrence(product(factor, normals[process.n :]) - self.initial, process.predict)
         reader = BlockReader(keys["track"], batch, 1)
         self._coins = Ahead(reader.ahead, lambda slots: reader.uniforms(slots)[:, 0, :] < 0.5)
 
     def distance(self, k: int) -> Floats:
         """d_k, (n, R): the distance from the process's track to its twin's."""
-        if k < self._k:
-            self._k, self._distance = 0, self._apart
-        while self._k < k:
-            self._distance = self._process.predict(self._distance)
-            self._k += 1
-        return self._distance
+        return self._distance.at(k)
 
     def on_twin(self, k: int) -> Flags:
         """Whether the packet of slot k is on the twin's track, (R,), by a fair coin."""
