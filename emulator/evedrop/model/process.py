@@ -56,8 +56,7 @@ def eigenvalues(A: Floats) -> NDArray[np.complex128]:
     alike = np.abs(values[:, None] - values) <= 4.0 * (moved[:, None] + moved)
     for _ in range(len(A).bit_length()):
         alike = alike @ alike
-    means: NDArray[np.complex128] = (alike @ values) / alike.sum(axis=1)
-    return means
+    return np.asarray((alike @ values) / alike.sum(axis=1))
 
 
 def modulus_in(A: Floats) -> Callable[[float, float], float]:
@@ -216,7 +215,10 @@ class StateFactors:
         first = max(slots.start, 1)
         if first < self._k:
             self._k, self._carried = 1, self._initial
-        self._go_to(first)
+        while self._k < first:
+            count = min(first - self._k, _SLOTS_AT_ONCE)
+            self._carried = kernels.carried_factors(self._A, self._noise_factor, self._carried, count)[-1].copy()
+            self._k += count
         factors = np.zeros((len(slots), *self._A.shape))
         if slots.stop > first:
             rows = factors[first - slots.start :]
@@ -224,12 +226,6 @@ class StateFactors:
             rows[1:] = kernels.carried_factors(self._A, self._noise_factor, self._carried, len(rows) - 1)
             self._k, self._carried = slots.stop - 1, rows[-1].copy()
         return factors
-
-    def _go_to(self, k: int) -> None:
-        while self._k < k:
-            count = min(k - self._k, _SLOTS_AT_ONCE)
-            self._carried = kernels.carried_factors(self._A, self._noise_factor, self._carried, count)[-1].copy()
-            self._k += count
 
 
 def mistakes_of(

@@ -15,7 +15,7 @@ from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats, Process
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.theory.closed_forms import ClosedForm, ReceiverConditions, reference_covariances, reference_limit
-from evedrop.model.theory.covariances import NOBODY, Outcomes, has_infinite_variance, limit_trace
+from evedrop.model.theory.covariances import NOBODY, Outcomes, has_infinite_variance, limit_trace, traces_of_slots
 
 _FOLLOWED = 32  # critical slots whose consequences are computed each by itself
 
@@ -108,9 +108,7 @@ class ReferenceForm(ClosedForm):
         """The traces of all slots, (slots,)."""
         if self.bound:
             return reference_floor(self.process, self.received, self.acknowledged, self.slots)
-        covariances = reference_covariances(self.process, self.received, self.acknowledged, self.slots)
-        traces: Floats = np.trace(covariances, axis1=1, axis2=2)
-        return traces
+        return traces_of_slots(reference_covariances(self.process, self.received, self.acknowledged, self.slots))
 
     @cached_property
     def limit(self) -> float:

@@ -57,8 +57,7 @@ class Chain:
                 if len(slots) >> bit & 1:
                     row = np.einsum("zs,zst->zt", row, steps[bit])
             at = slots.stop
-        spectrum: Spectrum = row.sum(axis=1)
-        return spectrum
+        return np.asarray(row.sum(axis=1))
 
     def count_variance(self, parts: Sequence[Thinned]) -> float:
         """Variance of the number of packets of these ascending parts that get through; the chain continues between them.

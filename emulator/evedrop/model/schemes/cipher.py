@@ -12,7 +12,7 @@ from evedrop.model.process import MARGINAL, Floats, Process
 from evedrop.model.receiver import Flags, Reception, select
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.streams import Batch
-from evedrop.model.theory.covariances import Outcomes, state_covariances
+from evedrop.model.theory.covariances import Outcomes, state_covariances, traces_of_slots
 from evedrop.model.theory.leaked_bits import RevealedBits
 
 
@@ -77,8 +77,7 @@ class Cipher(Scheme):
 
         Source: docs/mathematics/model.md, model.
         """
-        traces: Floats = np.trace(state_covariances(self.process, slots), axis1=1, axis2=2)
-        return traces, self.process.spectral_radius >= 1.0 - MARGINAL
+        return traces_of_slots(state_covariances(self.process, slots)), self.process.spectral_radius >= 1.0 - MARGINAL
 
     def revealed_bits(self) -> RevealedBits:
         """Nothing."""

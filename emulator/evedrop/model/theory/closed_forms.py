@@ -35,6 +35,7 @@ from evedrop.model.theory.covariances import (
     lyapunov,
     radius,
     state_covariances,
+    traces_of_slots,
     unstable_part,
 )
 
@@ -265,8 +266,7 @@ class SensorChain:
             self.reset.T @ stationary, left.reshape(-1)
         )
         solution = np.linalg.solve(np.eye(len(operator)) - operator, noise)
-        total: Floats = solution.reshape(states, n, n).sum(axis=0)
-        return total
+        return np.asarray(solution.reshape(states, n, n).sum(axis=0))
 
     def has_infinite_variance(self, process: Process) -> bool:
         """Whether E (tr P_k)² outgrows (E tr P_k)², so that a sample mean proves nothing.
@@ -288,8 +288,7 @@ class SensorChain:
         """Stationary distribution of the state, (S,)."""
         states = len(self.start)
         balance = np.vstack([(self.reset + self.carried).T - np.eye(states), np.ones(states)])
-        stationary: Floats = np.linalg.lstsq(balance, np.append(np.zeros(states), 1.0), rcond=None)[0]
-        return stationary
+        return np.asarray(np.linalg.lstsq(balance, np.append(np.zeros(states), 1.0), rcond=None)[0])
 
 
 def scheduled(threshold: int, received: float, acknowledged: tuple[float, float]) -> SensorChain:
@@ -442,9 +441,7 @@ class ChainForm(ClosedForm):
     @cached_property
     def traces(self) -> Floats:
         """The traces of all slots, (slots,)."""
-        covariances = self.chain.covariances(self.process, self.slots, self.quantisation)
-        traces: Floats = np.trace(covariances, axis1=1, axis2=2)
-        return traces
+        return traces_of_slots(self.chain.covariances(self.process, self.slots, self.quantisation))
 
     @cached_property
     def limit(self) -> float:
@@ -519,8 +516,7 @@ class TakesNoise(ClosedForm):
     @cached_property
     def traces(self) -> Floats:
         """The traces of all slots, (slots,)."""
-        traces: Floats = np.trace(self.covariances, axis1=1, axis2=2)
-        return traces
+        return traces_of_slots(self.covariances)
 
     @cached_property
     def limit(self) -> float:

@@ -245,8 +245,7 @@ class TheoreticalCovariance:
     def next_traces(self, slots: int) -> Floats:
         """The trace of the expectation in the next slots, (slots,)."""
         with np.errstate(over="ignore"):
-            traces: Floats = np.trace(self._own.next(slots), axis1=1, axis2=2)
-        return traces
+            return traces_of_slots(self._own.next(slots))
 
     def _advanced(self) -> Floats:
         if not self._settled:
@@ -283,6 +282,11 @@ def theoretical_covariances(process: Process, outcomes: Outcomes, slots: int) ->
     Source: docs/mathematics/model.md, expectations.
     """
     return TheoreticalCovariance(process, outcomes).next(slots)
+
+
+def traces_of_slots(covariances: Floats) -> Floats:
+    """The trace of each slot's covariance, (slots, n, n) → (slots,)."""
+    return np.asarray(np.trace(covariances, axis1=1, axis2=2))
 
 
 def theoretical_traces(process: Process, outcomes: Outcomes, slots: int) -> Floats:

@@ -148,8 +148,7 @@ def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Flo
 
     def slope(of: Floats) -> Floats:
         ours, theirs = (derivatives(each, of) for each in (problem.legitimate, problem.eavesdropper))
-        gradient: Floats = (problem.weight * ours - (1.0 - problem.weight) * theirs).sum(axis=0) / scale
-        return gradient
+        return np.asarray((problem.weight * ours - (1.0 - problem.weight) * theirs).sum(axis=0) / scale)
 
     constraint: Any = {
         "type": "ineq",
