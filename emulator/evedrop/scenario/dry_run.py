@@ -22,7 +22,7 @@ from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.streams import Batch
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks, EavesdropperSetup
+from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks
 from evedrop.scenario.conformance.links import DelayChecks, LossChecks
 from evedrop.scenario.conformance.problems import Problem
 from evedrop.scenario.conformance.rules import how_broken
@@ -82,7 +82,7 @@ def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: st
         kind = SCHEMES[scenario.encoding.scheme]
         strategy = STRATEGIES[table.strategy]
         make = partial(_scheme, spec)
-        checks = EavesdropperChecks(EavesdropperSetup(table.strategy, strategy, table.parameters, make, kind))
+        checks = EavesdropperChecks(table.strategy, strategy, table.parameters, make, kind)
         return how_broken(checks.at_first, Problem(scenario.process.process, batch))
     public = scenario.process
     process = (public.A, public.Q, public.initial_covariance, public.singular_noise)

@@ -9,7 +9,7 @@ from evedrop.model.process import Process
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
 from evedrop.model.schemes.scheme import NoInnovations, Scheme
-from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks, EavesdropperSetup
+from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks
 from evedrop.scenario.conformance.problems import small
 from evedrop.scenario.conformance.rules import RuleVerdict, how_broken
 from evedrop.scenario.conformance.schemes import SchemeChecks
@@ -30,9 +30,9 @@ def broken(verdicts: list[RuleVerdict]) -> dict[str, str]:
     return {verdict.rule: verdict.broken for verdict in verdicts if verdict.broken is not None}
 
 
-def setup_of(kind: type[Eavesdropper], name: str = "naive") -> EavesdropperSetup:
+def checks_of(kind: type[Eavesdropper], name: str = "naive") -> EavesdropperChecks:
     """An eavesdropper of a class, with the examples of its parameters, that hears the paper's scheme."""
-    return EavesdropperSetup(name, kind, dict(kind.parameters), lambda process: Innovation(process, 0.6), Innovation)
+    return EavesdropperChecks(name, kind, dict(kind.parameters), lambda process: Innovation(process, 0.6), Innovation)
 
 
 def blocks_of_scheme(kind: type[Scheme]) -> str | None:
@@ -46,7 +46,7 @@ def blocks_of_scheme(kind: type[Scheme]) -> str | None:
 
 def blocks_of_eavesdropper(kind: type[Eavesdropper]) -> str | None:
     """The same of an eavesdropper."""
-    return _first(EavesdropperChecks(setup_of(kind)))
+    return _first(checks_of(kind))
 
 
 def _first(checks: SchemeChecks | EavesdropperChecks) -> str | None:

@@ -18,7 +18,7 @@ from evedrop.model.registry import asked
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.scenario.conformance import eavesdroppers
-from evedrop.scenario.conformance.eavesdroppers import EavesdropperSetup, eavesdropper_verdicts
+from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks
 from evedrop.scenario.conformance.examine import examined
 from evedrop.scenario.conformance.links import LossChecks
 from evedrop.scenario.conformance.problems import Problem, small
@@ -112,11 +112,9 @@ class Boastful(Naive):
 def test_an_eavesdropper_that_breaks_a_rule_is_told_which(kind: Any, rule: str, message: str) -> None:
     """As a scheme is."""
     parameters = dict(kind.parameters)
-    name = "suspicious" if kind is Forgetful else "naive"
-    setup = EavesdropperSetup(name, kind, parameters, lambda process: Innovation(process, 0.6), Innovation)
-    if kind is Boastful:
-        setup = replace(setup, name=f"{__name__}:Boastful")
-    assert message in broken(eavesdropper_verdicts(setup))[rule]
+    name = {Forgetful: "suspicious", Boastful: f"{__name__}:Boastful"}.get(kind, "naive")
+    checks = EavesdropperChecks(name, kind, parameters, lambda process: Innovation(process, 0.6), Innovation)
+    assert message in broken(checks.verdicts())[rule]
 
 
 @pytest.mark.parametrize(
@@ -179,9 +177,9 @@ def test_whatever_a_class_says_of_itself_is_a_verdict() -> None:
     (verdict,) = LossChecks(lambda: Chained(0.9), Chained).verdicts()
     assert verdict.rule == "shapes and types"
     assert "'int' object has no attribute 'transitions'" in str(verdict.broken)
-    setup = EavesdropperSetup("anywhen", Anywhen, {}, lambda process: Innovation(process, 0.6), Innovation)
+    checks = EavesdropperChecks("anywhen", Anywhen, {}, lambda process: Innovation(process, 0.6), Innovation)
     with pytest.raises(Broken, match=r"betrayed\(\) is 'three'; expected a slot"):
-        eavesdropper_verdicts(setup)
+        checks.verdicts()
     assert asked(Silent, {"depth": 3}) == [
         (
             "depth",

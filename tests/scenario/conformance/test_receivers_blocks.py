@@ -14,9 +14,8 @@ from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Reception
 from evedrop.model.schemes.plain import PlainEstimator
-from evedrop.scenario.conformance.eavesdroppers import eavesdropper_verdicts
 from evedrop.scenario.conformance.receivers import divisions
-from tests.scenario.conformance.breaking import blocks_of_eavesdropper, blocks_of_scheme, broken, plain_with, setup_of
+from tests.scenario.conformance.breaking import blocks_of_eavesdropper, blocks_of_scheme, broken, checks_of, plain_with
 
 
 class Follows(PlainEstimator):
@@ -293,7 +292,7 @@ def test_a_block_with_a_betrayed_state_is_taken_slot_by_slot() -> None:
 
 def test_the_rule_is_one_of_those_that_are_checked() -> None:
     """An eavesdropper whose blocks are right keeps it; one whose blocks are wrong breaks this rule alone."""
-    right, wrong = (eavesdropper_verdicts(setup_of(kind)) for kind in (EvenBlocks, Odd))
+    right, wrong = (checks_of(kind).verdicts() for kind in (EvenBlocks, Odd))
     assert "many slots at once" in [verdict.rule for verdict in right]
     assert "many slots at once" not in broken(right)
     assert broken(wrong).keys() - broken(right).keys() == {"many slots at once"}

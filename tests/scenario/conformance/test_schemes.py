@@ -14,7 +14,7 @@ from evedrop.model.schemes.innovation import Innovation, SharedSecret
 from evedrop.model.schemes.plain import PlainEncoder, PlainEstimator
 from evedrop.model.schemes.scheme import Packet, Scheme
 from evedrop.model.theory.covariances import Outcomes
-from evedrop.scenario.conformance.schemes import scheme_verdicts
+from evedrop.scenario.conformance.schemes import SchemeChecks
 from tests.scenario.conformance.breaking import broken, plain_with
 
 
@@ -150,7 +150,7 @@ def test_a_scheme_that_breaks_a_rule_is_told_which(rule: str) -> None:
     def scheme_of(process: Process) -> Scheme:
         return kind(process, **parameters)
 
-    result = broken(scheme_verdicts(scheme_of, kind))
+    result = broken(SchemeChecks(scheme_of, kind).verdicts())
     assert message in result[rule]
     assert remedy in result[rule]
 
@@ -158,5 +158,5 @@ def test_a_scheme_that_breaks_a_rule_is_told_which(rule: str) -> None:
 def test_a_scheme_says_of_every_packet_whether_it_is_encrypted() -> None:
     """One flag for each slot and trial; anything else is told."""
     kind = plain_with(encrypted=lambda self, packets: packets.nu[0])  # noqa: ARG005 - a method
-    result = broken(scheme_verdicts(kind, kind))
+    result = broken(SchemeChecks(kind, kind).verdicts())
     assert "encrypted()" in result["shapes and types"]

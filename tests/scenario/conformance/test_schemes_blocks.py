@@ -13,7 +13,7 @@ from evedrop.model.receiver import Belief, Reception
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock
-from evedrop.scenario.conformance.schemes import scheme_verdicts
+from evedrop.scenario.conformance.schemes import SchemeChecks
 from tests.scenario.conformance.breaking import blocks_of_scheme, broken, plain_with
 
 
@@ -124,7 +124,7 @@ def test_a_block_that_begins_in_a_later_slot_is_no_other() -> None:
 def test_the_rule_is_one_of_those_that_are_checked() -> None:
     """A scheme whose blocks are right keeps every rule; one whose blocks are wrong breaks this rule alone."""
     right, wrong = (
-        scheme_verdicts(lambda process, kind=kind: plain_with(kind)(process), plain_with(kind))  # type: ignore[misc]
+        SchemeChecks(lambda process, kind=kind: plain_with(kind)(process), plain_with(kind)).verdicts()  # type: ignore[misc]
         for kind in (Blocks, ByRow)
     )
     assert "many slots at once" in [verdict.rule for verdict in right]

@@ -107,20 +107,20 @@ def _dry_run(
     """Report what breaks in some slots of a scenario. Source: docs/your-own/rules.md, mistakes."""
     del kind  # the class of the strategy, or of the strategy it reads as
     from evedrop.model.schemes import SCHEMES, scheme_of  # noqa: PLC0415 - the same
-    from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks, EavesdropperSetup  # noqa: PLC0415 - needed last
+    from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks  # noqa: PLC0415 - needed last
     from evedrop.scenario.conformance.problems import Problem  # noqa: PLC0415 - the same
     from evedrop.scenario.conformance.rules import how_broken  # noqa: PLC0415 - the same
 
     A, Q, initial_covariance, singular_noise = process
     model = Process(np.array(A), np.array(Q), np.array(initial_covariance), singular_noise)
-    setup = EavesdropperSetup(
+    checks = EavesdropperChecks(
         strategy,
         eavesdroppers.STRATEGIES.imported(strategy),
         parameters,
         lambda process: scheme_of(process, scheme),
         SCHEMES[scheme["scheme"]],
     )
-    return how_broken(EavesdropperChecks(setup).at_first, Problem(model, Batch(*batch)))
+    return how_broken(checks.at_first, Problem(model, Batch(*batch)))
 
 
 _ASKED: Mapping[str, Callable[..., Any]] = {

@@ -16,10 +16,11 @@ from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.registry import Registry, asked
 from evedrop.model.schemes import PAPERS_SCHEME, SCHEMES, scheme_of
-from evedrop.scenario.conformance.eavesdroppers import EavesdropperSetup, eavesdropper_verdicts
+from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks
 from evedrop.scenario.conformance.links import DelayChecks, LossChecks
+from evedrop.scenario.conformance.problems import SchemeOf
 from evedrop.scenario.conformance.rules import Broken, RuleVerdict, calling
-from evedrop.scenario.conformance.schemes import scheme_verdicts
+from evedrop.scenario.conformance.schemes import SchemeChecks
 from evedrop.scenario.plugins import look_in
 
 _REGISTRIES: Mapping[str, Registry[Any]] = {
@@ -99,11 +100,14 @@ def _given(kind: Any, parameters: Mapping[str, Any]) -> dict[str, Any]:
 
 def _verdicts(option: str, named: _Named) -> list[RuleVerdict]:
     if option == "scheme":
-        return scheme_verdicts(
-            lambda process: scheme_of(process, {"scheme": named.name, **named.parameters}), named.kind
-        )
+        return SchemeChecks(_maker(named), named.kind).verdicts()
     checks = LossChecks if option == "link" else DelayChecks
     return checks(lambda: named.kind(**named.parameters), named.kind).verdicts()
+
+
+def _maker(named: _Named) -> SchemeOf:
+    spec = {"scheme": named.name, **named.parameters}
+    return lambda process: scheme_of(process, spec)
 
 
 def _listened(eavesdropper: _Named, scheme: _Named) -> list[RuleVerdict]:
@@ -113,16 +117,10 @@ def _listened(eavesdropper: _Named, scheme: _Named) -> list[RuleVerdict]:
             f"--eavesdropper {eavesdropper.name}: asks for the key of {' and '.join(lacking)}, and the scheme {scheme.name} has "
             f"{', '.join(scheme.kind.secret_streams) or 'no keys'}; give another --scheme, or take it out of streams()"
         )
-    spec = {"scheme": scheme.name, **scheme.parameters}
-    setup = EavesdropperSetup(
-        eavesdropper.name,
-        eavesdropper.kind,
-        eavesdropper.parameters,
-        lambda process: scheme_of(process, spec),
-        scheme.kind,
-    )
     try:
-        return eavesdropper_verdicts(setup)
+        return EavesdropperChecks(
+            eavesdropper.name, eavesdropper.kind, eavesdropper.parameters, _maker(scheme), scheme.kind
+        ).verdicts()
     except Broken as error:
         return [RuleVerdict("facts on the class", str(error))]
 

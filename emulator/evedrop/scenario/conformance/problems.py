@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.model.process import Process, Trajectory
+from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Belief, Beliefs, Flags, Receiver, Reception, asymmetry
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme
 from evedrop.model.streams import Batch, BlockReader
-from evedrop.scenario.conformance.rules import Broken, NamedKeys, Row, calling, expect_array, expect_finite, frozen, key
+from evedrop.scenario.conformance.rules import Broken, NamedKeys, calling, expect_array, expect_finite, frozen, key
 
 QUALITY = 0.7
 """The link quality of every problem."""
@@ -102,14 +102,14 @@ class Slot:
     after: Belief
 
     @property
+    def squared_error(self) -> Floats:
+        """The squared error of the belief after it, (R,)."""
+        return np.asarray(((self.x - self.after.x_hat) ** 2).sum(axis=0))
+
+    @property
     def sent(self) -> dict[str, Any]:
         """The parts of the packet that are compared."""
         return sent_of(self.packet)
-
-    @property
-    def row(self) -> Row:
-        """Everything that is compared."""
-        return {**self.sent, **row_of(self.after)}
 
 
 def sent_of(packet: Packet) -> dict[str, Any]:

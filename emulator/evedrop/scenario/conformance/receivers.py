@@ -17,8 +17,7 @@ import numpy as np
 from evedrop.model import update
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.packet_user import PacketUser
-from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Beliefs, Receiver, Reception
+from evedrop.model.receiver import Action, Belief, Beliefs, Receiver
 from evedrop.model.schemes.scheme import Encoder, PacketBlock, Scheme
 from evedrop.model.theory.covariances import OutcomesAt, TheoreticalCovariance
 from evedrop.scenario.conformance.problems import (
@@ -44,23 +43,41 @@ _COLUMN = (
     "batch's trials"
 )
 
-Step = tuple[Belief, Reception, Belief]
-"""The belief before a slot, the reception in it, and the belief after it."""
-
 
 class ReceiverChecks(ABC):
-    """The rules that schemes and eavesdroppers share, each checked on one problem."""
+    """The rules that schemes and eavesdroppers share, each checked on one problem. kind: the class that is checked."""
 
     state: ClassVar[str]
     """What to do if another one of its kind makes a difference."""
+    unpredictable: ClassVar[str]
+    """What to do if actions depend on more than γ."""
+    unexpected = "correct them, or return None: no closed form"
+    """What to do if its errors contradict the outcomes that it states."""
+
+    def __init__(self, kind: type) -> None:
+        self._kind = kind
+        self._slots: dict[int, tuple[Problem, list[Slot]]] = {}
+        """The slots of a problem, by its id."""
 
     @abstractmethod
-    def rows(self, problem: Problem, rubbish: float = 0.0) -> Iterable[Row]:
-        """Everything that is compared, slot by slot; rubbish: the value in place of a lost packet."""
+    def played(self, problem: Problem, *, rubbish: float = 0.0) -> Iterator[Slot]:
+        """Every slot of a problem, with the receiver's beliefs; rubbish: the value in place of a lost packet."""
 
     @abstractmethod
-    def undisturbed(self, problem: Problem) -> list[Row]:
-        """The same of one by itself, computed once for all rules that compare something with it."""
+    def row(self, slot: Slot) -> Row:
+        """Everything in a slot that is compared."""
+
+    @abstractmethod
+    def receiver(self, problem: Problem) -> Receiver:
+        """A new receiver for a problem."""
+
+    @abstractmethod
+    def follows_gamma(self, problem: Problem) -> bool:
+        """Whether γ alone determines the receiver's actions, as the class states."""
+
+    @abstractmethod
+    def outcomes_at(self, problem: Problem) -> OutcomesAt | None:
+        """The outcomes that the class states; None if it states none."""
 
     @abstractmethod
     def shapes(self, problem: Problem) -> None:
@@ -70,6 +87,12 @@ class ReceiverChecks(ABC):
     def blocks(self, problem: Problem) -> None:
         """Blocks of slots give the same results as single slots."""
 
+    def slots(self, problem: Problem) -> list[Slot]:
+        """The slots of `played`, computed once for all rules that compare something with them."""
+        if id(problem) not in self._slots:
+            self._slots[id(problem)] = (problem, list(self.played(problem)))
+        return self._slots[id(problem)][1]
+
     def at_first(self, problem: Problem) -> None:
         """The rules that a dry run checks: shapes, types and blocks of slots."""
         self.shapes(problem)
@@ -77,91 +100,98 @@ class ReceiverChecks(ABC):
 
     def twice(self, problem: Problem) -> None:
         """Two that take turns do the same as one alone."""
-        once = self.undisturbed(problem)
-        for rows in zip(*zip(self.rows(problem), self.rows(problem), strict=True), strict=True):
-            words = "{0!r} by itself and {1!r} with another one of its kind"
-            expect_same(once, rows, slice(None), problem.batch.first_trial, words, self.state)
+        words = "{0!r} by itself and {1!r} with another one of its kind"
+        for slots in zip(*zip(self.played(problem), self.played(problem), strict=True), strict=True):
+            self._expect_same(problem, slots, words, self.state)
 
     def alone(self, problem: Problem) -> None:
         """A trial alone gives the same bits as among others."""
-        among = self.undisturbed(problem)
+        words = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
         for trial in (0, problem.batch.trials - 1):
-            by_itself = list(self.rows(problem.part(trial, 1)))
-            words = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
-            number = problem.batch.first_trial + trial
-            expect_same(among, by_itself, slice(trial, trial + 1), number, words, _COLUMN)
+            by_itself = self.played(problem.part(trial, 1))
+            self._expect_same(problem, by_itself, words, _COLUMN, slice(trial, trial + 1))
 
     def lost(self, problem: Problem) -> None:
         """The value in place of a lost packet changes nothing."""
-        zeros, rubbish = self.undisturbed(problem), list(self.rows(problem, 1e30))
         words = "{0!r} or {1!r}, depending on z where nothing was received"
         remedy = "look at z where gamma is true alone, such as by np.where(heard.gamma, …)"
-        expect_same(zeros, rubbish, slice(None), problem.batch.first_trial, words, remedy)
+        self._expect_same(problem, self.played(problem, rubbish=1e30), words, remedy)
 
+    def _expect_same(
+        self, problem: Problem, slots: Iterable[Slot], words: str, remedy: str, trials: slice = slice(0, None)
+    ) -> None:
+        """Raise Broken unless these slots are those of `played`; the rest as for `expect_same`."""
+        once, again = ([self.row(slot) for slot in some] for some in (self.slots(problem), slots))
+        expect_same(once, again, trials, problem.batch.first_trial + trials.start, words, remedy)
 
-def expect_pure(receiver: Receiver, steps: Sequence[Step], problem: Problem, kind: type) -> None:
-    """Raise Broken unless a receiver, asked for slots backwards, answers as before, and has a prior for every slot."""
-    rows = []
-    for k, (before, heard, _) in reversed([*enumerate(steps)]):
-        with calling(f"slot {k}: step(), asked for again after later slots,", kind):
-            belief = receiver.step(k, before, heard)
-        expect_belief(f"slot {k}: Belief", belief, problem)
-        rows.append(row_of(belief))
-    words = "{0!r} at first and {1!r} when the slot is asked for again"
-    remedy = "keep what a receiver remembers in Belief.memory, and nothing in itself"
-    once = [row_of(after) for _, _, after in steps]
-    expect_same(once, rows[::-1], slice(None), problem.batch.first_trial, words, remedy)
-    with calling("prior(first=3)", kind):
-        expect_belief("prior(first=3): Belief", receiver.prior(3), problem)
+    def again(self, problem: Problem) -> None:
+        """The receiver, asked for slots backwards, answers as before, and has a prior for every slot."""
+        receiver, slots, rows = self.receiver(problem), self.slots(problem), []
+        for slot in reversed(slots):
+            with calling(f"slot {slot.k}: step(), asked for again after later slots,", self._kind):
+                belief = receiver.step(slot.k, slot.before, slot.heard)
+            expect_belief(f"slot {slot.k}: Belief", belief, problem)
+            rows.append(row_of(belief))
+        words = "{0!r} at first and {1!r} when the slot is asked for again"
+        remedy = "keep what a receiver remembers in Belief.memory, and nothing in itself"
+        once = [row_of(slot.after) for slot in slots]
+        expect_same(once, rows[::-1], slice(None), problem.batch.first_trial, words, remedy)
+        with calling("prior(first=3)", self._kind):
+            expect_belief("prior(first=3): Belief", receiver.prior(3), problem)
 
+    def actions(self, problem: Problem) -> None:
+        """If γ alone determines actions, `act` predicts from it what `step` does, and the covariance follows from that."""
+        if not self.follows_gamma(problem):
+            return
+        receiver = self.receiver(problem)
+        for slot in self.slots(problem):
+            k, gamma, after = slot.k, slot.heard.gamma, slot.after
+            with calling(f"slot {k}: act()", self._kind):
+                action = receiver.act(k, gamma)
+            expect_array(f"slot {k}: act()", action, np.uint8, gamma.shape, "an `Action` for each of the R trials")
+            other = action != after.action
+            if other.any():
+                at = int(np.argmax(other))
+                contradiction = f"act() says {_action_name(action[at])} and step() did {_action_name(after.action[at])}"
+                raise Broken(
+                    f"slot {k}, trial {problem.batch.first_trial + at}: {contradiction}; make them agree, or "
+                    f"{self.unpredictable}"
+                )
+            P = update.reported_covariance(problem.process, k, slot.before.P, action)
+            unlike = (P != after.P).any(axis=(0, 1))
+            if unlike.any():
+                at = int(np.argmax(unlike))
+                raise Broken(
+                    f"slot {k}, trial {problem.batch.first_trial + at}: Belief.P after {_action_name(action[at])} is not that "
+                    f"of update.reported_covariance; use that function, or {self.unpredictable}"
+                )
 
-def expect_actions(receiver: Receiver, steps: Sequence[Step], problem: Problem, kind: type, remedy: str) -> None:
-    """Raise Broken unless `act` predicts from γ what `step` does, and the covariance follows from it."""
-    for k, (before, heard, after) in enumerate(steps):
-        with calling(f"slot {k}: act()", kind):
-            action = receiver.act(k, heard.gamma)
-        expect_array(f"slot {k}: act()", action, np.uint8, heard.gamma.shape, "an `Action` for each of the R trials")
-        other = action != after.action
-        if other.any():
-            at = int(np.argmax(other))
-            contradiction = f"act() says {_action_name(action[at])} and step() did {_action_name(after.action[at])}"
+    def theory(self, problem: Problem) -> None:
+        """The outcomes that the class states are the observed ones, if it states any: errors contradict them only by chance."""
+        outcomes_at = self.outcomes_at(problem)
+        if outcomes_at is None:
+            return
+        outcomes = outcomes_at(QUALITY)
+        parts = (outcomes.predicted, outcomes.decoded, outcomes.leaked, outcomes.state, outcomes.misled)
+        if abs(sum_in_order(parts) - 1.0) > 1e-9 or min(parts) < 0.0:
             raise Broken(
-                f"slot {k}, trial {problem.batch.first_trial + at}: {contradiction}; make them agree, or {remedy}"
+                f"outcomes sum to {sum_in_order(parts):.6g}, the least is {min(parts):.3g}; expected probabilities that sum "
+                "to 1"
             )
-        P = update.reported_covariance(problem.process, k, before.P, action)
-        unlike = (P != after.P).any(axis=(0, 1))
-        if unlike.any():
-            at = int(np.argmax(unlike))
-            raise Broken(
-                f"slot {k}, trial {problem.batch.first_trial + at}: Belief.P after {_action_name(action[at])} is not that of "
-                f"update.reported_covariance; use that function, or {remedy}"
-            )
+        slots = self.slots(problem)
+        expected = TheoreticalCovariance(problem.process, outcomes).next_traces(len(slots))
+        for slot, trace in zip(slots, expected.tolist(), strict=True):
+            error = slot.squared_error
+            chance = SIGMAS * float(error.std()) / float(np.sqrt(len(error))) + _SLACK * trace + 1e-9
+            if abs(float(error.mean()) - trace) > chance:
+                raise Broken(
+                    f"slot {slot.k}: the mean squared error is {error.mean():.4g}, and outcomes say {trace:.4g}; "
+                    f"{self.unexpected}"
+                )
 
 
 def _action_name(action: int) -> str:
     return Action(action).name if int(action) in set(Action) else str(int(action))
-
-
-def expect_expected(
-    problem: Problem,
-    outcomes_at: OutcomesAt,
-    errors: Sequence[Floats],
-    remedy: str = "correct them, or return None: no closed form",
-) -> None:
-    """Raise Broken if the mean squared errors (R,) of every slot contradict the outcomes beyond chance; remedy: what to do."""
-    outcomes = outcomes_at(QUALITY)
-    parts = (outcomes.predicted, outcomes.decoded, outcomes.leaked, outcomes.state, outcomes.misled)
-    if abs(sum_in_order(parts) - 1.0) > 1e-9 or min(parts) < 0.0:
-        raise Broken(
-            f"outcomes sum to {sum_in_order(parts):.6g}, the least is {min(parts):.3g}; expected probabilities that sum to 1"
-        )
-    expected = TheoreticalCovariance(problem.process, outcomes).next_traces(len(errors))
-    for k, error in enumerate(errors):
-        chance = SIGMAS * float(error.std()) / float(np.sqrt(len(error))) + _SLACK * float(expected[k]) + 1e-9
-        if abs(float(error.mean()) - float(expected[k])) > chance:
-            raise Broken(
-                f"slot {k}: the mean squared error is {error.mean():.4g}, and outcomes say {expected[k]:.4g}; {remedy}"
-            )
 
 
 _LENGTHS = (1, 3, 2, 7, 70)
@@ -183,7 +213,6 @@ def divisions(slots: int) -> list[list[range]]:
 
 def expect_same_in_blocks(scheme: Scheme, slots: Sequence[Slot], problem: Problem, kind: type[Scheme]) -> None:
     """Raise Broken unless both sides of a scheme do in blocks what they do in single slots, made together and apart."""
-    steps = [(slot.before, slot.heard, slot.after) for slot in slots]
     for apart in (False, True):
         for blocks in divisions(problem.slots):
             encoder, estimator = sides(scheme, problem, kind, apart)
@@ -191,53 +220,53 @@ def expect_same_in_blocks(scheme: Scheme, slots: Sequence[Slot], problem: Proble
                 continue  # it cannot know of blocks, and the estimator alone is next
             packets: list[tuple[range, PacketBlock]] = []
             followed: list[_Followed] = []
-            belief = steps[0][0]
+            belief = slots[0].before
             for block in blocks:
                 # The next packet may depend on the acknowledgements of this one.
                 for some in [range(k, k + 1) for k in block] if scheme.needs_acknowledgements else [block]:
                     packets.append((some, _encoded(encoder, some, slots, problem, scheme, kind)))
-                if _plain(block, steps):
-                    followed.append(_followed(estimator, block, belief, steps, problem, kind))
+                if _plain(block, slots):
+                    followed.append(_followed(estimator, block, belief, slots, problem, kind))
                     belief = frozen_belief(followed[-1][2])
             _expect_same_packets(encoder, packets, slots, problem)
-            _expect_same_beliefs(estimator, followed, steps, problem)
-    expect_same_followed(lambda: sides(scheme, problem, kind, apart=True)[1], steps, problem, kind)
+            _expect_same_beliefs(estimator, followed, slots, problem)
+    expect_same_followed(lambda: sides(scheme, problem, kind, apart=True)[1], slots, problem, kind)
 
 
-def expect_same_followed(make: Callable[[], Receiver], steps: Sequence[Step], problem: Problem, kind: type) -> None:
+def expect_same_followed(make: Callable[[], Receiver], slots: Sequence[Slot], problem: Problem, kind: type) -> None:
     """Raise Broken unless a receiver has the same beliefs for every division into blocks; `make` makes one for each division."""
     whole, single, uneven = divisions(problem.slots)
     for blocks, every in ((whole, 1), (single, 1), (uneven, 1), (uneven, 2)):
         receiver = make()
         if type(receiver).follow is Receiver.follow:
             return  # which takes slot by slot
-        followed = list(_in_order(receiver, blocks, every, steps, problem, kind))
-        _expect_same_beliefs(receiver, followed, steps, problem)
+        followed = list(_in_order(receiver, blocks, every, slots, problem, kind))
+        _expect_same_beliefs(receiver, followed, slots, problem)
         _expect_same_uses(receiver, blocks, problem, kind)
     receiver = make()
-    plain = [block for block in reversed(uneven) if _plain(block, steps)]
-    again = [_followed(receiver, block, steps[block.start][0], steps, problem, kind) for block in plain]
-    _expect_same_beliefs(receiver, again, steps, problem)
+    plain = [block for block in reversed(uneven) if _plain(block, slots)]
+    again = [_followed(receiver, block, slots[block.start].before, slots, problem, kind) for block in plain]
+    _expect_same_beliefs(receiver, again, slots, problem)
 
 
-def _plain(block: range, steps: Sequence[Step]) -> bool:
+def _plain(block: range, slots: Sequence[Slot]) -> bool:
     """Whether nothing but packets is heard in a block, as where a run takes its slots at once."""
-    return all(steps[k][1].header is None and steps[k][1].truth is None for k in block)
+    return all(slots[k].heard.header is None and slots[k].heard.truth is None for k in block)
 
 
 def _in_order(
-    receiver: Receiver, blocks: list[range], every: int, steps: Sequence[Step], problem: Problem, kind: type
+    receiver: Receiver, blocks: list[range], every: int, slots: Sequence[Slot], problem: Problem, kind: type
 ) -> Iterator[_Followed]:
     """The beliefs of a receiver after blocks, one after the other; only one block in `every` is taken at once."""
-    belief = steps[0][0]
+    belief = slots[0].before
     for number, block in enumerate(blocks):
-        if number % every == 0 and _plain(block, steps):
-            yield (followed := _followed(receiver, block, belief, steps, problem, kind))
+        if number % every == 0 and _plain(block, slots):
+            yield (followed := _followed(receiver, block, belief, slots, problem, kind))
             belief = frozen_belief(followed[2])
         else:
             for k in block:
                 with calling(f"slot {k}: {_method_name(receiver, 'step')} after a block of slots", kind):
-                    belief = frozen_belief(receiver.step(k, belief, steps[k][1]))
+                    belief = frozen_belief(receiver.step(k, belief, slots[k].heard))
 
 
 def _encoded(
@@ -255,9 +284,9 @@ def _encoded(
 
 
 def _followed(
-    receiver: Receiver, some: range, belief: Belief, steps: Sequence[Step], problem: Problem, kind: type
+    receiver: Receiver, some: range, belief: Belief, slots: Sequence[Slot], problem: Problem, kind: type
 ) -> _Followed:
-    gamma, z = (frozen(np.array([getattr(steps[k][1], name) for k in some])) for name in ("gamma", "z"))
+    gamma, z = (frozen(np.array([getattr(slots[k].heard, name) for k in some])) for name in ("gamma", "z"))
     with calling(f"{slots_text(some)}: {_method_name(receiver, 'follow')}", kind):
         result: Any = receiver.follow(some, belief, gamma, z)
     expect_beliefs(some, result, problem)
@@ -274,14 +303,14 @@ def _expect_same_packets(
 
 
 def _expect_same_beliefs(
-    receiver: Receiver, followed: Sequence[_Followed], steps: Sequence[Step], problem: Problem
+    receiver: Receiver, followed: Sequence[_Followed], slots: Sequence[Slot], problem: Problem
 ) -> None:
     name = _method_name(receiver, "follow")
     for some, beliefs, after in followed:
         rows = [row_of(Belief(*(column[row] for column in beliefs))) for row in range(len(some))]
-        _expect_same([row_of(steps[k][2]) for k in some], rows, some, problem, name)
+        _expect_same([row_of(slots[k].after) for k in some], rows, some, problem, name)
         last = f"the last Belief of {name}"
-        _expect_same([row_of(steps[some[-1]][2])], [row_of(after)], some[-1:], problem, last)
+        _expect_same([row_of(slots[some[-1]].after)], [row_of(after)], some[-1:], problem, last)
 
 
 def _expect_same_uses(receiver: Receiver, blocks: list[range], problem: Problem, kind: type) -> None:
