@@ -6,10 +6,11 @@ Source: docs/your-own/rules.md.
 from __future__ import annotations
 
 import copy
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import final
+from typing import ClassVar, Generic, TypeVar, final
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from evedrop.model.streams import BlockReader
 from evedrop.scenario.conformance.problems import Problem, large, small
 from evedrop.scenario.conformance.receivers import SIGMAS
 from evedrop.scenario.conformance.rules import (
+    Array,
     Broken,
     RuleVerdict,
     calling,
@@ -34,16 +36,51 @@ from evedrop.scenario.conformance.rules import (
     key,
 )
 
+Model = TypeVar("Model", bound=LossModel | DelayModel)
 _COLUMN = "compute each trial from its own column of numbers alone"
 _PIECES = "let a slot depend only on the model's memory and the slot's numbers, not on how many slots are asked for"
 
 
-@final
-class LossChecks:
-    """The rules for loss models, each checked on one problem. model: makes a new instance."""
+class _ModelChecks(ABC, Generic[Model]):
+    """The rules that loss models and delay models share, each checked on one problem. model: makes a new instance."""
 
-    def __init__(self, model: Callable[[], LossModel], kind: type[LossModel]) -> None:
+    result: ClassVar[str]
+    """What a model decides of a packet, for messages."""
+
+    def __init__(self, model: Callable[[], Model], kind: type[Model]) -> None:
         self._model, self._kind = model, kind
+
+    @abstractmethod
+    def _whole(self, problem: Problem, bounds: tuple[int, ...] = ()) -> Array:
+        """All results of a problem, (slots, R), in one call, or in several calls that begin at 0 and at these slots."""
+
+    def _made(self) -> Model:
+        with calling(f"{self._kind.__name__}(…)", self._kind):
+            return self._model()
+
+    def alone(self, problem: Problem) -> None:
+        """A trial alone gives the same results as among others."""
+        among = self._whole(problem)
+        words = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
+        for trial in (0, problem.batch.trials - 1):
+            part = problem.part(trial, 1)
+            self._same(among[:, trial : trial + 1], self._whole(part), part, words, _COLUMN)
+
+    def pieces(self, problem: Problem) -> None:
+        """Slots give the same results in one call and in several."""
+        once, several = self._whole(problem), self._whole(problem, (1, 4, 5))
+        self._same(once, several, problem, "{0!r} in one call and {1!r} in several", _PIECES)
+
+    def _same(self, first: Array, second: Array, problem: Problem, words: str, remedy: str) -> None:
+        rows = [[{self.result: row} for row in results] for results in (first, second)]
+        expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, words, remedy)
+
+
+@final
+class LossChecks(_ModelChecks[LossModel]):
+    """The rules for loss models."""
+
+    result = "the fate"
 
     def verdicts(self) -> list[RuleVerdict]:
         """Check every rule, on small problems."""
@@ -57,10 +94,6 @@ class LossChecks:
         return judged(
             (exact, small()), ([("quality agrees with simulation", self.rate)], [_long(loss) for loss in large()])
         )
-
-    def _made(self) -> LossModel:
-        with calling(f"{self._kind.__name__}(…)", self._kind):
-            return self._model()
 
     def _uniforms(self, model: LossModel, problem: Problem) -> Floats:
         words = model.uniforms_per_slot
@@ -83,9 +116,11 @@ class LossChecks:
             )
         return fates
 
-    def _whole(self, problem: Problem) -> Codes:
+    def _whole(self, problem: Problem, bounds: tuple[int, ...] = ()) -> Codes:
         model = self._made()
-        return self._fates(model, 0, self._uniforms(model, problem))
+        uniforms = self._uniforms(model, problem)
+        pieces = pairwise((0, *bounds, problem.slots))
+        return np.concatenate([self._fates(model, first, uniforms[first:stop]) for first, stop in pieces])
 
     def shapes(self, problem: Problem) -> None:
         """Fates, and the numbers that the model states, have the right shapes and types."""
@@ -124,22 +159,6 @@ class LossChecks:
         for fates in each:
             self._same(once, np.concatenate(fates), problem, words, "keep no state outside of the model")
 
-    def alone(self, problem: Problem) -> None:
-        """A trial alone gives the same fates as among others."""
-        among = self._whole(problem)
-        for trial in (0, problem.batch.trials - 1):
-            by_itself = self._whole(problem.part(trial, 1))
-            words = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
-            self._same(among[:, trial : trial + 1], by_itself, problem.part(trial, 1), words, _COLUMN)
-
-    def pieces(self, problem: Problem) -> None:
-        """Slots give the same fates in one call and in several."""
-        once, model = self._whole(problem), self._made()
-        uniforms = self._uniforms(model, problem)
-        bounds = [0, 1, 4, 5, problem.slots]
-        parts = [self._fates(model, first, uniforms[first:stop]) for first, stop in pairwise(bounds)]
-        self._same(once, np.concatenate(parts), problem, "{0!r} in one call and {1!r} in several", _PIECES)
-
     def copied(self, problem: Problem) -> None:
         """A shallow copy continues from where it was made, whatever the original does meanwhile."""
         once, model = self._whole(problem), self._made()
@@ -167,17 +186,12 @@ class LossChecks:
                 f"{variance:.3g}; give `chain`, or a rate_variance() of its own"
             )
 
-    def _same(self, first: Codes, second: Codes, problem: Problem, words: str, remedy: str) -> None:
-        rows = [[{"the fate": row} for row in codes] for codes in (first, second)]
-        expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, words, remedy)
-
 
 @final
-class DelayChecks:
-    """The rules for delay models, each checked on one problem. model: makes a new instance."""
+class DelayChecks(_ModelChecks[DelayModel]):
+    """The rules for delay models."""
 
-    def __init__(self, model: Callable[[], DelayModel], kind: type[DelayModel]) -> None:
-        self._model, self._kind = model, kind
+    result = "the delay"
 
     def verdicts(self) -> list[RuleVerdict]:
         """Check every rule, on small problems."""
@@ -188,12 +202,12 @@ class DelayChecks:
         ]
         return judged((exact, small()), ([("delays agree with simulation", self.says)], large()))
 
-    def _delays(self, problem: Problem, bounds: tuple[int, ...] = ()) -> Floats:
+    def _whole(self, problem: Problem, bounds: tuple[int, ...] = ()) -> Floats:
+        """As above; each call is to a new instance."""
         reader, parts = BlockReader(key("delay"), problem.batch, 1), []
         for first, stop in pairwise((0, *bounds, problem.slots)):
             slots = range(first, stop)
-            with calling(f"{self._kind.__name__}(…)", self._kind):
-                model = self._model()
+            model = self._made()
             numbers = frozen((reader.normals(slots) if model.normal else reader.uniforms(slots))[:, 0])
             where = f"delays() of slot {first} and on"
             with calling(where, self._kind):
@@ -207,7 +221,7 @@ class DelayChecks:
 
     def shapes(self, problem: Problem) -> None:
         """Delays, and the probabilities that the model states, have the right shapes and types."""
-        self._delays(problem)
+        self._whole(problem)
         with calling("arrived()", self._kind):
             probabilities = [self._model().arrived(lag) for lag in range(4)]
         given = [probability for probability in probabilities if probability is not None]
@@ -221,22 +235,9 @@ class DelayChecks:
                 f"arrived() of 0 to 3 is {probabilities}; expected probabilities that do not fall, or None always"
             )
 
-    def alone(self, problem: Problem) -> None:
-        """A trial alone gives the same delays as among others."""
-        among = self._delays(problem)
-        for trial in (0, problem.batch.trials - 1):
-            by_itself = self._delays(problem.part(trial, 1))
-            words = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
-            self._same(among[:, trial : trial + 1], by_itself, problem.part(trial, 1), words, _COLUMN)
-
-    def pieces(self, problem: Problem) -> None:
-        """Slots give the same delays in one call as in several calls to new instances."""
-        once = self._delays(problem)
-        self._same(once, self._delays(problem, (1, 4)), problem, "{0!r} in one call and {1!r} in several", _PIECES)
-
     def says(self, problem: Problem) -> None:
         """The fraction of packets in time is the stated one."""
-        delays = self._delays(problem)
+        delays = self._whole(problem)
         for lag in range(4):
             promised = self._model().arrived(lag)
             fraction = float((delays < lag + 1).mean())
@@ -246,10 +247,6 @@ class DelayChecks:
                 raise Broken(
                     f"{fraction:.4f} of the delays are below {lag + 1} slots, and arrived({lag}) is {promised:.4f}"
                 )
-
-    def _same(self, first: Floats, second: Floats, problem: Problem, words: str, remedy: str) -> None:
-        rows = [[{"the delay": row} for row in delays] for delays in (first, second)]
-        expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, words, remedy)
 
 
 def _long(problem: Problem) -> Problem:
