@@ -35,19 +35,6 @@ from evedrop.scenario.tables import Scenario
 Split = tuple[float, float]
 
 
-@final
-class ClosedStream:
-    """The traces of a closed form, a number of slots at a time."""
-
-    def __init__(self, closed: ClosedForm) -> None:
-        self._closed, self._next = closed, 0
-
-    def next_traces(self, slots: int) -> Floats:
-        """The traces of the next slots, (slots,)."""
-        self._next += slots
-        return self._closed.traces[self._next - slots : self._next]
-
-
 def closed_of(scenario: Scenario, receiver: str) -> ClosedForm | None:
     """A receiver's closed form; None if scheme and strategy have none, or the links violate its assumptions."""
     form = stated_form(scenario, receiver)
@@ -247,7 +234,7 @@ class Expectation:
     def stream(self) -> TheoreticalTraceStream:
         """The theoretical traces from slot 0 on; NaN without a theory."""
         if self.closed is not None:
-            return ClosedStream(self.closed)
+            return KnownTraces(self.closed.traces)
         if self._outcomes is not None:
             return TheoreticalCovariance(self.process, self._outcomes)
         if self._known is None:

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Annotated, ClassVar, Self
 
 from pydantic import Field
 
 from evedrop.scenario.application import APPLICATIONS, applications_in
-from evedrop.scenario.events.event import Act, EventKind, Jamming, Spoofing, Surroundings, begun_too_early
+from evedrop.scenario.events.event import Act, EventKind, Jamming, Spoofing, Surroundings
 from evedrop.scenario.table import Mistake
 from evedrop.scenario.words import as_toml
 
@@ -20,9 +21,8 @@ from evedrop.scenario.words import as_toml
 class Attack(EventKind):
     """The attack lasts only during such events; their main entry is the word for what is attacked."""
 
-    attacked: ClassVar[str]
-    """The only value of the main entry."""
     does: ClassVar[type[Jamming] | type[Spoofing]]
+    """Its `attacked` is the only value of the main entry."""
     lasts = True
 
     @abstractmethod
@@ -31,22 +31,26 @@ class Attack(EventKind):
 
     def acts(self) -> Iterator[Act]:
         """The attack's beginning and end."""
-        yield self.begin(f"{self.attacked} are attacked", self.does(on=True))
+        yield self.begin(f"{self.does.attacked} are attacked", self.does(on=True))
         if self.to is not None:
-            yield Act(self.to, self.kind, (), f"{self.attacked} are no longer attacked", self.does(on=False))
+            yield Act(self.to, self.kind, (), f"{self.does.attacked} are no longer attacked", self.does(on=False))
 
     def compared(self, surroundings: Surroundings) -> Iterator[Mistake]:
         """A mistake for another value of the main entry, and those of `undescribed`."""
         given = getattr(self, self.kind)
-        if given != self.attacked:
-            yield self.kind, f"is {as_toml(given)}; expected {as_toml(self.attacked)}"
+        if given != self.does.attacked:
+            yield self.kind, f"is {as_toml(given)}; expected {as_toml(self.does.attacked)}"
         else:
             yield from ((self.kind, sentence) for sentence in self.undescribed(surroundings))
 
     @classmethod
     def in_turn(cls, events: Sequence[tuple[int, Self]]) -> Iterator[str]:
         """Mistakes where an attack begins before the previous one has ended."""
-        yield from begun_too_early(events)
+        in_order = sorted(events, key=lambda numbered: numbered[1].first)
+        for (_, before), (i, event) in pairwise(in_order):
+            if before.to is None or before.to > event.first:
+                lasting = "while another one lasts; expected that one to end first"
+                yield f"event.{i}.{event.kind}: begins in slot {event.first}, {lasting}"
 
 
 class Jam(Attack):
@@ -56,7 +60,6 @@ class Jam(Attack):
     """`"acknowledgements"`: the attack that `[acknowledgements]` describes lasts only during such events."""
 
     kind = "jam"
-    attacked = Jamming.attacked
     does = Jamming
 
     def undescribed(self, surroundings: Surroundings) -> Iterator[str]:
@@ -76,15 +79,11 @@ class Spoof(Attack):
     """`"measurements"`: the attack that `[integrity]` describes lasts only during such events."""
 
     kind = "spoof"
-    attacked = Spoofing.attacked
     does = Spoofing
 
     def undescribed(self, surroundings: Surroundings) -> Iterator[str]:
         """Mistakes unless an attack on measurements is described."""
         if not surroundings.monitored:
-            able = [
-                f"[{name}]"
-                for name, application in applications_in(APPLICATIONS.names).items()
-                if application.has_monitor
-            ]
+            loaded = applications_in(APPLICATIONS.names).items()
+            able = [f"[{name}]" for name, application in loaded if application.has_monitor]
             yield f"no attack is described; expected a table {' or '.join(able)} with an attack as well"

@@ -11,7 +11,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, model_validator
@@ -287,16 +286,6 @@ def _expect_acts(acts: Sequence[object]) -> None:
             raise NoAnswer("it names no receiver; expected one, or several")
         if len(act.names) != 1 and act.effect.one_receiver:
             raise NoAnswer("it names several receivers; expected one")
-
-
-def begun_too_early(events: Sequence[tuple[int, EventKind]]) -> Iterator[str]:
-    """Mistakes where an event of a kind begins before the previous one has ended; events: each with its number."""
-    in_order = sorted(events, key=lambda numbered: numbered[1].first)
-    for (_, before), (i, event) in pairwise(in_order):
-        if before.to is None or before.to > event.first:
-            yield (
-                f"event.{i}.{event.kind}: begins in slot {event.first}, while another one lasts; expected that one to end first"
-            )
 
 
 def spoken(names: Sequence[str]) -> str:

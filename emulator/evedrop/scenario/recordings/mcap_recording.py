@@ -54,9 +54,8 @@ class _Channel:
 
     topic: str
     metadata: str
-    sequences: list[int] = field(default_factory=list)
-    logged: list[int] = field(default_factory=list)
-    published: list[int] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)
+    """Of each message: sequence, log time and time of publication."""
 
 
 @dataclass(frozen=True)
@@ -334,10 +333,7 @@ def _keep(records: Iterator[Any], channels: dict[tuple[int, int], _Channel], fil
     for record in records:
         if isinstance(record, tuple):
             with suppress(KeyError):  # a message without a channel is a mistake of the recorder's
-                channel = channels[file, record[0]]
-                channel.sequences.append(record[1])
-                channel.logged.append(record[2])
-                channel.published.append(record[3])
+                channels[file, record[0]].numbers.extend(record[1:])
         else:
             metadata = "\n".join(record.metadata.values())
             channels.setdefault((file, record.id), _Channel(record.topic, f"{metadata}\n"))
@@ -348,15 +344,12 @@ def _joined_by_topic(channels: Iterable[tuple[tuple[int, int], _Channel]]) -> li
     by_topic: dict[tuple[str, int], list[_Channel]] = {}
     met: Counter[tuple[int, str]] = Counter()
     for (file, _), channel in channels:
-        if channel.sequences:
+        if channel.numbers:
             met[file, channel.topic] += 1
             by_topic.setdefault((channel.topic, met[file, channel.topic]), []).append(channel)
     joined = []
     for (topic, _), parts in by_topic.items():
-        columns = (
-            np.array([value for part in parts for value in getattr(part, name)], np.uint64).astype(np.int64)
-            for name in ("sequences", "logged", "published")
-        )
-        messages = _Messages(topic, parts[0].metadata, *columns)
+        numbers = np.array([number for part in parts for number in part.numbers], np.uint64).astype(np.int64)
+        messages = _Messages(topic, parts[0].metadata, *numbers.reshape(-1, 3).T)
         joined.append(messages.of(np.argsort(messages.logged, kind="stable")))
     return joined
