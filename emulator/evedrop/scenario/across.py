@@ -34,11 +34,19 @@ from evedrop.scenario.expect import Around
 from evedrop.scenario.plant import PlantTable
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.process_noise import filter_mistakes, singular_mistakes
-from evedrop.scenario.receivers import CHANGEABLE, LinkTable, changed_link, other_model, tie_of, unchangeable
+from evedrop.scenario.receivers import (
+    CHANGEABLE,
+    LinkTable,
+    changed_link,
+    entries_after,
+    other_model,
+    tie_of,
+    unchangeable,
+)
 from evedrop.scenario.table import Table, sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import expectations_of
-from evedrop.scenario.timeline import entries_after, numbered_acts
+from evedrop.scenario.timeline import numbered_acts
 from evedrop.scenario.words import as_toml, listed
 
 Numbered = tuple[int, Act]
@@ -59,7 +67,9 @@ def event_mistakes(scenario: Scenario) -> Iterator[str]:
         yield from _name_mistakes(path, event, scenario.receivers)
         yield from _own(path, type(event), partial(_compared, path, event, surroundings))
     yield from _changes_mistakes(scenario)
-    yield from _order_mistakes(scenario)
+    acts = numbered_acts(scenario.event)
+    for name in scenario.receivers:
+        yield from _order_mistakes(name, [(i, act) for i, act in acts if name in act.names])
     kinds = dict.fromkeys(type(event) for event in scenario.event)
     for kind in kinds:
         events = [(i, event) for i, event in enumerate(scenario.event) if type(event) is kind]
@@ -170,15 +180,11 @@ def _silent(scenario: Scenario) -> str:
     )
 
 
-def _order_mistakes(scenario: Scenario) -> Iterator[str]:
-    """Events that end a cut or an outage that has not begun, or that begin one while another of its kind lasts."""
-    acts = numbered_acts(scenario.event)
-    for name in scenario.receivers:
-        yield from _order_mistakes_of(name, [(i, act) for i, act in acts if name in act.names])
+def _order_mistakes(name: str, acts: Sequence[Numbered]) -> Iterator[str]:
+    """Events that end a cut or an outage of a receiver that has not begun, or that begin one while another of its kind lasts.
 
-
-def _order_mistakes_of(name: str, acts: Sequence[Numbered]) -> Iterator[str]:
-    """The same for one receiver; acts: those that concern it, in order of slots."""
+    acts: those that concern it, in order of slots.
+    """
     cut: int | None = None
     away: tuple[int, Fate] | None = None
     ended = -1
@@ -210,7 +216,7 @@ def _order_mistakes_of(name: str, acts: Sequence[Numbered]) -> Iterator[str]:
 def link_mistakes(scenario: Scenario) -> Iterator[str]:
     """Mistakes in correlations, and in delays in seconds."""
     for name, link in scenario.links.items():
-        path = f"{LEGITIMATE}.link" if name == LEGITIMATE else f"eavesdroppers.{name}.link"
+        path = scenario.link_path(name)
         yield from (f"{path}.{line}" for line in link.delay_mistakes(scenario.slot_seconds))
         if link.correlation is not None:
             yield from _correlation_mistakes(f"{path}.correlation.with", name, link, link.correlation.to, scenario)
@@ -264,8 +270,7 @@ def acknowledgement_mistakes(scenario: Scenario) -> Iterator[str]:
     if scheme.may_be_silent:
         for receiver, link in scenario.links.items():
             if link.rate is not None:
-                path = receiver if receiver == LEGITIMATE else f"eavesdroppers.{receiver}"
-                yield f"{path}.link.rate: {_silent(scenario)}"
+                yield f"{scenario.link_path(receiver)}.rate: {_silent(scenario)}"
 
 
 def scheme_mistakes(scenario: Scenario) -> Iterator[str]:

@@ -118,14 +118,10 @@ def given_state_mistakes(scenario: Scenario) -> Iterator[str]:
 
 def _plant_and_process(plant: PlantTable, process: ProcessTable) -> Iterator[str]:
     n = len(process.A)
-    matrices = {name: getattr(plant, name) for name in ("input_matrix", "disturbance_matrix", "noise")}
-    for name, rows in matrices.items():
-        if rows is None:
-            continue
-        if name == "noise":
-            yield from noise_mistakes(plant, n)
-        elif len(rows) != n:
+    for name, rows in (("input_matrix", plant.input_matrix), ("disturbance_matrix", plant.disturbance_matrix)):
+        if rows is not None and len(rows) != n:
             yield f"plant.{name}: has {len(rows)} rows; expected {n}, one for each state"
+    yield from noise_mistakes(plant, n)
     inside = {"process.reference": process.around}
     if plant.start is not None and len(plant.start) != n:
         yield f"plant.start: has {len(plant.start)} entries; expected {n}, one for each state"

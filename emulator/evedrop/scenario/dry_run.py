@@ -6,7 +6,6 @@ Source: docs/your-own/rules.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import partial
 from typing import Any
 
 from pydantic import ValidationError
@@ -17,11 +16,8 @@ from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.integrity import SENSOR_ATTACKS
 from evedrop.model.links import LOSS_MODELS, POOLED, loss_of, single_specs
-from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
-from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.streams import Batch
-from evedrop.names import LEGITIMATE
 from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks
 from evedrop.scenario.conformance.links import DelayChecks, LossChecks
 from evedrop.scenario.conformance.problems import Problem
@@ -81,8 +77,9 @@ def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: st
     if not STRATEGIES.foreign(name):
         kind = SCHEMES[scenario.encoding.scheme]
         strategy = STRATEGIES[table.strategy]
-        make = partial(_scheme, spec)
-        checks = EavesdropperChecks(table.strategy, strategy, table.parameters, make, kind)
+        checks = EavesdropperChecks(
+            table.strategy, strategy, table.parameters, lambda process: scheme_of(process, spec), kind
+        )
         return how_broken(checks.at_first, Problem(scenario.process.process, batch))
     public = scenario.process
     process = (public.A, public.Q, public.initial_covariance, public.singular_noise)
@@ -105,15 +102,10 @@ def _ask_for_theory(scenario: Scenario, table: EavesdropperTable) -> None:
             outcomes_at(quality)
 
 
-def _scheme(spec: Mapping[str, Any], process: Process) -> Scheme:
-    return scheme_of(process, spec)
-
-
 def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
     for receiver in scenario.receivers:
-        path = f"{LEGITIMATE}.link" if receiver == LEGITIMATE else f"eavesdroppers.{receiver}.link"
         link = scenario.link(receiver)
-        yield from _settings_mistakes(path, link.settings(scenario.slot_seconds), problem)
+        yield from _settings_mistakes(scenario.link_path(receiver), link.settings(scenario.slot_seconds), problem)
     for i, event in enumerate(scenario.event):
         # An event's models are checked when tables are compared: mistakes are reported there, not here.
         for act in event.acts():

@@ -27,12 +27,18 @@ _TABLES = {"plant": ("disturbance", "disturbances", "disturbance_units"), "proce
 """Table that may name a file of numbers → the first word of its entries, and its entries with names and units."""
 
 
-def locate_tables(tables: Mapping[str, Any], folder: Path) -> None:
-    """Replace the names of the files of states and disturbances with their paths, in place; folder: that of the scenario."""
+def _tables_with_files(tables: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """The tables that name a file of numbers: name, first word of the entries, and entries."""
     for name, (kind, *_) in _TABLES.items():
         table = tables.get(name)
         if isinstance(table, dict) and isinstance(table.get(f"{kind}_file"), str):
-            table[f"{kind}_file"] = str(found_file(table[f"{kind}_file"], folder))
+            yield name, kind, table
+
+
+def locate_tables(tables: Mapping[str, Any], folder: Path) -> None:
+    """Replace the names of the files of states and disturbances with their paths, in place; folder: that of the scenario."""
+    for _, kind, table in _tables_with_files(tables):
+        table[f"{kind}_file"] = str(found_file(table[f"{kind}_file"], folder))
 
 
 def read_tables(tables: Mapping[str, Any]) -> list[str]:
@@ -41,12 +47,10 @@ def read_tables(tables: Mapping[str, Any]) -> list[str]:
     A file of states is left alone unless states come from it. Returns the mistakes, with their paths.
     """
     mistakes = []
-    for name, (kind, *labels) in _TABLES.items():
-        table = tables.get(name)
-        unused = kind == "state" and isinstance(table, dict) and table.get("source") != "file"
-        if isinstance(table, dict) and isinstance(table.get(f"{kind}_file"), str) and not unused:
-            wrong = _read(tables, table, kind, *(table.get(label) for label in labels))
-            mistakes += [f"{name}.{kind}_file: {sentence}" for sentence in wrong]
+    for name, kind, table in _tables_with_files(tables):
+        if kind != "state" or table.get("source") == "file":
+            labels = (table.get(label) for label in _TABLES[name][1:])
+            mistakes += [f"{name}.{kind}_file: {sentence}" for sentence in _read(tables, table, kind, *labels)]
     return mistakes
 
 

@@ -24,10 +24,7 @@ _TOKEN = re.compile(
 
 def lines_of_entries(text: str) -> dict[str, int]:
     """Dotted path → line, from 1, of each table and entry of a valid TOML text; inside a value there are no paths."""
-    lines_: dict[str, int] = {}
-    for path, line in _paths(text):
-        lines_.setdefault(path, line)
-    return lines_
+    return dict(reversed([*_paths(text)]))  # the first line of each path
 
 
 def given_twice(text: str, line: int) -> str | None:

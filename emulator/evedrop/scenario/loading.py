@@ -13,6 +13,7 @@ import sys
 import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, final
@@ -35,6 +36,7 @@ from evedrop.scenario.input_files import locate_recordings, locate_tables, read_
 from evedrop.scenario.line_numbers import excerpt, given_twice, with_line_numbers
 from evedrop.scenario.plugins import elsewhere, named_in
 from evedrop.scenario.process_noise import replace_filter_noise
+from evedrop.scenario.receivers import SHORT_FORMS
 from evedrop.scenario.stream_keys import secret_in
 from evedrop.scenario.table import sentences, unusable
 from evedrop.scenario.tables import Builders
@@ -141,31 +143,24 @@ def tables_in(text: str, source: str) -> dict[str, Any]:
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables nested without end
-        raise ScenarioError(source, [_no_toml(text, error)], [_where(text, error)]) from None
+        raise _no_toml(source, text, error) from None
     if mistakes := list(unusable(tables)):
         raise ScenarioError(source, mistakes)
     return tables
 
 
-def _no_toml(text: str, error: Exception) -> str:
-    """Why a text is not TOML, in words that name an entry that is given twice."""
-    place = _PLACE.search(str(error))
-    twice = None
-    if place is not None and str(error).startswith(_TWICE):
-        twice = given_twice(text, int(place[1]))
-    return f"not TOML: {error if twice is None else twice}"
-
-
 _PLACE = re.compile(r"\(at line (\d+), column (\d+)\)")
 
 
-def _where(text: str, error: Exception) -> str:
-    """The line that is not TOML, with a caret; empty if the error does not say where it is."""
-    place = _PLACE.search(str(error))
-    if place is None:
-        return ""
-    line = int(place[1])
-    return excerpt(text.split("\n")[line - 1], line, column=int(place[2]) - 1)
+def _no_toml(source: str, text: str, error: Exception) -> ScenarioError:
+    """Says why a text is not TOML, such as an entry that is given twice, with the line and a caret if the error has a place."""
+    place, problem, where = _PLACE.search(str(error)), str(error), ""
+    if place is not None:
+        line, column = int(place[1]), int(place[2])
+        where = excerpt(text.split("\n")[line - 1], line, column=column - 1)
+        if problem.startswith(_TWICE):
+            problem = given_twice(text, line) or problem
+    return ScenarioError(source, [f"not TOML: {problem}"], [where])
 
 
 def checked(
@@ -228,10 +223,6 @@ def _across(scenario: Scenario, beyond_horizon: bool, silent: bool = False) -> l
         return [f"modules: a class raised {place_of(error)} when it was asked about itself; expected no error"]
 
 
-_SHORT_FORMS = {"quality": "loss", "loss": "quality"}
-"""Entry of a link → the other form of it, which a change replaces."""
-
-
 def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
     """Put a value at a dotted key; a link's `quality` replaces its `loss`, and the other way round.
 
@@ -262,7 +253,7 @@ def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
 
 def _drop_other_form(table: dict[str, Any], names: list[str]) -> None:
     """Remove the other form of an entry of a link, or of a change of one, in place; names: the path of the entry."""
-    tables, other = [name for name in names[:-1] if not name.isdecimal()], _SHORT_FORMS.get(names[-1])
+    tables, other = [name for name in names[:-1] if not name.isdecimal()], SHORT_FORMS.get(names[-1])
     if other is not None and tables and tables[-1] in ("link", "links", "set"):
         table.pop(other, None)
 
@@ -326,8 +317,8 @@ def plain_tables(values: Mapping[str, Any], source: str, modules: str | None = N
     tables = {name: plain for name, value in values.items() if (plain := plain_tables.plain(name, value)) is not None}
     given = tables.get("modules", modules)
     if plain_tables.folders and not plain_tables.mistakes and isinstance(given, (str, Path, type(None))):
-        folders = dict.fromkeys(plain_tables.folders) if given is None else {str(Path(given).absolute()): None}
-        folders |= dict.fromkeys(plain_tables.folders)
+        named = [] if given is None else [str(Path(given).absolute())]
+        folders = dict.fromkeys([*named, *plain_tables.folders])
         if len(folders) > 1:
             both = " and ".join(folders)
             plain_tables.mistakes.append(
@@ -438,11 +429,6 @@ def built(values: Mapping[str, Any]) -> Scenario:
     return checked(tables, _SOURCE, beyond_horizon=True)
 
 
-def loaded(source: str | Path, changes: Mapping[str, Any]) -> Scenario:
-    """A built-in scenario or a file, with changes by dotted key. Raises ScenarioError with every mistake."""
-    return prepared(source, changes, beyond_horizon=True)
-
-
 def prepared(scenario: str | Path | Scenario, changes: Mapping[str, Any], *, beyond_horizon: bool = False) -> Scenario:
     """The scenario that a call is about, with changes by dotted key, checked as `load` does; None removes an entry.
 
@@ -483,9 +469,4 @@ def _remove(tables: dict[str, Any], keys: Collection[str]) -> None:
             inner.pop(last, None)
 
 
-def register() -> None:
-    """Let `Scenario(...)`, `Scenario.load` and `replace` check whole scenarios."""
-    Scenario.builders = Builders(built, loaded, changed)
-
-
-register()
+Scenario.builders = Builders(built, partial(prepared, beyond_horizon=True), changed)

@@ -14,7 +14,7 @@ from evedrop.model.registry import is_own
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.events.event import Fault, Slot
 from evedrop.scenario.table import Mistake, Table, expected
-from evedrop.scenario.words import as_toml, listed
+from evedrop.scenario.words import listed
 from evedrop.system.hints import near
 
 NEMESIS = "nemesis"
@@ -67,8 +67,8 @@ class NemesisTable(Table):
         for name, fault in drawn.items():
             for entry, words in fault.needs.items():
                 if getattr(self, entry) is None:
-                    example = as_toml((type(self).model_fields[entry].examples or [0])[0])
-                    yield entry, f"is missing, but the fault {name} is drawn; expected {words}: {entry} = {example}"
+                    example = f"{entry} = {self.example(entry)}"
+                    yield entry, f"is missing, but the fault {name} is drawn; expected {words}: {example}"
         used = {entry for fault in drawn.values() for entry in fault.entries}
         for name, kind in EVENTS.items():
             for entry in kind.fault.entries if kind.fault is not None else ():

@@ -70,8 +70,8 @@ class PlantTable(Table):
         yield from limit_mistakes("input", self.input_lower, self.input_upper, count, "one for each of inputs", {})
         for entry, other in (("output_matrix", "measurement_noise"), ("measurement_noise", "output_matrix")):
             if getattr(self, entry) is not None and getattr(self, other) is None:
-                example = as_toml((type(self).model_fields[other].examples or [0])[0])
-                yield other, f"is missing, but {entry} is given; expected {other} = {example}, or neither"
+                example = f"{other} = {self.example(other)}"
+                yield other, f"is missing, but {entry} is given; expected {example}, or neither"
         rows, disturbances = self.disturbance_values, len(self.disturbances)
         if disturbances and rows is None:
             yield "disturbance_file", 'is missing; expected disturbance_file = "day.csv", or disturbance_values'

@@ -188,8 +188,7 @@ class ProcessTable(Table):
             return None
         count = "1 row" if len(rows) == 1 else f"{len(rows)} rows"
         shape = f"{count} of {listed([str(n) for n in sorted(lengths)])} numbers" if rows else "no rows"
-        example = (type(self).model_fields[name].examples or [0])[0]
-        return f"has {shape}; expected a square matrix, such as {as_toml(example)}"
+        return f"has {shape}; expected a square matrix, such as {self.example(name)}"
 
     @property
     def around(self) -> list[float]:

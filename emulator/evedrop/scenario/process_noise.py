@@ -29,10 +29,7 @@ from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.tables import Scenario
 
 FILTER = "filter"
-_CERTAINLY, _NEARLY = (
-    1e-13,
-    1e-9,
-)  # singular values, of entries up to 1, that are 0
+_CERTAINLY, _NEARLY = 1e-13, 1e-9  # singular values, of entries up to 1, that are 0
 _SMALLEST = 1e-300
 
 

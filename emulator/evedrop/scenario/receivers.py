@@ -163,14 +163,24 @@ def unchangeable(changes: Mapping[str, Any]) -> Iterator[str]:
             yield f"{entry}: is not a link setting that can be changed; expected {listed(CHANGEABLE)}{near(entry, CHANGEABLE)}"
 
 
+SHORT_FORMS = {"quality": "loss", "loss": "quality"}
+"""Entry of a link → the other form of it, which a change replaces."""
+
+
+def entries_after(entries: Mapping[str, Any], changes: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The entries of a link after changes; None undoes all earlier ones.
+
+    A quality removes an earlier loss, and a loss an earlier quality.
+    """
+    if changes is None:
+        return {}
+    gone = {SHORT_FORMS[name] for name in changes if name in SHORT_FORMS}
+    return {**{name: value for name, value in entries.items() if name not in gone}, **changes}
+
+
 def changed_link(link: LinkTable, changes: Mapping[str, Any]) -> LinkTable:
     """A link with some entries changed. Raises ValidationError if the result is not a valid link."""
-    entries = link.model_dump(exclude_unset=True)
-    if "quality" in changes:
-        entries.pop("loss", None)
-    if "loss" in changes:
-        entries.pop("quality", None)
-    return LinkTable.model_validate({**entries, **changes})
+    return LinkTable.model_validate(entries_after(link.model_dump(exclude_unset=True), changes))
 
 
 def tie_of(name: str, ties: Mapping[str, str]) -> str | None:
@@ -324,10 +334,10 @@ class EavesdropperTable(Table):
         for name, example in parameters.items():
             if name not in fields and name not in given:
                 yield name, f"is missing; the strategy {self.strategy} needs it; expected {name} = {as_toml(example)}"
-        for name, field in fields.items():
+        for name in fields:
             if name in wanted and name not in given:
                 of = "" if name == "link" else f"the strategy {self.strategy} needs it; "
-                yield name, f"is missing; {of}expected {name} = {as_toml((field.examples or [0])[0])}"
+                yield name, f"is missing; {of}expected {name} = {self.example(name)}"
             if name in given and name not in {"strategy", "window", *wanted}:
                 instead = "; its entry is links" if name == "link" else ""
                 yield name, f"is set, but the strategy {self.strategy} has no such parameter{instead}; remove the line"

@@ -108,6 +108,11 @@ class Table(BaseModel):
         return cls.entries()
 
     @classmethod
+    def example(cls, entry: str) -> str:
+        """A value of an entry, as in a file."""
+        return as_toml((cls.model_fields[entry].examples or [0])[0])
+
+    @classmethod
     def inner(cls, entry: str) -> type[Table] | None:
         """The class of the table, or of the tables in a list or by name, in an entry; None if the entry holds no table."""
         field = cls.model_fields.get(entry)

@@ -447,6 +447,10 @@ class Scenario(Table):
         """A receiver's link, or its pooled links as one."""
         return self.legitimate.link if receiver == LEGITIMATE else self.eavesdroppers[receiver].pool
 
+    def link_path(self, receiver: str) -> str:
+        """The dotted key of a receiver's link."""
+        return "legitimate.link" if receiver == LEGITIMATE else f"eavesdroppers.{receiver}.link"
+
     def window(self, receiver: str) -> int:
         """The number of slots by which a packet may be late for a receiver."""
         return (self.legitimate if receiver == LEGITIMATE else self.eavesdroppers[receiver]).window

@@ -11,6 +11,7 @@ from typing import Any
 
 from evedrop.model.slot.link import NEVER, Change, ReceiverOutage
 from evedrop.scenario.events.event import Act, EventKind, Jamming, Spoofing
+from evedrop.scenario.receivers import entries_after
 
 Changed = Callable[[str, Mapping[str, Any]], dict[str, Any]]
 """Maps a receiver and the changed entries of its link to the link's new settings."""
@@ -93,18 +94,6 @@ def _changes(name: str, acts: Sequence[Act], changed: Changed) -> Iterator[Chang
             yield Change(act.at, settings=changed(name, entries))
         if act.effect.cuts is not None:
             yield Change(act.at, cut=act.effect.cuts)
-
-
-def entries_after(entries: Mapping[str, Any], changes: Mapping[str, Any] | None) -> dict[str, Any]:
-    """All changed entries of a link after further changes; None undoes all of them.
-
-    A quality removes an earlier loss, and a loss an earlier quality.
-    """
-    if changes is None:
-        return {}
-    dropped = {"quality": "loss", "loss": "quality"}
-    gone = {dropped[name] for name in changes if name in dropped}
-    return {**{name: value for name, value in entries.items() if name not in gone}, **changes}
 
 
 def _outages(name: str, acts: Sequence[Act]) -> Iterator[ReceiverOutage]:

@@ -106,11 +106,6 @@ class Slot:
         """The squared error of the belief after it, (R,)."""
         return np.asarray(((self.x - self.after.x_hat) ** 2).sum(axis=0))
 
-    @property
-    def sent(self) -> dict[str, Any]:
-        """The parts of the packet that are compared."""
-        return sent_of(self.packet)
-
 
 def sent_of(packet: Packet) -> dict[str, Any]:
     """The parts of a packet that are compared."""

@@ -298,7 +298,7 @@ def _expect_same_packets(
 ) -> None:
     for some, packets in coded:
         rows = [sent_of(packets.at(row)) for row in range(len(some))]
-        once = [slots[k].sent for k in some]
+        once = [sent_of(slots[k].packet) for k in some]
         _expect_same(once, rows, some, problem, _method_name(encoder, "encode_block"))
 
 

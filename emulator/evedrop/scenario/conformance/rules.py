@@ -122,8 +122,13 @@ def expect_bool(where: str, value: Any) -> None:
 
 def expect_probability(where: str, value: Any) -> None:
     """Raise Broken unless a value is a number from 0 to 1."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating)) or not 0.0 <= value <= 1.0:
+    if not _is_probability(value, 0.0):
         raise Broken(f"{where} is {_short(value)}; expected a number from 0 to 1")
+
+
+def _is_probability(value: Any, slack: float) -> bool:
+    number = isinstance(value, (int, float, np.floating)) and not isinstance(value, bool)
+    return bool(number and -slack <= value <= 1.0 + slack)
 
 
 def expect_outcomes(where: str, outcomes: Any) -> None:
@@ -134,11 +139,7 @@ def expect_outcomes(where: str, outcomes: Any) -> None:
         raise Broken(f"{where} is {_short(outcomes)}; expected Outcomes, or None: no closed form")
     for field in fields(Outcomes):
         value = getattr(outcomes, field.name)
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, (int, float, np.floating))
-            or not -_SLACK <= value <= 1 + _SLACK
-        ):
+        if not _is_probability(value, _SLACK):
             raise Broken(
                 f"{where}.{field.name} is {_short(value)}; expected a probability, or None in place of Outcomes"
             )
@@ -188,16 +189,13 @@ def judged(*groups: tuple[Sequence[Rule], Sequence[Any]]) -> list[RuleVerdict]:
     verdicts: list[RuleVerdict] = []
     for rules, problems in groups:
         for title, check in rules:
-            broken = next((how for problem in problems if (how := _how_broken(check, problem)) is not None), None)
-            verdicts.append(RuleVerdict(title, broken))
+            broken = ((problem, how_broken(check, problem)) for problem in problems)
+            verdicts.append(
+                RuleVerdict(title, next((f"{problem}: {how}" for problem, how in broken if how is not None), None))
+            )
             if verdicts[0].broken is not None:
                 return verdicts
     return verdicts
-
-
-def _how_broken(check: Callable[[Any], None], problem: Any) -> str | None:
-    how = how_broken(check, problem)
-    return None if how is None else f"{problem}: {how}"
 
 
 def how_broken(check: Callable[[Any], None], problem: Any) -> str | None:

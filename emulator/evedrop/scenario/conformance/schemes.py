@@ -14,7 +14,7 @@ from evedrop.model.outcomes import legitimate_outcomes
 from evedrop.model.receiver import Receiver
 from evedrop.model.schemes.scheme import PacketBlock, Scheme
 from evedrop.model.theory.covariances import OutcomesAt
-from evedrop.scenario.conformance.problems import Problem, SchemeOf, Slot, large, made, played, row_of, small
+from evedrop.scenario.conformance.problems import Problem, SchemeOf, Slot, large, made, played, row_of, sent_of, small
 from evedrop.scenario.conformance.receivers import SIGMAS, ReceiverChecks, expect_same_in_blocks
 from evedrop.scenario.conformance.rules import (
     Broken,
@@ -70,7 +70,7 @@ class SchemeChecks(ReceiverChecks):
 
     def row(self, slot: Slot) -> Row:
         """Packets and beliefs."""
-        return {**slot.sent, **row_of(slot.after)}
+        return {**sent_of(slot.packet), **row_of(slot.after)}
 
     def receiver(self, problem: Problem) -> Receiver:
         """The estimator."""

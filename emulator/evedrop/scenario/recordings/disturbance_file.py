@@ -70,26 +70,15 @@ def read_disturbances(
             [f"is read for {slots} slots of {len(names)} columns; expected at most {most} slots, or fewer columns"],
         )
     limit = _ROWS_UNASKED if slots is None else max(0, slots)
-    rows = _rows(path, limit, len(names))
-    head = next(rows, None)
-    if head is None:
-        problem = f"is empty; expected a line of names such as {_EXAMPLE}, then a line for every slot"
-        raise DisturbanceError(str(path), [problem])
-    columns, mistakes = _columns(head, names, units)
-    if mistakes:
-        raise DisturbanceError(str(path), mistakes)
-    columns_read = _numbers(islice(rows, limit), len(head.cells), columns)
-    numbers, mistakes = columns_read.numbers, columns_read.mistakes
-    timed = columns != [] and columns[0].name == _TIME and _TIME not in names
-    if timed and not mistakes:
-        times = [row[0] for row in numbers]
-        mistakes = list(_few(_time_mistakes(columns_read.lines, times, slot_seconds, recorded), "times"))
-    if not mistakes and slots is not None and len(numbers) < slots:
-        few = f"has {len(numbers)} rows; expected slots, which is {slots}, or more"
-        mistakes = [f"{few}: a longer file, or slots = {len(numbers)}" if numbers else few]
-    if mistakes:
-        raise DisturbanceError(str(path), mistakes)
-    return [row[1:] for row in numbers] if timed else numbers
+    head, rows = _begun(path, limit, len(names), _EXAMPLE)
+    found = _found(path, head, rows, names, units, limit)
+    if found.times is not None:
+        found.check_times(slot_seconds, recorded)
+    count = len(found.numbers)
+    if slots is not None and count < slots:
+        few = f"has {count} rows; expected slots, which is {slots}, or more"
+        raise DisturbanceError(str(path), [f"{few}: a longer file, or slots = {count}" if count else few])
+    return found.numbers
 
 
 @dataclass(frozen=True)
@@ -110,28 +99,17 @@ def recorded_states(path: Path, names: Sequence[str] | None = None) -> StateReco
 
     Raises DisturbanceError as `read_disturbances` does; times may scatter by a tenth of their mean distance.
     """
-    rows = _rows(path, MOST_NUMBERS, 1)
-    head = next(rows, None)
-    if head is None:
-        raise DisturbanceError(
-            str(path), ["is empty; expected a line of names such as x, y, then a line for every slot"]
-        )
+    head, rows = _begun(path, MOST_NUMBERS, 1, "x, y")
     there = [match["name"] if (match := _HEADER.match(cell)) else cell for cell in head.cells]
     names = [name for name in there if name != _TIME] if names is None else names
-    columns, mistakes = _columns(head, names, None)
-    columns_read = _numbers(islice(rows, MOST_NUMBERS // max(1, len(columns))), len(head.cells), columns)
-    if mistakes := mistakes or columns_read.mistakes:
-        raise DisturbanceError(str(path), mistakes)
-    numbers, seconds = columns_read.numbers, None
-    if columns[0].name == _TIME and _TIME not in names:
-        times, numbers = [row[0] for row in numbers], [row[1:] for row in numbers]
+    found, seconds = _found(path, head, rows, names, None, None), None
+    if (times := found.times) is not None:
         seconds = (times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.0
         if len(times) > 1 and not 0.0 < seconds < math.inf:
             raise DisturbanceError(str(path), ["has times that do not grow from line to line; expected seconds"])
-        if mistakes := list(_few(_time_mistakes(columns_read.lines, times, seconds, recorded=True), "times")):
-            raise DisturbanceError(str(path), mistakes)
+        found.check_times(seconds, recorded=True)
     units = [match["unit"].strip() for cell in head.cells if (match := _HEADER.match(cell)) and match["name"] in names]
-    return StateRecording(str(path), names, units if len(units) == len(names) else None, numbers, seconds)
+    return StateRecording(str(path), names, units if len(units) == len(names) else None, found.numbers, seconds)
 
 
 def table_text(names: Sequence[str], units: Sequence[str] | None, rows: Sequence[Sequence[float]]) -> str:
@@ -168,11 +146,19 @@ class _Column:
 
 @dataclass(frozen=True)
 class _Found:
-    """The contents of the lines after the first: numbers and line number of each, and the mistakes."""
+    """The contents of the lines after the first: numbers, line number and time of each."""
 
+    path: Path
     numbers: list[list[float]]
     lines: list[int]
-    mistakes: list[str]
+    times: list[float] | None
+    """None without a column of times."""
+
+    def check_times(self, slot_seconds: float, recorded: bool) -> None:
+        """Raise DisturbanceError unless the times advance by one slot; recorded: as in `read_disturbances`."""
+        mistakes = list(_few(_time_mistakes(self.lines, self.times or [], slot_seconds, recorded), "times"))
+        if mistakes:
+            raise DisturbanceError(str(self.path), mistakes)
 
 
 def _rows(path: Path, slots: int, columns: int) -> Iterator[_Row]:
@@ -186,6 +172,16 @@ def _rows(path: Path, slots: int, columns: int) -> Iterator[_Row]:
     except (Unreadable, csv.Error) as error:
         problem = f"cannot be read ({error}); expected a CSV file whose first line is such as {_EXAMPLE}"
         raise DisturbanceError(str(path), [problem]) from error
+
+
+def _begun(path: Path, slots: int, columns: int, example: str) -> tuple[_Row, Iterator[_Row]]:
+    """The first line and the others, as from `_rows`; example: a first line, for the message."""
+    rows = _rows(path, slots, columns)
+    head = next(rows, None)
+    if head is None:
+        empty = f"is empty; expected a line of names such as {example}, then a line for every slot"
+        raise DisturbanceError(str(path), [empty])
+    return head, rows
 
 
 def _columns(head: _Row, names: Sequence[str], units: Sequence[str] | None) -> tuple[list[_Column], list[str]]:
@@ -232,14 +228,20 @@ def _factor(unit: str | None, wanted: str | None) -> float | None:
     return None
 
 
-def _numbers(rows: Iterable[_Row], width: int, columns: Sequence[_Column]) -> _Found:
-    """The columns' values of every line, and the mistakes in lines."""
+def _found(
+    path: Path, head: _Row, rows: Iterable[_Row], names: Sequence[str], units: Sequence[str] | None, limit: int | None
+) -> _Found:
+    """The columns' values of every line, up to this limit, or to `MOST_NUMBERS`. Raises DisturbanceError with the mistakes."""
+    columns, mistakes = _columns(head, names, units)
+    if mistakes:
+        raise DisturbanceError(str(path), mistakes)
+    width, timed = len(head.cells), columns != [] and columns[0].name == _TIME and _TIME not in names
     places = [(column.place, column.factor) for column in columns]
     numbers: list[list[float]] = []
     lines: list[int] = []
     wrong: list[_Row] = []
     all_lines = all_wrong = 0
-    for row in rows:
+    for row in islice(rows, MOST_NUMBERS // max(1, len(columns)) if limit is None else limit):
         line, cells = row
         all_lines += 1
         try:
@@ -253,8 +255,11 @@ def _numbers(rows: Iterable[_Row], width: int, columns: Sequence[_Column]) -> _F
         all_wrong += 1
         if all_wrong <= MOST_REPORTED + 1:  # more are not reported, and need not be kept
             wrong.append(row)
-    mistakes = list(_few(_cell_mistakes(wrong, width, columns), f"{all_wrong} of {all_lines} lines"))
-    return _Found(numbers, lines, mistakes)
+    if mistakes := list(_few(_cell_mistakes(wrong, width, columns), f"{all_wrong} of {all_lines} lines")):
+        raise DisturbanceError(str(path), mistakes)
+    if timed:
+        return _Found(path, [row[1:] for row in numbers], lines, [row[0] for row in numbers])
+    return _Found(path, numbers, lines, None)
 
 
 def _cell_mistakes(rows: Sequence[_Row], width: int, columns: Sequence[_Column]) -> Iterator[str]:

@@ -28,7 +28,7 @@ from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.scenario.recordings.link_recording import DELAY, LinkRecording, Outcomes
-from evedrop.scenario.recordings.message_recording import MessageRecording
+from evedrop.scenario.recordings.message_recording import COUNTS, MessageRecording
 
 _SCOUTED = 50_000  # outcomes on which starting points are compared
 _SCOUTING, _MOST = 40, 400  # steps
@@ -359,9 +359,7 @@ def gilbert(outcomes: Outcomes) -> Candidate:
 def gilbert_elliott(outcomes: Outcomes) -> Candidate:
     """Gilbert and Elliott's model with all four parameters, by expectation-maximisation."""
     model, likelihood = most_likely(outcomes, _starts(outcomes))
-    spec = {"model": "gilbert-elliott", "p": model.p, "r": model.r}
-    spec |= {"good": model.good, "bad": model.bad}
-    return Candidate("gilbert-elliott", spec, likelihood, 4)
+    return Candidate("gilbert-elliott", {"model": "gilbert-elliott", **vars(model)}, likelihood, 4)
 
 
 def _starts(outcomes: Outcomes) -> list[TwoStates]:
@@ -621,13 +619,15 @@ def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> RunLengths:
 
 def lines(fitted: Fit) -> list[str]:
     """The fit as printed lines."""
+    return [_headline(fitted, "outcomes", "slots"), *model_lines(fitted), fitted.toml]
+
+
+def _headline(fitted: Fit, packets: str, unit: str) -> str:
+    """How much was recorded and lost; packets, unit: what is counted, and what bursts are measured in."""
     fraction = 100.0 * fitted.lost / fitted.count
-    mean = "none of them ended" if fitted.bursts.mean is None else f"{fitted.bursts.mean:.4g} slots on average"
-    return [
-        f"{fitted.trace}: {fitted.count} outcomes, {fitted.lost} lost ({fraction:.4g} %), {fitted.bursts.count} bursts, {mean}",
-        *model_lines(fitted),
-        fitted.toml,
-    ]
+    mean = "none of them ended" if fitted.bursts.mean is None else f"{fitted.bursts.mean:.4g} {unit} on average"
+    counted = f"{fitted.count} {packets}, {fitted.lost} lost ({fraction:.4g} %)"
+    return f"{fitted.trace}: {counted}, {fitted.bursts.count} bursts, {mean}"
 
 
 def model_lines(fitted: Fit) -> list[str]:
@@ -697,11 +697,7 @@ class MessageFit:
         series, link = self.recording.series, self.scenario_link
         return {
             **self.fit.as_dict(),
-            "parts": series.parts,
-            "repeated": series.repeated,
-            "late": series.late,
-            "restarts": series.restarts,
-            "leaps": series.leaps,
+            **{name: getattr(series, name) for name in COUNTS},
             "outages": list(series.outages),
             "notes": list(self.recording.notes),
             "settings": self.settings,
@@ -732,9 +728,7 @@ def fit_messages(recording: MessageRecording, slot: float | None = None) -> Mess
 def message_lines(fitted: MessageFit) -> list[str]:
     """The fit as printed lines."""
     fit = fitted.fit
-    mean = "none of them ended" if fit.bursts.mean is None else f"{fit.bursts.mean:.4g} messages on average"
-    fraction = 100.0 * fit.lost / fit.count
-    told = [f"{fit.trace}: {fit.count} messages, {fit.lost} lost ({fraction:.4g} %), {fit.bursts.count} bursts, {mean}"]
+    told = [_headline(fit, "messages", "messages")]
     told += [f"  {sentence}" for sentence in (*_counted(fitted), *fitted.recording.notes)]
     told += [*model_lines(fit), "# for a wire file:", fitted.wire_toml]
     link = fitted.scenario_link

@@ -169,12 +169,11 @@ class LinkRecording:
             yield
         except TraceError:
             raise
-        except (Unreadable, csv.Error) as error:
-            self._unreadable(error)
         except Exception as error:
-            if not self._is_parquet:
+            # A damaged Parquet file makes pyarrow raise errors of many kinds.
+            if not self._is_parquet and not isinstance(error, (Unreadable, csv.Error)):
                 raise
-            self._unreadable(error)  # a damaged Parquet file makes pyarrow raise errors of many kinds
+            self._unreadable(error)
 
     def _csv_values(self, column: str | None) -> Iterator[tuple[str, str]]:
         rows = _rows(lines_of(self._path, _LIMIT))
@@ -206,7 +205,8 @@ class LinkRecording:
         for batch in table.iter_batches(columns=[names[place]]):
             values = batch.column(0)
             # Text values are taken one at a time: every row may contain the same long text.
-            for value in (element.as_py() for element in values) if _is_dictionary(values) else values.to_pylist():
+            repeated = hasattr(values, "dictionary")
+            for value in (element.as_py() for element in values) if repeated else values.to_pylist():
                 row += 1
                 yield f"row {row}", _as_text(value)
 
@@ -252,10 +252,6 @@ def _parquet(path: Path) -> Any:
     ]
     # A text that is repeated in a million rows is kept once.
     return pq.ParquetFile(path, read_dictionary=texts)
-
-
-def _is_dictionary(values: Any) -> bool:
-    return hasattr(values, "dictionary")
 
 
 def _some(names: Sequence[str]) -> str:

@@ -64,19 +64,19 @@ class MessageSeries:
     """Which of the arrivals are the first of their message, in the order of arrival, (m,)."""
 
 
+COUNTS = ("parts", "repeated", "late", "restarts", "leaps")
+"""The numbers in a series."""
+
+
 def joined(series: Sequence[MessageSeries]) -> MessageSeries:
     """Several series, one after the other."""
     times = [part.seconds for part in series if part.seconds is not None]
     return MessageSeries(
         np.concatenate([part.outcomes for part in series]),
-        sum(part.parts for part in series),
-        sum(part.repeated for part in series),
-        sum(part.late for part in series),
-        sum(part.restarts for part in series),
-        sum(part.leaps for part in series),
-        tuple(outage for part in series for outage in part.outages),
-        float(np.median(times)) if times else None,
-        np.concatenate([part.first_arrivals for part in series]),
+        **{name: sum(getattr(part, name) for part in series) for name in COUNTS},
+        outages=tuple(outage for part in series for outage in part.outages),
+        seconds=float(np.median(times)) if times else None,
+        first_arrivals=np.concatenate([part.first_arrivals for part in series]),
     )
 
 
