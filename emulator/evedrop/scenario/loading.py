@@ -14,7 +14,6 @@ import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, final
 
@@ -230,25 +229,20 @@ def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
     """
     names = dotted.split(".")
     inner: Any = tables
-    for i, (name, after) in enumerate(pairwise(names)):
-        new: Any = [] if after == "0" else {}
+    for i, name in enumerate(names):
+        last = i == len(names) - 1
+        new = value if last else [] if names[i + 1] == "0" else {}
         if isinstance(inner, dict) and name:
             _drop_other_form(inner, names[: i + 1])
-            inner = inner.setdefault(name, new)
+            if last or name not in inner:
+                inner[name] = new
+            inner = inner[name]
         elif isinstance(inner, list) and name.isdecimal() and int(name) <= len(inner):
-            if int(name) == len(inner):
-                inner.append(new)
+            if last or int(name) == len(inner):
+                inner[int(name) : int(name) + 1] = [new]
             inner = inner[int(name)]
         else:
             raise _no_such_key(dotted, name, inner)
-    last = names[-1]
-    if isinstance(inner, dict) and last:
-        _drop_other_form(inner, names)
-        inner[last] = value
-    elif isinstance(inner, list) and last.isdecimal() and int(last) <= len(inner):
-        inner[int(last) : int(last) + 1] = [value]
-    else:
-        raise _no_such_key(dotted, last, inner)
 
 
 def _drop_other_form(table: dict[str, Any], names: list[str]) -> None:

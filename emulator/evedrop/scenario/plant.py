@@ -19,11 +19,10 @@ from evedrop.model.plant import Plant
 from evedrop.model.process import MOST_STATES, Floats, Process
 from evedrop.model.slot.cores import LARGEST
 from evedrop.scenario.process import row_mistake, word_mistake
-from evedrop.scenario.table import Matrix, Mistake, Number, Table, one_of, parameter_mistakes
+from evedrop.scenario.table import Matrix, Mistake, Names, Number, Table, one_of, parameter_mistakes
 from evedrop.scenario.words import as_toml
 
 Numbers = list[Number]
-Names = list[Annotated[str, Field(strict=True, min_length=1)]]
 
 
 class PlantTable(Table):

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field
 
 from evedrop.model.process import Process, mistakes_of
 from evedrop.model.slot.cores import LARGEST
-from evedrop.scenario.table import Matrix, Mistake, Number, ProcessName, Table, expected
+from evedrop.scenario.table import Matrix, Mistake, Names, Number, ProcessName, Table, expected
 from evedrop.scenario.words import as_toml, listed
 
 Source = Literal["model", "file", "zenoh"]
@@ -134,11 +134,9 @@ class ProcessTable(Table):
     """Whether Q may be singular. `Q = "filter"` implies it."""
     reference: Annotated[list[Number] | None, Field(examples=[[55.0, 50.0]])] = None
     """The public levels that states are deviations from: tables and view show `reference` + x; packets contain x."""
-    states: Annotated[
-        list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["SOC", "LOH"]])
-    ] = None
+    states: Annotated[Names | None, Field(examples=[["SOC", "LOH"]])] = None
     """The names of the states, for tables and view, and in files and messages of states."""
-    units: Annotated[list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["%", "%"]])] = None
+    units: Annotated[Names | None, Field(examples=[["%", "%"]])] = None
     """The units of the states."""
 
     directions: Annotated[dict[ProcessName, list[Number]] | None, Field(examples=[{"sum": [1.0, 1.0]}])] = None

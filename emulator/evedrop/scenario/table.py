@@ -88,6 +88,7 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Probability = Annotated[float, Field(strict=True), AfterValidator(_probability)]
 ProcessName = Annotated[str, AfterValidator(_process_name)]
 Matrix = list[list[Number]]
+Names = list[Annotated[str, Field(strict=True, min_length=1)]]
 Mistake = tuple[str, str]
 """A mistake in a table: the entry and a description."""
 

@@ -27,7 +27,7 @@ from evedrop.scenario.conformance.problems import (
     row_of,
     small,
 )
-from evedrop.scenario.conformance.receivers import ReceiverChecks, expect_same_followed
+from evedrop.scenario.conformance.receivers import ReceiverChecks
 from evedrop.scenario.conformance.rules import (
     Broken,
     NamedKeys,
@@ -160,7 +160,3 @@ class EavesdropperChecks(ReceiverChecks):
                 )
             expect_outcomes(f"outcomes() of the quality {mu_e}", outcomes)
         expect_bool("follows_gamma()", follows)
-
-    def blocks(self, problem: Problem) -> None:
-        """Blocks of slots give the same beliefs as single slots."""
-        expect_same_followed(lambda: self.receiver(problem), self.slots(problem), problem, self._kind)

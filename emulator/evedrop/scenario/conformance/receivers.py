@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import accumulate, cycle, pairwise, takewhile
 from typing import Any, ClassVar
 
@@ -83,9 +84,9 @@ class ReceiverChecks(ABC):
     def shapes(self, problem: Problem) -> None:
         """All results have the right shapes and types, and no input is changed."""
 
-    @abstractmethod
     def blocks(self, problem: Problem) -> None:
         """Blocks of slots give the same results as single slots."""
+        BlockChecks(self.slots(problem), problem, self._kind).expect_same_beliefs(lambda: self.receiver(problem))
 
     def slots(self, problem: Problem) -> list[Slot]:
         """The slots of `played`, computed once for all rules that compare something with them."""
@@ -211,128 +212,116 @@ def divisions(slots: int) -> list[list[range]]:
     ]
 
 
-def expect_same_in_blocks(scheme: Scheme, slots: Sequence[Slot], problem: Problem, kind: type[Scheme]) -> None:
-    """Raise Broken unless both sides of a scheme do in blocks what they do in single slots, made together and apart."""
-    for apart in (False, True):
-        for blocks in divisions(problem.slots):
-            encoder, estimator = sides(scheme, problem, kind, apart)
-            if apart and type(encoder).encode_block is Encoder.encode_block:
-                continue  # it cannot know of blocks, and the estimator alone is next
-            packets: list[tuple[range, PacketBlock]] = []
-            followed: list[_Followed] = []
-            belief = slots[0].before
-            for block in blocks:
-                # The next packet may depend on the acknowledgements of this one.
-                for some in [range(k, k + 1) for k in block] if scheme.needs_acknowledgements else [block]:
-                    packets.append((some, _encoded(encoder, some, slots, problem, scheme, kind)))
-                if _plain(block, slots):
-                    followed.append(_followed(estimator, block, belief, slots, problem, kind))
-                    belief = frozen_belief(followed[-1][2])
-            _expect_same_packets(encoder, packets, slots, problem)
-            _expect_same_beliefs(estimator, followed, slots, problem)
-    expect_same_followed(lambda: sides(scheme, problem, kind, apart=True)[1], slots, problem, kind)
+@dataclass(frozen=True)
+class BlockChecks:
+    """The rule for many slots at once on one problem. kind: the class that is checked."""
 
+    slots: Sequence[Slot]
+    """What single slots give."""
+    problem: Problem
+    kind: type
 
-def expect_same_followed(make: Callable[[], Receiver], slots: Sequence[Slot], problem: Problem, kind: type) -> None:
-    """Raise Broken unless a receiver has the same beliefs for every division into blocks; `make` makes one for each division."""
-    whole, single, uneven = divisions(problem.slots)
-    for blocks, every in ((whole, 1), (single, 1), (uneven, 1), (uneven, 2)):
+    def expect_same_sides(self, scheme: Scheme) -> None:
+        """Raise Broken unless both sides of a scheme do in blocks what they do in single slots, made together and apart."""
+        for apart in (False, True):
+            for blocks in divisions(self.problem.slots):
+                encoder, estimator = sides(scheme, self.problem, self.kind, apart)
+                if apart and type(encoder).encode_block is Encoder.encode_block:
+                    continue  # it cannot know of blocks, and the estimator alone is next
+                packets: list[tuple[range, PacketBlock]] = []
+                followed: list[_Followed] = []
+                belief = self.slots[0].before
+                for block in blocks:
+                    # The next packet may depend on the acknowledgements of this one.
+                    for some in [range(k, k + 1) for k in block] if scheme.needs_acknowledgements else [block]:
+                        packets.append((some, self._encoded(encoder, some, scheme)))
+                    if self._plain(block):
+                        followed.append(self._followed(estimator, block, belief))
+                        belief = frozen_belief(followed[-1][2])
+                self._expect_same_packets(encoder, packets)
+                self._expect_same_beliefs(estimator, followed)
+
+    def expect_same_beliefs(self, make: Callable[[], Receiver]) -> None:
+        """Raise Broken unless receivers, made by `make` for each division into blocks, have the same beliefs in all."""
+        whole, single, uneven = divisions(self.problem.slots)
+        for blocks, every in ((whole, 1), (single, 1), (uneven, 1), (uneven, 2)):
+            receiver = make()
+            if type(receiver).follow is Receiver.follow:
+                return  # which takes slot by slot
+            self._expect_same_beliefs(receiver, list(self._in_order(receiver, blocks, every)))
+            self._expect_same_uses(receiver, blocks)
         receiver = make()
-        if type(receiver).follow is Receiver.follow:
-            return  # which takes slot by slot
-        followed = list(_in_order(receiver, blocks, every, slots, problem, kind))
-        _expect_same_beliefs(receiver, followed, slots, problem)
-        _expect_same_uses(receiver, blocks, problem, kind)
-    receiver = make()
-    plain = [block for block in reversed(uneven) if _plain(block, slots)]
-    again = [_followed(receiver, block, slots[block.start].before, slots, problem, kind) for block in plain]
-    _expect_same_beliefs(receiver, again, slots, problem)
+        plain = [block for block in reversed(uneven) if self._plain(block)]
+        again = [self._followed(receiver, block, self.slots[block.start].before) for block in plain]
+        self._expect_same_beliefs(receiver, again)
 
+    def _plain(self, block: range) -> bool:
+        """Whether nothing but packets is heard in a block, as where a run takes its slots at once."""
+        return all(self.slots[k].heard.header is None and self.slots[k].heard.truth is None for k in block)
 
-def _plain(block: range, slots: Sequence[Slot]) -> bool:
-    """Whether nothing but packets is heard in a block, as where a run takes its slots at once."""
-    return all(slots[k].heard.header is None and slots[k].heard.truth is None for k in block)
+    def _in_order(self, receiver: Receiver, blocks: list[range], every: int) -> Iterator[_Followed]:
+        """The beliefs of a receiver after blocks, one after the other; only one block in `every` is taken at once."""
+        belief = self.slots[0].before
+        for number, block in enumerate(blocks):
+            if number % every == 0 and self._plain(block):
+                yield (followed := self._followed(receiver, block, belief))
+                belief = frozen_belief(followed[2])
+            else:
+                for k in block:
+                    with calling(f"slot {k}: {_method_name(receiver, 'step')} after a block of slots", self.kind):
+                        belief = frozen_belief(receiver.step(k, belief, self.slots[k].heard))
 
+    def _encoded(self, encoder: Encoder, some: range, scheme: Scheme) -> PacketBlock:
+        x, predicted = (frozen(np.array([getattr(self.slots[k], name) for k in some])) for name in ("x", "predicted"))
+        with calling(f"{slots_text(some)}: {_method_name(encoder, 'encode_block')}", self.kind):
+            packets = encoder.encode_block(some, x, predicted)
+        expect_packets(some, packets, scheme, self.problem)
+        if scheme.needs_acknowledgements:
+            for k in some:
+                with calling(f"slot {k}: {_method_name(encoder, 'acknowledged')}", self.kind):
+                    encoder.acknowledged(k, frozen(self.slots[k].acknowledged))
+        return packets
 
-def _in_order(
-    receiver: Receiver, blocks: list[range], every: int, slots: Sequence[Slot], problem: Problem, kind: type
-) -> Iterator[_Followed]:
-    """The beliefs of a receiver after blocks, one after the other; only one block in `every` is taken at once."""
-    belief = slots[0].before
-    for number, block in enumerate(blocks):
-        if number % every == 0 and _plain(block, slots):
-            yield (followed := _followed(receiver, block, belief, slots, problem, kind))
-            belief = frozen_belief(followed[2])
-        else:
-            for k in block:
-                with calling(f"slot {k}: {_method_name(receiver, 'step')} after a block of slots", kind):
-                    belief = frozen_belief(receiver.step(k, belief, slots[k].heard))
+    def _followed(self, receiver: Receiver, some: range, belief: Belief) -> _Followed:
+        gamma, z = (frozen(np.array([getattr(self.slots[k].heard, name) for k in some])) for name in ("gamma", "z"))
+        with calling(f"{slots_text(some)}: {_method_name(receiver, 'follow')}", self.kind):
+            result: Any = receiver.follow(some, belief, gamma, z)
+        expect_beliefs(some, result, self.problem)
+        return some, *result
 
+    def _expect_same_packets(self, encoder: Encoder, coded: Sequence[tuple[range, PacketBlock]]) -> None:
+        for some, packets in coded:
+            rows = [sent_of(packets.at(row)) for row in range(len(some))]
+            once = [sent_of(self.slots[k].packet) for k in some]
+            self._expect_same(once, rows, some, _method_name(encoder, "encode_block"))
 
-def _encoded(
-    encoder: Encoder, some: range, slots: Sequence[Slot], problem: Problem, scheme: Scheme, kind: type
-) -> PacketBlock:
-    x, predicted = (frozen(np.array([getattr(slots[k], name) for k in some])) for name in ("x", "predicted"))
-    with calling(f"{slots_text(some)}: {_method_name(encoder, 'encode_block')}", kind):
-        packets = encoder.encode_block(some, x, predicted)
-    expect_packets(some, packets, scheme, problem)
-    if scheme.needs_acknowledgements:
-        for k in some:
-            with calling(f"slot {k}: {_method_name(encoder, 'acknowledged')}", kind):
-                encoder.acknowledged(k, frozen(slots[k].acknowledged))
-    return packets
+    def _expect_same_beliefs(self, receiver: Receiver, followed: Sequence[_Followed]) -> None:
+        name = _method_name(receiver, "follow")
+        for some, beliefs, after in followed:
+            rows = [row_of(Belief(*(column[row] for column in beliefs))) for row in range(len(some))]
+            once = [row_of(self.slots[k].after) for k in some]
+            self._expect_same(once, rows, some, name)
+            self._expect_same(once[-1:], [row_of(after)], some[-1:], f"the last Belief of {name}")
 
+    def _expect_same_uses(self, receiver: Receiver, blocks: list[range]) -> None:
+        """Raise Broken unless `uses_block` is `uses`, slot by slot, also where nothing arrives."""
+        if not isinstance(receiver, PacketUser) or type(receiver).uses_block is PacketUser.uses_block:
+            return
+        every = np.ones(self.problem.batch.trials, np.bool_)
+        for some in blocks:
+            name = _method_name(receiver, "uses_block")
+            with calling(f"{slots_text(some)}: {name}", self.kind):
+                uses, single = receiver.uses_block(some), [receiver.uses(k) for k in some]
+            if uses is not None:
+                shape = (len(some), self.problem.batch.trials)
+                expect_array(f"{slots_text(some)}: {name}", uses, np.bool_, shape, "slots, R trials; or None: always")
+            rows = [{"whether a packet is used": every if uses is None else uses[row]} for row in range(len(some))]
+            once = [{"whether a packet is used": every if use is None else use} for use in single]
+            self._expect_same(once, rows, some, name)
 
-def _followed(
-    receiver: Receiver, some: range, belief: Belief, slots: Sequence[Slot], problem: Problem, kind: type
-) -> _Followed:
-    gamma, z = (frozen(np.array([getattr(slots[k].heard, name) for k in some])) for name in ("gamma", "z"))
-    with calling(f"{slots_text(some)}: {_method_name(receiver, 'follow')}", kind):
-        result: Any = receiver.follow(some, belief, gamma, z)
-    expect_beliefs(some, result, problem)
-    return some, *result
-
-
-def _expect_same_packets(
-    encoder: Encoder, coded: Sequence[tuple[range, PacketBlock]], slots: Sequence[Slot], problem: Problem
-) -> None:
-    for some, packets in coded:
-        rows = [sent_of(packets.at(row)) for row in range(len(some))]
-        once = [sent_of(slots[k].packet) for k in some]
-        _expect_same(once, rows, some, problem, _method_name(encoder, "encode_block"))
-
-
-def _expect_same_beliefs(
-    receiver: Receiver, followed: Sequence[_Followed], slots: Sequence[Slot], problem: Problem
-) -> None:
-    name = _method_name(receiver, "follow")
-    for some, beliefs, after in followed:
-        rows = [row_of(Belief(*(column[row] for column in beliefs))) for row in range(len(some))]
-        _expect_same([row_of(slots[k].after) for k in some], rows, some, problem, name)
-        last = f"the last Belief of {name}"
-        _expect_same([row_of(slots[some[-1]].after)], [row_of(after)], some[-1:], problem, last)
-
-
-def _expect_same_uses(receiver: Receiver, blocks: list[range], problem: Problem, kind: type) -> None:
-    """Raise Broken unless `uses_block` is `uses`, slot by slot, also where nothing arrives."""
-    if not isinstance(receiver, PacketUser) or type(receiver).uses_block is PacketUser.uses_block:
-        return
-    every = np.ones(problem.batch.trials, np.bool_)
-    for some in blocks:
-        name = _method_name(receiver, "uses_block")
-        with calling(f"{slots_text(some)}: {name}", kind):
-            uses, single = receiver.uses_block(some), [receiver.uses(k) for k in some]
-        if uses is not None:
-            shape = (len(some), problem.batch.trials)
-            expect_array(f"{slots_text(some)}: {name}", uses, np.bool_, shape, "slots, R trials; or None: always")
-        rows = [{"whether a packet is used": every if uses is None else uses[row]} for row in range(len(some))]
-        once = [{"whether a packet is used": every if use is None else use} for use in single]
-        _expect_same(once, rows, some, problem, name)
-
-
-def _expect_same(once: Sequence[Row], rows: Sequence[Row], some: range, problem: Problem, name: str) -> None:
-    message = f"{{0!r}} in a single slot and {{1!r}} by {name} of {slots_text(some)}"
-    expect_same(once, rows, slice(None), problem.batch.first_trial, message, _REMEDY, some.start)
+    def _expect_same(self, once: Sequence[Row], rows: Sequence[Row], some: range, name: str) -> None:
+        message = f"{{0!r}} in a single slot and {{1!r}} by {name} of {slots_text(some)}"
+        expect_same(once, rows, slice(None), self.problem.batch.first_trial, message, _REMEDY, some.start)
 
 
 def _method_name(instance: object, method: str) -> str:

@@ -15,7 +15,7 @@ from evedrop.model.receiver import Receiver
 from evedrop.model.schemes.scheme import PacketBlock, Scheme
 from evedrop.model.theory.covariances import OutcomesAt
 from evedrop.scenario.conformance.problems import Problem, SchemeOf, Slot, large, made, played, row_of, sent_of, small
-from evedrop.scenario.conformance.receivers import SIGMAS, ReceiverChecks, expect_same_in_blocks
+from evedrop.scenario.conformance.receivers import SIGMAS, BlockChecks, ReceiverChecks
 from evedrop.scenario.conformance.rules import (
     Broken,
     NamedKeys,
@@ -130,7 +130,9 @@ class SchemeChecks(ReceiverChecks):
 
     def blocks(self, problem: Problem) -> None:
         """Blocks of slots give the same packets and beliefs as single slots."""
-        expect_same_in_blocks(made(self._scheme_of, problem, self._kind), self.slots(problem), problem, self._kind)
+        scheme = made(self._scheme_of, problem, self._kind)
+        BlockChecks(self.slots(problem), problem, self._kind).expect_same_sides(scheme)
+        super().blocks(problem)
 
     def prediction(self, problem: Problem) -> None:
         """The estimator's mean error never exceeds that of a receiver that hears nothing."""

@@ -8,10 +8,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from evedrop.model.registry import Registry
-from evedrop.scenario.events.attacks import Jam, Spoof
-from evedrop.scenario.events.event import EventKind, Note
-from evedrop.scenario.events.links import Cut, Heal, Partition, Set
-from evedrop.scenario.events.processes import Kill, Pause, Restart, Resume
+from evedrop.scenario.events.event import EventKind
+from evedrop.scenario.events.kinds import (
+    Cut,
+    Heal,
+    Jam,
+    Kill,
+    Note,
+    Partition,
+    Pause,
+    Restart,
+    Resume,
+    Set,
+    Spoof,
+)
 
 _BUILT_IN: Mapping[str, type[EventKind]] = {
     "set": Set,

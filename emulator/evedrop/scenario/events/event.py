@@ -1,7 +1,7 @@
 """What an event is: the base class of its kinds, with its time and acts, and the effects that acts can have.
 
 The code that carries out effects on links, receivers and processes knows neither the kinds of event nor those of effect: it asks
-an effect what it does. `note`, a line in the list of events, is the kind without an effect.
+an effect what it does.
 
 Source: docs/architecture.md, events; docs/scenario.md, events; docs/your-own/event.md.
 """
@@ -286,22 +286,3 @@ def _expect_acts(acts: Sequence[object]) -> None:
             raise NoAnswer("it names no receiver; expected one, or several")
         if len(act.names) != 1 and act.effect.one_receiver:
             raise NoAnswer("it names several receivers; expected one")
-
-
-def spoken(names: Sequence[str]) -> str:
-    """Receivers in the line of an act."""
-    return ", ".join(names)
-
-
-class Note(EventKind):
-    """`note`: nothing happens; the text appears in the list of events."""
-
-    note: Annotated[str, Field(examples=["the door is opened"])]
-    """A text for the journal. Nothing happens."""
-
-    kind = "note"
-    does = Nothing
-
-    def acts(self) -> Iterator[Act]:
-        """The line."""
-        yield self.begin(self.note, Nothing())
