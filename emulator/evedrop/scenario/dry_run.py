@@ -12,11 +12,12 @@ from pydantic import ValidationError
 
 from evedrop.errors import NoAnswer
 from evedrop.model.controllers import CONTROLLERS
-from evedrop.model.delays import DELAY_MODELS, delay_of
+from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.integrity import SENSOR_ATTACKS
-from evedrop.model.links import LOSS_MODELS, POOLED, loss_of, single_specs
-from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.links import LOSS_MODELS, POOLED, single_specs
+from evedrop.model.registry import Registry
+from evedrop.model.schemes import SCHEMES
 from evedrop.model.streams import Batch
 from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks
 from evedrop.scenario.conformance.links import DelayChecks, LossChecks
@@ -53,10 +54,9 @@ def dry_run(scenario: Scenario) -> list[str]:
     batch = Batch(min(scenario.slots, _SLOTS), _TRIALS, scenario.first_trial)
     problem = Problem(scenario.process.process, batch)
     mistakes = [*_link_mistakes(scenario, problem)]
-    spec = scenario.encoding.spec
-    kind = SCHEMES[scenario.encoding.scheme]
+    kind = scenario.scheme
     if SCHEMES.foreign(scenario.encoding.scheme):
-        broken = how_broken(SchemeChecks(lambda process: scheme_of(process, spec), kind).at_first, problem)
+        broken = how_broken(SchemeChecks(kind, scenario.encoding.parameters).at_first, problem)
         if broken is not None:
             return [*mistakes, f"encoding.scheme: is {as_toml(scenario.encoding.scheme)}; in a dry run: {broken}"]
     for name, table in scenario.eavesdroppers.items():
@@ -75,11 +75,9 @@ def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: st
     """What breaks when an eavesdropper hears the scheme; a class that is not built in runs in a process of its own."""
     spec, name = scenario.encoding.spec, getattr(table, entry)
     if not STRATEGIES.foreign(name):
-        kind = SCHEMES[scenario.encoding.scheme]
+        kind = scenario.scheme
         strategy = STRATEGIES[table.strategy]
-        checks = EavesdropperChecks(
-            table.strategy, strategy, table.parameters, lambda process: scheme_of(process, spec), kind
-        )
+        checks = EavesdropperChecks(table.strategy, strategy, table.parameters, kind, scenario.encoding.parameters)
         return how_broken(checks.at_first, Problem(scenario.process.process, batch))
     public = scenario.process
     process = (public.A, public.Q, public.initial_covariance, public.singular_noise)
@@ -125,16 +123,15 @@ def _describes_models(settings: Mapping[str, Any]) -> bool:
 
 
 def _settings_mistakes(path: str, settings: Mapping[str, Any], problem: Problem) -> Iterator[str]:
-    losses = settings.get("loss")
-    for spec in single_specs(losses) if losses else ():
-        if LOSS_MODELS.foreign(spec["model"]):
-            check = LossChecks(lambda spec=spec: loss_of(spec), LOSS_MODELS[spec["model"]]).shapes  # type: ignore[misc]
-            broken = how_broken(check, problem)
+    losses, delay = settings.get("loss"), settings.get("delay")
+    described: list[tuple[str, Registry[Any], Any, Mapping[str, Any]]]
+    described = [("loss", LOSS_MODELS, LossChecks, spec) for spec in (single_specs(losses) if losses else ())]
+    if delay:
+        in_slots = {name: value for name, value in delay.items() if name != "unit"}
+        described.append(("delay", DELAY_MODELS, DelayChecks, in_slots))
+    for entry, models, checks, spec in described:
+        if models.foreign(spec["model"]):
+            parameters = {name: value for name, value in spec.items() if name != "model"}
+            broken = how_broken(checks(models[spec["model"]], parameters).shapes, problem)
             if broken is not None:
-                yield f"{path}.loss.model: is {as_toml(spec['model'])}; in a dry run: {broken}"
-    delay = settings.get("delay")
-    if delay and DELAY_MODELS.foreign(delay["model"]):
-        given = {name: value for name, value in delay.items() if name != "unit"}
-        broken = how_broken(DelayChecks(lambda: delay_of(given), DELAY_MODELS[delay["model"]]).shapes, problem)
-        if broken is not None:
-            yield f"{path}.delay.model: is {as_toml(delay['model'])}; in a dry run: {broken}"
+                yield f"{path}.{entry}.model: is {as_toml(spec['model'])}; in a dry run: {broken}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
-from evedrop.model.process import Process
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
 from evedrop.model.schemes.scheme import NoInnovations, Scheme
@@ -32,16 +31,12 @@ def broken(verdicts: list[RuleVerdict]) -> dict[str, str]:
 
 def checks_of(kind: type[Eavesdropper], name: str = "naive") -> EavesdropperChecks:
     """An eavesdropper of a class, with the examples of its parameters, that hears the paper's scheme."""
-    return EavesdropperChecks(name, kind, dict(kind.parameters), lambda process: Innovation(process, 0.6), Innovation)
+    return EavesdropperChecks(name, kind, dict(kind.parameters), Innovation, {"state_probability": 0.6})
 
 
 def blocks_of_scheme(kind: type[Scheme]) -> str | None:
     """How a scheme breaks the rule for many slots at once on the first problem that shows it; its single slots are right."""
-
-    def scheme_of(process: Process) -> Scheme:
-        return kind(process, **kind.parameters)
-
-    return _first(SchemeChecks(scheme_of, kind))
+    return _first(SchemeChecks(kind, kind.parameters))
 
 
 def blocks_of_eavesdropper(kind: type[Eavesdropper]) -> str | None:

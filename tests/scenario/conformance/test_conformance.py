@@ -113,7 +113,7 @@ def test_an_eavesdropper_that_breaks_a_rule_is_told_which(kind: Any, rule: str, 
     """As a scheme is."""
     parameters = dict(kind.parameters)
     name = {Forgetful: "suspicious", Boastful: f"{__name__}:Boastful"}.get(kind, "naive")
-    checks = EavesdropperChecks(name, kind, parameters, lambda process: Innovation(process, 0.6), Innovation)
+    checks = EavesdropperChecks(name, kind, parameters, Innovation, {"state_probability": 0.6})
     assert message in broken(checks.verdicts())[rule]
 
 
@@ -174,10 +174,10 @@ class Silent(Naive):
 
 def test_whatever_a_class_says_of_itself_is_a_verdict() -> None:
     """Nothing that it returns ends the check by an error; once shapes are wrong, no other rule is asked."""
-    (verdict,) = LossChecks(lambda: Chained(0.9), Chained).verdicts()
+    (verdict,) = LossChecks(Chained, {"quality": 0.9}).verdicts()
     assert verdict.rule == "shapes and types"
     assert "'int' object has no attribute 'transitions'" in str(verdict.broken)
-    checks = EavesdropperChecks("anywhen", Anywhen, {}, lambda process: Innovation(process, 0.6), Innovation)
+    checks = EavesdropperChecks("anywhen", Anywhen, {}, Innovation, {"state_probability": 0.6})
     with pytest.raises(Broken, match=r"betrayed\(\) is 'three'; expected a slot"):
         checks.verdicts()
     assert asked(Silent, {"depth": 3}) == [

@@ -70,7 +70,7 @@ def test_a_loss_model_that_breaks_a_rule_is_told_which(
     kind: Any, parameters: dict[str, float], rule: str, message: str
 ) -> None:
     """As a scheme is."""
-    assert message in broken(LossChecks(lambda: kind(**parameters), kind).verdicts())[rule]
+    assert message in broken(LossChecks(kind, parameters).verdicts())[rule]
 
 
 class Early(Normal):
@@ -83,5 +83,5 @@ class Early(Normal):
 
 def test_a_delay_model_that_breaks_a_rule_is_told_which() -> None:
     """As a loss model is."""
-    result = broken(DelayChecks(lambda: Early(2.0, 1.0), Early).verdicts())
+    result = broken(DelayChecks(Early, {"mean": 2.0, "standard_deviation": 1.0}).verdicts())
     assert "and arrived(" in result["delays agree with simulation"]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.model.process import Floats, Process
+from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Flags, Reception
 from evedrop.model.schemes.cipher import Cipher, CipherEstimator
 from evedrop.model.schemes.innovation import Innovation, SharedSecret
@@ -145,12 +145,7 @@ SCHEME_RULES: dict[str, tuple[type[Scheme], str, str]] = {
 def test_a_scheme_that_breaks_a_rule_is_told_which(rule: str) -> None:
     """With the slot, the trial, both values and the remedy."""
     kind, message, remedy = SCHEME_RULES[rule]
-    parameters = kind.parameters
-
-    def scheme_of(process: Process) -> Scheme:
-        return kind(process, **parameters)
-
-    result = broken(SchemeChecks(scheme_of, kind).verdicts())
+    result = broken(SchemeChecks(kind, kind.parameters).verdicts())
     assert message in result[rule]
     assert remedy in result[rule]
 
@@ -158,5 +153,5 @@ def test_a_scheme_that_breaks_a_rule_is_told_which(rule: str) -> None:
 def test_a_scheme_says_of_every_packet_whether_it_is_encrypted() -> None:
     """One flag for each slot and trial; anything else is told."""
     kind = plain_with(encrypted=lambda self, packets: packets.nu[0])  # noqa: ARG005 - a method
-    result = broken(SchemeChecks(kind, kind).verdicts())
+    result = broken(SchemeChecks(kind, {}).verdicts())
     assert "encrypted()" in result["shapes and types"]

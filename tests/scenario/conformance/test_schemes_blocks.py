@@ -123,10 +123,7 @@ def test_a_block_that_begins_in_a_later_slot_is_no_other() -> None:
 
 def test_the_rule_is_one_of_those_that_are_checked() -> None:
     """A scheme whose blocks are right keeps every rule; one whose blocks are wrong breaks this rule alone."""
-    right, wrong = (
-        SchemeChecks(lambda process, kind=kind: plain_with(kind)(process), plain_with(kind)).verdicts()  # type: ignore[misc]
-        for kind in (Blocks, ByRow)
-    )
+    right, wrong = (SchemeChecks(plain_with(kind), {}).verdicts() for kind in (Blocks, ByRow))
     assert "many slots at once" in [verdict.rule for verdict in right]
     assert broken(right) == {}
     assert list(broken(wrong)) == ["many slots at once"]

@@ -106,7 +106,7 @@ def _dry_run(
 ) -> str | None:
     """Report what breaks in some slots of a scenario. Source: docs/your-own/rules.md, mistakes."""
     del kind  # the class of the strategy, or of the strategy it reads as
-    from evedrop.model.schemes import SCHEMES, scheme_of  # noqa: PLC0415 - the same
+    from evedrop.model.schemes import SCHEMES  # noqa: PLC0415 - the same
     from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks  # noqa: PLC0415 - needed last
     from evedrop.scenario.conformance.problems import Problem  # noqa: PLC0415 - the same
     from evedrop.scenario.conformance.rules import how_broken  # noqa: PLC0415 - the same
@@ -117,8 +117,8 @@ def _dry_run(
         strategy,
         eavesdroppers.STRATEGIES.imported(strategy),
         parameters,
-        lambda process: scheme_of(process, scheme),
         SCHEMES[scheme["scheme"]],
+        {name: value for name, value in scheme.items() if name != "scheme"},
     )
     return how_broken(checks.at_first, Problem(model, Batch(*batch)))
 

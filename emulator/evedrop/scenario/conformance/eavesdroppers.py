@@ -17,7 +17,6 @@ from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.covariances import OutcomesAt
 from evedrop.scenario.conformance.problems import (
     Problem,
-    SchemeOf,
     Slot,
     expect_belief,
     frozen_belief,
@@ -51,8 +50,8 @@ _TAKES_OTHERWISE = (
 class EavesdropperChecks(ReceiverChecks):
     """The rules, each checked on one problem.
 
-    name, kind, parameters: the eavesdropper's class, and its parameters; scheme_of: makes the scheme that it hears, of a process;
-    scheme: the class of that.
+    name, kind, parameters: the eavesdropper's class, and its parameters; scheme, scheme_parameters: those of the scheme that it
+    hears.
     """
 
     state = "keep no state outside of Belief, and take random numbers from the streams alone"
@@ -64,11 +63,12 @@ class EavesdropperChecks(ReceiverChecks):
         name: str,
         kind: type[Eavesdropper],
         parameters: Mapping[str, Any],
-        scheme_of: SchemeOf,
         scheme: type[Scheme],
+        scheme_parameters: Mapping[str, Any],
     ) -> None:
         super().__init__(kind)
-        self._name, self._parameters, self._scheme_of, self._scheme = name, parameters, scheme_of, scheme
+        self._name, self._parameters = name, parameters
+        self._scheme, self._scheme_parameters = scheme, scheme_parameters
         if issubclass(kind, PacketTaker):
             self.unexpected = _TAKES_OTHERWISE
 
@@ -99,7 +99,7 @@ class EavesdropperChecks(ReceiverChecks):
         """The eavesdropper."""
         with calling("streams()", self._kind):
             streams = self._kind.streams(self._parameters)
-        scheme = made(self._scheme_of, problem, self._scheme)
+        scheme = made(self._scheme, self._scheme_parameters, problem)
         of_slots = scheme.mu_d if isinstance(scheme.mu_d, tuple) else None
         mu_d, keys = scheme.state_probability, NamedKeys.of(streams)
         knowledge = Knowledge(problem.process, mu_d, self._parameters, keys, of_slots, scheme.noise_distribution)
@@ -112,7 +112,7 @@ class EavesdropperChecks(ReceiverChecks):
         with calling("prior()", self._kind):
             belief = receiver.prior()
         expect_belief("prior(): Belief", belief, problem)
-        for slot in played(self._scheme_of, problem, self._scheme, rubbish=rubbish):
+        for slot in played(self._scheme, self._scheme_parameters, problem, rubbish=rubbish):
             heard = slot.heard._replace(truth=frozen(slot.x) if slot.k == self._betrayed else None)
             with calling(f"slot {slot.k}: step()", self._kind):
                 after = receiver.step(slot.k, belief, heard)
@@ -132,7 +132,7 @@ class EavesdropperChecks(ReceiverChecks):
 
     def outcomes_at(self, problem: Problem) -> OutcomesAt | None:
         """Those of its class with this scheme."""
-        scheme = made(self._scheme_of, problem, self._scheme)
+        scheme = made(self._scheme, self._scheme_parameters, problem)
         with calling("outcomes()", self._kind):
             return eavesdropper_outcomes(scheme, self._name, self._parameters)
 

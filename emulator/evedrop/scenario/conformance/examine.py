@@ -15,14 +15,14 @@ from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.registry import Registry, asked
-from evedrop.model.schemes import PAPERS_SCHEME, SCHEMES, scheme_of
+from evedrop.model.schemes import PAPERS_SCHEME, SCHEMES
 from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks
 from evedrop.scenario.conformance.links import DelayChecks, LossChecks
-from evedrop.scenario.conformance.problems import SchemeOf
 from evedrop.scenario.conformance.rules import Broken, RuleVerdict, calling
 from evedrop.scenario.conformance.schemes import SchemeChecks
 from evedrop.scenario.plugins import look_in
 
+_CHECKS: Mapping[str, Any] = {"scheme": SchemeChecks, "link": LossChecks, "delay": DelayChecks}
 _REGISTRIES: Mapping[str, Registry[Any]] = {
     "scheme": SCHEMES,
     "eavesdropper": STRATEGIES,
@@ -72,7 +72,7 @@ def examined(names: Mapping[str, str], parameters: Mapping[str, Any]) -> Iterato
             scheme = classes.get("scheme") or _scheme_for(named)
             yield Examined(f"{title}, with the scheme {scheme.name}", _listened(named, scheme))
         else:
-            yield Examined(title, _verdicts(option, named))
+            yield Examined(title, _CHECKS[option](named.kind, named.parameters).verdicts())
 
 
 def _named(option: str, name: str, parameters: Mapping[str, Any]) -> _Named:
@@ -98,18 +98,6 @@ def _given(kind: Any, parameters: Mapping[str, Any]) -> dict[str, Any]:
     return examples | {entry: value for entry, value in parameters.items() if entry in kind.parameters}
 
 
-def _verdicts(option: str, named: _Named) -> list[RuleVerdict]:
-    if option == "scheme":
-        return SchemeChecks(_maker(named), named.kind).verdicts()
-    checks = LossChecks if option == "link" else DelayChecks
-    return checks(lambda: named.kind(**named.parameters), named.kind).verdicts()
-
-
-def _maker(named: _Named) -> SchemeOf:
-    spec = {"scheme": named.name, **named.parameters}
-    return lambda process: scheme_of(process, spec)
-
-
 def _listened(eavesdropper: _Named, scheme: _Named) -> list[RuleVerdict]:
     lacking = sorted({*_streams(eavesdropper)} - {*scheme.kind.secret_streams})
     if lacking:
@@ -119,7 +107,7 @@ def _listened(eavesdropper: _Named, scheme: _Named) -> list[RuleVerdict]:
         )
     try:
         return EavesdropperChecks(
-            eavesdropper.name, eavesdropper.kind, eavesdropper.parameters, _maker(scheme), scheme.kind
+            eavesdropper.name, eavesdropper.kind, eavesdropper.parameters, scheme.kind, scheme.parameters
         ).verdicts()
     except Broken as error:
         return [RuleVerdict("facts on the class", str(error))]

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
-from typing import ClassVar, Generic, TypeVar, final
+from typing import Any, ClassVar, Generic, TypeVar, final
 
 import numpy as np
 
@@ -42,13 +42,13 @@ _PIECES = "let a slot depend only on the model's memory and the slot's numbers, 
 
 
 class _ModelChecks(ABC, Generic[Model]):
-    """The rules that loss models and delay models share, each checked on one problem. model: makes a new instance."""
+    """The rules that loss models and delay models share, each checked on one problem. kind, parameters: those of the model."""
 
     result: ClassVar[str]
     """What a model decides of a packet, for messages."""
 
-    def __init__(self, model: Callable[[], Model], kind: type[Model]) -> None:
-        self._model, self._kind = model, kind
+    def __init__(self, kind: type[Model], parameters: Mapping[str, Any]) -> None:
+        self._kind, self._parameters = kind, parameters
 
     @abstractmethod
     def _whole(self, problem: Problem, bounds: tuple[int, ...] = ()) -> Array:
@@ -56,7 +56,7 @@ class _ModelChecks(ABC, Generic[Model]):
 
     def _made(self) -> Model:
         with calling(f"{self._kind.__name__}(…)", self._kind):
-            return self._model()
+            return self._kind(**self._parameters)
 
     def alone(self, problem: Problem) -> None:
         """A trial alone gives the same results as among others."""
@@ -223,7 +223,7 @@ class DelayChecks(_ModelChecks[DelayModel]):
         """Delays, and the probabilities that the model states, have the right shapes and types."""
         self._whole(problem)
         with calling("arrived()", self._kind):
-            probabilities = [self._model().arrived(lag) for lag in range(4)]
+            probabilities = [self._made().arrived(lag) for lag in range(4)]
         given = [probability for probability in probabilities if probability is not None]
         for lag, probability in enumerate(probabilities):
             if probability is not None:
@@ -239,7 +239,7 @@ class DelayChecks(_ModelChecks[DelayModel]):
         """The fraction of packets in time is the stated one."""
         delays = self._whole(problem)
         for lag in range(4):
-            promised = self._model().arrived(lag)
+            promised = self._made().arrived(lag)
             fraction = float((delays < lag + 1).mean())
             if promised is not None and abs(fraction - promised) > SIGMAS * np.sqrt(
                 max(promised * (1.0 - promised), 1e-3) / delays.size

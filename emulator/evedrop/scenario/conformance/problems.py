@@ -6,7 +6,7 @@ estimator, slot by slot.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -82,8 +82,6 @@ def large() -> list[Problem]:
 
 _TRIALS = "one for each of the R trials"
 
-SchemeOf = Callable[[Process], Scheme]
-
 
 @dataclass(frozen=True)
 class Slot:
@@ -124,21 +122,26 @@ def row_of(belief: Belief) -> dict[str, Any]:
     return {"Belief.x_hat": belief.x_hat, "Belief.P": belief.P, "Belief.action": belief.action}
 
 
-def made(scheme_of: SchemeOf, problem: Problem, kind: type[Scheme]) -> Scheme:
-    """The scheme for a problem's process."""
+def made(kind: type[Scheme], parameters: Mapping[str, Any], problem: Problem) -> Scheme:
+    """The scheme of a class for a problem's process."""
     with calling(f"{kind.__name__}(process, …)", kind):
-        return scheme_of(problem.process)
+        return kind(problem.process, **parameters)
 
 
 def played(
-    scheme_of: SchemeOf, problem: Problem, kind: type[Scheme], *, apart: bool = False, rubbish: float = 0.0
+    kind: type[Scheme],
+    parameters: Mapping[str, Any],
+    problem: Problem,
+    *,
+    apart: bool = False,
+    rubbish: float = 0.0,
 ) -> Iterator[Slot]:
     """Every slot of a problem.
 
     apart: sensor and estimator are made separately, as in processes of their own; rubbish: the value that a receiver finds in
     place of a lost packet. Everything passed in is read-only; everything returned is checked.
     """
-    scheme, batch, n = made(scheme_of, problem, kind), problem.batch, problem.process.n
+    scheme, batch, n = made(kind, parameters, problem), problem.batch, problem.process.n
     encoder, estimator = sides(scheme, problem, kind, apart)
     with calling("initial_state()", kind):
         initial = scheme.initial_state(NamedKeys.of(scheme.secret_streams), batch)

@@ -5,8 +5,8 @@ Source: docs/your-own/rules.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import final
+from collections.abc import Iterator, Mapping
+from typing import Any, final
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from evedrop.model.outcomes import legitimate_outcomes
 from evedrop.model.receiver import Receiver
 from evedrop.model.schemes.scheme import PacketBlock, Scheme
 from evedrop.model.theory.covariances import OutcomesAt
-from evedrop.scenario.conformance.problems import Problem, SchemeOf, Slot, large, made, played, row_of, sent_of, small
+from evedrop.scenario.conformance.problems import Problem, Slot, large, made, played, row_of, sent_of, small
 from evedrop.scenario.conformance.receivers import SIGMAS, BlockChecks, ReceiverChecks
 from evedrop.scenario.conformance.rules import (
     Broken,
@@ -35,15 +35,15 @@ _QUALITIES = (0.0, 0.5, 1.0)
 
 @final
 class SchemeChecks(ReceiverChecks):
-    """The rules, each checked on one problem. scheme_of: makes the scheme of a process."""
+    """The rules, each checked on one problem. kind, parameters: the scheme's class, and its parameters."""
 
     state = "keep no state outside of what is made from the keys, and take random numbers from their streams alone"
     unpredictable = "set reads_packets = True if it depends on more than γ"
     _kind: type[Scheme]
 
-    def __init__(self, scheme_of: SchemeOf, kind: type[Scheme]) -> None:
+    def __init__(self, kind: type[Scheme], parameters: Mapping[str, Any]) -> None:
         super().__init__(kind)
-        self._scheme_of = scheme_of
+        self._parameters = parameters
 
     def verdicts(self) -> list[RuleVerdict]:
         """Check every rule, on small problems."""
@@ -66,7 +66,7 @@ class SchemeChecks(ReceiverChecks):
 
     def played(self, problem: Problem, *, rubbish: float = 0.0, apart: bool = False) -> Iterator[Slot]:
         """Every slot; apart: sensor and estimator are made separately."""
-        return played(self._scheme_of, problem, self._kind, apart=apart, rubbish=rubbish)
+        return played(self._kind, self._parameters, problem, apart=apart, rubbish=rubbish)
 
     def row(self, slot: Slot) -> Row:
         """Packets and beliefs."""
@@ -74,17 +74,17 @@ class SchemeChecks(ReceiverChecks):
 
     def receiver(self, problem: Problem) -> Receiver:
         """The estimator."""
-        scheme = made(self._scheme_of, problem, self._kind)
+        scheme = made(self._kind, self._parameters, problem)
         with calling("estimator()", self._kind):
             return scheme.estimator(NamedKeys.of(scheme.estimator_streams), problem.batch)
 
     def follows_gamma(self, problem: Problem) -> bool:
         """Unless the scheme reads packets."""
-        return not made(self._scheme_of, problem, self._kind).reads_packets
+        return not made(self._kind, self._parameters, problem).reads_packets
 
     def outcomes_at(self, problem: Problem) -> OutcomesAt | None:
         """Those of the legitimate estimator."""
-        return legitimate_outcomes(made(self._scheme_of, problem, self._kind))
+        return legitimate_outcomes(made(self._kind, self._parameters, problem))
 
     def shapes(self, problem: Problem) -> None:
         """All results have the right shapes and types, made together and apart, and no input is changed."""
@@ -92,7 +92,7 @@ class SchemeChecks(ReceiverChecks):
             expect_names(name, getattr(self._kind, name))
         for name in ("needs_acknowledgements", "reads_packets", "may_be_silent"):
             expect_bool(name, getattr(self._kind, name))
-        scheme = made(self._scheme_of, problem, self._kind)
+        scheme = made(self._kind, self._parameters, problem)
         more = sorted(set(scheme.estimator_streams) - set(scheme.secret_streams))
         if more:
             raise Broken(f"estimator_streams has {more}, which secret_streams lacks; expected some of those")
@@ -130,7 +130,7 @@ class SchemeChecks(ReceiverChecks):
 
     def blocks(self, problem: Problem) -> None:
         """Blocks of slots give the same packets and beliefs as single slots."""
-        scheme = made(self._scheme_of, problem, self._kind)
+        scheme = made(self._kind, self._parameters, problem)
         BlockChecks(self.slots(problem), problem, self._kind).expect_same_sides(scheme)
         super().blocks(problem)
 
