@@ -21,8 +21,8 @@ from evedrop.model.receiver import Action
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.score.expectations_held import Evidence
-from evedrop.score.secrecy import Claim, Secrecy
-from evedrop.score.summary import Judged, LinkSummary, PeerSummary
+from evedrop.score.secrecy import Claim
+from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary
 from evedrop.score.sums import Tally
 from evedrop.score.watched_tally import SYNCHRONISED, WatchedQuantity, WatchedTally
 from evedrop.simulate.montecarlo import Plan
@@ -193,7 +193,7 @@ def test_a_trial_that_never_is_synchronised_is_found_as_nothing(tmp_path: Path) 
     secret = {"secrecy": "relative", "against": "smart"}
     scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged, secret]})
     short = {name: Tally(9, 1) for name in scenario.receivers}
-    open_ = Secrecy("smart", Claim.UNDECIDED, Claim.UNDECIDED, True, 1, "", True, 1.0, 1, "mean")
+    open_ = SecrecySummary(Claim.UNDECIDED, Claim.UNDECIDED, True, 1, True, "mean", "")
     peers = dict.fromkeys(scenario.receivers, PeerSummary({"used_fraction": 0.5}, None, False, None))
     judged = Evidence(scenario, peers, {}, short, {"smart": open_}).judged("evedrop run x")
     assert [judgement.held for judgement in judged] == [None] * 3
@@ -219,8 +219,7 @@ def test_secrecy_is_held_where_theory_and_run_agree(
         scenario = load("eavesdroppers", {"expect": [{"secrecy": kind, "against": "smart"}]})
         other: dict[str, Any] = {"relative": Claim.HELD, "perfect": Claim.HELD}
         claims: dict[str, Any] = {"relative_by_theory": True, "perfect_by_theory": True, f"{kind}_by_theory": promised}
-        verdict = Secrecy("smart", **{**other, kind: shown}, **claims, relative_from=None, windows="", ratio=1.0,
-                          trials=9, judged_by="mean")  # fmt: skip
+        verdict = SecrecySummary(**{**other, kind: shown}, **claims, relative_from=None, judged_by="mean", sentence="")
         (judged,) = Evidence(scenario, {}, {}, {}, {"smart": verdict}).judged(None)
         assert (judged.value, judged.held) == (value, held)
 

@@ -19,7 +19,8 @@ from evedrop.scenario.loading import load
 from evedrop.scenario.theory import Expectation, expectations_of
 from evedrop.score.rare_events import rare_events_of
 from evedrop.score.scorekeeper import verdicts
-from evedrop.score.secrecy import Claim, Secrecy, rejected, secrecy
+from evedrop.score.secrecy import Claim, rejected, secrecy
+from evedrop.score.summary import SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
 from tests.score.test_verdict_calibration import tally_of
 
@@ -61,16 +62,21 @@ BURSTS = {"model": "gilbert-elliott", "p": 0.01, "r": 0.1}
 ROTE = {"model": "trace", "outcomes": "110", "random_start": True}
 
 
-def judged(legitimate: Tally, other: Tally, mu_e: float = 0.5, use_innovation: float = 0.0) -> Secrecy:
+def entry(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tally, Expectation]) -> SecrecySummary:
+    """The summary's entry."""
+    return secrecy(legitimate, eavesdropper)[0]
+
+
+def judged(legitimate: Tally, other: Tally, mu_e: float = 0.5, use_innovation: float = 0.0) -> SecrecySummary:
     """The verdict when theory knows a good legitimate link and an eavesdropper with these probabilities."""
     expected = expectation(good(0.9), 0.5), expectation(good(mu_e), 0.5, (1.0, use_innovation))
-    return secrecy((legitimate, expected[0]), ("eve", other, expected[1]))
+    return entry((legitimate, expected[0]), ("eve", other, expected[1]))
 
 
 def test_relative_secrecy_held_where_every_window_is_above() -> None:
     """A larger error in every window, beyond doubt."""
     verdict = judged(tally(around(0.03)), tally(around(0.06)))
-    assert verdict.relative is Claim.HELD
+    assert verdict.relative == Claim.HELD
     assert verdict.ratio == pytest.approx(2.0, rel=0.05)
     assert "its error was larger in every window" in verdict.sentence
 
@@ -80,7 +86,7 @@ def test_relative_secrecy_failed_where_one_window_is_below() -> None:
     levels = np.full(WINDOWS, 0.06)
     levels[3] = 0.015
     verdict = judged(tally(around(0.03)), tally(around(levels)))
-    assert verdict.relative is Claim.FAILED
+    assert verdict.relative == Claim.FAILED
     assert "its error was not larger in slots " in verdict.sentence
 
 
@@ -111,7 +117,7 @@ def test_an_unclear_window_leaves_the_verdict_open() -> None:
     levels = np.full(WINDOWS, 0.002)
     levels[3] = 0.001
     other = around(levels, spread=0.9)
-    assert judged(tally(around(0.001, 0.9)[::-1]), tally(other)).relative is Claim.UNDECIDED
+    assert judged(tally(around(0.001, 0.9)[::-1]), tally(other)).relative == Claim.UNDECIDED
 
 
 def test_rare_events_that_theory_expects_of_the_user_leave_held_open() -> None:
@@ -125,13 +131,13 @@ def test_rare_events_that_theory_expects_of_the_user_leave_held_open() -> None:
         lambda quality: Outcomes.eavesdropper(quality, 0.02, 1.0, 0.0),
     )
     legitimate, other = tally(around(0.1, trials=200)), tally(around(20.0, trials=200))
-    result = secrecy((legitimate, ours), ("eve", other, theirs))
-    assert result.relative is Claim.UNDECIDED
+    result = entry((legitimate, ours), ("eve", other, theirs))
+    assert result.relative == Claim.UNDECIDED
     assert "200 trials are too few to decide: theory expects a larger error of legitimate" in result.sentence
     assert re.search(r"; [0-9,]+ trials would contain them, and montecarlo --rare estimates its mean;", result.sentence)
     # The same the other way round: an eavesdropper whose rare events are missing has not broken the secret.
-    result = secrecy((other, theirs), ("eve", legitimate, ours))
-    assert result.relative is Claim.UNDECIDED
+    result = entry((other, theirs), ("eve", legitimate, ours))
+    assert result.relative == Claim.UNDECIDED
     assert "theory expects a larger error of eve" in result.sentence
 
 
@@ -141,7 +147,7 @@ def test_without_a_closed_form_an_event_that_no_trial_met_may_still_be_there(tri
     process = Process(np.array([[1.0]]), np.array([[1.0]]), np.array([[1e3]]))
     unknown = Expectation(process, distribution_of(LinkSchedule({"loss": good(0.99)})), None)
     quiet, loud = tally(around(0.1, trials=trials)), tally(around(5.0, trials=trials))
-    verdicts = secrecy((quiet, unknown), ("eve", loud, unknown)), secrecy((loud, unknown), ("eve", quiet, unknown))
+    verdicts = entry((quiet, unknown), ("eve", loud, unknown)), entry((loud, unknown), ("eve", quiet, unknown))
     enough = trials > 200
     assert [verdict.relative for verdict in verdicts] == (
         [Claim.HELD, Claim.FAILED] if enough else [Claim.UNDECIDED] * 2
@@ -160,8 +166,8 @@ def test_a_recorded_link_is_judged_by_its_own_fraction_of_losses(first_loss: flo
     process = Process(np.array([[1.5]]), np.array([[1.0]]), np.array([[1.0]]))
     recorded = Expectation(process, None, None, recorded_loss=first_loss)
     known = expectation(good(0.9), 0.5)
-    result = secrecy((tally(around(0.1)), recorded), ("eve", tally(around(50.0)), known))
-    assert result.relative is relative
+    result = entry((tally(around(0.1)), recorded), ("eve", tally(around(50.0)), known))
+    assert result.relative == relative
     never = "no theory bounds the error of legitimate in them, however many trials there are;"
     assert (never in result.sentence) == math.isnan(first_loss)
 
@@ -186,7 +192,7 @@ def test_a_replayed_recording_is_in_the_verdict_and_warned_of() -> None:
     for random_start, trials, replayed in ((False, 30, True), (True, 30, False), (False, 1, False)):
         link = {"loss": {**trace, "random_start": random_start}}
         scenario = load("vehicle", {"slots": 100, "trials": trials, "legitimate": {"link": link}})
-        _, verdict = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
+        *_, verdict = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
         assert verdict is not None
         assert (", given this recording of losses" in verdict.sentence) == replayed
         warned = "the first 100 of 400 recorded outcomes" in " ".join(warnings_of(scenario))
@@ -198,15 +204,15 @@ def test_a_recording_on_the_link_of_an_eavesdropper_is_in_its_own_verdict() -> N
     """And not in those on others."""
     link = {"loss": {"model": "trace", "outcomes": "0111" * 100}}
     scenario = load("vehicle", {"slots": 100, "trials": 30, "eavesdroppers.smart.link": link})
-    each, _ = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
-    replaying = {entry.eavesdropper for entry in each if entry.compared is not None and entry.compared.replayed}
+    _, each, _ = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
+    replaying = {compared.eavesdropper for compared in each if compared.replayed}
     assert replaying == {"smart"}
 
 
 def test_one_trial_decides_nothing() -> None:
     """However far apart the errors are."""
     verdict = judged(tally(around(0.001, trials=1)), tally(around(9.0, trials=1)))
-    assert verdict.relative is Claim.UNDECIDED
+    assert verdict.relative == Claim.UNDECIDED
     assert verdict.sentence == "eve: theory promises relative secrecy"
 
 
@@ -220,7 +226,7 @@ def test_a_run_that_measured_nothing_says_so() -> None:
     """An interrupt before the first slot is neither an infinite advantage nor a verdict."""
     verdict = judged(tally(around(0.0), done=0), tally(around(0.0), done=0))
     assert verdict.sentence == "eve: nothing was measured; theory promises relative secrecy"
-    assert verdict.relative is Claim.UNDECIDED
+    assert verdict.relative == Claim.UNDECIDED
 
 
 @pytest.mark.parametrize("slots", [1, 2, 5, 8])
@@ -230,7 +236,7 @@ def test_fewer_slots_than_windows_are_judged_by_those_there_are(slots: int) -> N
     means = window_means(legitimate)
     assert np.isnan(means).any(axis=1).sum() == WINDOWS - min(WINDOWS, slots - 1)
     expected = Claim.HELD if slots > 1 else Claim.UNDECIDED
-    assert judged(legitimate, other).relative is expected
+    assert judged(legitimate, other).relative == expected
 
 
 @pytest.mark.parametrize("slots", [1, 2, 5, 8, 9, 10, 100, 1001])
@@ -257,13 +263,13 @@ def test_perfect_secrecy_asks_for_growth(levels: Floats, verdict: Claim) -> None
     """Where theory says that the eavesdropper's error has no bound, the run must show it growing."""
     result = judged(tally(around(1e-5)), tally(around(levels)), use_innovation=1.0)
     assert result.perfect_by_theory
-    assert result.perfect is verdict
+    assert result.perfect == verdict
 
 
 def test_perfect_secrecy_asks_for_a_bounded_legitimate_error() -> None:
     """Growth is worth nothing when the legitimate error is beyond its own bound."""
     levels = np.linspace(1.0, 9.0, WINDOWS)
-    assert judged(tally(around(5.0)), tally(around(levels)), use_innovation=1.0).perfect is Claim.FAILED
+    assert judged(tally(around(5.0)), tally(around(levels)), use_innovation=1.0).perfect == Claim.FAILED
 
 
 def test_perfect_secrecy_is_not_claimed_where_theory_denies_it() -> None:
@@ -276,7 +282,7 @@ def test_theory_of_relative_secrecy_needs_a_worse_eavesdropper() -> None:
     """An eavesdropper with a perfect link is better off than a legitimate estimator with a poor one, and theory says so."""
     legitimate, other = tally(around(0.001)), tally(around(0.002))
     expected = expectation(good(0.3), 0.9), expectation(good(1.0), 0.9, (1.0, 0.0))
-    assert not secrecy((legitimate, expected[0]), ("eve", other, expected[1])).relative_by_theory
+    assert not entry((legitimate, expected[0]), ("eve", other, expected[1])).relative_by_theory
     assert judged(legitimate, other).relative_by_theory
 
 
@@ -284,9 +290,9 @@ def test_theory_of_secrecy_knows_bursts() -> None:
     """Behind a link that loses in bursts the claims of theory are those of its chain."""
     legitimate, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     smart, naive = expectation(BURSTS, 0.5, (1.0, 0.0)), expectation(BURSTS, 0.5, (1.0, 1.0))
-    result = secrecy((legitimate, expectation(BURSTS, 0.5)), ("eve", other, smart))
+    result = entry((legitimate, expectation(BURSTS, 0.5)), ("eve", other, smart))
     assert (result.relative_by_theory, result.perfect_by_theory, result.perfect) == (True, False, Claim.FAILED)
-    result = secrecy((legitimate, expectation(BURSTS, 0.5)), ("eve", other, naive))
+    result = entry((legitimate, expectation(BURSTS, 0.5)), ("eve", other, naive))
     assert (result.relative_by_theory, result.perfect_by_theory, result.perfect) == (True, True, Claim.HELD)
 
 
@@ -295,14 +301,13 @@ def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str,
     """Neither claim of theory is made, and the sentence says so; what the run shows is said all the same."""
     legitimate, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     expected = expectation(links[0], 0.5), expectation(links[1], 0.5, (1.0, 0.0))
-    result = secrecy((legitimate, expected[0]), ("eve", other, expected[1]))
+    result = entry((legitimate, expected[0]), ("eve", other, expected[1]))
     assert (result.relative_by_theory, result.perfect_by_theory) == (None, None)
     assert (result.relative, result.perfect) == (Claim.HELD, Claim.HELD)
     assert result.sentence.endswith("no theory covers these links")
     bounded = "stayed bounded" if links[0] == good(0.9) else "did not"
     assert f"its error grew while the legitimate one {bounded};" in result.sentence
-    assert (result.summary.relative_by_theory, result.summary.perfect_by_theory) == (None, None)
-    nothing = secrecy((tally(around(0.0), done=0), expected[0]), ("eve", tally(around(0.0), done=0), expected[1]))
+    nothing = entry((tally(around(0.0), done=0), expected[0]), ("eve", tally(around(0.0), done=0), expected[1]))
     assert nothing.sentence == "eve: nothing was measured; no theory covers these links"
 
 
@@ -310,10 +315,10 @@ def test_an_error_without_a_known_bound_must_not_grow() -> None:
     """If both errors grow, the legitimate error may be unbounded, too; with a known bound it may grow up to that."""
     legitimate, other = tally(around(np.linspace(1e-5, 2e-5, WINDOWS))), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     unknown = expectation(ROTE, 0.5), expectation(good(0.5), 0.5, (1.0, 1.0))
-    result = secrecy((legitimate, unknown[0]), ("eve", other, unknown[1]))
+    result = entry((legitimate, unknown[0]), ("eve", other, unknown[1]))
     assert (result.relative, result.perfect) == (Claim.HELD, Claim.UNDECIDED)
     assert "its error was larger in every window" in result.sentence
-    assert judged(legitimate, other, use_innovation=1.0).perfect is Claim.HELD
+    assert judged(legitimate, other, use_innovation=1.0).perfect == Claim.HELD
 
 
 def test_an_error_that_approaches_its_limit_from_above_is_within_its_bound() -> None:
@@ -329,9 +334,9 @@ def test_an_error_that_approaches_its_limit_from_above_is_within_its_bound() -> 
     assert means[-1] > 1.5 * ours.limit
     other = tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     for factor, verdict in ((1.0, Claim.HELD), (2.0, Claim.FAILED)):
-        result = secrecy((tally(around(factor * means)), ours), ("eve", other, theirs))
+        result = entry((tally(around(factor * means)), ours), ("eve", other, theirs))
         assert result.perfect_by_theory
-        assert result.perfect is verdict
+        assert result.perfect == verdict
 
 
 def test_the_limit_of_a_mere_model_bounds_no_error_of_a_run() -> None:
@@ -339,14 +344,14 @@ def test_the_limit_of_a_mere_model_bounds_no_error_of_a_run() -> None:
     other = tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     ours, theirs = (replace(expectation(good(0.9), 0.5, uses), of_model=True) for uses in (None, (1.0, 1.0)))
     for levels, verdict in ((0.5, Claim.HELD), (np.linspace(0.1, 0.9, WINDOWS), Claim.UNDECIDED)):
-        assert secrecy((tally(around(levels)), ours), ("eve", other, theirs)).perfect is verdict
+        assert entry((tally(around(levels)), ours), ("eve", other, theirs)).perfect == verdict
 
 
 def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
     """Without a closed form, the genie is a bound: secrecy that holds against the genie holds; otherwise it is left open."""
     legitimate, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
 
-    def judged_(process: Process, mu: float, mu_e: float) -> Secrecy:
+    def judged_(process: Process, mu: float, mu_e: float) -> SecrecySummary:
         ours = Expectation(
             process,
             distribution_of(LinkSchedule({"loss": good(mu)})),
@@ -355,7 +360,7 @@ def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
         chain = distribution_of(LinkSchedule({"loss": good(mu_e)}))
         theirs = Expectation(process, chain, None, lambda quality: Outcomes.genie(quality, 0.6))
         assert np.isnan(theirs.traces(3)).all()
-        return secrecy((legitimate, ours), ("eve", other, theirs))
+        return entry((legitimate, ours), ("eve", other, theirs))
 
     unstable = Process(np.array([[1.0, 0.3], [0.5, 1.001]]), np.eye(2) * 1e-3, np.eye(2))
     for process, mu_e, relative, perfect in (
@@ -369,7 +374,7 @@ def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
         )
         assert verdict.sentence.endswith(f"theory promises {promise}")
     nothing = Expectation(STABLE, distribution_of(LinkSchedule({"loss": good(0.9)})), None)
-    verdict = secrecy((legitimate, expectation(good(0.9), 0.5)), ("eve", other, nothing))
+    verdict = entry((legitimate, expectation(good(0.9), 0.5)), ("eve", other, nothing))
     assert verdict.sentence.endswith("no closed form of its error is known")
 
 
@@ -381,7 +386,7 @@ def test_rounding_on_a_perfect_link_is_no_failure() -> None:
         STABLE, distribution_of(LinkSchedule({"loss": good(1.0)})), lambda quality: Outcomes.legitimate(quality, 0.5)
     )
     misled = expectation(good(0.5), 0.5, (1.0, 1.0))
-    assert secrecy((legitimate, perfect), ("eve", other, misled)).perfect is Claim.HELD
+    assert entry((legitimate, perfect), ("eve", other, misled)).perfect == Claim.HELD
 
 
 @pytest.mark.parametrize("slots", [SLOTS, 5])
@@ -390,19 +395,19 @@ def test_errors_that_are_both_rounding_are_equal(slots: int, levels: tuple[float
     """Their ratio means nothing; that of an error to one of rounding is infinite."""
     perfect = expectation(good(1.0), 0.5), expectation(good(1.0), 0.5, (1.0, 1.0))
     ours, theirs = (tally(around(level), done=slots, slots=slots) for level in levels)
-    result = secrecy((ours, perfect[0]), ("eve", theirs, perfect[1]))
+    result, compared = secrecy((ours, perfect[0]), ("eve", theirs, perfect[1]))
     assert result.ratio == 1.0
-    assert result.compared is not None
-    assert result.compared.after_start.ratio == 1.0
+    assert compared.after_start.ratio == 1.0
     larger = tally(around(1.0), done=slots, slots=slots)
-    assert math.isinf(secrecy((ours, perfect[0]), ("eve", larger, perfect[1])).ratio)
+    _, compared = secrecy((ours, perfect[0]), ("eve", larger, perfect[1]))
+    assert math.isinf(compared.after_start.ratio)
 
 
 def test_one_slot_proves_nothing() -> None:
     """Theory claims relative secrecy for slots k ≥ 1, and a run of one slot has none."""
     tally_ = Tally(1, 3)
     tally_.done, tally_.offered, tally_.error = 1, 3, 1.0
-    result = secrecy((tally_, expectation(good(0.9), 0.5)), ("eve", tally_, expectation(good(0.9), 0.5, (1.0, 0.0))))
+    result = entry((tally_, expectation(good(0.9), 0.5)), ("eve", tally_, expectation(good(0.9), 0.5, (1.0, 0.0))))
     assert result.relative_by_theory is False
 
 

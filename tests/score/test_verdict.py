@@ -95,7 +95,7 @@ def test_a_run_of_one_slot_does_not_decide() -> None:
     """Neither of several trials, whose errors are all 0 there, nor of one."""
     for trials in (1, 20):
         scenario = load("vehicle", {"slots": 1, "trials": trials})
-        _, verdict = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
+        *_, verdict = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
         assert verdict is not None
         assert verdict.outcome == SecrecyOutcome.OPEN
 
@@ -114,8 +114,8 @@ def test_a_trial_without_states_has_a_verdict_without_distances() -> None:
 def test_the_interval_of_several_trials_has_no_bound_below_zero() -> None:
     """It is that of the logarithm: with few trials an error that scatters widely is not said to be perhaps 0 times as large."""
     scenario = load("vehicle", {"slots": 400, "trials": 8})
-    eavesdroppers, _ = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
-    compared = [secrecy.compared.after_start for secrecy in eavesdroppers if secrecy.compared is not None]
+    _, each, _ = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
+    compared = [entry.after_start for entry in each]
     intervals = [(values.ratio, *values.interval) for values in compared if values.interval is not None]
     assert len(intervals) == 3
     for ratio, low, high in intervals:

@@ -19,7 +19,6 @@ from pydantic import TypeAdapter
 from evedrop.errors import UsageError
 from evedrop.results.reading import ByName
 from evedrop.results.summary_file import plain
-from evedrop.score.secrecy import Claim, Secrecy
 from evedrop.score.summary import RARE_FRACTION, RareEvents, SecrecySummary
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.system.files import Unreadable, text_of
@@ -126,7 +125,9 @@ class Cell:
     legitimate: SimulatedError | None = None
     """The legitimate estimator in the same simulation: an attack may affect it, too."""
     eavesdropper: SimulatedError | None = None
-    secrecy: Secrecy | None = None
+    secrecy: SecrecySummary | None = None
+    trials: int = 0
+    """Of the simulation."""
 
     @property
     def ratio(self) -> float | None:
@@ -138,14 +139,14 @@ class Cell:
             return None
         first, second = self.legitimate, self.eavesdropper
         if not (first.infinite_variance or second.infinite_variance):
-            return self.secrecy.ratio
+            return math.inf if self.secrecy.ratio is None else self.secrecy.ratio
         legitimate, other = (each.quantiles["0.5"] for each in (first, second))
         return other / legitimate if legitimate else math.inf
 
     @property
     def ratio_error(self) -> float | None:
         """Standard error of the ratio; None for one trial, and for a ratio of medians."""
-        return None if self.secrecy is None else self.secrecy.ratio_error
+        return None if self.secrecy is None else self.secrecy.ratio_standard_error
 
     @property
     def verdict(self) -> SecrecyOutcome | None:
@@ -166,7 +167,7 @@ class Cell:
             "ratio": self.ratio,
             "ratio_standard_error": self.ratio_error,
             "verdict": verdict.value,
-            "secrecy": asdict(self.secrecy.summary),
+            "secrecy": asdict(self.secrecy),
         }
 
 
@@ -240,11 +241,7 @@ class SchemeResult:
     @property
     def protection_range(self) -> Range:
         """Where the least of the expected errors of these adversaries is."""
-        ranges = [
-            cell.eavesdropper.expected(cell.secrecy.trials)
-            for cell in self._played
-            if cell.eavesdropper is not None and cell.secrecy is not None
-        ]
+        ranges = [cell.eavesdropper.expected(cell.trials) for cell in self._played if cell.eavesdropper is not None]
         least, most = (min(ends) for ends in zip(*ranges, strict=True)) if ranges else (0.0, math.inf)
         return least, most
 
@@ -402,7 +399,7 @@ def _rows(scheme: SchemeResult) -> Iterator[dict[str, Any]]:
 
 
 def read_comparison(folder: Path) -> Comparison:
-    """The comparison in a results folder. Its verdicts lack `windows`, which only sentences have. Raises UsageError."""
+    """The comparison in a results folder. Raises UsageError."""
     path = folder / COMPARISON
     try:
         return _comparison(json.loads(text_of(path, _MOST_BYTES)))
@@ -419,52 +416,32 @@ def _comparison(data: Mapping[str, Any]) -> Comparison:
         int(data["seed"]),
         int(data["first_trial"]),
         tuple(data["adversaries"]),
-        {
-            name: _scheme(name, table, (int(data["slots"]), int(data["trials"])))
-            for name, table in data["schemes"].items()
-        },
+        {name: _scheme(name, table, int(data["trials"])) for name, table in data["schemes"].items()},
         {name: tuple(why) for name, why in data["left_out"].items()},
         bool(data.get("of_estimate", False)),
     )
 
 
-def _scheme(name: str, data: Mapping[str, Any], size: tuple[int, int]) -> SchemeResult:
+def _scheme(name: str, data: Mapping[str, Any], trials: int) -> SchemeResult:
     needs = {key: value for key, value in data["needs"].items() if key != "packet_bits"}
     return SchemeResult(
         name,
         data["parameters"],
         TypeAdapter(Needs).validate_python(needs),
         _simulated_error(data["legitimate"]),
-        {adversary: _cell(name, adversary, table, size) for adversary, table in data["against"].items()},
+        {adversary: _cell(name, adversary, table, trials) for adversary, table in data["against"].items()},
         None if data["leak"] is None else TypeAdapter(PacketLeak).validate_python(data["leak"]),
     )
 
 
-def _cell(scheme: str, adversary: str, data: Mapping[str, Any], size: tuple[int, int]) -> Cell:
+def _cell(scheme: str, adversary: str, data: Mapping[str, Any], trials: int) -> Cell:
     if "verdict" not in data:
         return Cell(Match(scheme, adversary, not_defined=data["not_defined"]))
     match = Match(scheme, adversary, data["reads_as"], data["attack"], betrayed=bool(data["betrayed"]))
-    summary = TypeAdapter(SecrecySummary).validate_python(data["secrecy"])
-    first = data["secrecy"]["ratio_from"]
-    if summary.verdict is None:
+    secrecy = TypeAdapter(SecrecySummary).validate_python(data["secrecy"])
+    if secrecy.verdict is None:
         raise KeyError("verdict")  # results of an older version
-    secrecy = Secrecy(
-        match.receiver,
-        Claim(summary.relative),
-        Claim(summary.perfect),
-        summary.relative_by_theory,
-        summary.relative_from,
-        "",
-        summary.perfect_by_theory,
-        math.inf if summary.ratio is None else summary.ratio,
-        size[1],
-        summary.judged_by,
-        ratio_error=summary.ratio_standard_error,
-        leak=summary.leak,
-        ratio_slots=None if first is None else (first, size[0] - 1),
-        verdict=summary.verdict,
-    )
-    return Cell(match, _simulated_error(data["legitimate"]), _simulated_error(data["eavesdropper"]), secrecy)
+    return Cell(match, _simulated_error(data["legitimate"]), _simulated_error(data["eavesdropper"]), secrecy, trials)
 
 
 def _simulated_error(data: Mapping[str, Any]) -> SimulatedError:

@@ -15,8 +15,16 @@ from evedrop.model.links.loss_model import REASONS
 from evedrop.scenario.application import APPLICATIONS, Summary
 from evedrop.scenario.expect import ExpectTable, direction_metric, link_metric
 from evedrop.scenario.tables import Scenario
-from evedrop.score.secrecy import Claim, Secrecy
-from evedrop.score.summary import MODES, DirectionSummary, Judged, JudgedValue, LinkSummary, PeerSummary
+from evedrop.score.secrecy import Claim
+from evedrop.score.summary import (
+    MODES,
+    DirectionSummary,
+    Judged,
+    JudgedValue,
+    LinkSummary,
+    PeerSummary,
+    SecrecySummary,
+)
 from evedrop.score.sums import Tally, quantile_of
 from evedrop.score.watched_tally import watch_of
 
@@ -45,7 +53,7 @@ class Evidence:
     peers: Mapping[str, PeerSummary]
     links: Mapping[str, LinkSummary]
     tallies: Mapping[str, Tally]
-    secrecy: Mapping[str, Secrecy]
+    secrecy: Mapping[str, SecrecySummary]
     applications: Mapping[str, Summary] = field(default_factory=dict)
     """Application → its entry of the summary."""
     directions: Mapping[str, Mapping[str, DirectionSummary]] = field(default_factory=dict)
@@ -109,29 +117,26 @@ class Evidence:
         return account.rate, account.within_interval
 
     def _secrecy(self, expect: ExpectTable) -> tuple[JudgedValue, bool | None]:
-        """Held if theory promises secrecy and the run shows it, otherwise not; undecided in a run that was cut short."""
-        if expect.direction is not None:
-            return self._secrecy_in(expect)
-        verdict = self.secrecy[str(expect.against)]
-        relative = expect.secrecy == "relative"
-        shown = verdict.relative if relative else verdict.perfect
-        promised = verdict.relative_by_theory if relative else verdict.perfect_by_theory
-        verdicts = f"{_THEORY[promised]}, {_RUN.get(shown.value, f'the run has {shown.value}')}"
-        complete = all(tally.done == tally.slots for tally in self.tallies.values())
-        return verdicts, promised is True and shown is Claim.HELD if complete else None
+        """Held if theory promises secrecy and the run shows it, otherwise not; undecided in a run that was cut short.
 
-    def _secrecy_in(self, expect: ExpectTable) -> tuple[JudgedValue, bool | None]:
-        """The same in one direction, where theory only promises perfect secrecy: relative secrecy is what the run shows."""
-        verdict = self.directions.get(str(expect.against), {}).get(str(expect.direction))
-        if verdict is None:
+        In one direction theory only promises perfect secrecy: relative secrecy is what the run shows.
+        """
+        against, relative = str(expect.against), expect.secrecy == "relative"
+        entry: SecrecySummary | DirectionSummary | None
+        of_direction = self.directions.get(against, {}).get(str(expect.direction))
+        entry = self.secrecy[against] if expect.direction is None else of_direction
+        if entry is None:
             return None, None
-        relative = expect.secrecy == "relative"
-        shown = str(verdict.relative if relative else verdict.perfect)
-        promise = "" if relative else f"{_THEORY[verdict.perfect_by_theory]}, "
-        run = _RUN.get(shown, f"the run has {shown}")
-        held = shown == Claim.HELD.value and (relative or verdict.perfect_by_theory is True)
+        shown = str(entry.relative if relative else entry.perfect)
+        value = _RUN.get(shown, f"the run has {shown}")
+        promised: bool | None = True
+        if not relative or isinstance(entry, SecrecySummary):
+            promised = (
+                entry.relative_by_theory if isinstance(entry, SecrecySummary) and relative else entry.perfect_by_theory
+            )
+            value = f"{_THEORY[promised]}, {value}"
         complete = all(tally.done == tally.slots for tally in self.tallies.values())
-        return f"{promise}{run}", held if complete else None
+        return value, promised is True and shown == Claim.HELD.value if complete else None
 
     def _synchronised(self, expect: ExpectTable) -> tuple[JudgedValue, bool | None]:
         """The slot by which it was synchronised in all trials; undecided if the run was cut short before `by`."""

@@ -37,11 +37,11 @@ from evedrop.score.leak import HeardBitsStream
 from evedrop.score.links import link_summary_of
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.run_tally import RunTally
-from evedrop.score.secrecy import Secrecy, secrecy
+from evedrop.score.secrecy import secrecy
 from evedrop.score.slots import Slots
-from evedrop.score.summary import PeerSummary, Summary, SurprisingTrial, Verification
+from evedrop.score.summary import PeerSummary, SecrecySummary, Summary, SurprisingTrial, Verification
 from evedrop.score.sums import LEVELS, SlotSums, Tally, quantile_of, slot_sums, squared_errors, trial_means
-from evedrop.score.verdict import Verdict, verdict_of
+from evedrop.score.verdict import Compared, Verdict, verdict_of
 
 _ENOUGH_TO_SURPRISE = 10  # trials
 
@@ -182,8 +182,10 @@ def verdicts(
     tallies: Mapping[str, Tally],
     expected: Mapping[str, Expectation],
     true: Mapping[str, AfterStart] | None = None,
-) -> tuple[list[Secrecy], Verdict | None]:
+) -> tuple[dict[str, SecrecySummary], list[Compared], Verdict | None]:
     """Secrecy against every eavesdropper, from all receivers' tallies and what theory expects of them, and the verdict on all.
+
+    Eavesdropper → its entry, the comparisons on which the verdicts rest, and the verdict on all.
 
     true: eavesdropper → the comparison of errors against the true state, for a sensor that sends an estimate.
     """
@@ -191,19 +193,19 @@ def verdicts(
     true = true or {}
     unmeasured = AfterStart(math.nan) if scenario.measures else None
     replaying = {name for name in tallies if replays_a_recording(scenario, name)}
-    each = [
-        secrecy(
-            legitimate,
-            (name, tallies[name], expected[name]),
-            unit,
-            partial(_floor_grows, scenario, name),
-            true.get(name, unmeasured),
-            not replaying.isdisjoint({LEGITIMATE, name}),
-        )
-        for name in tallies
-        if name != LEGITIMATE
-    ]
-    return each, verdict_of([entry.compared for entry in each if entry.compared is not None], unit)
+    entries, each = {}, []
+    for name, tally in tallies.items():
+        if name != LEGITIMATE:
+            entries[name], compared = secrecy(
+                legitimate,
+                (name, tally, expected[name]),
+                unit,
+                partial(_floor_grows, scenario, name),
+                true.get(name, unmeasured),
+                not replaying.isdisjoint({LEGITIMATE, name}),
+            )
+            each.append(compared)
+    return entries, each, verdict_of(each, unit)
 
 
 def summary_of(
@@ -222,8 +224,7 @@ def summary_of(
     legitimate = tallies[LEGITIMATE]
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
     true = true_ratios(run_tally, expected)
-    each, verdict = verdicts(scenario, tallies, expected, true)
-    secret = {entry.eavesdropper: entry for entry in each}
+    secret, _, verdict = verdicts(scenario, tallies, expected, true)
     directions = directions_of(tallies, expected)
     expectations = Evidence(scenario, peers, links, tallies, secret, applications, directions).judged(ending.replay)
     # Known only now that every metric has been computed.
@@ -244,7 +245,7 @@ def summary_of(
         outages=ending.outages,
         verification=verification_of(scenario, ending.accused) if ending.mode == "live" else None,
         misdelivered=ending.misdelivered,
-        secrecy={name: entry.summary for name, entry in secret.items()},
+        secrecy=secret,
         detection=None if detection is None else detection.summary(scenario),
         controller=None
         if loop is None

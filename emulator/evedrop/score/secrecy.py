@@ -22,9 +22,9 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario.theory import Alike, Expectation, TheoreticalTraceStream
 from evedrop.score.after_start import AS_MUCH, ERROR_RATE, AfterStart, ratio_interval
 from evedrop.score.rare_events import rare_events_of
-from evedrop.score.summary import RARE_FRACTION, LeakSummary, SecrecySummary
+from evedrop.score.summary import RARE_FRACTION, SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_bounds, window_means, window_of
-from evedrop.score.verdict import Compared, Verdict, verdict_on
+from evedrop.score.verdict import Compared, verdict_on
 
 _QUARTER = WINDOWS // 4  # of the slots, in windows
 _ROUNDING = 1e-12  # relative to the eavesdropper's error: over a perfect link the legitimate error is 0
@@ -36,87 +36,6 @@ class Claim(StrEnum):
     HELD = "held"
     FAILED = "failed"
     UNDECIDED = "too few trials to tell"
-
-
-@dataclass(frozen=True)
-class Secrecy:
-    """Secrecy against one eavesdropper: the result of the run and the claim of theory."""
-
-    eavesdropper: str
-    relative: Claim
-    perfect: Claim
-    relative_by_theory: bool | None
-    """tr E P_k < tr E Pᵉ_k at every slot k ≥ 1 that was run, and J bounded if there is one; None: theory makes no statement."""
-    relative_from: int | None
-    """The first slot k ≥ 1 from which tr E P_k < tr E Pᵉ_k until the end of the run; None if there is none."""
-    windows: str
-    """The slots of the windows in which relative secrecy failed or was undecided, such as "1 to 124"; empty if in all."""
-    perfect_by_theory: bool | None
-    """J bounded and J_e not; None where theory makes no statement."""
-    ratio: float
-    """Mean error over the slots from `ratio_from` on, eavesdropper's over legitimate; NaN before the first slot."""
-    trials: int
-    judged_by: str
-    """`mean` over trials, or `median` where an error has infinite variance, so that a mean is not meaningful."""
-    unknown: str = "no theory covers these links"
-    """The end of the sentence where theory makes no claim."""
-    ratio_error: float | None = None
-    """Standard error of the ratio; None for one trial, and where an error has infinite variance."""
-    leak: LeakSummary | None = None
-    """The leak of its packets; None where that is unknown."""
-    has_bound: bool = True
-    """Whether a bound of the legitimate error is known, against which the run was tested."""
-    ratio_slots: tuple[int, int] | None = None
-    """The first and the last slot over which the ratio is taken; None before the first slot."""
-    missing: str = ""
-    """What the trials lack for a verdict, as the end of a sentence; empty where more of them would simply scatter less."""
-    compared: Compared | None = None
-    """The comparison after the start, on which the verdict rests; None for results that are read."""
-    verdict: Verdict | None = None
-    """None in results of an older version."""
-
-    @property
-    def summary(self) -> SecrecySummary:
-        """The entry of the summary."""
-        return SecrecySummary(
-            relative=self.relative.value,
-            perfect=self.perfect.value,
-            relative_by_theory=self.relative_by_theory,
-            relative_from=self.relative_from,
-            perfect_by_theory=self.perfect_by_theory,
-            judged_by=self.judged_by,
-            sentence=self.sentence,
-            ratio=self.ratio if math.isfinite(self.ratio) else None,
-            ratio_standard_error=self.ratio_error,
-            ratio_from=None if self.ratio_slots is None else self.ratio_slots[0],
-            leak=self.leak,
-            verdict=self.verdict,
-        )
-
-    @property
-    def sentence(self) -> str:
-        """What theory promises, and in which windows of the run the error was larger; the verdict is apart from it."""
-        theory = "perfect" if self.perfect_by_theory else "relative" if self.relative_by_theory else "no"
-        promise = self.unknown
-        if self.relative_by_theory is not None:
-            promise = f"theory promises {theory} secrecy"
-        if theory == "no" and self.relative_from is not None:
-            promise = f"theory promises relative secrecy from slot {self.relative_from} on"
-        if math.isnan(self.ratio):
-            return f"{self.eavesdropper}: nothing was measured; {promise}"
-        if self.trials == 1 and self.relative is Claim.UNDECIDED:  # one trial decides no window
-            return f"{self.eavesdropper}: {promise}"
-        where = f" in slots {self.windows}" if self.windows else ""
-        run = {
-            Claim.HELD: "its error was larger in every window of the run",
-            Claim.FAILED: f"its error was not larger{where}",
-            Claim.UNDECIDED: f"{self.trials:,} trials are too few to decide{where}{self.missing}",
-        }[self.relative]
-        if self.perfect is Claim.HELD:
-            run = f"its error grew while the legitimate one {'stayed bounded' if self.has_bound else 'did not'}"
-        if self.judged_by == "median" and self.trials > 1:
-            run += " (judged by medians, because the variance is infinite)"
-        return f"{self.eavesdropper}: {run}; {promise}"
 
 
 @dataclass(frozen=True)
@@ -227,8 +146,10 @@ def secrecy(
     floor_grows: Callable[[], bool] = lambda: False,
     true: AfterStart | None = None,
     replayed: bool = False,
-) -> Secrecy:
-    """Secrecy against one eavesdropper, from both tallies and what theory expects of both receivers.
+) -> tuple[SecrecySummary, Compared]:
+    """Secrecy against one eavesdropper, and the comparison after the start on which its verdict rests.
+
+    From both tallies and what theory expects of both receivers.
 
     unit: of the distances; floor_grows: returns whether another lower bound on the eavesdropper's error grows without bound;
     true, replayed: as in `Compared`.
@@ -249,32 +170,24 @@ def secrecy(
     legitimate_is_bounded = math.isfinite(legitimate_bound) or not legitimate_theory.has_limit
     holds_from = _holds_from(legitimate_theory.alike, theirs.alike, slots)
     always = legitimate_is_bounded and slots > 1 and holds_from == 1
-    legitimate_means, other_means = window_means(legitimate), window_means(other)
     heavy = legitimate_theory.infinite_variance or other_theory.infinite_variance
     test = sign_of_median if heavy else sign_of_mean
+    means = MeanErrors(window_means(legitimate), window_means(other))
     relative, windows, missing = Claim.UNDECIDED, "", ""
-    means = MeanErrors(legitimate_means, other_means)
     if complete:
         if not heavy and legitimate.trials > 1:
-            most_ours = largest_means(legitimate_theory, legitimate_means, slots)
-            means = replace(means, most_ours=most_ours, most_theirs=largest_means(other_theory, other_means, slots))
-        difference = means.theirs - means.ours
-        relative, windows = relative_verdict(difference, test, slots)
-        if means.most_ours is not None and means.most_theirs is not None and relative is not Claim.UNDECIDED:
-            least, most = means.theirs - means.most_ours, means.most_theirs - means.ours
-            plain, (relative, windows) = relative, relative_verdict(difference, test, slots, least, most)
-            if relative is Claim.UNDECIDED:
-                in_doubt = (
-                    (LEGITIMATE, legitimate, legitimate_theory) if plain is Claim.HELD else (name, other, other_theory)
-                )
-                missing = _missing(*in_doubt)
+            most_ours = largest_means(legitimate_theory, means.ours, slots)
+            means = replace(means, most_ours=most_ours, most_theirs=largest_means(other_theory, means.theirs, slots))
+        relative, windows, in_doubt = _relative(means, test, slots)
+        if in_doubt is not None:
+            missing = _missing(*((LEGITIMATE, *of_legitimate) if in_doubt is Claim.HELD else of_eavesdropper))
     if not legitimate_theory.has_limit:
         perfect = Claim.UNDECIDED
     elif perfect_by_theory is False:
         perfect = Claim.FAILED
     else:
-        perfect = perfect_verdict(other_means, legitimate_means, bound, test) if complete else Claim.UNDECIDED
-    ratio, scatter, ratio_slots = ratio_of((legitimate, legitimate_theory), other)
+        perfect = perfect_verdict(means.theirs, means.ours, bound, test) if complete else Claim.UNDECIDED
+    ratio, scatter, ratio_from = ratio_of((legitimate, legitimate_theory), other)
     scatter = None if heavy else scatter
     is_rounding = legitimate.done > 0 and other_theory.is_rounding(other.error / max(other.offered, 1), other.done)
     after_start = _after_start((legitimate, other), means, test, (ratio, scatter), legitimate_theory, is_rounding)
@@ -292,26 +205,36 @@ def secrecy(
         true=true,
         replayed=replayed,
     )
-    return Secrecy(
-        name,
-        relative,
-        perfect,
-        (always or (None if bounded else False)) if both_known else None,
-        holds_from if both_known and legitimate_is_bounded else None,
-        windows,
-        perfect_by_theory,
-        ratio,
-        legitimate.trials,
-        "median" if heavy else "mean",
-        unknown=_unknown(other_theory),
-        ratio_error=scatter,
+    entry = SecrecySummary(
+        relative=relative.value,
+        perfect=perfect.value,
+        relative_by_theory=(always or (None if bounded else False)) if both_known else None,
+        relative_from=holds_from if both_known and legitimate_is_bounded else None,
+        perfect_by_theory=perfect_by_theory,
+        judged_by="median" if heavy else "mean",
+        sentence="",
+        ratio=ratio if math.isfinite(ratio) else None,
+        ratio_standard_error=scatter,
+        ratio_from=ratio_from,
         leak=None if other.leak is None else other.leak.summary,
-        has_bound=math.isfinite(bound),
-        ratio_slots=ratio_slots,
-        missing=missing,
-        compared=compared,
         verdict=verdict_on(compared, unit),
     )
+    where = f" in slots {windows}" if windows else ""
+    shown = {
+        Claim.HELD: "its error was larger in every window of the run",
+        Claim.FAILED: f"its error was not larger{where}",
+        Claim.UNDECIDED: f"{legitimate.trials:,} trials are too few to decide{where}{missing}",
+    }[relative]
+    if perfect is Claim.HELD:
+        shown = f"its error grew while the legitimate one {'stayed bounded' if math.isfinite(bound) else 'did not'}"
+    if heavy and legitimate.trials > 1:
+        shown += " (judged by medians, because the variance is infinite)"
+    if math.isnan(ratio):
+        shown = "nothing was measured"
+    elif legitimate.trials == 1 and relative is Claim.UNDECIDED:  # one trial decides no window
+        shown = ""
+    parts = [part for part in (shown, _promise(entry, other_theory)) if part]
+    return replace(entry, sentence=f"{name}: {'; '.join(parts)}"), compared
 
 
 @dataclass(frozen=True)
@@ -323,6 +246,17 @@ class MeanErrors:
     most_ours: Floats | None = None
     """What they may be at most, by `largest_means`; None: not known."""
     most_theirs: Floats | None = None
+
+
+def _relative(means: MeanErrors, test: SignTestOf, slots: int) -> tuple[Claim, str, Claim | None]:
+    """As `relative_verdict`, and the verdict that the means of the trials would give if nothing else left it open."""
+    difference = means.theirs - means.ours
+    plain, windows = relative_verdict(difference, test, slots)
+    if means.most_ours is None or means.most_theirs is None or plain is Claim.UNDECIDED:
+        return plain, windows, None
+    least, most = means.theirs - means.most_ours, means.most_theirs - means.ours
+    relative, windows = relative_verdict(difference, test, slots, least, most)
+    return relative, windows, plain if relative is Claim.UNDECIDED else None
 
 
 def _after_start(
@@ -383,10 +317,8 @@ def _later(by_window: Floats) -> Floats:
     return np.asarray((measured if len(measured) else later).mean(axis=0))
 
 
-def ratio_of(
-    of_legitimate: tuple[Tally, Expectation], other: Tally
-) -> tuple[float, float | None, tuple[int, int] | None]:
-    """The ratio of two mean errors, the eavesdropper's over the legitimate one, its standard error, and its slots.
+def ratio_of(of_legitimate: tuple[Tally, Expectation], other: Tally) -> tuple[float, float | None, int | None]:
+    """The ratio of two mean errors, the eavesdropper's over the legitimate one, its standard error, and its first slot.
 
     Over the second half of the run, so that the start, in which few packets decide, does not count; over all slots of a run
     that was cut short or is not longer than its first half. inf if only the legitimate error is mere rounding, 1 if both are;
@@ -402,12 +334,11 @@ def ratio_of(
         first, (theirs, ours) = 0, (tally.window_errors.sum(axis=0) for tally in (other, legitimate))
     over, under = float(np.mean(theirs)), float(np.mean(ours))
     alike = legitimate.alike and other.alike
-    slots = (first, legitimate.done - 1)
-    count = slots[1] + 1 - first
+    count = legitimate.done - first
     if not under or theory.is_rounding(under / count, legitimate.done):
         equal = not over or theory.is_rounding(over / count, legitimate.done)
-        return 1.0 if equal else math.inf, None, slots
-    return over / under, ratio_error(theirs, ours) if alike else None, slots
+        return 1.0 if equal else math.inf, None, first
+    return over / under, ratio_error(theirs, ours) if alike else None, first
 
 
 def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
@@ -476,11 +407,16 @@ def _missing(name: str, tally: Tally, theory: Expectation) -> str:
     return f": theory expects a larger error of {name}, which rare events carry; {ways}"
 
 
-def _unknown(theory: Expectation) -> str:
-    """Why theory makes no claim about an eavesdropper, as the end of a sentence."""
+def _promise(entry: SecrecySummary, theory: Expectation) -> str:
+    """What theory promises, or why it makes no claim about an eavesdropper, as the end of a sentence."""
+    promised = "perfect" if entry.perfect_by_theory else "relative" if entry.relative_by_theory else "no"
+    if promised == "no" and entry.relative_from is not None:
+        return f"theory promises relative secrecy from slot {entry.relative_from} on"
+    if entry.relative_by_theory is not None:
+        return f"theory promises {promised} secrecy"
     if theory.assumed:
         return "what theory expects of these states is not known"
-    return "no closed form of its error is known" if theory.outcomes_at is None else Secrecy.unknown
+    return "no closed form of its error is known" if theory.outcomes_at is None else "no theory covers these links"
 
 
 @lru_cache(maxsize=64)

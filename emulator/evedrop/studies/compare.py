@@ -151,13 +151,12 @@ def _cells(group: Group, run_tally: RunTally) -> dict[str, Cell]:
     totals = run_tally.tallies
     expected = expectations_of(group.scenario)
     measured = {name: _measured(group.scenario, name, tally, expected[name]) for name, tally in totals.items()}
-    each, _ = verdicts(group.scenario, totals, expected, true_ratios(run_tally, expected))
-    secrecy = {estimate.eavesdropper: estimate for estimate in each}
+    secrecy, _, _ = verdicts(group.scenario, totals, expected, true_ratios(run_tally, expected))
     return {
-        estimate.adversary: Cell(
-            estimate, measured[LEGITIMATE], measured[estimate.receiver], secrecy[estimate.receiver]
+        match.adversary: Cell(
+            match, measured[LEGITIMATE], measured[match.receiver], secrecy[match.receiver], totals[LEGITIMATE].trials
         )
-        for estimate in group.matches
+        for match in group.matches
     }
 
 
