@@ -17,11 +17,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from evedrop.errors import UsageError
-from evedrop.results.crash_proof_tables import parquet_batches, stream_of
 from evedrop.results.reading import Results
 from evedrop.scenario.progress_events import RunEvent
 from evedrop.scenario.recorded import recorded
-from evedrop.system.files import Unreadable, opened, whole_file
+from evedrop.system.files import whole_file
 
 SUFFIX = ".mcap"
 _BATCH_ROWS = 4096
@@ -69,7 +68,7 @@ def export_mcap(
         writer.add_metadata("evedrop", title)
         for event in results.events:
             messages.add_event(event)
-        tables = _Tables(results.folder, batch_rows)
+        tables = _Tables(results, batch_rows)
         _add_trial(tables, scenario.receivers[0], messages)
         for row in tables.rows("slots"):
             messages.add(f"/statistics/{row.pop('peer')}", "evedrop.Statistics", row)
@@ -166,38 +165,21 @@ def _kind(value: Any) -> dict[str, Any]:
 class _Tables:
     """The tables of a run, read some rows at a time."""
 
-    def __init__(self, folder: Path, batch_rows: int) -> None:
-        self._folder, self._batch_rows = folder, batch_rows
+    def __init__(self, results: Results, batch_rows: int) -> None:
+        self._results, self._batch_rows = results, batch_rows
 
     def first_trial(self, name: str) -> pc.Expression | None:
         """A filter for the rows of the first recorded trial; None for a table without rows."""
-        least = [pc.min(batch["trial"]).as_py() for batch in self._batches(name, ["trial"]) if batch.num_rows]
+        least = [pc.min(piece["trial"]).as_py() for piece in self._pieces(name, ["trial"]) if piece.num_rows]
         return pc.field("trial") == min(least) if least else None
 
     def rows(self, name: str, which: pc.Expression | None = None) -> Iterator[dict[str, Any]]:
         """The rows of a table, all or some; none if there is no such table. Raises UsageError if it cannot be read."""
-        for batch in self._batches(name):
-            yield from (batch if which is None else batch.filter(which)).to_pylist()
+        for piece in self._pieces(name):
+            chosen = piece if which is None else piece.filter(which)
+            for batch in chosen.to_batches(max_chunksize=self._batch_rows):
+                yield from batch.to_pylist()
 
-    def _batches(self, name: str, columns: list[str] | None = None) -> Iterator[pa.RecordBatch]:
-        """The rows of a table in batches, from its Parquet file, or from the stream of a run in progress or killed."""
-        path = self._folder / f"{name}.parquet"
-        with stream_of(self._folder, name) as stream:
-            if stream is not None:
-                for batch in stream[1]:
-                    yield from self._parts(batch if columns is None else batch.select(columns))
-            if stream is not None or not path.exists():
-                return
-        try:
-            with opened(path):  # reading a pipe would block
-                pass
-            for batch in parquet_batches(path, self._batch_rows, columns):
-                batch.validate(full=True)
-                yield batch
-        except (Unreadable, OSError, pa.ArrowException) as error:
-            why = " ".join(str(error).split())
-            raise UsageError(f"{path} cannot be read ({why}); run the scenario again") from error
-
-    def _parts(self, batch: pa.RecordBatch) -> Iterator[pa.RecordBatch]:
-        for start in range(0, batch.num_rows, self._batch_rows):
-            yield batch.slice(start, self._batch_rows)
+    def _pieces(self, name: str, columns: list[str] | None = None) -> Iterator[pa.Table]:
+        if self._results.has(name):
+            yield from self._results.pieces(name, columns, self._batch_rows)

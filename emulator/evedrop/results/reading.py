@@ -6,7 +6,7 @@ Source: docs/results.md.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ from evedrop.results.crash_proof_tables import (
     stream_of,
 )
 from evedrop.results.summary_file import plain
-from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, inputs_schema_in, trials_schema
+from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, inputs_schema_like, trials_schema_like
 from evedrop.scenario.arguments import path_argument
 from evedrop.scenario.progress_events import RunEvent
 from evedrop.score.summary import Summary
@@ -120,24 +120,37 @@ class Results:
         """The events of the run; also of a run of an older version."""
         return [RunEvent(event["slot"], event["event"], event["by"]) for event in self.summary.get("events", ())]
 
-    def _table(self, name: str, expected: pa.Schema | None = None) -> pa.Table:
-        path = self.folder / f"{name}.parquet"
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.parquet"
+
+    @contextmanager
+    def _opened(self, name: str) -> Iterator[tuple[pa.Schema, Iterator[pa.RecordBatch]] | None]:
+        """A table's stream, None for a Parquet file. Raises UsageError if it cannot be read, in the block either."""
         try:
             with stream_of(self.folder, name) as stream:
                 if stream is None:
-                    _refuse_pipe(path)
-                    # By its path: threads of Arrow that read a Python file may abort the interpreter at its end (Python 3.11).
-                    # Not by `read_table`, which takes four times as long for a small one.
-                    parquet = pq.ParquetFile(path)
-                    table = parquet.read(use_threads=parquet.metadata.num_rows > _ROWS_WORTH_THREADS)
-                else:
-                    schema, batches = stream
-                    table = pa.Table.from_batches(batches, schema)
+                    with opened(self._path(name)):  # reading a pipe would block
+                        pass
+                yield stream
+        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
+            raise UsageError(
+                f"{self._path(name)} cannot be read ({_one_line(error)}); run the scenario again"
+            ) from error
+
+    def _table(self, name: str, schema_like: Callable[[pa.Schema], pa.Schema]) -> pa.Table:
+        """A whole table; schema_like: returns the schema that it must have, given its own."""
+        path = self._path(name)
+        with self._opened(name) as stream:
+            if stream is None:
+                # By its path: threads of Arrow that read a Python file may abort the interpreter at its end (Python 3.11).
+                # Not by `read_table`, which takes four times as long for a small one.
+                parquet = pq.ParquetFile(path)
+                table = parquet.read(use_threads=parquet.metadata.num_rows > _ROWS_WORTH_THREADS)
+            else:
+                table = pa.Table.from_batches(stream[1], stream[0])
             columns = table.column_names  # which are read only here, and need not be text
             table.validate(full=True)  # a damaged column of words may name words that are not there
-        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
-            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
-        wanted = trials_schema(_states_in(table.schema)) if expected is None else expected
+        wanted = schema_like(table.schema)
         if not table.schema.equals(wanted):
             raise UsageError(
                 f"{path} is not a table of this version ({_differences(table.schema, wanted)}); run the scenario again"
@@ -152,85 +165,58 @@ class Results:
 
         Raises UsageError if the table cannot be read, or lacks a column.
         """
-        path = self.folder / f"{name}.parquet"
-        try:
-            with stream_of(self.folder, name) as stream:
-                if stream is None:
-                    _refuse_pipe(path)
-                    table = pq.read_table(path, columns=list(columns), filters=where)
-                else:
-                    schema, batches = stream
-                    whole = pa.Table.from_batches(batches, schema)
-                    table = (whole if where is None else whole.filter(where)).select(columns)
+        with self._opened(name) as stream:
+            if stream is None:
+                table = pq.read_table(self._path(name), columns=list(columns), filters=where)
+            else:
+                whole = pa.Table.from_batches(stream[1], stream[0])
+                table = (whole if where is None else whole.filter(where)).select(columns)
             table.validate(full=True)
-        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
-            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
         return table
 
-    def pieces(self, name: str, columns: Sequence[str]) -> Iterator[pa.Table]:
-        """Some columns of a table in pieces of some thousand rows: memory does not grow with the table.
+    def pieces(self, name: str, columns: Sequence[str] | None = None, rows: int = _PIECE_ROWS) -> Iterator[pa.Table]:
+        """All or some columns of a table, this many rows of a Parquet file at a time: memory does not grow with the table.
 
         Raises UsageError if the table cannot be read, or lacks a column.
         """
-        path = self.folder / f"{name}.parquet"
-        try:
-            with stream_of(self.folder, name) as stream:
-                if stream is None:
-                    _refuse_pipe(path)
-                for batch in parquet_batches(path, _PIECE_ROWS, list(columns)) if stream is None else stream[1]:
-                    yield _validated(batch, columns)
-        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
-            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
+        with self._opened(name) as stream:
+            for batch in parquet_batches(self._path(name), rows, columns) if stream is None else stream[1]:
+                piece = pa.Table.from_batches([batch])
+                piece = piece if columns is None else piece.select(columns)
+                piece.validate(full=True)
+                yield piece
 
     @property
     def slots(self) -> pa.Table:
         """A row per slot and peer: statistics over trials."""
-        return self._table("slots", SLOTS)
+        return self._table("slots", lambda _: SLOTS)
 
     @property
     def trials(self) -> pa.Table:
         """A row per slot, peer and recorded trial."""
-        return self._table("trials")
+        return self._table("trials", trials_schema_like)
 
     @property
     def journal(self) -> pa.Table:
         """A row per slot and link."""
-        return self._table("journal", JOURNAL)
+        return self._table("journal", lambda _: JOURNAL)
 
     @property
     def inputs(self) -> pa.Table | None:
         """A row per slot and recorded trial of a closed loop; None without a controller."""
-        path = self.folder / "inputs.parquet"
-        schema = schema_of(self.folder, "inputs")
-        written = path.exists()
         # Metrics of before the first slot have no controller, although a run that was killed soon after has rows.
-        if self.summary.get("controller") is None and schema is None and not written:
+        if self.summary.get("controller") is None and not self.has("inputs"):
             return None
-        return self._table("inputs", inputs_schema_in(path) if schema is None else schema)
+        return self._table("inputs", inputs_schema_like)
+
+    def has(self, name: str) -> bool:
+        """Whether there is such a table."""
+        return schema_of(self.folder, name) is not None or self._path(name).exists()
 
     @property
     def digests(self) -> pa.Table:
         """A row per peer, trial and block of 256 slots. Raises UsageError for the digests of an older version."""
-        return self._table("digests", DIGESTS)
-
-
-def _refuse_pipe(path: Path) -> None:
-    """Raise an error unless a path is that of a regular file: reading a pipe would block."""
-    with opened(path):
-        pass
-
-
-def _validated(batch: pa.RecordBatch, columns: Sequence[str]) -> pa.Table:
-    """Some columns of a batch. Raises an error of Arrow if their contents are damaged, or one is not there."""
-    table = pa.Table.from_batches([batch]).select(columns)
-    table.validate(full=True)
-    return table
-
-
-def _states_in(schema: pa.Schema) -> int:
-    """The number of states in a table of trials; 1 if it is not such a table."""
-    x = schema.field("x").type if "x" in schema.names else None
-    return int(x.list_size) if x is not None and pa.types.is_fixed_size_list(x) else 1
+        return self._table("digests", lambda _: DIGESTS)
 
 
 def _differences(schema: pa.Schema, wanted: pa.Schema) -> str:

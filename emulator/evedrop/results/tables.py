@@ -8,12 +8,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from evedrop.model.digest import DIGEST_BYTES
@@ -24,7 +22,6 @@ from evedrop.model.record import Record, columns
 from evedrop.model.slot.records import ReceiverSlots, SensorSlots
 from evedrop.score.slots import Slots
 from evedrop.score.sums import LEVELS
-from evedrop.system.files import opened
 
 SLOTS = pa.schema(
     [
@@ -131,17 +128,20 @@ def inputs_schema(inputs: int, disturbances: int, monitored: bool = False) -> pa
     )
 
 
-def inputs_schema_in(path: Path) -> pa.Schema:
-    """The schema that a file should have; for a file that is not such a table, one with which reading it reports that."""
-    try:
-        with opened(path):  # a pipe would be waited for
-            pass
-        schema = pq.read_schema(path)
-        u, d = (int(schema.field(name).type.list_size) if name in schema.names else 0 for name in ("u", "d"))
-        monitored = "statistic" in schema.names
-    except Exception:  # pyarrow raises many kinds of errors for a damaged file, and the table's reader reports them
-        u, d, monitored = 0, 0, False
-    return inputs_schema(max(1, u), d, monitored)
+def trials_schema_like(schema: pa.Schema) -> pa.Schema:
+    """The schema that a table of trials with these columns should have."""
+    return trials_schema(_length_in(schema, "x") or 1)
+
+
+def inputs_schema_like(schema: pa.Schema) -> pa.Schema:
+    """The schema that a table of inputs with these columns should have."""
+    return inputs_schema(_length_in(schema, "u") or 1, _length_in(schema, "d"), "statistic" in schema.names)
+
+
+def _length_in(schema: pa.Schema, name: str) -> int:
+    """The number of numbers in each cell of a column; 0 if there is no such column, or it has no such lists."""
+    at = schema.get_field_index(name)
+    return int(schema.types[at].list_size) if at >= 0 and pa.types.is_fixed_size_list(schema.types[at]) else 0
 
 
 def input_columns(slots: Slots, plant: Plant, disturbances: Floats, first_trial: int) -> list[NDArray[Any]]:
