@@ -8,7 +8,6 @@ Source: docs/results.md, summary.json.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
@@ -26,44 +25,6 @@ from evedrop.score.verdict import Verdict
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
-
-
-class BuiltInMetrics(ABC):
-    """The built-in metrics, each None if it has no value; those of installed packages only have names."""
-
-    @abstractmethod
-    def metric(self, name: str) -> float | None:
-        """A metric by its name; None if it has no value, or if there is no such metric."""
-
-    @property
-    def mean_squared_error(self) -> float | None:
-        """Mean of |x − x̂|² over slots and trials; None in a covariance-only study."""
-        return self.metric("mean_squared_error")
-
-    @property
-    def mean_trace_covariance(self) -> float | None:
-        """Mean of tr P, the error covariance that the receiver reports."""
-        return self.metric("mean_trace_covariance")
-
-    @property
-    def theoretical_trace_covariance(self) -> float | None:
-        """The trace of the theoretical error covariance over the same slots; None if no theory covers it."""
-        return self.metric("theoretical_trace_covariance")
-
-    @property
-    def received_fraction(self) -> float | None:
-        """The fraction of packets received."""
-        return self.metric("received_fraction")
-
-    @property
-    def used_fraction(self) -> float | None:
-        """The fraction of packets received and used."""
-        return self.metric("used_fraction")
-
-    @property
-    def mean_actual_trace_covariance(self) -> float | None:
-        """In a covariance-only study, the mean trace of the actual error covariance given the events; otherwise None."""
-        return self.metric("mean_actual_trace_covariance")
 
 
 JudgedValue = float | int | str | None
@@ -115,8 +76,8 @@ class RareEstimate:
 
 
 @dataclass(frozen=True)
-class PeerSummary(BuiltInMetrics):
-    """The entry of a receiver; its built-in metrics are attributes."""
+class PeerSummary:
+    """The entry of a receiver; its built-in metrics are attributes, each None if it has no value."""
 
     metrics: Mapping[str, float | None]
     """Name of the metric → its value; None if it has none."""
@@ -144,6 +105,36 @@ class PeerSummary(BuiltInMetrics):
         if name not in self.all_metrics and name not in METRICS.names:
             raise UnknownName("metric", name, self.all_metrics)
         return self.all_metrics.get(name)
+
+    @property
+    def mean_squared_error(self) -> float | None:
+        """Mean of |x − x̂|² over slots and trials; None in a covariance-only study."""
+        return self.metric("mean_squared_error")
+
+    @property
+    def mean_trace_covariance(self) -> float | None:
+        """Mean of tr P, the error covariance that the receiver reports."""
+        return self.metric("mean_trace_covariance")
+
+    @property
+    def theoretical_trace_covariance(self) -> float | None:
+        """The trace of the theoretical error covariance over the same slots; None if no theory covers it."""
+        return self.metric("theoretical_trace_covariance")
+
+    @property
+    def received_fraction(self) -> float | None:
+        """The fraction of packets received."""
+        return self.metric("received_fraction")
+
+    @property
+    def used_fraction(self) -> float | None:
+        """The fraction of packets received and used."""
+        return self.metric("used_fraction")
+
+    @property
+    def mean_actual_trace_covariance(self) -> float | None:
+        """In a covariance-only study, the mean trace of the actual error covariance given the events; otherwise None."""
+        return self.metric("mean_actual_trace_covariance")
 
     def as_dict(self) -> dict[str, Any]:
         """The entry of summary.json."""
