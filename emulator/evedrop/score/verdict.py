@@ -122,19 +122,16 @@ def verdict_on(compared: Compared, unit: str = "", *, best: bool = False) -> Ver
         numbers += ", in this trial"
     elif compared.replayed:
         numbers += ", given this recording of losses"
-    match outcome:
-        case SecrecyOutcome.BROKEN:
-            knows = "more than" if values.ratio < _SMALLER else "as much as"
-            if compared.denied and values.larger is None:
-                reason = f"by theory, {name} knows as much as the estimator in the long run; here {numbers}"
-                return Verdict(outcome, reason, name, times)
-            return Verdict(outcome, f"{name} knows {knows} the estimator; {numbers}", name, times)
-        case SecrecyOutcome.OPEN:
-            return Verdict(outcome, f"{values.why_open}; {numbers}", name, times)
-        case SecrecyOutcome.PERFECT:
-            return Verdict(outcome, f"{numbers}, and growing", name, times)
-        case SecrecyOutcome.RELATIVE:
-            return Verdict(outcome, numbers, name, times)
+    knows = "more than" if values.ratio < _SMALLER else "as much as"
+    reason = {
+        SecrecyOutcome.BROKEN: f"{name} knows {knows} the estimator; {numbers}",
+        SecrecyOutcome.OPEN: f"{values.why_open}; {numbers}",
+        SecrecyOutcome.PERFECT: f"{numbers}, and growing",
+        SecrecyOutcome.RELATIVE: numbers,
+    }[outcome]
+    if outcome is SecrecyOutcome.BROKEN and values.larger is None:  # only theory says so
+        reason = f"by theory, {name} knows as much as the estimator in the long run; here {numbers}"
+    return Verdict(outcome, reason, name, times)
 
 
 def verdict_of(compared: Iterable[Compared], unit: str = "") -> Verdict | None:
