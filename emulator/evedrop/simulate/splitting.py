@@ -118,28 +118,20 @@ class SplitMeans:
         """The mean error of the run by each population, (P,)."""
         return np.asarray(self.errors.mean(axis=1), np.float64)
 
-    @property
-    def doubt(self) -> str | None:
-        """Why the estimate is not to be trusted; None if it is."""
-        means = self.of_populations
-        if not np.isfinite(means).all():
-            return "an error leaves double precision; give fewer slots"
-        mean, error = float(means.mean()), standard_error(means)
-        if mean == 0.0 or error is None:
-            return None
-        if error > _WIDEST * mean:
-            return (
-                f"its standard error would be {100 * error / mean:.0f} % of the mean; give more trials or fewer slots"
-            )
-        return None
-
     def estimate(self, trials: int, expected: Expectation) -> RareEstimate:
         """The entry of the summary; trials: of each population; expected: what theory expects of the receiver."""
         means, count = self.of_populations, len(self.errors)
         about = (count, trials, len(self.splits), self.counting)
-        if (doubt := self.doubt) is not None:
+        mean, finite, doubt = float(means.mean()), bool(np.isfinite(means).all()), None
+        error = standard_error(means) if finite else None
+        if not finite:
+            doubt = "an error leaves double precision; give fewer slots"
+        elif error is not None and error > _WIDEST * mean > 0.0:
+            doubt = (
+                f"its standard error would be {100 * error / mean:.0f} % of the mean; give more trials or fewer slots"
+            )
+        if doubt is not None:
             return RareEstimate(None, None, None, *about, doubt, {})
-        mean, error = float(means.mean()), standard_error(means)
         comparable = expected.known and not expected.of_model
         theory = float(expected.traces(self.errors.shape[1]).mean()) if comparable else None
         slots = {
