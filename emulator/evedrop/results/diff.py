@@ -47,9 +47,7 @@ def difference(a: Results, b: Results) -> RunDifference:
     first = _first(a, b)
     if not common and first is None:
         return _by_rows_alone(a, b)
-    unequal = sorted(
-        (block, trial, peer) for peer, trial, block in common if _differ(blocks_a, blocks_b, peer, trial, block)
-    )
+    unequal = sorted((key[2], key[1], key[0]) for key in common if blocks_a[key] != blocks_b[key])
     only = len(blocks_a) + len(blocks_b) - 2 * len(common)
     rest = f" ({only} blocks of up to 256 slots are in one run only)" if only else ""
     if first is not None and (not unequal or first.slot < unequal[0][0] + BLOCK_SLOTS):
@@ -118,12 +116,6 @@ def _blocks(results: Results) -> dict[tuple[str, int, int], bytes]:
     columns = results.digests.to_pydict()
     keys = zip(columns["peer"], columns["trial"], columns["block"], strict=True)
     return dict(zip(keys, columns["digest"], strict=True))
-
-
-def _differ(
-    a: dict[tuple[str, int, int], bytes], b: dict[tuple[str, int, int], bytes], peer: str, trial: int, block: int
-) -> bool:
-    return a[peer, trial, block] != b[peer, trial, block]
 
 
 @dataclass(frozen=True)

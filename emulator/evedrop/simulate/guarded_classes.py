@@ -9,7 +9,7 @@ Source: docs/your-own/rules.md, mistakes.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any, final
 
 import numpy as np
@@ -114,13 +114,8 @@ _EACH = "one for each of the R trials"
 def _models_of(schedule: LinkSchedule) -> Iterator[str]:
     """The names of a link's models that are not built in, at first and after changes."""
     for settings in (schedule.settings, *(change.settings or {} for change in schedule.changes)):
-        yield from _names_in(settings)
-
-
-def _names_in(settings: Mapping[str, Any]) -> Iterator[str]:
-    loss, delay = settings.get("loss"), settings.get("delay")
-    for spec in single_specs(loss) if loss else ():
-        if LOSS_MODELS.foreign(spec["model"]):
-            yield spec["model"]
-    if delay and DELAY_MODELS.foreign(delay["model"]):
-        yield delay["model"]
+        loss, delay = settings.get("loss"), settings.get("delay")
+        losses = [spec["model"] for spec in single_specs(loss)] if loss else []
+        yield from filter(LOSS_MODELS.foreign, losses)
+        if delay and DELAY_MODELS.foreign(delay["model"]):
+            yield delay["model"]

@@ -177,13 +177,18 @@ class Simulation:
         # The square of an error may leave double precision; then it is inf, as it should be.
         @np.errstate(over="ignore")
         def play(chunk: range, links: Mapping[str, LinkCore]) -> Chunk:
-            measured = self._blank(chunk, links)
+            shape = len(chunk), trials
+            measured = {
+                name: ReceiverChunk(np.empty(shape), np.empty(shape), np.empty(shape, np.uint8), link.fates)
+                for name, link in links.items()
+            }
             delivered = {name: link.in_time for name, link in links.items()}
             for row, k in enumerate(chunk):
                 nu, w = self._nu(k), noise.block(range(k, k + 1))[0]
                 if trajectory is not None:
                     trajectory.advance()
-                for name, action, values in self._acts(k, row, measured, delivered):
+                for name, values in measured.items():
+                    action = values.action[row] = self._act(name, self._receivers[name], k, delivered[name][row])
                     errors[name] = update.error(
                         self._process,
                         errors[name],
@@ -262,19 +267,3 @@ class Simulation:
             if outcomes is not None and outcomes(1.0).misled > 0.0:
                 misled.add(name)
         return misled
-
-    def _blank(self, chunk: range, links: Mapping[str, LinkCore]) -> dict[str, ReceiverChunk]:
-        shape = (len(chunk), self._batch.trials)
-        return {
-            name: ReceiverChunk(np.empty(shape), np.empty(shape), np.empty(shape, np.uint8), link.fates)
-            for name, link in links.items()
-        }
-
-    def _acts(
-        self, k: int, row: int, measured: Mapping[str, ReceiverChunk], delivered: Mapping[str, Flags]
-    ) -> Iterator[tuple[str, Codes, ReceiverChunk]]:
-        """Every receiver's action in slot k, from one row of `delivered` (c, R)."""
-        for name, values in measured.items():
-            action = self._act(name, self._receivers[name], k, delivered[name][row])
-            values.action[row] = action
-            yield name, action, values
