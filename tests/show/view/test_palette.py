@@ -23,15 +23,12 @@ from evedrop.show.view import lanes, palette
 from evedrop.show.view.palette import (
     ALARM,
     GROUND,
-    LANES,
-    PANELS,
     PLANT,
     RESERVE,
     STRATEGIES,
     TRUTH,
     TRUTH_CURVE,
     VERDICTS,
-    WIRE_LANES,
     Colour,
     dim,
     hexadecimal,
@@ -52,6 +49,24 @@ _LABEL_GROUNDS = (30, 31, 33), (120, 121, 123)
 """The grounds of labels on `GROUND`, in the dark theme and in the light one."""
 _BOTH = 4.35  # 4.4 is the greatest contrast with white and `_DARK` that any colour has
 _TEXT, _LARGE = 4.5, 3.0  # WCAG 2.1, 1.4.3 and 1.4.11: contrasts of letters, and of curves
+
+
+LANES: tuple[Colour, ...] = (
+    palette.STATE, palette.DECODED, palette.DISCARDED, palette.MISLED, palette.DROPPED, palette.SILENT,
+)  # fmt: skip
+"""The outcomes of a packet, brighter where more was used."""
+WIRE_LANES: tuple[Colour, ...] = (*LANES, palette.STEEL)
+"""The fates of the messages of a wire's link."""
+PANELS: dict[str, Iterable[Colour]] = {
+    "plant": PLANT,
+    "lanes": LANES,
+    "what the legitimate estimator knows": palette.KNOWLEDGE,
+    "what an eavesdropper knows": palette.SPIED,
+    "lanes of a wire": WIRE_LANES,
+    "figures": palette.FIGURES,
+    "verdicts": VERDICTS.values(),
+}
+"""The colours that share a panel, other than those of receivers."""
 
 
 @cache
@@ -176,7 +191,7 @@ def test_no_other_colour_is_green_or_vermilion() -> None:
         *WIRE_LANES,
         *PLANT,
         *palette.FIGURES,
-        *VERDICTS,
+        *VERDICTS.values(),
         *palette.SPIED,
     }
     assert {colour for colour in others if _green(colour)} == set()
@@ -218,7 +233,7 @@ def test_letters_can_be_read() -> None:
     assert min(_contrast(letters(ink), ground) for ink in inks for ground in (_DARK, _WHITE)) >= _BOTH
     assert min(_contrast(palette.LABEL, ground) for ground in _LABEL_GROUNDS) >= _BOTH
     assert min(_contrast(ink, GROUND) for ink in (TRUTH, ALARM)) >= _TEXT
-    for ground in (*palette.KNOWLEDGE, *palette.SPIED, *VERDICTS):
+    for ground in (*palette.KNOWLEDGE, *palette.SPIED, *VERDICTS.values()):
         assert max(_contrast(ink, ground) for ink in (_BLACK, _WHITE)) >= _TEXT
     assert min(_contrast(colour, GROUND) for colour in PLANT) >= _LARGE
     assert min(_contrast(colour, _WHITE) for colour in palette.FIGURES) >= _LARGE

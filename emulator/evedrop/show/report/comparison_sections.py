@@ -16,16 +16,9 @@ from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.comparison import comparison_lines, conclusion, pairs_table, schemes_table, verdict
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.travel import OF_PAGE, circumstances, download, input_files
-from evedrop.show.view import palette
-from evedrop.show.view.palette import hexadecimal
+from evedrop.show.view.palette import VERDICTS, hexadecimal
 from evedrop.system.files import Unreadable, text_of
 
-_GROUND = {
-    SecrecyOutcome.PERFECT: palette.PERFECT,
-    SecrecyOutcome.RELATIVE: palette.RELATIVE,
-    SecrecyOutcome.OPEN: palette.UNDECIDED,
-    SecrecyOutcome.BROKEN: palette.BROKEN,
-}
 _INK = {SecrecyOutcome.PERFECT: "#fff"}
 _DARK = "#16191d"
 _MOST_BYTES = 2**20
@@ -82,7 +75,7 @@ def _cell(cell: Cell, glyphs: bool) -> Mapping[str, str | None]:
     return {
         "verdict": f"{kept.glyph}\u00a0" if glyphs else verdict(cell),
         "ratio": f"{short_text(cell.ratio)}×",
-        "ground": hexadecimal(_GROUND[kept]),
+        "ground": hexadecimal(VERDICTS[kept]),
         "ink": _INK.get(kept, _DARK),
     }
 

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 
 from evedrop.names import LEGITIMATE as _LEGITIMATE_NAME
+from evedrop.score.verdict import SecrecyOutcome
 
 Colour = tuple[int, int, int]
 
@@ -63,18 +64,14 @@ RESERVE: tuple[Colour, ...] = (
 ALARM: Colour = (255, 101, 64)
 """Broken secrecy."""
 
+# Outcomes of a packet, brighter where more was used, and fates of a wire's messages, brighter where they are worse.
 SILENT: Colour = (25, 29, 33)
 DROPPED: Colour = (53, 74, 95)  # slate
 DISCARDED: Colour = (122, 91, 78)  # brown
 DECODED: Colour = (179, 200, 223)  # light blue-grey
 MISLED: Colour = (184, 156, 124)  # sand
 STATE: Colour = (242, 237, 222)  # ivory
-LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT)
-"""The outcomes of a packet, brighter where more was used."""
-
 STEEL: Colour = (106, 131, 157)
-WIRE_LANES: tuple[Colour, ...] = (SILENT, DROPPED, DISCARDED, STEEL, MISLED, DECODED, STATE)
-"""The fates of the messages of a wire's link, brighter where they are worse: none, delivered, not by the link, …, cut."""
 
 PLANT: tuple[Colour, ...] = (STATE, MISLED, DECODED, STEEL, DISCARDED)
 """Disturbances and inputs of a closed loop, and other curves of its plant, in order, on `GROUND`."""
@@ -96,23 +93,13 @@ GREY: Colour = (125, 130, 136)
 FIGURES: tuple[Colour, ...] = (SLATE, OCHRE, GREY)
 """Curves of figures that are not those of receivers, on white."""
 
-PERFECT: Colour = (31, 111, 178)
-RELATIVE: Colour = (169, 205, 234)
-UNDECIDED: Colour = (241, 239, 232)
-BROKEN: Colour = ALARM
-VERDICTS: tuple[Colour, ...] = (PERFECT, RELATIVE, UNDECIDED, BROKEN)
-"""The backgrounds of verdicts on secrecy in a comparison."""
-
-PANELS: dict[str, tuple[Colour, ...]] = {
-    "plant": PLANT,
-    "lanes": LANES,
-    "what the legitimate estimator knows": KNOWLEDGE,
-    "what an eavesdropper knows": SPIED,
-    "lanes of a wire": WIRE_LANES,
-    "figures": FIGURES,
-    "verdicts": VERDICTS,
+VERDICTS: Mapping[SecrecyOutcome, Colour] = {
+    SecrecyOutcome.PERFECT: (31, 111, 178),
+    SecrecyOutcome.RELATIVE: (169, 205, 234),
+    SecrecyOutcome.OPEN: (241, 239, 232),
+    SecrecyOutcome.BROKEN: ALARM,
 }
-"""The colours that share a panel, other than those of receivers."""
+"""The backgrounds of verdicts on secrecy in a comparison."""
 
 
 def identities(strategies: Mapping[str, str]) -> dict[str, Colour]:

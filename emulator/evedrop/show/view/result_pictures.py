@@ -31,12 +31,12 @@ from evedrop.scenario.arguments import refuse_unless
 from evedrop.scenario.recorded import recorded, recorded_noise, recorded_strategies, recorded_units
 from evedrop.score.rare_events import recorded_rare_errors, sound_errors
 from evedrop.score.verdict import SecrecyOutcome
-from evedrop.show.view import journal_column, palette
+from evedrop.show.view import journal_column
 from evedrop.show.view.axis_name import as_mathematics, axis_name, squared_unit, without_mathematics
 from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
 from evedrop.show.view.figure_style import drawing, panels
 from evedrop.show.view.lanes import EAVESDROPPER
-from evedrop.show.view.palette import TRUTH_CURVE, hexadecimal, paper_inks
+from evedrop.show.view.palette import TRUTH_CURVE, VERDICTS, hexadecimal, paper_inks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -319,12 +319,7 @@ def _positions(values: list[Any]) -> list[float]:
 
 
 # Blue for secrecy kept, darker where perfect; orange for broken: distinct with any colour blindness, and in greyscale.
-_GROUND = {
-    SecrecyOutcome.PERFECT: hexadecimal(palette.PERFECT),
-    SecrecyOutcome.RELATIVE: hexadecimal(palette.RELATIVE),
-    SecrecyOutcome.OPEN: hexadecimal(palette.UNDECIDED),
-    SecrecyOutcome.BROKEN: hexadecimal(palette.BROKEN),
-}
+_GROUND = {outcome: hexadecimal(colour) for outcome, colour in VERDICTS.items()}
 _INK = {
     SecrecyOutcome.PERFECT: "white",
     SecrecyOutcome.RELATIVE: "#10202e",
