@@ -70,7 +70,9 @@ def threads_named(name: str) -> set[threading.Thread]:
 def first_bytes(served_at: Served) -> bytes:
     """What a reader gets who leaves at once; nothing without a place."""
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{served_at.port}{served_at.path}", timeout=LIMIT) as reply:
+        with urllib.request.urlopen(
+            f"http://127.0.0.1:{served_at.server_port}{served_at.path}", timeout=LIMIT
+        ) as reply:
             return bytes(reply.read(3))
     except (OSError, http.client.HTTPException):
         return b""

@@ -164,8 +164,7 @@ def test_who_takes_the_port_of_a_viewer_gets_nothing(
         recording.add(slots)
     assert recording.close()
     port = free_port()
-    for module in ("viewer", "picture"):
-        monkeypatch.setattr(f"evedrop.show.view.{module}.free_port", lambda: port)
+    monkeypatch.setattr(viewer, "free_port", lambda: port)
     stolen = tmp_path / "stolen.rrd"
     thief = spawn(port, ["--port", str(port), "--save", str(stolen)], tmp_path)
     show: Callable[[], object] = {
@@ -275,13 +274,13 @@ def test_a_window_whose_port_is_free_at_the_second_try_opens(tmp_path: Path, mon
     """A port that is taken is not the last word."""
     opened = []
 
-    def taken_once(*_: object, **__: object) -> Viewer:
+    def taken_once(*_: object, **__: object) -> None:
         opened.append(1)
         if len(opened) == 1:
             raise PortTaken("taken")
         raise UsageError("no driver")
 
-    monkeypatch.setattr(Viewer, "_window", taken_once)
+    monkeypatch.setattr(viewer, "spawn", taken_once)
     monkeypatch.setenv("DISPLAY", ":0")
     with pytest.raises(UsageError, match="no driver"):
         Viewer.start("native", tmp_path, tmp_path / "r.rrd")

@@ -30,10 +30,9 @@ from rerun.experimental import ViewerClient, ViewerState
 from evedrop.errors import RunError, UsageError
 from evedrop.show.view.column import CLOCK, ELAPSED, TIMELINE
 from evedrop.show.view.layout import Layout
-from evedrop.show.view.viewer import PortTaken, end, guarded, spawn, without_driver
+from evedrop.show.view.viewer import end, guarded, spawn_anywhere, without_driver
 from evedrop.system.environment import viewer_environment
 from evedrop.system.files import whole_file
-from evedrop.system.ports import free_port
 from evedrop.system.signals import raise_on_signals
 
 DRAWING_SECONDS: Final = 1800.0
@@ -82,7 +81,6 @@ def _hung(subject: str) -> RunError:
     )
 
 
-_ATTEMPTS = 3
 _PATIENCE = 600.0  # seconds for one answer, for loading and for drawing; only a viewer that hangs needs them
 _PAUSE = 0.05
 _FILE_HEADER_BYTES = 12
@@ -269,18 +267,9 @@ def _started(size: tuple[int, int], logs: Path) -> tuple[subprocess.Popen[bytes]
     """A viewer's process, and the port on which it listens; size: of its pictures."""
     left, top, right, bottom = _FRAME
     window = f"{size[0] + left + right}x{size[1] + top + bottom}"
-    for attempt in range(1, _ATTEMPTS + 1):
-        port = free_port()
-        shown = ["--window-size", window, "--hide-welcome-screen"]
-        try:
-            # Otherwise the viewer would write into the picture that it is drawing without a graphics card.
-            quiet = {"RUST_LOG": "error"}
-            arguments = ["--headless", "--port", str(port), *shown]
-            return spawn(port, arguments, logs, environment=quiet), port
-        except PortTaken:
-            if attempt == _ATTEMPTS:
-                raise
-    raise AssertionError
+    # Otherwise the viewer would write into the picture that it is drawing without a graphics card.
+    quiet = {"RUST_LOG": "error"}
+    return spawn_anywhere(["--headless", "--window-size", window, "--hide-welcome-screen"], logs, environment=quiet)
 
 
 def _ends(state: ViewerState) -> dict[str, int]:

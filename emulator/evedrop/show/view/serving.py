@@ -26,7 +26,6 @@ import socket
 import threading
 import weakref
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import IO, final
 
@@ -117,18 +116,21 @@ def feed(followed: Followed, pipe: IO[bytes]) -> None:
     threading.Thread(target=write, name="view", daemon=True).start()
 
 
-def _listening(server_at: Callable[[str, int], BoundedServer], host: str, port: int) -> BoundedServer:
+class _ViewServer(BoundedServer):
     """A server that accepts readers at host and port; port 0: any free one. Raises UsageError if the port is not available."""
-    try:
-        server = server_at(host, port)
-    except OSError as error:
-        raise UsageError(f"{host}:{port} cannot be used ({error.strerror}) to show the run; give another") from error
-    server.start()
-    return server
+
+    def __init__(self, host: str, port: int, handler: type[QuietHandler]) -> None:
+        try:
+            super().__init__((host, port), handler)
+        except OSError as error:
+            raise UsageError(
+                f"{host}:{port} cannot be used ({error.strerror}) to show the run; give another"
+            ) from error
+        self.start()
 
 
 @final
-class Served:
+class Served(_ViewServer):
     """A recording at an address that cannot be guessed.
 
     Raises UsageError if the port is not available.
@@ -137,29 +139,17 @@ class Served:
     def __init__(self, followed: Followed, host: str, port: int, private: bool = False) -> None:
         """private: only programs of this user get the recording, because its address is written to a file."""
         self.path = f"/{secrets.token_urlsafe(24)}/recording.rrd"
-        self._server = _listening(partial(_RecordingServer, followed, self.path, private), host, port)
-        self.port = int(self._server.server_address[1])
-
-    def stop(self) -> None:
-        """Accept no more readers. Those in progress continue by themselves."""
-        self._server.stop()
-
-
-class _RecordingServer(BoundedServer):
-    def __init__(self, followed: Followed, path: str, private: bool, host: str, port: int) -> None:
-        self.followed = followed
-        self.private = private
-        self.path = path.encode()
-        super().__init__((host, port), _RecordingHandler)
+        self.followed, self.private = followed, private
+        super().__init__(host, port, _RecordingHandler)
 
 
 class _RecordingHandler(QuietHandler):
-    server: _RecordingServer
+    server: Served
 
     def do_GET(self) -> None:
         """Send the recording to a reader that knows its address."""
         self.close_connection = True
-        unknown = not hmac.compare_digest(self.path.encode(), self.server.path)
+        unknown = not hmac.compare_digest(self.path.encode(), self.server.path.encode())
         if unknown or (self.server.private and other_user(self.connection) not in {os.getuid(), None}):
             self.refuse(404)
             return
@@ -291,7 +281,7 @@ _LOOPBACK, _NOWHERE = "http://127.0.0.1:* http://localhost:*", "'none'"
 
 
 @final
-class WebPage:
+class WebPage(_ViewServer):
     """The page at an address; it can load recordings from one port of the same host, and nothing from elsewhere.
 
     Raises UsageError if the port is not available.
@@ -304,12 +294,9 @@ class WebPage:
 
         recordings: the port of the recording; framed: whether pages of this machine may show the page in a frame.
         """
-        self._server = _listening(partial(_PageServer, rerun, (seen, recordings), framed), host, port)
-        self.port = int(self._server.server_address[1])
-
-    def stop(self) -> None:
-        """Accept no more browsers."""
-        self._server.stop()
+        self.rerun, self.html, self.framed = rerun, own_page(rerun.html), framed
+        self.recordings = (seen, recordings)
+        super().__init__(host, port, _PageHandler)
 
 
 def own_page(html: str) -> str:
@@ -339,17 +326,8 @@ def policy(html: str, recordings: list[str], framed: bool = False) -> str:
     )
 
 
-class _PageServer(BoundedServer):
-    def __init__(self, rerun: RerunPage, recordings: tuple[str, int], framed: bool, host: str, port: int) -> None:
-        self.rerun = rerun
-        self.framed = framed
-        self.html = own_page(rerun.html)
-        self.recordings = recordings
-        super().__init__((host, port), _PageHandler)
-
-
 class _PageHandler(QuietHandler):
-    server: _PageServer
+    server: WebPage
 
     def do_GET(self) -> None:
         """Send the page, or one of the files that it loads."""

@@ -56,7 +56,7 @@ class Mp4File(VideoFile):
 
     def __init__(self, path: Path, rate: float) -> None:
         self._told = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `stop`
-        words = [
+        given = [
             "-y",
             "-loglevel",
             "error",
@@ -71,7 +71,7 @@ class Mp4File(VideoFile):
         ]
         coded = ["-codec:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4"]
         self._process = subprocess.Popen(
-            guarded([ffmpeg(), *words, *coded, str(path)]),
+            guarded([ffmpeg(), *given, *coded, str(path)]),
             bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,

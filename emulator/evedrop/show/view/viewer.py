@@ -26,7 +26,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, final
+from typing import IO, TYPE_CHECKING, Any, final
 from urllib.parse import quote
 
 from evedrop.errors import UsageError
@@ -46,6 +46,7 @@ NOTEBOOK = "notebook"
 """The view as a page that notebooks of this machine can show in a frame."""
 _LSOF = "/usr/sbin/lsof"
 _START_SECONDS = 120.0
+_ATTEMPTS = 3
 _STOP_SECONDS = 3.0
 _FOREIGN_PROBES = 5
 """How often in succession a port must belong to another process before a viewer is given up."""
@@ -142,6 +143,18 @@ def spawn(
         raise UsageError(why)
     last = text.strip().splitlines()[-5:]
     raise UsageError("\n".join([f"the viewer {problem}; turn the view off to do without it. Its log ends:", *last]))
+
+
+def spawn_anywhere(arguments: Sequence[str], logs: Path, **options: Any) -> tuple[subprocess.Popen[bytes], int]:
+    """As `spawn`, at a free port, which is returned, too: at another one if another process takes it meanwhile."""
+
+    def spawned(port: int) -> tuple[subprocess.Popen[bytes], int]:
+        return spawn(port, ["--port", str(port), *arguments], logs, **options), port
+
+    for _ in range(_ATTEMPTS - 1):
+        with contextlib.suppress(PortTaken):
+            return spawned(free_port())
+    return spawned(free_port())
 
 
 def without_driver(log: str) -> str | None:
@@ -247,7 +260,6 @@ def _log(logs: Path) -> IO[bytes]:
         return tempfile.TemporaryFile()
 
 
-_ATTEMPTS = 3
 _WINDOW = ("--hide-welcome-screen",)
 _DARK = "theme=dark"
 """The page's theme, for which the colours of the panels are made, whatever the browser's theme is."""
@@ -357,15 +369,17 @@ class Viewer:
         mode = choose(mode)
         if mode == "off":
             return None
-        from evedrop.show.view.serving import Followed  # noqa: PLC0415 - only with a view
+        from evedrop.show.view.serving import Followed, feed  # noqa: PLC0415 - only with a view
 
         followed = Followed(recording, complete)
         if mode in {"web", NOTEBOOK}:
             return cls._page(followed, HOST, HOST, 0, 0, framed=mode == NOTEBOOK)
-        for _ in range(_ATTEMPTS - 1):
-            with contextlib.suppress(PortTaken):
-                return cls._window(followed, free_port(), logs, options, meanwhile)
-        return cls._window(followed, free_port(), logs, options, meanwhile)
+        process, _ = spawn_anywhere(
+            [*options, "-"], logs, stdin=subprocess.PIPE, apart=not _screen_is_remote(), meanwhile=meanwhile
+        )
+        assert process.stdin is not None  # noqa: S101 - it is a pipe
+        feed(followed, process.stdin)
+        return cls(followed, process)
 
     @classmethod
     def serve(cls, web_address: WebAddress, recording: Path, complete: bool = False) -> Viewer:
@@ -392,26 +406,12 @@ class Viewer:
         rerun = RerunPage(executable())
         served = Served(followed, host, data_port, private=framed)
         try:
-            page = WebPage(rerun, host, port, seen, served.port, framed)
+            page = WebPage(rerun, host, port, seen, served.server_port, framed)
         except BaseException:
             served.stop()
             raise
-        data = quote(f"http://{seen}:{served.port}{served.path}", safe="")
-        return cls(followed, None, [served, page], f"http://{seen}:{page.port}/?url={data}&{_DARK}")
-
-    @classmethod
-    def _window(
-        cls, followed: Followed, port: int, logs: Path, options: Sequence[str], meanwhile: Callable[[], None]
-    ) -> Viewer:
-        from evedrop.show.view.serving import feed  # noqa: PLC0415 - only with a view
-
-        arguments = ["--port", str(port), *options, "-"]
-        process = spawn(
-            port, arguments, logs, stdin=subprocess.PIPE, apart=not _screen_is_remote(), meanwhile=meanwhile
-        )
-        assert process.stdin is not None  # noqa: S101 - it is a pipe
-        feed(followed, process.stdin)
-        return cls(followed, process)
+        data = quote(f"http://{seen}:{served.server_port}{served.path}", safe="")
+        return cls(followed, None, [served, page], f"http://{seen}:{page.server_port}/?url={data}&{_DARK}")
 
     def alive(self) -> bool:
         """Whether it still runs; a window may have been closed."""
