@@ -21,7 +21,7 @@ from evedrop.model.process import Floats
 from evedrop.show.view.column import ELAPSED, laid_out
 from evedrop.show.view.event_log import EventLog, LogLine
 from evedrop.show.view.palette import TRUTH, dim, series
-from evedrop.show.view.panels.curves import dark_ground
+from evedrop.show.view.panels.curves import time_series
 from evedrop.show.view.panels.fates import LETTER, LINE, DrawnGraph, StateLanes
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.time_steps import (
@@ -237,7 +237,7 @@ class WirePanels:
 
 def _curves(title: str, path: str, axis: rrb.TimeAxis, *, named: bool) -> rrb.TimeSeriesView:
     corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=named)
-    return rrb.TimeSeriesView(name=title, origin=path, axis_x=axis, plot_legend=corner, background=dark_ground())
+    return time_series(title, axis, origin=path, plot_legend=corner)
 
 
 def _sliding(before: Counts | None, counts: Counts, over: int) -> tuple[Counts, Counts]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import rerun as rr
@@ -51,28 +51,23 @@ def whole_run(scene: Scene) -> rrb.TimeAxis:
     """An axis from slot 0 to the last."""
     times = times_of(scene)
     first, last = 0, scene.slots
-    if (
-        times.line == CLOCK
-    ):  # Rerun writes a date at each midnight: the first is not cut at the border, and the last is left out
+    if times.line == CLOCK:
+        # Rerun writes a date at each midnight: the first is not cut at the border, and the last is left out.
         first, last = -scene.slots // _ROOM_FOR_DATE, scene.slots - scene.slots // _HIDDEN
     return rrb.TimeAxis(view_range=rrb.TimeRange(start=times.at(first), end=times.at(last)), zoom_lock=True)
 
 
-def dark_ground() -> PlotBackground:
-    """The background of curves, which is dark in both themes: most of their colours would be illegible on white."""
-    return PlotBackground(color=GROUND)
+def time_series(title: str, axis: rrb.TimeAxis, **more: Any) -> rrb.TimeSeriesView:
+    """A view of curves on a ground that is dark in both themes: most of their colours would be illegible on white.
+
+    axis: horizontal; more: as of Rerun.
+    """
+    return rrb.TimeSeriesView(name=title, axis_x=axis, background=PlotBackground(color=GROUND), **more)
 
 
-def receivers_view(title: str, kinds: list[str], axis: rrb.TimeAxis) -> rrb.TimeSeriesView:
-    """A view of the curves below some paths, in the receivers' colours, which the legend of the whole view explains."""
-    return rrb.TimeSeriesView(
-        name=title,
-        origin="/",
-        contents=[f"/{kind}/**" for kind in kinds],
-        axis_x=axis,
-        plot_legend=rrb.PlotLegend(visible=False),
-        background=dark_ground(),
-    )
+def receivers_view(title: str, contents: list[str], axis: rrb.TimeAxis, origin: str = "/") -> rrb.TimeSeriesView:
+    """A view of curves in the receivers' colours, which the legend of the whole view explains."""
+    return time_series(title, axis, origin=origin, contents=contents, plot_legend=rrb.PlotLegend(visible=False))
 
 
 def curves_view(
@@ -83,9 +78,7 @@ def curves_view(
     legend: whether it names its curves, which those of truth and receivers do not need.
     """
     corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
-    return rrb.TimeSeriesView(
-        name=title, origin=f"/{path}", axis_x=axis, axis_y=values, plot_legend=corner, background=dark_ground()
-    )
+    return time_series(title, axis, origin=f"/{path}", axis_y=values, plot_legend=corner)
 
 
 def line_style(label: str, bright: Colour, width: float, *, steps: bool = False) -> rr.SeriesLines:
@@ -132,6 +125,10 @@ def powers_of_ten(scene: Scene) -> str:
     return f"−1: {less}{unit} · 1: {more}{unit}"
 
 
+def _errors_style(label: str, colour: Colour, width: float, **more: Any) -> rr.SeriesLines:
+    return rr.SeriesLines(names=label, colors=colour, widths=width, aggregation_policy=LARGEST, **more)
+
+
 _ERROR_PATH, _BAND = "error", "band"
 _NO_NAME = " "
 """The name of curves in the legend, which the receivers' own curves explain."""
@@ -145,10 +142,11 @@ class SquaredError(ViewPanel):
     def views(self) -> Iterator[PlacedView]:
         """One view: of the whole run for a closed loop, otherwise of the recent slots."""
         title = f"Error   {'dim: 95 %   ' if self._with_bands else ''}{powers_of_ten(self.scene)}{self._mixture}"
+        contents = [f"/{kind}/**" for kind in ([_ERROR_PATH, _BAND] if self._with_bands else [_ERROR_PATH])]
         if self.scene.moving:
-            yield PlacedView(receivers_view(title, self._paths, whole_run(self.scene)), "right", 1.2)
+            yield PlacedView(receivers_view(title, contents, whole_run(self.scene)), "right", 1.2)
         else:
-            yield PlacedView(receivers_view(title, self._paths, recent_slots(self.scene)), "middle")
+            yield PlacedView(receivers_view(title, contents, recent_slots(self.scene)), "middle")
 
     @property
     def _mixture(self) -> str:
@@ -160,22 +158,14 @@ class SquaredError(ViewPanel):
     def _with_bands(self) -> bool:
         return self.scene.trials > 1
 
-    @property
-    def _paths(self) -> list[str]:
-        return [_ERROR_PATH, _BAND] if self._with_bands else [_ERROR_PATH]
-
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each curve in its receiver's colour, and the edges of its band dim."""
         styles = {}
         for shown in self.scene.receivers:
             bright = self.scene.colours[shown.name]
-            styles[f"{_ERROR_PATH}/{shown.name}"] = rr.SeriesLines(
-                names=shown.name, colors=bright, widths=1.5, aggregation_policy=LARGEST
-            )
+            styles[f"{_ERROR_PATH}/{shown.name}"] = _errors_style(shown.name, bright, 1.5)
             for side in _SIDES if self._with_bands else ():
-                styles[f"{_BAND}/{shown.name}/{side}"] = rr.SeriesLines(
-                    names=_NO_NAME, colors=dim(bright), widths=1.0, aggregation_policy=LARGEST
-                )
+                styles[f"{_BAND}/{shown.name}/{side}"] = _errors_style(_NO_NAME, dim(bright), 1.0)
         return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
@@ -199,7 +189,7 @@ class TraceOfP(ViewPanel):
         """One view, below the errors, or beside them where lanes leave little height."""
         if not self.scene.moving:
             title = f"Root of tr P   dim: theory   {powers_of_ten(self.scene)}"
-            view = receivers_view(title, [_REPORTED, _THEORY], recent_slots(self.scene))
+            view = receivers_view(title, [f"/{_REPORTED}/**", f"/{_THEORY}/**"], recent_slots(self.scene))
             yield PlacedView(view, "left" if crowded(self.scene) else "middle")
 
     def styles(self) -> dict[str, rr.SeriesLines]:
@@ -207,12 +197,8 @@ class TraceOfP(ViewPanel):
         styles = {}
         for shown in self.scene.receivers:
             bright, label = self.scene.colours[shown.name], shown.name
-            styles[f"{_REPORTED}/{label}"] = rr.SeriesLines(
-                names=label, colors=bright, widths=1.5, interpolation_mode="StepAfter", aggregation_policy=LARGEST
-            )
-            styles[f"{_THEORY}/{label}"] = rr.SeriesLines(
-                names=f"{label}, theory", colors=dim(bright), widths=1.0, aggregation_policy=LARGEST
-            )
+            styles[f"{_REPORTED}/{label}"] = _errors_style(label, bright, 1.5, interpolation_mode="StepAfter")
+            styles[f"{_THEORY}/{label}"] = _errors_style(f"{label}, theory", dim(bright), 1.0)
         return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
@@ -232,14 +218,7 @@ def worlds_over_time(scene: Scene, path: str, axis: rrb.TimeAxis) -> Iterator[Pl
 
     def view(title: str, *names: str, legend: bool = False) -> rrb.TimeSeriesView:
         contents, corner = [f"{path}/{name}" for name in names], rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
-        return rrb.TimeSeriesView(
-            name=title,
-            origin=path,
-            contents=contents,
-            axis_x=axis,
-            plot_legend=corner,
-            background=dark_ground(),
-        )
+        return time_series(title, axis, origin=path, contents=contents, plot_legend=corner)
 
     attacked = bool(lane_count(scene))
     if scene.drawing is None:
@@ -292,16 +271,9 @@ class StateOverTime(ViewPanel):
     def views(self) -> Iterator[PlacedView]:
         """One view, on the right."""
         if not self.scene.moving:
-            view = rrb.TimeSeriesView(
-                name="State and estimates",
-                origin=_STATE_PATH,
-                contents=["$origin/**", f"- /{_STATE_PATH}/{_ATTACKS}/**"],
-                axis_x=recent_slots(self.scene),
-                plot_legend=rrb.PlotLegend(visible=False),
-                background=dark_ground(),
-            )
-            yield PlacedView(view, "right")
-            yield from worlds_over_time(self.scene, _STATE_PATH, recent_slots(self.scene))
+            axis, contents = recent_slots(self.scene), ["$origin/**", f"- /{_STATE_PATH}/{_ATTACKS}/**"]
+            yield PlacedView(receivers_view("State and estimates", contents, axis, _STATE_PATH), "right")
+            yield from worlds_over_time(self.scene, _STATE_PATH, axis)
 
     def styles(self) -> dict[str, rr.AsComponents]:
         """Each estimate in its receiver's colour; the truth grey and wide."""
