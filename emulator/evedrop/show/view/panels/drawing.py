@@ -20,7 +20,7 @@ from evedrop.scenario.application import DrawnFlow, DrawnLevel
 from evedrop.show.view.column import Column, line_strips
 from evedrop.show.view.palette import GROUND, LABEL, PLANT, TRUTH, TRUTH_CURVE, Colour, dim
 from evedrop.show.view.panels.panel import PlacedView, ViewPanel
-from evedrop.show.view.panels.plane import frames
+from evedrop.show.view.panels.plane import arrow_lines, frames
 from evedrop.show.view.scene import Scene, SceneSlots
 
 _PATH = "drawing"
@@ -54,15 +54,9 @@ class DrawnPlant(ViewPanel):
         """One view, in the scene."""
         width, height = self._drawing.size
         bounds = rrb.VisualBounds2D(x_range=(0.0, width), y_range=(0.0, height))
-        yield PlacedView(
-            rrb.Spatial2DView(
-                name=self.scene.what_happens,
-                origin=_PATH,
-                background=list(GROUND),
-                visual_bounds=bounds,
-            ),
-            "truth",
-        )
+        title = self.scene.what_happens
+        view = rrb.Spatial2DView(name=title, origin=_PATH, background=list(GROUND), visual_bounds=bounds)
+        yield PlacedView(view, "truth")
 
     def styles(self) -> dict[str, rr.AsComponents]:
         """The lines that do not change, colours, and where the words are."""
@@ -156,10 +150,7 @@ def arrow(flow: DrawnFlow, powers: Floats, widths: Strips) -> Strips:
     tails, tips = np.where(backwards, end, start), np.where(backwards, start, end)
     tips = np.where((np.abs(powers) < _NOTHING)[:, None], tails, tips)
     along = (tips - tails) / np.maximum(np.hypot(*(tips - tails).T), 1e-9)[:, None]
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    head = (_HEAD + 2.0 * widths)[:, None]
-    sides = [tips - head * (along + sign * 0.6 * across) for sign in (1.0, -1.0)]
-    return np.stack([tails, tips, sides[0], tips, sides[1]], axis=1).astype(np.float32)
+    return arrow_lines(tails, tips, along, (_HEAD + 2.0 * widths)[:, None]).astype(np.float32)
 
 
 def level_text(level: DrawnLevel, value: float, scene: Scene) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, final
 
 import numpy as np
@@ -157,9 +158,8 @@ class StatePlane(ViewPanel):
         labels: list[Points] = []
         yield Column(_FRAME, k[at], rr.LineStrips2D.columns(strips=line_strips(boxes)))
         size = boxes[:, 2] - boxes[:, 0]
-        yield Column(
-            _HEADING, k[at], rr.LineStrips2D.columns(strips=line_strips(heading_strips(truth, headings, size)))
-        )
+        arrows_of_truth = line_strips(heading_strips(truth, headings, size))
+        yield Column(_HEADING, k[at], rr.LineStrips2D.columns(strips=arrows_of_truth))
         bars, lengths = scale_bars(boxes[:, 0], boxes[:, 2])
         texts = [self._distance.text(length) for length in lengths.tolist()]
         yield Column(_SCALE, k[at], rr.LineStrips2D.columns(strips=line_strips(bars), labels=texts))
@@ -245,33 +245,14 @@ def _point_styles(name: str, bright: Colour, *, radius: float, order: float) -> 
     }
 
 
-def _trail(name: str) -> str:
-    return f"{_PLANE_PATH}/{name}/trail"
+def _part(name: str, part: str) -> str:
+    """The path of something that belongs to the truth or to a receiver."""
+    return f"{_PLANE_PATH}/{name}/{part}"
 
 
-def _ellipse(name: str) -> str:
-    return f"{_PLANE_PATH}/{name}/cov"
-
-
-def _point(name: str) -> str:
-    return f"{_PLANE_PATH}/{name}/at"
-
-
-def _arrow(name: str) -> str:
-    return f"{_PLANE_PATH}/{name}/arrow"
-
-
-def _away(name: str) -> str:
-    return f"{_PLANE_PATH}/{name}/away"
-
-
-def _cut(name: str) -> str:
-    return f"{_PLANE_PATH}/{name}/cut"
-
-
-def _off(name: str) -> str:
-    return f"{_PLANE_PATH}/{name}/off"
-
+_trail, _ellipse, _point, _arrow, _away, _cut, _off = (
+    partial(_part, part=part) for part in ("trail", "cov", "at", "arrow", "away", "cut", "off")
+)
 
 Points = NDArray[np.float32]
 
@@ -289,10 +270,8 @@ _LINE = 0.11  # of a frame's height: what a label needs
 _VEHICLE = 0.09  # length of the vehicle, compared with the longer side
 _SCALE_BAR = 0.25  # of a frame's width: the longest scale
 _HEADLINE = 0.04  # of a frame's height, from its upper border: where words about the whole frame are
-_BESIDE, _MOST_BESIDE = (
-    0.06,
-    8,
-)  # from one tip to the next, compared with the longer side; and tips that stand side by side
+_BESIDE = 0.06  # from one tip to the next, compared with the longer side
+_MOST_BESIDE = 8  # tips that stand side by side
 _ARROW = 0.08  # length of an arrow, compared with the longer side
 _FRAME_ROOM = 0.3  # around what the frame follows, compared with its longer side
 
@@ -355,9 +334,7 @@ def borders(truth: Points, points: Points, low: Points, high: Points) -> Points:
     towards = points.astype(np.float64) - truth
     with np.errstate(all="ignore"):
         room = np.where(towards > 0.0, high - edge - truth, low + edge - truth) / towards
-    fraction = np.clip(
-        np.nan_to_num(np.where(towards == 0.0, np.inf, room), nan=0.0).min(axis=1, initial=1.0), 0.0, 1.0
-    )
+    fraction = np.nan_to_num(np.where(towards == 0.0, np.inf, room), nan=0.0).min(axis=1, initial=1.0).clip(0.0, 1.0)
     moved = truth + fraction[:, None] * towards
     return _shown(np.where(inside(points, low, high)[:, None], points, moved))
 
@@ -381,19 +358,24 @@ def arrows(truth: Points, points: Points, ends: Points, low: Points, high: Point
     tips = ends.astype(np.float64)
     towards = points.astype(np.float64) - truth
     direction = towards / np.maximum(np.hypot(towards[:, 0], towards[:, 1]), 1e-300)[:, None]
-    across = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
     length = _ARROW * (high - low).astype(np.float64).max(axis=1, keepdims=True, initial=0.0)
-    heads = [tips - 0.4 * length * (direction + sign * 0.6 * across) for sign in (1.0, -1.0)]
-    return _shown(np.stack([tips - length * direction, tips, heads[0], tips, heads[1]], axis=1))
+    return _shown(arrow_lines(tips - length * direction, tips, direction, 0.4 * length))
 
 
 def heading_strips(truth: Points, headings: Points, size: Points) -> Points:
     """Arrows at the truth, (f, 2), in its directions, (f, 2), as lines, (f, 5, 2); size: of the frames."""
     length = _VEHICLE * size.max(axis=1, keepdims=True)
-    across = np.stack([-headings[:, 1], headings[:, 0]], axis=1)
     tips = truth + 0.6 * length * headings
-    sides = [tips - 0.5 * length * (headings + sign * 0.7 * across) for sign in (1.0, -1.0)]
-    return _shown(np.stack([truth - 0.4 * length * headings, tips, sides[0], tips, sides[1]], axis=1))
+    return _shown(arrow_lines(truth - 0.4 * length * headings, tips, headings, 0.5 * length, 0.7))
+
+
+def arrow_lines(
+    tails: NDArray[Any], tips: NDArray[Any], along: NDArray[Any], head: NDArray[Any], spread: float = 0.6
+) -> NDArray[Any]:
+    """Arrows, (f, 5, 2): a shaft and both sides of its head; along: their directions, (f, 2); head: its length, (f, 1)."""
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    sides = [tips - head * (along + sign * spread * across) for sign in (1.0, -1.0)]
+    return np.stack([tails, tips, sides[0], tips, sides[1]], axis=1)
 
 
 def scale_bars(low: Points, high: Points) -> tuple[Points, Floats]:
