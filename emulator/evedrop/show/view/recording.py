@@ -70,17 +70,9 @@ class PanelSet:
         """Record every panel's styles."""
         self._each(lambda panel: _style(panel.styles(), to))
 
-    def send(self, slots: SceneSlots, put: Callable[[Column], None]) -> None:
-        """Record the next slots; put: is called with each column."""
-        self._each(lambda panel: _send(panel.columns(slots), put))
-
-    def conclude(self, k: int, verdict: Verdict, put: Callable[[Column], None]) -> None:
-        """Record the verdict on the run, at its last slot."""
-        self._each(lambda panel: _send(panel.conclusion(k, verdict), put))
-
-    def send_notes(self, notes: Sequence[Event], put: Callable[[Column], None]) -> None:
-        """Record lines about the run."""
-        self._each(lambda panel: _send(panel.notes(notes), put))
+    def send(self, columns: Callable[[ViewPanel], Iterable[Column]], put: Callable[[Column], None]) -> None:
+        """Record what each panel answers; put: is called with each column."""
+        self._each(lambda panel: _send(columns(panel), put))
 
     def _each(self, ask: Callable[[ViewPanel], Sequence[T]]) -> list[T]:
         return [answer for name, panel in [*self._panels.items()] for answer in self._tried(name, partial(ask, panel))]
@@ -402,11 +394,12 @@ class ViewRecording(RecordingThread[SceneSlots, Event]):
         if chunks:
             slots = SceneSlots.joined(chunks)
             self._recorded = slots.first + slots.count
-            self._panels.send(slots, put)
-        if self._last and self._verdict is not None and self._recorded:
-            self._panels.conclude(self._recorded - 1, self._verdict, put)
+            self._panels.send(lambda panel: panel.columns(slots), put)
+        verdict, last = self._verdict, self._recorded - 1
+        if self._last and verdict is not None and self._recorded:
+            self._panels.send(lambda panel: panel.conclusion(last, verdict), put)
         if notes:
-            self._panels.send_notes(notes, put)
+            self._panels.send(lambda panel: panel.notes(notes), put)
         if self._staged is not None and (chunks or notes or self._last):
             self._staged.pass_on(self._recorded, self._patience, self._last)
         return bool(chunks or notes or (self._last and self._verdict is not None))
