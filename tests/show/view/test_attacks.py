@@ -11,8 +11,8 @@ import pytest
 from evedrop import load_results, montecarlo, run
 from evedrop.model.acknowledgements import ACTS, ATTACKS, AckChannel, AckFate
 from evedrop.model.receiver import Flags
-from evedrop.show.view import palette
 from evedrop.show.view.attacks import Attacks, cut_off, lane_count
+from evedrop.show.view.lanes import EAVESDROPPER
 from evedrop.show.view.scene import AckScene, AttackSpan, Scene, SceneSlots, Shown
 from evedrop.show.view.scene_slots import replay
 from tests.examples import mostly_long
@@ -209,10 +209,10 @@ def test_the_colour_of_an_attack_is_the_attackers() -> None:
     scene = a_scene(acknowledgements=AckScene("critical", "eve"), spans=(AttackSpan("", 2, 5, "eve"),))
     (_, acks), (_, attack) = Attacks(scene).lanes()
     assert acks.colours[AckFate.BLOCKED] == scene.colours["eve"]
-    assert set(attack.colours) <= set(palette.LANES)
+    assert set(attack.colours) <= set(EAVESDROPPER.colours)
     for name in ATTACKS:
         ((_, lane_of_acks),) = Attacks(a_scene(acknowledgements=AckScene(name, None))).lanes()
-        assert set(lane_of_acks.colours) <= set(palette.LANES)
+        assert set(lane_of_acks.colours) <= set(EAVESDROPPER.colours)
         assert len({lane_of_acks.colours[act] for act in ACTS[name]} | {lane_of_acks.colours[1]}) == 1 + len(ACTS[name])
     assert cut_off(scene, "eve", np.arange(7)).tolist() == [False, False, True, True, True, False, False]
     assert not cut_off(scene, "legitimate", np.arange(7)).any()

@@ -12,12 +12,11 @@ from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
 from evedrop.score.verdict import Verdict
-from evedrop.show.view.scene_slots import AckFates, loop_values_of, open_recording, shown
+from evedrop.show.view.scene_slots import ShownTrial, open_recording
 from evedrop.system.world import world
 
 if TYPE_CHECKING:
     from evedrop.show.view.recording import ViewRecording
-    from evedrop.show.view.scene_slots import LoopValues
 
 
 @final
@@ -26,22 +25,19 @@ class RunView:
 
     def __init__(self) -> None:
         self._recording: ViewRecording | None = None
-        self._loop_values: LoopValues | None = None
-        self._ack_fates: AckFates | None = None
-        self._around: Sequence[float] = ()
+        self._trial: ShownTrial | None = None
         self._noted = 0
 
     def open(self, scenario: Scenario, run: str, path: Path) -> None:
         """Begin the recording of the run with this name."""
         world().process.switch_threads_soon()  # the view's thread computes for tens of milliseconds at a time
-        self._around, self._loop_values = scenario.process.around, loop_values_of(scenario)
-        self._ack_fates = AckFates(scenario, scenario.first_trial)
+        self._trial = ShownTrial(scenario, scenario.first_trial)
         self._recording = open_recording(scenario, run, path, lambda text: emit(ViewOpened(None, text)), live=True)
 
     def add_slots(self, slots: Slots, scored: Mapping[str, Scored]) -> None:
         """Show the next slots."""
-        if self._recording is not None:
-            self._recording.add(shown(slots, scored, self._around, self._loop_values, self._ack_fates))
+        if self._recording is not None and self._trial is not None:
+            self._recording.add(self._trial.scored(slots, scored))
 
     def note(self, events: Sequence[RunEvent]) -> None:
         """Note the events of the run that are new; events: all so far."""

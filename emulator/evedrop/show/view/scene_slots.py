@@ -11,7 +11,8 @@ Source: docs/view.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -46,19 +47,15 @@ if TYPE_CHECKING:
     from evedrop.show.view.recording import ViewRecording
 
 
-_RANGES = ((0x20, 0x7E), (0xA1, 0x148), (0x14A, 0x2AF), (0x386, 0x3CE), (0x400, 0x45F))  # Latin, Greek, Cyrillic
-_SINGLE = frozenset("−≤≥≈₀ₖ→←∞∑·…–—„“”‘’‰€‖∂\u0302")
-_UNASSIGNED = frozenset("\u0387\u038b\u038d\u03a2")
+_UNKNOWN = re.compile(
+    "[^ -~\u00a1-\u0148\u014a-\u02af\u0386\u0388-\u038a\u038c\u038e-\u03a1\u03a3-\u03ce\u0400-\u045f"  # Latin, Greek, Cyrillic
+    "−≤≥≈₀ₖ→←∞∑·…–—„“”‘’‰€‖∂\u0302]"
+)
 
 
 def drawable(text: str) -> str:
     """The text with a question mark for each letter that the viewer's font may lack."""
-    return "".join(character if _known(character) else "?" for character in text)
-
-
-def _known(letter: str) -> bool:
-    inside = any(first <= ord(letter) <= last for first, last in _RANGES)
-    return letter in _SINGLE or (inside and letter not in _UNASSIGNED)
+    return _UNKNOWN.sub("?", text)
 
 
 @final
@@ -73,7 +70,7 @@ class LoopValues:
 
     @classmethod
     def of(cls, scenario: Scenario) -> LoopValues | None:
-        """An instance for a scenario; None without a controller."""
+        """For the trial that the view shows; None without a controller."""
         loop = controlled_plant(scenario)
         return None if loop is None else cls(loop, scenario)
 
@@ -170,11 +167,6 @@ def _drawable(sketch: Sketch) -> Sketch:
     return replace(sketch, levels=tuple(levels), flows=tuple(flows))
 
 
-def loop_values_of(scenario: Scenario) -> LoopValues | None:
-    """An object that follows the trial of a closed loop that the view shows; None without a controller."""
-    return LoopValues.of(scenario)
-
-
 def open_recording(
     scenario: Scenario,
     run: str,
@@ -233,39 +225,44 @@ def _growth(scenario: Scenario) -> float:
     return scenario.slots * max(0.0, math.log10(max(largest, 1.0)))
 
 
-def shown(
-    slots: Slots,
-    scored: Mapping[str, Scored],
-    around: Sequence[float],
-    loop_values: LoopValues | None = None,
-    ack_fates: AckFates | None = None,
-) -> Any:
-    """Some slots as `SceneSlots`: the first recorded trial, in absolute values, and means over all trials.
+@final
+class ShownTrial:
+    """The trial that the view shows, whose slots come in order."""
 
-    around: the reference from which states are deviations, (n,); loop_values: follows the same trial of a closed loop;
-    ack_fates: follows its acknowledgements.
-    """
-    peers = {
-        name: PeerSlots(
-            slots.first,
-            x_hat=receiver.x_hat[:, :, 0] + around,
-            P=receiver.P[:, :, :, 0],
-            action=receiver.action[:, 0],
-            squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
-            standard_error=scored[name].sums.standard_errors,
-            trace=_sums(receiver)[:, 0] / slots.trials,
-            theoretical_trace=scored[name].expected,
-        )
-        for name, receiver in slots.receivers.items()
-    }
-    sensor, moved = slots.sensor, None
-    if loop_values is not None:
+    def __init__(self, scenario: Scenario, trial: int, unknown_links: Collection[str] = ()) -> None:
+        """unknown_links: as in `open_recording`."""
+        self.around = np.array(scenario.process.around)
+        """The reference from which states are deviations, (n,)."""
+        self.loop_values = LoopValues.of(scenario)
+        self._ack_fates = AckFates(scenario, trial, unknown_links)
+
+    def scored(self, slots: Slots, scored: Mapping[str, Scored]) -> SceneSlots:
+        """Some slots for the view: the first recorded trial, in absolute values, and means over all trials."""
+        peers = {
+            name: PeerSlots(
+                slots.first,
+                x_hat=receiver.x_hat[:, :, 0] + self.around,
+                P=receiver.P[:, :, :, 0],
+                action=receiver.action[:, 0],
+                squared_error=np.asarray(scored[name].squared_error.mean(axis=1)),
+                standard_error=scored[name].sums.standard_errors,
+                trace=_sums(receiver)[:, 0] / slots.trials,
+                theoretical_trace=scored[name].expected,
+            )
+            for name, receiver in slots.receivers.items()
+        }
+        sensor = slots.sensor.part(slice(0, 1))
         estimates = {name: receiver.x_hat[:, :, 0] for name, receiver in slots.receivers.items()}
-        moved = loop_values.take(sensor.part(slice(0, 1)), estimates)
-    sent = None if sensor.sent is None else sensor.sent[:, 0]
-    actions = {name: peer.action for name, peer in peers.items()}
-    acknowledged = None if ack_fates is None else ack_fates.take(slots.first, sent, actions)
-    return SceneSlots(slots.first, sensor.x[:, :, 0] + around, sensor.nu[:, 0], peers, moved, sent, acknowledged)
+        return self.slots(sensor, sensor.x[:, :, 0] + self.around, estimates, peers)
+
+    def slots(
+        self, sensor: SensorSlots, x: Floats, estimates: Mapping[str, Floats], peers: Mapping[str, PeerSlots]
+    ) -> SceneSlots:
+        """Some slots for the view; sensor: in this trial alone; x: true states, (c, n); estimates: as deviations, (c, n)."""
+        moved = None if self.loop_values is None else self.loop_values.take(sensor, estimates)
+        sent = None if sensor.sent is None else sensor.sent[:, 0]
+        acknowledged = self._ack_fates.take(sensor.first, sent, {name: peer.action for name, peer in peers.items()})
+        return SceneSlots(sensor.first, x, sensor.nu[:, 0], peers, moved, sent, acknowledged)
 
 
 _CHUNK = 1000  # slots recorded at once
@@ -286,11 +283,9 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     if not len(x):
         raise UsageError(f"{folder} has no recorded trial to show; run it again, for example in the exact mode")
     _check_shapes(folder, len(scenario.process.A), x, peers)
-    loop_values = loop_values_of(scenario)
-    if loop_values is not None and (sensor.u is None or len(sensor.u) != len(x)):
+    trial = ShownTrial(scenario, _first_trial_of(results), looked_at.unknown_links)
+    if trial.loop_values is not None and (sensor.u is None or len(sensor.u) != len(x)):
         raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
-    around = np.array(scenario.process.around)
-    ack_fates = AckFates(scenario, _first_trial_of(results), looked_at.unknown_links)
     try:
         # One that is cut short would be shown ever after as that of the whole run.
         with private_replacement(path, lasting=False) as unfinished:
@@ -298,7 +293,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
                 scenario, folder.name, unfinished, words=looked_at.words, unknown_links=looked_at.unknown_links
             )
             with closing(recording):
-                _record(recording, results, sensor, peers, around, loop_values, ack_fates)
+                _record(recording, results, sensor, peers, trial)
             if recording.failure is not None:
                 raise OSError(recording.failure)
     except OSError as error:
@@ -307,25 +302,14 @@ def replay(folder: Path, path: Path | None = None) -> Path:
 
 
 def _record(
-    recording: ViewRecording,
-    results: Results,
-    sensor: SensorSlots,
-    peers: Mapping[str, PeerSlots],
-    around: Floats,
-    loop_values: LoopValues | None,
-    ack_fates: AckFates,
+    recording: ViewRecording, results: Results, sensor: SensorSlots, peers: Mapping[str, PeerSlots], trial: ShownTrial
 ) -> None:
     """Add all slots, events and the verdict; sensor and peers: in absolute values."""
-    count = len(sensor.x)
-    for first in range(0, count, _CHUNK):
-        rows = slice(first, min(first + _CHUNK, count))
-        deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
-        some = sensor.rows(rows)
-        moved = None if loop_values is None else loop_values.take(some, deviations)
-        shown = {name: peer.rows(rows) for name, peer in peers.items()}
-        sent = None if some.sent is None else some.sent[:, 0]
-        acknowledged = ack_fates.take(first, sent, {name: peer.action for name, peer in shown.items()})
-        recording.add(SceneSlots(first, some.x[:, :, 0], some.nu[:, 0], shown, moved, sent, acknowledged))
+    for first in range(0, len(sensor.x), _CHUNK):
+        rows = slice(first, min(first + _CHUNK, len(sensor.x)))
+        some, believed = sensor.rows(rows), {name: peer.rows(rows) for name, peer in peers.items()}
+        deviations = {name: peer.x_hat - trial.around for name, peer in believed.items()}
+        recording.add(trial.slots(some, some.x[:, :, 0], deviations, believed))
     for event in results.events:
         recording.note(event.slot, "INFO", event.line)
     if results.remark is None:
