@@ -6,10 +6,11 @@ The threshold adapts, so that a run of any length gets at most a few hundred lin
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from typing import NamedTuple, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evedrop.model.acknowledgements import AckFate
 from evedrop.model.receiver import INNOVATION, Action, Codes, Flags
@@ -42,77 +43,81 @@ def introduction(scene: Scene) -> list[Event]:
     return about
 
 
+class _StretchWatcher(ABC):
+    """Finds stretches without a good slot, chunk by chunk: one is reported when it has become long, and when it ends."""
+
+    def __init__(self, scene: Scene, counted: int) -> None:
+        """counted: the number of flags of slots that are counted in a stretch."""
+        self._spacing = max(_SLOTS_PER_LINE, scene.slots // _LINES)
+        self._long, self._reported = _SHORTEST, 0
+        # The length so far of the stretch that the next chunk may continue, and how many of its slots have each flag.
+        self._bad, self._counts = 0, np.zeros(counted, np.int64)
+
+    @abstractmethod
+    def _lost(self, *counts: int) -> str:
+        """The line about a stretch that has become long; counts: how many of its slots have each flag."""
+
+    @abstractmethod
+    def _regained(self) -> str:
+        """The line about the end of a stretch that was long."""
+
+    def _stretches(self, first: int, good: Flags, *flags: Flags) -> Iterator[Event]:
+        """The lines about the stretches of the chunk that starts at slot `first`; good, flags: (c,) each."""
+        places = np.flatnonzero(good)
+        starts, ends = np.concatenate([[0], places + 1]), np.append(places, len(good))
+        # A shorter stretch that also begins and ends in the chunk changes nothing.
+        looked_at = ends - starts >= self._long
+        looked_at[[0, -1]] = True
+        before = np.stack([np.concatenate([[0], np.cumsum(each)]) for each in flags])
+        for start, end in zip(starts[looked_at].tolist(), ends[looked_at].tolist(), strict=True):
+            length = self._bad + end - start
+            if self._bad < self._long <= length:
+                turn = start + self._long - self._bad  # the slot after the one that made it long
+                counts = self._counts + before[:, turn] - before[:, start]
+                yield Event(first + turn - 1, "WARN", self._lost(*counts.tolist()))
+            self._bad, self._counts = length, self._counts + before[:, end] - before[:, start]
+            if end < len(good):
+                yield from self._end(first + end)
+
+    def _end(self, k: int) -> Iterator[Event]:
+        if self._bad >= self._long:
+            yield Event(k, "INFO", self._regained())
+            self._reported += 1
+            if self._reported > 3 + k // self._spacing:
+                self._long += 1
+        self._bad, self._counts = 0, np.zeros_like(self._counts)
+
+
 @final
-class Watcher:
-    """Finds the events of one receiver in its lane's codes, chunk by chunk.
+class Watcher(_StretchWatcher):
+    """Finds the events of one receiver in its lane's codes.
 
     A good slot tells the receiver as much as the state: for the legitimate estimator any packet, for an eavesdropper a state
-    that it used as such. A stretch without a good slot is reported when it has become long, and when it ends.
+    that it used as such.
     """
 
     def __init__(self, shown: Shown, scene: Scene) -> None:
+        super().__init__(scene, 2)
         self._name = shown.name
         other = scheme_of(scene).sent_words[-1]
         self._other = f"an {other}" if other == INNOVATION else other
         self._legitimate = shown.role == "legitimate"
-        self._spacing = max(_SLOTS_PER_LINE, scene.slots // _LINES)
-        self._long = _SHORTEST
-        self._reported = 0
-        self._bad = 0  # length so far of the stretch that the next chunk may continue
-        self._misled = 0  # how many of these slots misled the receiver
-        self._silent = 0  # how many of them had no packet
-        self._told = False  # whether this stretch was reported
         self._ever_misled = False
 
     def watch(self, first: int, codes: Codes) -> list[Event]:
         """Events of the chunk that starts at slot `first`, in order of slot."""
-        misled, silent = codes == MISLED_CODE, codes == SILENT_CODE
-        good = (codes == Action.STATE) | (codes == Action.INNOVATION)
+        misled = codes == MISLED_CODE
         events: list[Event] = []
         if not self._ever_misled and misled.any():
             self._ever_misled = True
             k = first + int(misled.argmax())
             events.append(Event(k, "WARN", f"{self._name} took {self._other} for the state, for the first time"))
-        places = np.flatnonzero(good)
-        starts, ends = np.concatenate([[0], places + 1]), np.append(places, len(codes))
-        looked_at = (
-            ends - starts >= self._long
-        )  # a shorter stretch that also begins and ends in the chunk changes nothing
-        looked_at[[0, -1]] = True
-        before = _numbers_before(misled), _numbers_before(silent)
-        for start, end in zip(starts[looked_at].tolist(), ends[looked_at].tolist(), strict=True):
-            if end > start:
-                self._extend(first, start, end, before, events)
-            if end < len(codes):
-                self._recover(first + end, events)
+        good = (codes == Action.STATE) | (codes == Action.INNOVATION)
+        events += self._stretches(first, good, misled, codes == SILENT_CODE)
         return sorted(events, key=lambda event: event.k)
 
-    def _extend(
-        self, first: int, start: int, end: int, before: tuple[NDArray[np.int64], NDArray[np.int64]], events: list[Event]
-    ) -> None:
-        """Extend the current stretch by some slots of the chunk; before: how many slots before each are misled, and silent."""
-        misled, silent = before
-        length = self._bad + end - start
-        if not self._told and length >= self._long:
-            turn = start + self._long - self._bad  # the slot after the one that made it long
-            deceived = self._misled + int(misled[turn] - misled[start])
-            unsent = self._silent + int(silent[turn] - silent[start])
-            events.append(Event(first + turn - 1, "WARN", self._lost(deceived, unsent)))
-            self._told = True
-        self._bad = length
-        self._misled += int(misled[end] - misled[start])
-        self._silent += int(silent[end] - silent[start])
-
-    def _recover(self, k: int, events: list[Event]) -> None:
-        if self._told:
-            events.append(Event(k, "INFO", f"{self._name} regained synchronisation after {self._bad} slots"))
-            self._told = False
-            self._reported += 1
-            if self._reported > 3 + k // self._spacing:
-                self._long += 1
-        self._bad = self._misled = self._silent = 0
-
-    def _lost(self, deceived: int, unsent: int) -> str:
+    def _lost(self, *counts: int) -> str:
+        deceived, unsent = counts
         if self._legitimate and not unsent:
             return f"{self._name} lost {self._long} packets in a row"
         line = f"{self._name} lost synchronisation: {self._long} slots without a state"
@@ -121,52 +126,32 @@ class Watcher:
         line = f"{line}, {unsent} of them silent" if unsent else line
         return f"{line}, {deceived} misled" if deceived else line
 
+    def _regained(self) -> str:
+        return f"{self._name} regained synchronisation after {self._bad} slots"
+
 
 @final
-class AckWatcher:
-    """Finds the first act of each kind on acknowledgements, and long stretches in which none reached the sensor.
-
-    As for `Watcher`, a stretch is reported when it has become long, and when it ends.
-    """
+class AckWatcher(_StretchWatcher):
+    """Finds the first act of each kind on acknowledgements, and long stretches in which none reached the sensor."""
 
     def __init__(self, scene: Scene) -> None:
+        super().__init__(scene, 1)
         self._new = dict(Attacks(scene).possible)
-        self._spacing = max(_SLOTS_PER_LINE, scene.slots // _LINES)
-        self._long, self._reported = _SHORTEST, 0
-        self._missing, self._acted = 0, 0  # slots of the stretch so far, and how many acts were among them
 
     def watch(self, first: int, fates: Codes) -> list[Event]:
         """Events of the chunk that starts at slot `first`, in order of slot; fates: `AckFate`, (c,)."""
         events: list[Event] = []
-        for k, fate in enumerate(fates.tolist(), first):
-            if fate in self._new:
-                events.append(
-                    Event(k, "WARN", f"an acknowledgement was {self._new.pop(AckFate(fate))}, for the first time")
-                )
-            if fate in _REACHED:
-                self._end(k, events)
-                continue
-            self._missing += 1
-            self._acted += fate in (AckFate.BLOCKED, AckFate.IGNORED)
-            if self._missing == self._long:
-                attacked = f", {self._acted} by the attack" if self._acted else ""
-                events.append(
-                    Event(k, "WARN", f"the sensor got no acknowledgement for {self._missing} slots{attacked}")
-                )
-        return events
+        for act, words in [*self._new.items()]:
+            if len(at := np.flatnonzero(fates == act)):
+                del self._new[act]
+                events.append(Event(first + int(at[0]), "WARN", f"an acknowledgement was {words}, for the first time"))
+        reached, attacked = np.isin(fates, (AckFate.ARRIVED, AckFate.FORGED)), (AckFate.BLOCKED, AckFate.IGNORED)
+        events += self._stretches(first, reached, np.isin(fates, attacked))
+        return sorted(events, key=lambda event: event.k)
 
-    def _end(self, k: int, events: list[Event]) -> None:
-        if self._missing >= self._long:
-            events.append(Event(k, "INFO", f"the sensor got an acknowledgement again after {self._missing} slots"))
-            self._reported += 1
-            if self._reported > 3 + k // self._spacing:
-                self._long += 1
-        self._missing = self._acted = 0
+    def _lost(self, *counts: int) -> str:
+        attacked = f", {counts[0]} by the attack" if counts[0] else ""
+        return f"the sensor got no acknowledgement for {self._long} slots{attacked}"
 
-
-_REACHED = frozenset({AckFate.ARRIVED, AckFate.FORGED})
-
-
-def _numbers_before(flags: Flags) -> NDArray[np.int64]:
-    """How many flags before each are set, and how many in all, (c + 1,)."""
-    return np.concatenate([[0], np.cumsum(flags)])
+    def _regained(self) -> str:
+        return f"the sensor got an acknowledgement again after {self._bad} slots"
