@@ -55,17 +55,20 @@ def drawing(width: float, height: float, style: Any = None) -> Iterator[ShownFig
 
 
 @contextmanager
-def panels(
-    path: Path, columns: int, width: float, height: float, shows: Mapping[str, str] | None = None
-) -> Iterator[list[Axes]]:
+def panels(path: Path, columns: int, width: float, height: float) -> Iterator[list[Axes]]:
     """Axes to draw on, side by side; width and height in inches. Saved as `path`.png and `path`.pdf at the end.
-
-    shows: what the picture shows, by keyword; the PNG file keeps it as text, which any reader of PNG metadata can read.
 
     Uses no windowing toolkit, and leaves no global state changed.
     """
     with drawing(width, height) as figure:
-        axes = figure.subplots(1, columns, squeeze=False)
-        yield list(axes[0])
-        figure.savefig(path.with_suffix(".png"), dpi=180, metadata=dict(shows or {}))
-        figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
+        yield list(figure.subplots(1, columns, squeeze=False)[0])
+        save(path, figure)
+
+
+def save(path: Path, figure: ShownFigure, shows: Mapping[str, str] | None = None) -> None:
+    """Save a figure as `path`.png and `path`.pdf.
+
+    shows: what the picture shows, by keyword; the PNG file keeps it as text, which any reader of PNG metadata can read.
+    """
+    figure.savefig(path.with_suffix(".png"), dpi=180, metadata=dict(shows or {}))
+    figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})

@@ -34,7 +34,7 @@ from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.view import journal_column
 from evedrop.show.view.axis_name import as_mathematics, axis_name, squared_unit, without_mathematics
 from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
-from evedrop.show.view.figure_style import drawing, panels
+from evedrop.show.view.figure_style import drawing, save
 from evedrop.show.view.lanes import EAVESDROPPER
 from evedrop.show.view.palette import TRUTH_CURVE, VERDICTS, hexadecimal, paper_inks
 
@@ -241,22 +241,15 @@ def draw_sweep(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
 
     Bars at the marks are standard errors.
     """
-    count = min(_MOST_PANELS, len(_others(table.to_pylist(), keys)))
-    with panels(path, count, *_sweep_size(count)) as axes:
-        _draw_sweep_on(axes, table, keys)
+    save(path, sweep_figure(table, keys))
 
 
 def sweep_figure(table: pa.Table, keys: Sequence[str]) -> ShownFigure:
     """The plot of a sweep as a figure."""
     count = min(_MOST_PANELS, len(_others(table.to_pylist(), keys)))
-    with drawing(*_sweep_size(count)) as figure:
+    with drawing(1.2 + 4.2 * count, 3.9) as figure:
         _draw_sweep_on(list(figure.subplots(1, count, squeeze=False)[0]), table, keys)
     return figure
-
-
-def _sweep_size(count: int) -> tuple[float, float]:
-    """Width and height of this number of panels, in inches."""
-    return 1.2 + 4.2 * count, 3.9
 
 
 def _others(rows: list[dict[str, Any]], keys: Sequence[str]) -> list[tuple[Any, ...]]:
@@ -341,8 +334,7 @@ _LEAST_WIDTH = 9.0
 
 def draw_comparison(path: Path, result: Comparison) -> None:
     """Draw a comparison as `path`.png and `path`.pdf. The PNG file names its rows and columns in its metadata."""
-    with panels(path, 1, *_comparison_size(result), shown(result)) as (axes,):
-        _draw_comparison_on(axes, result)
+    save(path, comparison_figure(result), shown(result))
 
 
 def shown(comparison: Comparison) -> dict[str, str]:
@@ -356,7 +348,8 @@ def shown(comparison: Comparison) -> dict[str, str]:
 
 def comparison_figure(comparison: Comparison) -> ShownFigure:
     """The picture of a comparison as a figure."""
-    with drawing(*_comparison_size(comparison)) as figure:
+    width, height = 0.92 * (_LEFT + _right(comparison) + 2.0), 2.3 + 0.56 * len(comparison.schemes)
+    with drawing(width, height) as figure:
         _draw_comparison_on(figure.subplots(), comparison)
     return figure
 
@@ -364,11 +357,6 @@ def comparison_figure(comparison: Comparison) -> ShownFigure:
 def _right(comparison: Comparison) -> float:
     """The right end of the picture: room for the adversaries, and for the legend."""
     return max(float(len(comparison.adversaries)) + 1.1, _LEAST_WIDTH)
-
-
-def _comparison_size(comparison: Comparison) -> tuple[float, float]:
-    """Width and height in inches."""
-    return 0.92 * (_LEFT + _right(comparison) + 2.0), 2.3 + 0.56 * len(comparison.schemes)
 
 
 def _draw_comparison_on(axes: Axes, comparison: Comparison) -> None:
