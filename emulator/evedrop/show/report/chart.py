@@ -105,10 +105,8 @@ _INK, _DIM, _LINE = "#16191d", "#5a6068", "#d5d9de"
 _THEME: Mapping[str, str] = {_INK: "var(--ink)", _DIM: "var(--dim)", _LINE: "var(--line)"}
 """Ink of the drawing → that of the page, which is another one in its dark theme and on paper."""
 _DOTTED = (0, (0.1, 3.0))
-_MOST_LABELS, _LABEL_GAP = (
-    12,
-    0.075,
-)  # curves that are named beside their ends; a line of text as a fraction of the height
+_MOST_LABELS = 12  # curves that are named beside their ends
+_LABEL_GAP = 0.075  # a line of text as a fraction of the height
 _CLOSE = 100.0  # limits of an axis whose ratio is less have 2 and 5 times the powers of ten, too
 
 
@@ -262,9 +260,8 @@ def _embedded(svg: str) -> Markup:
     groups = svg[svg.index('<g id="figure_1">') : svg.rindex("</svg>")]
     groups = re.sub(r'<g id="[\w.]+_\d+">', "<g>", groups).replace("xlink:href=", "href=")
     groups = re.sub(r'(<text style="[^"]*)font-family: [^;"]*; ', r"\1", groups)
-    groups = re.sub(
-        r'(<text style=")font: ([\d.]+px)[^;"]*', r"\1font-size: \2", groups
-    )  # matplotlib 3.10 writes it so
+    # matplotlib 3.10 writes it so
+    groups = re.sub(r'(<text style=")font: ([\d.]+px)[^;"]*', r"\1font-size: \2", groups)
     for ink, of_page in _THEME.items():
         groups = groups.replace(f": {ink}", f": {of_page}")
     return Markup(f'<svg {size[0]} aria-hidden="true" focusable="false">\n{groups}</svg>')  # noqa: S704 - escaped by matplotlib

@@ -307,9 +307,9 @@ def _record(
     """Add all slots, events and the verdict; sensor and peers: in absolute values."""
     for first in range(0, len(sensor.x), _CHUNK):
         rows = slice(first, min(first + _CHUNK, len(sensor.x)))
-        some, believed = sensor.rows(rows), {name: peer.rows(rows) for name, peer in peers.items()}
-        deviations = {name: peer.x_hat - trial.around for name, peer in believed.items()}
-        recording.add(trial.slots(some, some.x[:, :, 0], deviations, believed))
+        some, beliefs = sensor.rows(rows), {name: peer.rows(rows) for name, peer in peers.items()}
+        deviations = {name: peer.x_hat - trial.around for name, peer in beliefs.items()}
+        recording.add(trial.slots(some, some.x[:, :, 0], deviations, beliefs))
     for event in results.events:
         recording.note(event.slot, "INFO", event.line)
     if results.remark is None:

@@ -160,10 +160,7 @@ class Events(ViewPanel):
     def views(self) -> Iterator[PlacedView]:
         """Two views: beside the strip of the scene, and at the bottom right of the numbers."""
         yield PlacedView(self._view(), "strip", 1.0, lanes_height(1))
-        if self.scene.moving:
-            yield PlacedView(self._view(), "right", 0.55)
-        else:
-            yield PlacedView(self._view(), "right", 0.45)
+        yield PlacedView(self._view(), "right", 0.55 if self.scene.moving else 0.45)
 
     @staticmethod
     def _view() -> rrb.TextDocumentView:
