@@ -28,7 +28,7 @@ from evedrop.show.view.column import Column, laid_out
 from evedrop.show.view.events import Event, introduction
 from evedrop.show.view.panels import PANELS
 from evedrop.show.view.panels.curves import times_of
-from evedrop.show.view.panels.panel import COLUMNS, ROWS_ABOVE, ROWS_BELOW, SCENE, PlacedView, ViewPanel
+from evedrop.show.view.panels.panel import COLUMNS, ROWS_ABOVE, ROWS_BELOW, SCENE, PlacedView, Side, ViewPanel
 from evedrop.show.view.scene import Scene, SceneSlots
 from evedrop.show.view.staged import StagedChunks, chunk_sizes
 from evedrop.system.output import warn
@@ -112,8 +112,7 @@ def _scene(placed: Sequence[PlacedView]) -> rrb.Container:
     if not strip:
         return rrb.Vertical(above, name=SCENE_TAB)
     height = max(view.height for view in strip)
-    row = rrb.Horizontal(*(view.view for view in strip), column_shares=[view.share for view in strip])
-    return rrb.Vertical(above, row, row_shares=[1.0 - height, height], name=SCENE_TAB)
+    return rrb.Vertical(above, _row(strip), row_shares=[1.0 - height, height], name=SCENE_TAB)
 
 
 def _rows(worlds: Sequence[PlacedView]) -> list[Sequence[PlacedView]]:
@@ -139,18 +138,17 @@ def _arranged(placed: Sequence[PlacedView]) -> rrb.Container:
     ]
     heights = {side: max((view.height for view in sides[side]), default=0.0) for side in (*ROWS_ABOVE, *ROWS_BELOW)}
     rest = max(_LEAST_REST, 1.0 - sum(heights.values()))
-    rows: list[tuple[rrb.Container, float]] = []
-    for side in (*ROWS_ABOVE, None, *ROWS_BELOW):
-        if side is None:
-            rows.append(
-                (rrb.Horizontal(*(view for view, _ in columns), column_shares=[width for _, width in columns]), rest)
-            )
-        elif sides[side]:
-            row = rrb.Horizontal(
-                *(view.view for view in sides[side]), column_shares=[view.share for view in sides[side]]
-            )
-            rows.append((row, max(heights[side], _LEAST_ROW)))
+    middle = rrb.Horizontal(*(view for view, _ in columns), column_shares=[width for _, width in columns])
+
+    def rows_of(chosen: Sequence[Side]) -> list[tuple[rrb.Container, float]]:
+        return [(_row(sides[side]), max(heights[side], _LEAST_ROW)) for side in chosen if sides[side]]
+
+    rows = [*rows_of(ROWS_ABOVE), (middle, rest), *rows_of(ROWS_BELOW)]
     return rrb.Vertical(*(row for row, _ in rows), row_shares=[share for _, share in rows], name=NUMBERS_TAB)
+
+
+def _row(views: Sequence[PlacedView]) -> rrb.Container:
+    return rrb.Horizontal(*(view.view for view in views), column_shares=[view.share for view in views])
 
 
 def _views(panel: ViewPanel, check: Callable[[PlacedView], PlacedView]) -> list[PlacedView]:
