@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import StringIO
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from markupsafe import Markup
@@ -272,12 +272,8 @@ def _thinned(curve: Curve) -> Curve:
     count = len(curve.x)
     if count <= POINTS:
         return curve
-    rows = [curve.x, curve.y, curve.low, curve.high, curve.theory]
-    given = [row for row in rows if row is not None]
+    given = {name: row for name in ("x", "y", "low", "high", "theory") if (row := getattr(curve, name)) is not None}
     groups = GroupMeans(count, POINTS, len(given))
-    groups.add(np.stack(given))
-    means = iter(groups.means)
-    x, y, low, high, theory = (None if row is None else next(means) for row in rows)
-    assert x is not None  # noqa: S101 - it was given
-    assert y is not None  # noqa: S101 - the same
-    return Curve(curve.name, curve.colour, x, y, low, high, theory)
+    groups.add(np.stack([*given.values()]))
+    means: dict[str, Any] = dict(zip(given, groups.means, strict=True))
+    return replace(curve, **means)
