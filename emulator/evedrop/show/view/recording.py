@@ -178,7 +178,9 @@ def _drawable(view: PlacedView) -> PlacedView:
     return view
 
 
-def _style(styles: Mapping[str, rr.AsComponents], to: rr.RecordingStream) -> tuple[()]:
+def _style(
+    styles: Mapping[str, rr.AsComponents | Iterable[rr.DescribedComponentBatch]], to: rr.RecordingStream
+) -> tuple[()]:
     for path, style in styles.items():
         to.log(path, style, static=True, strict=True)
     return ()

@@ -16,7 +16,6 @@ import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
-from rerun import AsComponents
 
 from evedrop.score.synchronisation import Synchronisation
 from evedrop.show.view import lanes
@@ -191,10 +190,11 @@ class DrawnGraph:
         bounds = rrb.VisualBounds2D(x_range=ranges[0], y_range=ranges[1])
         return rrb.GraphView(name=title, origin=self.path, visual_bounds=bounds)
 
-    def style(self) -> rr.AsComponents:
+    def style(self) -> list[rr.DescribedComponentBatch]:
         """The edges, and which nodes are where, to be recorded once at the path."""
         nodes = rr.GraphNodes([*self.nodes], positions=[*self.nodes.values()], radii=[_RADIUS] * len(self.nodes))
-        return _Together((nodes, rr.GraphEdges([*self.edges], graph_type="directed")))
+        edges = rr.GraphEdges([*self.edges], graph_type="directed")
+        return [*nodes.as_component_batches(), *edges.as_component_batches()]
 
     def columns(self, labels: Sequence[str], colours: Sequence[Colour]) -> rr.ComponentColumnList:
         """Labels and colours of all nodes at some times: those of the first time, then those of the second, and so on."""
@@ -202,17 +202,6 @@ class DrawnGraph:
         words: Any = pa.array(labels, pa.utf8())
         inks = np.array([letters(colour) for colour in colours], np.uint8)
         return rr.GraphNodes.columns(labels=words, colors=inks).partition(lengths)
-
-
-@dataclass(frozen=True)
-class _Together:
-    """Several of Rerun's archetypes as one."""
-
-    parts: tuple[rr.AsComponents, ...]
-
-    def as_component_batches(self) -> list[rr.DescribedComponentBatch]:
-        """The components of all."""
-        return [batch for part in self.parts for batch in part.as_component_batches()]
 
 
 _GRAPH_PATH = "graph"
@@ -252,7 +241,7 @@ class LastPacket(ViewPanel):
         view: rrb.View = self._drawn.view("The last packet, and how far off each is", (LETTER * longest / 2, LINE / 2))
         yield PlacedView(view, "top", 0.8, lanes_height(len(self.scene.receivers)))
 
-    def styles(self) -> dict[str, AsComponents]:
+    def styles(self) -> dict[str, list[rr.DescribedComponentBatch]]:
         """The edges, and where the nodes are."""
         return {_GRAPH_PATH: self._drawn.style()}
 

@@ -64,7 +64,7 @@ class ViewPanel(ABC):
     def views(self) -> Iterable[PlacedView]:
         """Its views; none if it is recorded but not shown."""
 
-    def styles(self) -> Mapping[str, rr.AsComponents]:
+    def styles(self) -> Mapping[str, rr.AsComponents | Iterable[rr.DescribedComponentBatch]]:
         """Path → name, colour and other styles, recorded once; by default none, so that Rerun chooses."""
         return {}
 
