@@ -22,7 +22,7 @@ class ChildProcess:
 
     def __init__(self, machine: VirtualMachine, name: str, *words: str) -> None:
         """words: the command."""
-        self._scheduler, pipe = machine.scheduler, Pipe(machine.scheduler)
+        pipe = Pipe(machine.scheduler)
         self.stderr: IO[str] | None = cast("IO[str]", _Lines(PipeFile(pipe)))
         self.process = VirtualProcess(machine.scheduler, machine.scheduler.process(name), pipe.end())
         machine.begin(name, partial(machine.program, words), self.process)
@@ -38,11 +38,10 @@ class ChildProcess:
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait for its end. Raises subprocess.TimeoutExpired."""
-        if self.process.task.alive:
-            self._scheduler.wait(self.process.ended, timeout)
-        if self.returncode is None:
+        status = self.process.wait(timeout)
+        if status is None:
             raise subprocess.TimeoutExpired("evedrop", timeout or 0.0)
-        return self.returncode
+        return status
 
     def send_signal(self, sig: int) -> None:
         """Send a signal to it."""

@@ -107,8 +107,7 @@ class VirtualDisk(Disk):
         """Let the next operation fail; seconds: until there is room again, if the disk is full."""
         at = self.operations + 1
         self.faults = lambda operation: fault if operation == at else None
-        if seconds is not None:
-            self._scheduler.at(self._scheduler.now + seconds, self.make_room)
+        self._scheduler.after_seconds(seconds, self.make_room)
 
     def make_room(self) -> None:
         """Let the disk be full no longer."""

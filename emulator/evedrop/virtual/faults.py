@@ -250,7 +250,7 @@ class FlapConnection(_OfConnection):
         """Cut it, also later."""
         scheduler = zenoh.scheduler
         for number in range(1, int((self.seconds or 0.0) / _FLAP_SECONDS) + 1):
-            scheduler.at(scheduler.now + number * _FLAP_SECONDS, lambda: zenoh.cut(target, 0.0))
+            scheduler.after_seconds(number * _FLAP_SECONDS, lambda: zenoh.cut(target, 0.0))
         return zenoh.cut(target, 0.0)
 
 

@@ -40,7 +40,7 @@ class LackThreads(_Lack):
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Let it have none."""
-        world.machine.no_threads_until = float("inf") if self.seconds is None else world.scheduler.now + self.seconds
+        world.machine.no_threads_until = world.scheduler.later(self.seconds)
         return True
 
 

@@ -98,10 +98,8 @@ class HostConnection:
         """Let nothing through for some time, or for good, though it seems open."""
         self.orders.freeze()
         self.answers.freeze()
-        self.frozen_until = float("inf")
-        if seconds is not None:
-            self.frozen_until = self._scheduler.now + seconds
-            self._scheduler.at(self.frozen_until, self._thaw)
+        self.frozen_until = self._scheduler.later(seconds)
+        self._scheduler.after_seconds(seconds, self._thaw)
 
     def _thaw(self) -> None:
         if not self.frozen:
@@ -153,10 +151,9 @@ class OtherHost:
             scheduler.thread("orders", lambda: self._pass_orders(orders)).start()
             while data := answers.read(_MOST_BYTES):
                 self.connection.answers.send(data)
-            while program.task.status is None:
-                scheduler.wait(program.ended)
+            status = program.wait()
             self.connection.answers.send(program.printed)
-            self.connection.answers.send(program.task.status)
+            self.connection.answers.send(cast(int, status))
             return 0
 
         machine.begin(part_on(SESSION, self.name), serve, server)
@@ -293,12 +290,9 @@ class VirtualSsh:
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait for its end. Raises subprocess.TimeoutExpired."""
-        deadline = None if timeout is None else self._scheduler.now + timeout
-        while (status := self.poll()) is None:
-            left = None if deadline is None else deadline - self._scheduler.now
-            if left is not None and left <= 0.0:
-                raise subprocess.TimeoutExpired("ssh", timeout or 0.0)
-            self._scheduler.wait(self._process.ended, left)
+        status = self._process.wait(timeout)
+        if status is None:
+            raise subprocess.TimeoutExpired("ssh", timeout or 0.0)
         return status
 
     def close(self) -> None:

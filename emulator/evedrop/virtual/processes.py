@@ -14,6 +14,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from queue import Empty
 from typing import IO, BinaryIO, NoReturn, cast, final
@@ -90,6 +91,11 @@ class VirtualProcess(ThisProcess):
         elif number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             scheduler.thread("signal", self._handle, task).start()
 
+    def wait(self, timeout: float | None = None) -> int | None:
+        """Wait for its end, for some seconds at most; returns its exit status, None while it runs."""
+        self._scheduler.wait_for(lambda: not self.task.alive, partial(self._scheduler.wait, self.ended), timeout)
+        return self.task.status
+
     @property
     def pid(self) -> int:
         """Its id."""
@@ -115,17 +121,14 @@ class VirtualProcess(ThisProcess):
     @contextmanager
     def stop_on_signals(self) -> Iterator[ThreadEvent]:
         """An event that these signals set."""
-        stop, before = VirtualEvent(self._scheduler), self._handle
-        self._handle = stop.set
-        try:
+        stop = VirtualEvent(self._scheduler)
+        with self._handling(stop.set):
             yield stop
-        finally:
-            self._handle = before
 
     @contextmanager
     def stop_or_leave_on_signals(self, leave: Callable[[], object]) -> Iterator[ThreadEvent]:
         """An event that the first of these signals sets; a later one, unless it comes at once, calls `leave`."""
-        stop, before, first = VirtualEvent(self._scheduler), self._handle, 0.0
+        stop, first = VirtualEvent(self._scheduler), 0.0
 
         def handle() -> None:
             nonlocal first
@@ -135,23 +138,25 @@ class VirtualProcess(ThisProcess):
             elif self._scheduler.now - first > AGAIN_SECONDS:
                 leave()
 
-        self._handle = handle
-        try:
+        with self._handling(handle):
             yield stop
-        finally:
-            self._handle = before
 
     @contextmanager
     def raise_on_signals(self) -> Iterator[None]:
         """Let the first of these signals raise KeyboardInterrupt on the thread of the block."""
-        thread, before = self._scheduler.current, self._handle
+        thread = self._scheduler.current
         assert thread is not None  # noqa: S101 - only programs call this
 
         def interrupt() -> None:
             self._handle = lambda: None
             self._scheduler.raise_in(thread, KeyboardInterrupt())
 
-        self._handle = interrupt
+        with self._handling(interrupt):
+            yield
+
+    @contextmanager
+    def _handling(self, handle: Callable[[], object]) -> Iterator[None]:
+        before, self._handle = self._handle, handle
         try:
             yield
         finally:
@@ -171,9 +176,7 @@ class VirtualProcess(ThisProcess):
         """Have a folder removed a moment after its death, and what is left of it after the block."""
 
         def remove() -> None:
-            self._scheduler.at(
-                self._scheduler.now + _REMOVED_SECONDS, lambda: shutil.rmtree(folder, ignore_errors=True)
-            )
+            self._scheduler.after_seconds(_REMOVED_SECONDS, lambda: shutil.rmtree(folder, ignore_errors=True))
 
         self.task.held.append(remove)
         try:
@@ -339,9 +342,7 @@ class VirtualForkServer:
         scheduler.thread("waits", lambda: self._report(process)).start()
 
     def _report(self, process: VirtualProcess) -> None:
-        while process.task.status is None:
-            self._scheduler.wait(process.ended)
-        self._reports.put((json.dumps({"pid": process.pid, "status": process.task.status}).encode(), []))
+        self._reports.put((json.dumps({"pid": process.pid, "status": process.wait()}).encode(), []))
 
 
 @final

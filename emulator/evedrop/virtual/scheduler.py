@@ -274,8 +274,7 @@ class VirtualScheduler:
     def hang(self, thread: VirtualThread, seconds: float | None) -> None:
         """Let a thread not go on for some time, or for good, while the others of its process do."""
         thread.hangs = True
-        if seconds is not None:
-            self.at(self.now + seconds, partial(self._end_hang, thread))
+        self.after_seconds(seconds, partial(self._end_hang, thread))
 
     def _end_hang(self, thread: VirtualThread) -> None:
         thread.hangs = False
@@ -324,6 +323,13 @@ class VirtualScheduler:
         self._switch(current)
         return waiter.value
 
+    def wait_for(self, ready: Callable[[], T], wait: Callable[[float | None], object], timeout: float | None) -> T:
+        """Wait, as often as needed, until something is true, or for `timeout` seconds; returns it. wait: for some seconds."""
+        deadline = self.later(timeout)
+        while not (result := ready()) and (left := deadline - self.now) > 0.0:
+            wait(None if timeout is None else left)
+        return result
+
     def sleep(self, seconds: float) -> None:
         """Let time pass."""
         current = self._running
@@ -345,6 +351,15 @@ class VirtualScheduler:
     def at(self, moment: float, what: Waiter | Callable[[], object]) -> None:
         """At this moment, let a thread go on, or something happen to the world."""
         heapq.heappush(self._timers, (moment, self.number(), what))
+
+    def later(self, seconds: float | None) -> float:
+        """The moment in some seconds; None: never."""
+        return float("inf") if seconds is None else self.now + seconds
+
+    def after_seconds(self, seconds: float | None, act: Callable[[], object]) -> None:
+        """In some seconds, do something to the world; None: never."""
+        if seconds is not None:
+            self.at(self.now + seconds, act)
 
     def after(self, events: int, act: Callable[[], object]) -> None:
         """Once this many events have happened, do something to the world, between the turns of threads."""
@@ -446,16 +461,16 @@ class VirtualLock:
         if me is None:  # the world itself, between the turns of threads
             return self._holder is None
         scheduler.interruptible()
-        deadline = None if timeout < 0 else scheduler.now + timeout
-        while self._holder is not None and not (self._again and self._holder is me):
-            if not blocking:
-                return False
-            left = None if deadline is None else deadline - scheduler.now
-            if left is not None and left <= 0.0:
-                return False
-            scheduler.wait(self.waiting, left)
+        seconds = 0.0 if not blocking else None if timeout < 0 else timeout
+        wait = partial(scheduler.wait, self.waiting)
+        if self._holder is not None and not scheduler.wait_for(self._is_free, wait, seconds):
+            return False
         self._holder, self._depth = me, self._depth + 1
         return True
+
+    def _is_free(self) -> bool:
+        """Whether the current thread can take it."""
+        return self._holder is None or (self._again and self.held_by_me())
 
     def release(self) -> None:
         """Give it back."""
@@ -512,13 +527,7 @@ class VirtualCondition:
 
     def wait_for(self, predicate: Callable[[], T], timeout: float | None = None) -> T:
         """Wait until something is true."""
-        deadline = None if timeout is None else self._scheduler.now + timeout
-        while not (result := predicate()):
-            left = None if deadline is None else deadline - self._scheduler.now
-            if left is not None and left <= 0.0:
-                break
-            self.wait(left)
-        return result
+        return self._scheduler.wait_for(predicate, self.wait, timeout)
 
     def notify(self, n: int = 1) -> None:
         """Wake up threads that wait."""
@@ -575,13 +584,11 @@ class VirtualQueue:
 
     def get(self, block: bool = True, timeout: float | None = None) -> Any:
         """Take the next item."""
-        scheduler = self._scheduler
-        deadline = None if timeout is None else scheduler.now + timeout
-        while not self._items:
-            left = None if deadline is None else deadline - scheduler.now
-            if not block or (left is not None and left <= 0.0):
-                raise Empty
-            scheduler.wait(self._waiting, left)
+        if block and not self._items:
+            scheduler = self._scheduler
+            scheduler.wait_for(self.qsize, partial(scheduler.wait, self._waiting), timeout)
+        if not self._items:
+            raise Empty
         return self._items.popleft()
 
     def get_nowait(self) -> Any:

@@ -108,7 +108,7 @@ class SimulatedProgram(Generic[T]):
 
         seconds: virtual ones, after which it raises RunError; None: as long as wires may last. RunError, too, if it was killed.
         """
-        wait_for_end(self._world, self._process, seconds)
+        self._process.wait(seconds)
         if self.is_running:
             raise RunError(f"{self.name} still runs after {seconds:g} virtual seconds")
         error, self.error = self.error, None
@@ -194,12 +194,6 @@ class SimulatedWires:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.__exit__(kind, error, trace)
-
-
-def wait_for_end(world: CallerWorld, process: VirtualProcess, seconds: float | None) -> None:
-    """Wait until a process has ended, or some virtual seconds are over."""
-    if process.task.alive:
-        world.scheduler.wait(process.ended, seconds)
 
 
 @final

@@ -8,39 +8,33 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Protocol, Self, final
 
 import zenoh
 
-from evedrop.virtual.scheduler import VirtualScheduler, VirtualTask, Waiter
+from evedrop.virtual.scheduler import Waiter
+from evedrop.virtual.zenoh.transport import AnySession
 
 _CALLBACK_ROOM = 256
 """How many items wait for a function that a thread calls with them; then who has another one waits."""
 
 
-class HandlingSession(Protocol):
-    """The part of a session that its handlers use."""
-
-    scheduler: VirtualScheduler
-    task: VirtualTask
-    """Its process."""
-
-
 @final
+@dataclass(frozen=True)
 class FifoChannel:
     """A handler that keeps up to `capacity` messages; then the session's receiving thread waits."""
 
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
+    capacity: int
 
 
 @final
+@dataclass(frozen=True)
 class RingChannel:
     """A handler that keeps the last `capacity` messages, and forgets the oldest ones; nobody waits. With its end all are gone."""
 
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
+    capacity: int
 
 
 @final
@@ -92,7 +86,7 @@ class Taker(Protocol):
 class Channel:
     """Keeps up to `capacity` items; a thread that has another one waits, or the oldest one is forgotten."""
 
-    def __init__(self, session: HandlingSession, capacity: int, *, forgets: bool = False) -> None:
+    def __init__(self, session: AnySession, capacity: int, *, forgets: bool = False) -> None:
         self._scheduler, self._task, self._capacity = session.scheduler, session.task, capacity
         self._forgets = forgets
         self._kept: deque[Any] = deque()
@@ -141,7 +135,7 @@ class Channel:
 class DirectCalls:
     """Calls the functions of a handler on the thread that has an item."""
 
-    def __init__(self, session: HandlingSession, handler: Callback) -> None:
+    def __init__(self, session: AnySession, handler: Callback) -> None:
         self._session, self._handler = session, handler
         self._over = False
 
@@ -164,7 +158,7 @@ class DirectCalls:
             attempt(self._session, function)
 
 
-def taker_of(session: HandlingSession, handler: FifoChannel | RingChannel | Callable[[Any], object]) -> Taker:
+def taker_of(session: AnySession, handler: FifoChannel | RingChannel | Callable[[Any], object]) -> Taker:
     """What takes the items of a handler; for a function, a thread of its own calls it for one item after the other."""
     if isinstance(handler, FifoChannel | RingChannel):
         return Channel(session, handler.capacity, forgets=isinstance(handler, RingChannel))
@@ -189,7 +183,7 @@ def items_of(channel: Channel) -> Iterator[Any]:
             yield channel.recv()
 
 
-def attempt(session: HandlingSession, function: Callable[[], object]) -> None:
+def attempt(session: AnySession, function: Callable[[], object]) -> None:
     """Call a function of a program, unless that has ended; the real Zenoh only logs what it raises."""
     try:
         if session.task.alive:

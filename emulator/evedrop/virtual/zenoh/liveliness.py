@@ -9,22 +9,14 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
-from typing import Protocol, final
+from typing import final
 
 import zenoh
 
 from evedrop.virtual.zenoh.access import intersects
 from evedrop.virtual.zenoh.handlers import Callback, Taker, VirtualDeclaration, taker_of
-from evedrop.virtual.zenoh.items import VirtualReply, VirtualSample
-from evedrop.virtual.zenoh.questions import QUERY_SECONDS, AskingSession
-from evedrop.virtual.zenoh.transport import End, TransportFrame
-
-
-class ShowingSession(AskingSession, Protocol):
-    """The part of a session that its liveliness uses."""
-
-    def lets_out(self, end: End, message: str, key: str) -> bool:
-        """Whether a message may go out to an end."""
+from evedrop.virtual.zenoh.questions import QUERY_SECONDS, VirtualQuestions
+from evedrop.virtual.zenoh.transport import End, TransportFrame, VirtualReply, VirtualSample
 
 
 @final
@@ -66,8 +58,9 @@ class VirtualWatch(VirtualDeclaration):
 class Liveliness:
     """Who is there, as a session shows and sees it."""
 
-    def __init__(self, session: ShowingSession) -> None:
-        self._session = session
+    def __init__(self, questions: VirtualQuestions) -> None:
+        """questions: of its session."""
+        self._questions, self._session = questions, questions.session
         self.shown: Counter[str] = Counter()
         """Token of this session → how often it is declared."""
         self.watching: list[VirtualWatch] = []
@@ -109,7 +102,7 @@ class Liveliness:
         self, key: str, handler: Callback | None = None, timeout: float = QUERY_SECONDS
     ) -> Iterator[VirtualReply] | None:
         """Who is there now; the handler gets that, if there is one. Raises ZError if the session is closed."""
-        return self._session.questions.ask(TransportFrame("liveliness_query", key), timeout, handler)
+        return self._questions.ask(TransportFrame("liveliness_query", key), timeout, handler)
 
     def known(self, key: str, but: End | None = None) -> list[str]:
         """The tokens that this session knows: its own, and those from all ends but one."""

@@ -9,7 +9,8 @@ import errno
 import os
 import socket
 import ssl
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self, final
@@ -30,6 +31,7 @@ _OPEN_SECONDS = 2e-3
 _OPEN_MS, _POLL_SECONDS = 10_000, 0.05
 _SLOW = 300.0
 """By which a slow connection takes longer."""
+_NEVER_SECONDS = 86_400.0
 _UNKNOWN = "unknown"
 """The name of a host that no host knows."""
 
@@ -232,7 +234,7 @@ class VirtualZenoh:
 
         def try_after(seconds: float) -> None:
             if seconds < _NEVER_SECONDS:
-                self.scheduler.at(self.scheduler.now + seconds, attempt)
+                self.scheduler.after_seconds(seconds, attempt)
 
         try_after(self.scheduler.random.expovariate(1.0 / _OPEN_SECONDS))
 
@@ -247,7 +249,7 @@ class VirtualZenoh:
         """A process is suspended: after the lease, the others take it for gone."""
         for session in self._sessions:
             if session.task is task:
-                self.scheduler.at(self.scheduler.now + session.lease, lambda session=session: self._expire(session))  # type: ignore[misc]
+                self.scheduler.after_seconds(session.lease, partial(self._expire, session))
 
     def _expire(self, session: VirtualSession) -> None:
         if session.task.stopped and self.scheduler.now >= session.task.since + session.lease:
@@ -256,11 +258,11 @@ class VirtualZenoh:
 
     # What a nemesis does
 
-    def _connections(self, process: str) -> Iterator[VirtualConnection]:
-        for session in self._sessions:
-            if session.name == process:
-                for end in [*session.ends]:
-                    yield end.connection
+    def _connections(self, process: str) -> list[VirtualConnection]:
+        return [end.connection for session in self._sessions if session.name == process for end in session.ends]
+
+    def _has_session(self, process: str) -> bool:
+        return any(session.name == process for session in self._sessions)
 
     @property
     def clients(self) -> list[str]:
@@ -269,56 +271,57 @@ class VirtualZenoh:
 
     def cut(self, process: str, seconds: float | None) -> bool:
         """Cut the connections of a process, which cannot be made again, nor for the first time, for some time, or for good."""
-        self._cut[process] = float("inf") if seconds is None else self.scheduler.now + seconds
+        self._cut[process] = self.scheduler.later(seconds)
         for connection in self._connections(process):
             connection.close("is cut")
         return True
 
     def freeze(self, process: str, seconds: float | None) -> bool:
         """Let nothing through the connections of a process for some time, or for good."""
-        hit = False
-        for connection in self._connections(process):
-            connection.freeze(seconds, min(end.session.lease for end in connection.ends))
-            hit = True
-        if hit:
-            self._cut[process] = float("inf") if seconds is None else self.scheduler.now + seconds
-        return hit
+        connections = self._connections(process)
+        for connection in connections:
+            connection.freeze(seconds)
+        if connections:
+            self._cut[process] = self.scheduler.later(seconds)
+        return bool(connections)
 
     def clog(self, router: str) -> bool:
         """Let nothing through the connections of a router for good, though both ends of each take the other for alive."""
-        connections = [*self._connections(router)]
+        connections = self._connections(router)
         for connection in connections:
-            connection.freeze(None, None)
+            connection.freeze(None, noticed=False)
         return bool(connections)
 
     def unplug(self, host: str, seconds: float | None) -> None:
         """Let nothing through between the processes of a host and all others for some time, or for good."""
-        self._unplugged[host] = float("inf") if seconds is None else self.scheduler.now + seconds
+        self._unplugged[host] = self.scheduler.later(seconds)
         for session in self._sessions:
-            for end in [*session.ends] if session.task.host == host else ():
+            for end in session.ends if session.task.host == host else ():
                 if end.other.session.task.host != host:
-                    end.connection.freeze(seconds, min(side.session.lease for side in end.connection.ends))
+                    end.connection.freeze(seconds)
 
     def slow(self, process: str, seconds: float | None) -> bool:
         """Make everything on the connections of a process take longer for some time, or for good."""
-        hit = False
-        for connection in self._connections(process):
+        connections = self._connections(process)
+        for connection in connections:
             connection.slow(_SLOW, seconds)
-            hit = True
-        return hit
+        return bool(connections)
 
     def confuse(self, process: str) -> bool:
         """Let the next message to a process arrive at the subscriber of another key."""
-        return self._mark(process, self._confused)
+        if hit := self._has_session(process):
+            self._confused.add(process)
+        return hit
 
     def confused(self, session: VirtualSession) -> bool:
         """Whether the message that a session gets now is to arrive at the wrong subscriber."""
-        return self._unmark(session, self._confused)
+        hit = session.name in self._confused
+        self._confused.discard(session.name)
+        return hit
 
     def change(self, process: str, change: Callable[[bytes], bytes | None]) -> bool:
         """Let the next message to a process for which `change` has another one be that one when it arrives."""
-        hit = any(session.name == process for session in self._sessions)
-        if hit:
+        if hit := self._has_session(process):
             self._changes[process] = change
         return hit
 
@@ -336,23 +339,6 @@ class VirtualZenoh:
     def occupy(self, place: str, says: bytes = b"") -> None:
         """Let another program listen at an endpoint, so that no router can; it hangs up unless it says something."""
         self._occupied[_address(place)] = says
-
-    def _mark(self, process: str, marked: set[str]) -> bool:
-        """Mark a process, if it has a session."""
-        hit = any(session.name == process for session in self._sessions)
-        if hit:
-            marked.add(process)
-        return hit
-
-    @staticmethod
-    def _unmark(session: VirtualSession, marked: set[str]) -> bool:
-        """Whether the process of a session was marked."""
-        hit = session.name in marked
-        marked.discard(session.name)
-        return hit
-
-
-_NEVER_SECONDS = 86_400.0
 
 
 def _address(place: str) -> Address:

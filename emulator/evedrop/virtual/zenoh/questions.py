@@ -9,48 +9,26 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import zenoh
 
-from evedrop.virtual.zenoh.access import Access, includes, intersects
-from evedrop.virtual.zenoh.handlers import (
-    Callback,
-    Channel,
-    HandlingSession,
-    Taker,
-    VirtualDeclaration,
-    items_of,
-    taker_of,
+from evedrop.virtual.zenoh.access import includes, intersects
+from evedrop.virtual.zenoh.handlers import Callback, Channel, Taker, VirtualDeclaration, items_of, taker_of
+from evedrop.virtual.zenoh.transport import (
+    AnySession,
+    End,
+    MatchingStatus,
+    ReplyError,
+    TransportFrame,
+    VirtualReply,
+    bytes_of,
+    details_of,
 )
-from evedrop.virtual.zenoh.items import MatchingStatus, ReplyError, VirtualReply, VirtualSample, bytes_of
-from evedrop.virtual.zenoh.transport import Details, End, TransportFrame
 
 QUERY_SECONDS = 10.0
 """How long a question takes at most, if the program does not say."""
 _NO_LIMIT = sys.maxsize
-
-
-class AskingSession(HandlingSession, Protocol):
-    """The part of a session that its questions use."""
-
-    router: bool
-    """Whether it is a router's."""
-    access: Access
-    ends: list[End]
-    questions: VirtualQuestions
-
-    def expect_open(self) -> None:
-        """Raise ZError if it is closed."""
-
-    def declare(self, kind: str, key: str) -> None:
-        """Tell all ends of a declaration."""
-
-    def withdraw(self, kind: str, key: str) -> None:
-        """Tell all ends that a declaration is withdrawn."""
-
-    def tokens_to_tell(self, key: str) -> list[str]:
-        """The liveliness tokens that a question finds at it."""
 
 
 @final
@@ -59,8 +37,8 @@ class VirtualQuery:
 
     parameters = ""
 
-    def __init__(self, session: AskingSession, frame: TransportFrame, number: int) -> None:
-        self._session, self.key_expr, self._number = session, frame.key, number
+    def __init__(self, questions: VirtualQuestions, frame: TransportFrame, number: int) -> None:
+        self._questions, self.key_expr, self._number = questions, frame.key, number
         self.payload = zenoh.ZBytes(frame.payload) if frame.payload else None
         self.encoding = frame.details.encoding
         self.attachment, self.source_info = frame.details.attachment, frame.details.source_info
@@ -84,17 +62,17 @@ class VirtualQuery:
         self._answer("error", self.key_expr, payload, details)
 
     def _answer(self, kind: str, key: str, payload: bytes | str | zenoh.ZBytes, details: Mapping[str, Any]) -> None:
-        self._session.expect_open()
+        self._questions.session.expect_open()
         if self._open:
-            self._session.questions.take(
-                None, TransportFrame(kind, key, bytes_of(payload), self._number, Details.of(**details))
+            self._questions.take(
+                None, TransportFrame(kind, key, bytes_of(payload), self._number, details_of(**details))
             )
 
     def drop(self) -> None:
         """Give no further answer."""
         if self._open:
             self._open = False
-            self._session.questions.take(None, TransportFrame("final", self.key_expr, b"", self._number))
+            self._questions.take(None, TransportFrame("final", self.key_expr, b"", self._number))
 
 
 @final
@@ -102,23 +80,23 @@ class VirtualQuery:
 class VirtualQueryable(VirtualDeclaration):
     """Answers questions at a key expression, by a function."""
 
-    session: AskingSession
+    questions: VirtualQuestions
     key: str
     taker: Taker
 
     def undeclare(self) -> None:
         """Answer no more."""
         self.taker.end()
-        self.session.questions.withdraw(self)
+        self.questions.withdraw(self)
 
 
 @final
 class VirtualQuerier(VirtualDeclaration):
     """Asks others, but not its own session, at a key expression."""
 
-    def __init__(self, session: AskingSession, key: str, timeout: float, latest: bool) -> None:
+    def __init__(self, questions: VirtualQuestions, key: str, timeout: float, latest: bool) -> None:
         """latest: whether its questions get the latest answer of each key."""
-        self._session, self._key, self._timeout, self._latest = session, key, timeout, latest
+        self._questions, self._key, self._timeout, self._latest = questions, key, timeout, latest
 
     def get(
         self,
@@ -132,14 +110,14 @@ class VirtualQuerier(VirtualDeclaration):
     ) -> None:
         """Ask; the handler gets the answers, and is told when there are no more. Raises ZError if the session is closed."""
         del parameters
-        details = Details.of(encoding=encoding, attachment=attachment, source_info=source_info)
+        details = details_of(encoding=encoding, attachment=attachment, source_info=source_info)
         frame = TransportFrame("query", self._key, bytes_of(payload), 0, details)
-        self._session.questions.ask(frame, self._timeout, handler, remote=True, latest=self._latest)
+        self._questions.ask(frame, self._timeout, handler, remote=True, latest=self._latest)
 
     @property
     def matching_status(self) -> MatchingStatus:
         """Whether somebody answers all questions at the key expression. Raises ZError if the session is closed."""
-        return MatchingStatus(self._session.questions.has_answer(self._key))
+        return MatchingStatus(self._questions.has_answer(self._key))
 
 
 @dataclass
@@ -161,30 +139,30 @@ class _Asked:
 class VirtualQuestions:
     """The questions of a session: its own, and those that it passes on."""
 
-    def __init__(self, session: AskingSession) -> None:
-        self._session = session
+    def __init__(self, session: AnySession) -> None:
+        self.session = session
         self.answering: list[VirtualQueryable] = []
         """What this session answers."""
         self._asked: dict[int, _Asked] = {}
 
     def declare_queryable(self, key: str, handler: Callable[[VirtualQuery], object]) -> VirtualQueryable:
         """Answer questions at a key expression. Raises ZError if the session is closed."""
-        self._session.expect_open()
-        queryable = VirtualQueryable(self._session, key, taker_of(self._session, handler))
+        self.session.expect_open()
+        queryable = VirtualQueryable(self, key, taker_of(self.session, handler))
         self.answering.append(queryable)
-        self._session.declare("declare_queryable", key)
+        self.session.declare("declare_queryable", key)
         return queryable
 
     def withdraw(self, queryable: VirtualQueryable) -> None:
         """Answer no more questions there."""
         if queryable in self.answering:
             self.answering.remove(queryable)
-            self._session.withdraw("declare_queryable", queryable.key)
+            self.session.withdraw("declare_queryable", queryable.key)
 
     def has_answer(self, key: str) -> bool:
         """Whether somebody else answers all questions at a key. Raises ZError if the session is closed."""
-        self._session.expect_open()
-        return any(includes(pattern, key) for end in self._session.ends for pattern in end.answers)
+        self.session.expect_open()
+        return any(includes(pattern, key) for end in self.session.ends for pattern in end.answers)
 
     def ask(
         self,
@@ -199,12 +177,12 @@ class VirtualQuestions:
 
         remote: only others. latest: to get the latest answer of each key, when there are no more.
         """
-        session = self._session
+        session = self.session
         session.expect_open()
         channel = Channel(session, _NO_LIMIT)
         taker = channel if handler is None else taker_of(session, handler)
         number = self._pass_on(_Asked(None, 0, [], taker, {} if latest else None), frame, remote=remote)
-        session.scheduler.at(session.scheduler.now + timeout, lambda: self._give_up(number))
+        session.scheduler.after_seconds(timeout, lambda: self._give_up(number))
         session.scheduler.interruptible()
         return items_of(channel) if handler is None else None
 
@@ -239,27 +217,27 @@ class VirtualQuestions:
 
     def _pass_on(self, asked: _Asked, frame: TransportFrame, *, remote: bool = False) -> int:
         """Ask all who may answer a question; returns its number here."""
-        number, source = self._session.scheduler.number(), asked.asker
+        number, source = self.session.scheduler.number(), asked.asker
         targets: list[End] = []
         liveliness = frame.kind == "liveliness_query"
-        for end in self._session.ends:
-            if end is source or (source is not None and not self._session.router):
+        for end in self.session.ends:
+            if end is source or (source is not None and not self.session.router):
                 continue
-            upward = end.to_router and not self._session.router
+            upward = end.to_router and not self.session.router
             wanted = upward or (not liveliness and any(intersects(pattern, frame.key) for pattern in end.answers))
-            if wanted and (upward or self._session.access.allows(end.peer, "egress", frame.kind, frame.key)):
+            if wanted and (upward or self.session.access.allows(end.peer, "egress", frame.kind, frame.key)):
                 targets.append(end)
         own = () if liveliness or remote else self.answering
         takers = [queryable.taker for queryable in own if intersects(queryable.key, frame.key)]
         asked.left = [*targets, *([None] * len(takers))]
         self._asked[number] = asked
         if liveliness:
-            for token in self._session.tokens_to_tell(frame.key):
+            for token in self.session.tokens_to_tell(frame.key):
                 self._reply(TransportFrame("reply", token), asked)
         for target in targets:
             target.send(frame._replace(number=number))
         for taker in takers:
-            taker.put(VirtualQuery(self._session, frame, number))
+            taker.put(VirtualQuery(self, frame, number))
         if not asked.left and number in self._asked:  # unless a queryable has just ended it
             self._finish(number)
         return number
@@ -267,16 +245,16 @@ class VirtualQuestions:
     def _reply(self, frame: TransportFrame, asked: _Asked) -> None:
         if asked.asker is not None:
             kind = "reply" if frame.payload else "liveliness_token"
-            if self._session.access.allows(asked.asker.peer, "egress", kind, frame.key):
+            if self.session.access.allows(asked.asker.peer, "egress", kind, frame.key):
                 asked.asker.send(frame._replace(number=asked.asked_as))
         elif asked.replies is not None:
             if frame.kind == "error":
                 error = ReplyError(zenoh.ZBytes(frame.payload), frame.details.encoding)
                 asked.replies.put(VirtualReply(None, error))
             elif asked.latest is None:
-                asked.replies.put(VirtualReply(VirtualSample.of(frame)))
+                asked.replies.put(VirtualReply(frame.sample()))
             else:
-                asked.latest[frame.key] = VirtualReply(VirtualSample.of(frame))
+                asked.latest[frame.key] = VirtualReply(frame.sample())
 
     def _finish(self, number: int, *errors: VirtualReply) -> None:
         asked = self._asked.pop(number)

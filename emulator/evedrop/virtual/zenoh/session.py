@@ -26,14 +26,6 @@ from evedrop.virtual.zenoh.handlers import (
     items_of,
     taker_of,
 )
-from evedrop.virtual.zenoh.items import (
-    MatchingStatus,
-    TransportEvent,
-    VirtualReply,
-    VirtualSample,
-    VirtualTransport,
-    bytes_of,
-)
 from evedrop.virtual.zenoh.liveliness import Liveliness, VirtualWatch
 from evedrop.virtual.zenoh.questions import (
     QUERY_SECONDS,
@@ -42,7 +34,17 @@ from evedrop.virtual.zenoh.questions import (
     VirtualQueryable,
     VirtualQuestions,
 )
-from evedrop.virtual.zenoh.transport import Details, End, TransportFrame
+from evedrop.virtual.zenoh.transport import (
+    End,
+    MatchingStatus,
+    TransportEvent,
+    TransportFrame,
+    VirtualReply,
+    VirtualSample,
+    VirtualTransport,
+    bytes_of,
+    details_of,
+)
 
 _LEASE_MS = 10_000
 _PATIENCE_US = 5_000_000
@@ -193,7 +195,7 @@ class VirtualSession:
         self._closed = False
         self._subscribers: list[VirtualSubscriber] = []
         self.questions = VirtualQuestions(self)
-        self._liveliness = Liveliness(self)
+        self._liveliness = Liveliness(self.questions)
         self.connects_to: str | None = None
         task.held.append(self._die)
         self.scheduler.thread("receives", self._receive, task).start()
@@ -278,7 +280,7 @@ class VirtualSession:
     ) -> VirtualQuerier:
         """Ask others at a key expression. Raises ZError if the session is closed."""
         self.expect_open()
-        return VirtualQuerier(self, str(key), timeout, consolidation != zenoh.ConsolidationMode.NONE)
+        return VirtualQuerier(self.questions, str(key), timeout, consolidation != zenoh.ConsolidationMode.NONE)
 
     def put(
         self,
@@ -288,12 +290,12 @@ class VirtualSession:
         allowed_destination: zenoh.Locality = zenoh.Locality.ANY,
         **details: Any,
     ) -> None:
-        """Put a message on a key; details: as `Details`. Raises ZError if the session is closed."""
+        """Put a message on a key; details: as of a `VirtualSample`. Raises ZError if the session is closed."""
         self.expect_open()
         self.task.allocate()
         message = bytes_of(payload)
         self.scheduler.note(notes.PUT, notes.key_within(str(key)), len(message), notes.said_in(message))
-        frame = TransportFrame("put", str(key), message, self.scheduler.events, Details.of(**details))
+        frame = TransportFrame("put", str(key), message, self.scheduler.events, details_of(**details))
         self._pass_on(None, frame, remote=allowed_destination == zenoh.Locality.REMOTE)
         self.scheduler.interruptible()
 
@@ -423,7 +425,7 @@ class VirtualSession:
                 concerned = source is not None or not (remote or subscriber.remote)
                 if concerned and intersects(subscriber.key, frame.key):
                     self.scheduler.note(notes.GETS, self.name, notes.key_within(frame.key), frame.number)
-                    subscriber.taker.put(VirtualSample.of(frame))
+                    subscriber.taker.put(frame.sample())
         for end in [*self.ends]:
             # A router passes on what comes from a client, or goes to one: not from a router to a router.
             if end is source or (source is not None and not self.router):
@@ -441,7 +443,7 @@ class VirtualSession:
             self.scheduler.note(
                 notes.LOST, self.name, notes.key_within(frame.key), frame.number, f"came as {notes.key_within(key)}"
             )
-            subscriber.taker.put(VirtualSample.of(frame, key))
+            subscriber.taker.put(frame.sample(key))
 
     def _tell_others(self, source: End, kind: str, key: str) -> None:
         if self.router:

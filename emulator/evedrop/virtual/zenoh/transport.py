@@ -1,4 +1,4 @@
-"""A connection between two simulated sessions: frames arrive in order, later, or never.
+"""A connection between two simulated sessions: frames arrive in order, later, or never; and what programs get of them.
 
 Source: docs/maintainers/simulated-world.md.
 """
@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, final
 
 import zenoh
 
 from evedrop.virtual import notes
 from evedrop.virtual.scheduler import VirtualQueue, VirtualScheduler, VirtualTask, Waiter
-from evedrop.virtual.zenoh.access import Peer
+from evedrop.virtual.zenoh.access import Access, Peer
 
 _DELAY_SECONDS = 1e-4
 """The mean time of a frame on its way."""
@@ -21,11 +22,14 @@ _NOTICE_SECONDS = 5e-3
 """The mean time until an end notices that the other one is gone."""
 _ROOM = 1 << 20
 """How many bytes are under way to one reader before its sender waits."""
+_NO_BYTES = zenoh.ZBytes(b"")
 
 
-class Details(NamedTuple):
-    """What a message carries besides its payload, in the order of `VirtualSample`."""
+class VirtualSample(NamedTuple):
+    """A message as its reader gets it; on its way, what it carries besides its key and payload."""
 
+    key_expr: str = ""
+    payload: zenoh.ZBytes = _NO_BYTES
     kind: zenoh.SampleKind = zenoh.SampleKind.PUT
     encoding: zenoh.Encoding = zenoh.Encoding.ZENOH_BYTES
     attachment: zenoh.ZBytes | None = None
@@ -40,16 +44,16 @@ class Details(NamedTuple):
         """Whether it waits for room, rather than to be dropped."""
         return self.congestion_control == zenoh.CongestionControl.BLOCK
 
-    @classmethod
-    def of(cls, attachment: bytes | zenoh.ZBytes | None = None, **given: Any) -> Details:
-        """Those that are given, but for None; the others as they are by default."""
-        details = {name: value for name, value in given.items() if value is not None and name in cls._fields}
-        if attachment is not None:
-            details["attachment"] = zenoh.ZBytes(attachment) if isinstance(attachment, bytes) else attachment
-        return cls(**details) if details else NO_DETAILS
+
+PLAIN = VirtualSample()
 
 
-NO_DETAILS = Details()
+def details_of(attachment: bytes | zenoh.ZBytes | None = None, **given: Any) -> VirtualSample:
+    """What a message carries: what is given, but for None; the rest as it is by default."""
+    details = {name: value for name, value in given.items() if value is not None and name in VirtualSample._fields}
+    if attachment is not None:
+        details["attachment"] = zenoh.ZBytes(attachment) if isinstance(attachment, bytes) else attachment
+    return VirtualSample(**details) if details else PLAIN
 
 
 class TransportFrame(NamedTuple):
@@ -60,28 +64,116 @@ class TransportFrame(NamedTuple):
     payload: bytes = b""
     number: int = 0
     """Of the message, or of the question that it belongs to."""
-    details: Details = NO_DETAILS
+    details: VirtualSample = PLAIN
+
+    def sample(self, key: str | None = None) -> VirtualSample:
+        """Its message; key: another one than its own."""
+        return self.details._replace(key_expr=self.key if key is None else key, payload=zenoh.ZBytes(self.payload))
 
 
-class EndOwner(Protocol):
-    """The part of a session that its ends use."""
+@dataclass(frozen=True)
+class VirtualTransport:
+    """Who is at the other end of a connection."""
+
+    zid: str
+    whatami: zenoh.WhatAmI
+    auth_identifier: str | None
+    dst: str
+
+
+@dataclass(frozen=True)
+class TransportEvent:
+    """A connection that was made (`PUT`) or lost (`DELETE`)."""
+
+    kind: zenoh.SampleKind
+    transport: VirtualTransport
+
+    @property
+    def link(self) -> VirtualTransport:
+        """The same: a connection has one link."""
+        return self.transport
+
+
+@dataclass(frozen=True)
+class MatchingStatus:
+    """Whether somebody reads what is published, or answers what is asked."""
+
+    matching: bool
+
+
+@dataclass(frozen=True)
+class ReplyError:
+    """What comes instead of an answer."""
+
+    payload: zenoh.ZBytes
+    encoding: zenoh.Encoding = zenoh.Encoding.ZENOH_BYTES
+
+
+@dataclass(frozen=True)
+class Replier:
+    """Who sent an answer."""
+
+    eid: int
+
+
+QUERYABLE = Replier(1)
+"""A queryable. Zenoh's routing, which sends nothing here, is number 0."""
+
+
+@dataclass(frozen=True)
+class VirtualReply:
+    """An answer to a question, or an error; without a replier that of the querier, whose time for answers is over."""
+
+    ok: VirtualSample | None
+    err: ReplyError | None = None
+    replier_id: Replier | None = QUERYABLE
+
+
+def bytes_of(payload: bytes | str | zenoh.ZBytes | None) -> bytes:
+    """The bytes of what a program puts."""
+    if payload is None or isinstance(payload, bytes):
+        return payload or b""
+    return payload.encode() if isinstance(payload, str) else payload.to_bytes()
+
+
+class AnySession(Protocol):
+    """What the parts of a session use of it."""
 
     scheduler: VirtualScheduler
     task: VirtualTask
     name: str
     """Of its process."""
+    router: bool
+    """Whether it is a router's."""
+    access: Access
     patience: float
     """Seconds that it waits for room before it closes a connection."""
     lease: float
     """Seconds without a word after which it takes the other end for gone."""
     inbox: VirtualQueue
+    ends: list[End]
+
+    def expect_open(self) -> None:
+        """Raise ZError if it is closed."""
+
+    def declare(self, kind: str, key: str) -> None:
+        """Tell all ends of a declaration."""
+
+    def withdraw(self, kind: str, key: str) -> None:
+        """Tell all ends that a declaration is withdrawn."""
+
+    def tokens_to_tell(self, key: str) -> list[str]:
+        """The liveliness tokens that a question finds at it."""
+
+    def lets_out(self, end: End, message: str, key: str) -> bool:
+        """Whether a message may go out to an end."""
 
 
 @final
 class End:
     """One end of a connection, as its session sees it."""
 
-    def __init__(self, session: EndOwner, peer: Peer, to_router: bool) -> None:
+    def __init__(self, session: AnySession, peer: Peer, to_router: bool) -> None:
         """peer: who is at the other end; to_router: whether that is a router."""
         self.session, self.peer, self.to_router = session, peer, to_router
         self.connection: VirtualConnection
@@ -195,18 +287,19 @@ class VirtualConnection:
                 moment = begun + self._scheduler.random.expovariate(1.0 / _NOTICE_SECONDS)
                 self._scheduler.at(moment, lambda end=end: end.session.inbox.put((end, None, 0)))  # type: ignore[misc]
 
-    def freeze(self, seconds: float | None, lease: float | None) -> None:
-        """Let nothing through for some time, or for good; after the lease, both ends take the other one for gone.
+    def freeze(self, seconds: float | None, *, noticed: bool = True) -> None:
+        """Let nothing through for some time, or for good; after the shorter lease, both ends take the other one for gone.
 
-        lease: None if they take it for alive.
+        noticed: whether they do.
         """
         if self.held is None:
             self.held = []
         self._scheduler.note(notes.FREEZES, self.ends[0].session.name, self.ends[1].session.name)
-        if lease is not None and (seconds is None or seconds >= lease):
-            self._scheduler.at(self._scheduler.now + lease, lambda: self.close("nothing came for the lease"))
-        elif seconds is not None:
-            self._scheduler.at(self._scheduler.now + seconds, self._thaw)
+        lease = min(end.session.lease for end in self.ends)
+        if noticed and (seconds is None or seconds >= lease):
+            self._scheduler.after_seconds(lease, lambda: self.close("nothing came for the lease"))
+        else:
+            self._scheduler.after_seconds(seconds, self._thaw)
 
     def _thaw(self) -> None:
         held, self.held = self.held, None
@@ -215,5 +308,4 @@ class VirtualConnection:
 
     def slow(self, factor: float, seconds: float | None) -> None:
         """Make everything take longer for some time, or for good."""
-        self._factor = factor
-        self._slow_until = float("inf") if seconds is None else self._scheduler.now + seconds
+        self._factor, self._slow_until = factor, self._scheduler.later(seconds)
