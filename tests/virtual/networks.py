@@ -157,11 +157,13 @@ class Network(ABC):
         lease: float = 10.0,
         zid: str | None = None,
         timeout_ms: int = 0,
+        peer: bool = False,
     ) -> Config:
         """A configuration of Zenoh.
 
         to: the router that it connects with. retry: whether it connects again by itself. patience: how many seconds it waits
         for room before it closes a connection. lease: after how many seconds of silence the other end takes it for gone.
+        peer: whether it is one.
         """
         retries = _OFTEN_MS if retry or router else _NEVER_MS
         auth: Config = {}
@@ -172,7 +174,7 @@ class Network(ABC):
         if user is not None:
             auth |= {"user": user, "password": secret}
         return {
-            "mode": "router" if router else "client",
+            "mode": "router" if router else "peer" if peer else "client",
             **({"listen": {"endpoints": [self.place(name)], "exit_on_failure": True}} if router else {}),
             **({"id": zid} if zid else {}),
             "connect": {
