@@ -13,8 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from evedrop.results.tables import JOURNAL
-from evedrop.virtual.fates import journal_rows
-from evedrop.virtual.reference import RunReference
+from evedrop.virtual.reference import RunReference, journal_rows
 from tests.faults import judge, ours
 from tests.faults.cases import PATIENT_SECONDS
 from tests.faults.kinds import Fault

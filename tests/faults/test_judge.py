@@ -21,7 +21,7 @@ import pytest
 from evedrop.results.reading import Results
 from evedrop.virtual.metrics import unlike_digests, unlike_memory, unlike_rows
 from evedrop.virtual.reference import RunReference, tables_of
-from evedrop.virtual.whole import missing_rows
+from evedrop.virtual.results import missing_rows
 from tests.conftest import wait_until
 from tests.examples import mostly_long
 from tests.faults import ours

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from evedrop.scenario.tables import Scenario
-from evedrop.virtual import faults, host_faults, host_parts, lacks
+from evedrop.virtual import faults, host_faults, host_parts
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY as ALL
 from evedrop.virtual.disturbance import LAUNCHER, Disturbance
@@ -25,8 +25,8 @@ OF_KINDS: Mapping[str, type[Disturbance]] = {
     "terminate": faults.TerminateProcess,
     "stop": faults.StopProcess,
     "stop and kill": faults.StopAndKillProcess,
-    "few processes": lacks.LackThreads,
-    "little memory": lacks.LackMemory,
+    "few processes": faults.LackThreads,
+    "little memory": faults.LackMemory,
     CONFUSED: faults.ConfuseKeys,
     "flap": faults.FlapConnection,
     "cut": faults.CutConnection,

@@ -9,7 +9,7 @@ import pytest
 from evedrop.cli.simulated import program
 from evedrop.results.reading import Results
 from evedrop.scenario.tables import Scenario
-from evedrop.virtual import campaign, faults, judge, lacks, notes, outsiders
+from evedrop.virtual import campaign, faults, judge, notes, outsiders
 from evedrop.virtual.campaign import play_case
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, LAUNCHER, Disturbance
@@ -43,9 +43,9 @@ STARTS, RUNS = 26, 90
         (faults.ShortenMessage("recorder", RUNS + 5), 3, "broke the protocol"),
         (faults.RenameResults("results", RUNS), 0, ""),
         (faults.RemoveResults("results", RUNS), 3, "was removed while the run went on"),
-        (lacks.LackThreads("machine", STARTS), 3, "cannot be started (Resource temporarily unavailable)"),
-        (lacks.LackMemory("eve", RUNS), 3, "there is not enough memory"),
-        (lacks.LackMemory(LAUNCHER, STARTS), 3, "there is not enough memory"),
+        (faults.LackThreads("machine", STARTS), 3, "cannot be started (Resource temporarily unavailable)"),
+        (faults.LackMemory("eve", RUNS), 3, "there is not enough memory"),
+        (faults.LackMemory(LAUNCHER, STARTS), 3, "there is not enough memory"),
         (outsiders.AskStatus("run", RUNS), 0, ""),
         (outsiders.PauseRun("run", RUNS, 2.0), 0, ""),
         (outsiders.LetStrangerIn("run", RUNS), 0, ""),
@@ -79,7 +79,7 @@ def test_everybody_is_cut_off() -> None:
 
 def test_a_machine_that_lacks_threads_for_some_time_has_them_again() -> None:
     """A router that is killed then cannot be started again; one that is killed later can."""
-    lack = lacks.LackThreads("machine", RUNS, 0.2)
+    lack = faults.LackThreads("machine", RUNS, 0.2)
     assert disturbed(lack, faults.KillProcess("router", RUNS + 1)).run.status == 3
     assert disturbed(lack, faults.KillProcess("router", RUNS + 60)).run.status == 0
 
@@ -90,7 +90,7 @@ def test_a_router_that_lacks_memory_says_so(after: int) -> None:
     tables = SCENARIO.as_tables()
     delayed = {"quality": 0.9, "delay": {"model": "constant", "value": 0.4}}
     scenario = Scenario({**tables, "legitimate": {"link": delayed}, "eavesdroppers": {}})
-    case = SimulatedCase(1, scenario, (lacks.LackMemory("router", after),))
+    case = SimulatedCase(1, scenario, (faults.LackMemory("router", after),))
     played = play_case(case, program)
     assert played.misses == ()
     assert "there is not enough memory" in played.run.said

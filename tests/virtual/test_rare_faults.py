@@ -15,13 +15,12 @@ from evedrop.model.receiver import Action
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual import by_hand, notes, rereading
 from evedrop.virtual.broken_messages import BreakMessage, broken
-from evedrop.virtual.by_hand import WriteBriefs
+from evedrop.virtual.by_hand import RunByHand, RunWrongly, WriteBriefs
 from evedrop.virtual.campaign import play_case
 from evedrop.virtual.cases import SimulatedCase, case_from, case_of
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.rare_faults import RARE_KINDS, ReadMetrics, SteerRun, TakePort
 from evedrop.virtual.rereading import RereadMessages
-from evedrop.virtual.runs_by_hand import RunByHand, RunWrongly
 from tests.virtual.disturbed_runs import RELAYED, SCENARIO, disturbed
 
 RUNS = 90

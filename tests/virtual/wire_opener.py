@@ -13,8 +13,7 @@ from typing import Any
 from evedrop.errors import EvedropError, UsageError
 from evedrop.system.output import say
 from evedrop.system.world import world
-from evedrop.virtual.children import ChildProcess
-from evedrop.virtual.processes import VirtualMachine
+from evedrop.virtual.processes import ChildProcess, VirtualMachine
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.running import ExpectationFailed, RunningWire, described_wire
 from tests.virtual.wire_programs import Course

@@ -18,6 +18,8 @@ EXCEPTIONS = {
     "emulator/evedrop/virtual/zenoh/session.py recv self.handler.recv": VIRTUAL,
     "emulator/evedrop/virtual/zenoh/session.py _receive self.inbox.get": VIRTUAL,
     "emulator/evedrop/virtual/processes.py _serve self._requests.get": VIRTUAL,
+    "emulator/evedrop/virtual/processes.py _report process.wait": VIRTUAL,
+    "emulator/evedrop/virtual/other_hosts.py serve program.wait": VIRTUAL,
     "emulator/evedrop/virtual/scheduler.py wait self._lock.acquire": VIRTUAL,
     "emulator/evedrop/virtual/scheduler.py __enter__ self.acquire": VIRTUAL,
     "emulator/evedrop/virtual/scheduler.py __enter__ self._lock.acquire": VIRTUAL,

@@ -14,7 +14,7 @@ from evedrop.errors import UsageError
 from evedrop.live.launch.briefs import MOST_SLOTS_AHEAD
 from evedrop.scenario.loading import Scenario
 from evedrop.virtual.broken_messages import BreakMessage
-from evedrop.virtual.by_hand import WriteBriefs
+from evedrop.virtual.by_hand import RunByHand, WriteBriefs
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import KINDS, faults_of
 from evedrop.virtual.drawn_hosts import DrawnHosts, drawn_hosts, kind_with
@@ -22,7 +22,6 @@ from evedrop.virtual.drawn_scenarios import scenario_of
 from evedrop.virtual.faults import ClogRouter, ShortenMessage
 from evedrop.virtual.programs import DrawnProgram, drawn_program
 from evedrop.virtual.rare_faults import RARE_KINDS, rare_faults
-from evedrop.virtual.runs_by_hand import RunByHand
 
 SEEDS_OF_A_SCENARIO = 6
 """How many seeds after each other play the same scenario: the same trials in memory are computed once for all of them."""

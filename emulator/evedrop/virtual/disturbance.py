@@ -59,6 +59,8 @@ class Disturbance(ABC):
     """Whether all that it does is to cut its target off from the others."""
     early: ClassVar[bool] = False
     """Whether it strikes before everything else."""
+    loses: ClassVar[bool] = True
+    """Whether messages may be lost by it."""
     only_target: ClassVar[str]
     """What it hits, if that is the same in every run."""
     harmless: ClassVar[bool | None] = None

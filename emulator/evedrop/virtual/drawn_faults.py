@@ -13,7 +13,7 @@ from evedrop.live.launch.briefs import flow_of
 from evedrop.model.schemes import SCHEMES
 from evedrop.names import CONTROLLER, LEGITIMATE, RECORDER, SENSOR
 from evedrop.scenario.tables import Scenario
-from evedrop.virtual import faults, lacks, outsiders
+from evedrop.virtual import faults, outsiders
 from evedrop.virtual.disturbance import ROUTERS, Disturbance, processes_of
 from evedrop.virtual.moments import (
     ACKNOWLEDGED,
@@ -80,8 +80,8 @@ KINDS: Mapping[str, type[Disturbance]] = {
         faults.CutPower,
         faults.RenameResults,
         faults.RemoveResults,
-        lacks.LackThreads,
-        lacks.LackMemory,
+        faults.LackThreads,
+        faults.LackMemory,
         outsiders.AskStatus,
         outsiders.PauseRun,
         outsiders.ChangeLink,

@@ -18,7 +18,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.virtual.disk import DiskFault
 from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance, processes_of
 from evedrop.virtual.host_parts import host_of, part_of
-from evedrop.virtual.processes import FORK_SERVERS
+from evedrop.virtual.processes import FORK_SERVERS, VirtualProcess
 
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld
@@ -41,14 +41,32 @@ class _OfProcess(Disturbance):
         """All processes, and rather those which all others need."""
         return [LAUNCHER, *FORK_SERVERS, *processes_of(scenario), ROUTER, SENSOR, RECORDER]
 
+    def strike(self, world: SimulatedWorld) -> bool:
+        """Do it, if the process runs."""
+        process = world.process(self.target)
+        return process is not None and self.disturb(world, process)
+
+    @abstractmethod
+    def disturb(self, world: SimulatedWorld, process: VirtualProcess) -> bool:
+        """Do it to a process; returns whether it hit anything."""
+
 
 class _EndProcess(_OfProcess):
     """Its target ends."""
+
+    number: ClassVar[signal.Signals]
+    """The signal that it gets."""
 
     def survived(self, longest_outage: float) -> bool:
         """Whether it is a router, which the launcher starts again."""
         del longest_outage
         return self.target in ROUTERS
+
+    def disturb(self, world: SimulatedWorld, process: VirtualProcess) -> bool:
+        """Send it the signal."""
+        del world
+        process.signal(self.number)
+        return True
 
 
 class _Kill(_EndProcess):
@@ -69,11 +87,7 @@ class _Kill(_EndProcess):
 class KillProcess(_Kill):
     """SIGKILL. A router is started again."""
 
-    kind, share = "kill", 14
-
-    def strike(self, world: SimulatedWorld) -> bool:
-        """Kill it."""
-        return _signal(world, self.target, signal.SIGKILL)
+    kind, share, number = "kill", 14, signal.SIGKILL
 
 
 @final
@@ -83,9 +97,9 @@ class StopAndKillProcess(_Kill):
     kind, share = "stop and kill", 4
     lasts, for_good = True, False
 
-    def strike(self, world: SimulatedWorld) -> bool:
+    def disturb(self, world: SimulatedWorld, process: VirtualProcess) -> bool:
         """Suspend it, and kill it later."""
-        return _suspend(world, self.target, self.seconds, signal.SIGKILL)
+        return _suspend(world, process, self.seconds, signal.SIGKILL)
 
     def survived(self, longest_outage: float) -> bool:
         """Whether it is a router, and not suspended for too long."""
@@ -95,16 +109,10 @@ class StopAndKillProcess(_Kill):
 class _Signal(_EndProcess):
     """A signal that ends a run if its launcher gets it."""
 
-    number: ClassVar[signal.Signals]
-
     @property
     def statuses(self) -> frozenset[int]:
         """Those of any failure, and that of an interrupt."""
         return super().statuses | {Interrupted.exit_status}
-
-    def strike(self, world: SimulatedWorld) -> bool:
-        """Ask it to end."""
-        return _signal(world, self.target, self.number)
 
 
 @final
@@ -139,11 +147,11 @@ class StopProcess(_OfProcess):
     """SIGSTOP, and SIGCONT after some time."""
 
     kind, share = "stop", 14
-    lasts, cuts_off = True, True
+    lasts, cuts_off, loses = True, True, False
 
-    def strike(self, world: SimulatedWorld) -> bool:
+    def disturb(self, world: SimulatedWorld, process: VirtualProcess) -> bool:
         """Suspend it."""
-        return _suspend(world, self.target, self.seconds, signal.SIGCONT)
+        return _suspend(world, process, self.seconds, signal.SIGCONT)
 
     def survived(self, longest_outage: float) -> bool:
         """A fork server has some seconds to tell of the end of a process; for a recorder, the time stands still."""
@@ -164,11 +172,11 @@ class StopProcess(_OfProcess):
 
 
 @final
-class HangProcess(Disturbance):
+class HangProcess(_OfProcess):
     """The thread that does a process's work does not go on for some time, as on a disk that does not answer; others do."""
 
     kind, share = "hang", 12
-    lasts, cuts_off = True, True
+    lasts, cuts_off, loses = True, True, False
 
     @classmethod
     def targets(cls, scenario: Scenario) -> Sequence[str]:
@@ -180,11 +188,8 @@ class HangProcess(Disturbance):
         """It; or who waits for what comes from it, directly or not, is as silent, and says on what it waits."""
         return (*super().blamed, "waits on ", "has not sent", "did not report")
 
-    def strike(self, world: SimulatedWorld) -> bool:
+    def disturb(self, world: SimulatedWorld, process: VirtualProcess) -> bool:
         """Hold it up."""
-        process = world.process(self.target)
-        if process is None:
-            return False
         world.scheduler.hang(process.task.threads[0], self.seconds)
         return True
 
@@ -194,17 +199,15 @@ class DelayThread(_OfProcess):
     """One of the other threads of a process does not go on for some time, as on a machine that is busy."""
 
     kind, share = "delay a thread of", 12
-    lasts, for_good, harmless = True, False, True
+    lasts, for_good, harmless, loses = True, False, True, False
     most_seconds = 1.0
 
-    def strike(self, world: SimulatedWorld) -> bool:
+    def disturb(self, world: SimulatedWorld, process: VirtualProcess) -> bool:
         """Hold one up that the seed chooses."""
-        process = world.process(self.target)
-        others = [] if process is None else [thread for thread in process.task.threads[1:] if not thread.over]
-        if not others:
-            return False
-        world.scheduler.hang(world.scheduler.random.choice(others), self.seconds)
-        return True
+        others = [thread for thread in process.task.threads[1:] if not thread.over]
+        if others:
+            world.scheduler.hang(world.scheduler.random.choice(others), self.seconds)
+        return bool(others)
 
 
 class _OfConnection(Disturbance):
@@ -444,20 +447,55 @@ class RemoveResults(_OfResults):
         return there
 
 
-def _signal(world: SimulatedWorld, target: str, number: signal.Signals) -> bool:
-    process = world.process(target)
-    if process is None:
-        return False
-    process.signal(number)
-    return True
-
-
-def _suspend(world: SimulatedWorld, target: str, seconds: float | None, number: signal.Signals) -> bool:
+def _suspend(world: SimulatedWorld, process: VirtualProcess, seconds: float | None, number: signal.Signals) -> bool:
     """Suspend a process, and send it a signal after some time."""
-    process = world.process(target)
-    if process is None:
-        return False
     process.signal(signal.SIGSTOP)
-    if seconds is not None:
-        world.scheduler.at(world.scheduler.now + seconds, lambda: process.signal(number))
+    world.scheduler.after_seconds(seconds, lambda: process.signal(number))
     return True
+
+
+class _Lack(Disturbance):
+    """There is too little of something: a process that needs it ends, and says what it lacks."""
+
+    lacking, harmless = True, False
+
+    @property
+    def blamed(self) -> tuple[str, ...]:
+        """What is lacking, or who could not be started for that reason."""
+        return (
+            "not enough memory",
+            "no further process or thread can be started",
+            "cannot be started",
+            "resource",
+        )
+
+
+@final
+class LackThreads(_Lack):
+    """No thread and no process can be started for some time, or any more."""
+
+    kind, share = "take the threads of", 3
+    lasts, only_target = True, "machine"
+
+    def strike(self, world: SimulatedWorld) -> bool:
+        """Let it have none."""
+        world.machine.no_threads_until = world.scheduler.later(self.seconds)
+        return True
+
+
+@final
+class LackMemory(_Lack, _OfProcess):
+    """A process does not get the memory that it asks for next."""
+
+    kind, share = "take the memory of", 4
+
+    @classmethod
+    def targets(cls, scenario: Scenario) -> Sequence[str]:
+        """All processes."""
+        return [LAUNCHER, *processes_of(scenario)]
+
+    def disturb(self, world: SimulatedWorld, process: VirtualProcess) -> bool:
+        """Let its next large allocation fail."""
+        del world
+        process.task.lacks_memory = True
+        return True

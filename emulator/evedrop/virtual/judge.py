@@ -252,7 +252,7 @@ def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
         brief = fault.seconds is not None and fault.seconds <= 1.0
         if not brief:
             most += _FAULT_SECONDS
-        elif not isinstance(fault, StopProcess | HangProcess | DelayThread):
+        elif fault.loses:
             most += _BRIEF_SECONDS
         most += fault.seconds or 0.0
         if fault.target == EVERYBODY or scenario.timeline.holds:  # what was lost may have to be asked for twice

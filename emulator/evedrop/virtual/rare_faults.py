@@ -15,14 +15,13 @@ from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.scenario.tables import Scenario
 from evedrop.system.world import world as here
 from evedrop.virtual.broken_messages import BreakMessage
-from evedrop.virtual.by_hand import WriteBriefs
+from evedrop.virtual.by_hand import RunByHand, RunWrongly, WriteBriefs
 from evedrop.virtual.disturbance import LAUNCHER, Disturbance
 from evedrop.virtual.drawn_faults import events_of
 from evedrop.virtual.faults import CutConnection, RenameResults
 from evedrop.virtual.moments import COMMANDS, DECISIONS, FINAL_BELIEFS, PROGRESS_OF_RECEIVERS
 from evedrop.virtual.outsiders import ChangeLink, OperatorCommand, PauseRun
 from evedrop.virtual.rereading import RereadMessages
-from evedrop.virtual.runs_by_hand import RunByHand, RunWrongly
 
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld

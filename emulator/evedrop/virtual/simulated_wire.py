@@ -15,8 +15,7 @@ from typing import Any, BinaryIO, Generic, ParamSpec, Self, TextIO, TypeVar, cas
 from evedrop.errors import RunError, UsageError
 from evedrop.system.signals import INTERRUPTED
 from evedrop.virtual.caller import CallerWorld
-from evedrop.virtual.children import ChildProcess
-from evedrop.virtual.processes import Program, VirtualProcess
+from evedrop.virtual.processes import ChildProcess, Program, VirtualProcess
 from evedrop.virtual.scheduler import Ended
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.running import RunningWire, described_wire
