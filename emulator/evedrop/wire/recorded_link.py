@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn, final
+from typing import NoReturn, final
 
 import numpy as np
 import pyarrow as pa
@@ -30,9 +30,9 @@ from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import JOURNAL_FOLDER, journal_tables
 from evedrop.wire.plan import WirePlan, numbered_as
-from evedrop.wire.records import REASONS, Kind, WireFate
+from evedrop.wire.records import Kind, WireFate, codes_of, delivered_again, records_of
 
-_COLUMNS = ["time", "link", "key", "source", "sequence", "reason", "delay", "n", "kind", "again"]
+_COLUMNS = ["time", "link", "key", "size", "source", "sequence", "reason", "delay", "n", "kind", "again"]
 _MOST_SHOWN = 10  # links or keys that a message lists
 _HIDDEN = {WireFate.OVERFLOW, WireFate.CUT, WireFate.TOO_LARGE, WireFate.LOOPED}
 """The fates of messages that the loss model may have lost as well: nobody can tell."""
@@ -89,18 +89,17 @@ class _LinkRows:
             rows = self._lossy(rows, plan)
         if not rows.num_rows:
             self._no("has only messages that no model decides on")
-        streams, n = self._streams(rows, key=numbered_as, kind=_stream_of), _numbers(rows["n"])
-        order = np.lexsort((n, streams))
-        streams, n = streams[order], n[order]
-        fates = _fates(rows)[order]
+        streams, records = self._streams(rows, key=numbered_as, kind=_stream_of), records_of(rows, {})
+        order = np.lexsort((records["n"], streams))
+        streams, records = streams[order], records[order]
+        fates, heard = records["fate"], records["time"]
         decided = ~np.isin(fates, list(_HIDDEN))
         hidden = int((~decided).sum())
         if hidden:
             self._notes.append(f"{hidden} messages met a cut, a full queue or a limit before the loss model: left out")
         if not decided.any():
             self._no("has only messages that met a cut, a full queue or a limit before the loss model")
-        follows = (np.diff(streams) == 0) & (np.diff(n) == 1)
-        heard = _floats(rows["time"])[order]
+        follows = (np.diff(streams) == 0) & (np.diff(records["n"]) == 1)
         goes_on = np.concatenate([[False], follows & decided[:-1]])
         apart = float(np.median(np.diff(heard)[follows])) if follows.any() else 0.0
         survived = ~np.isin(fates, [WireFate.LOST])
@@ -108,14 +107,14 @@ class _LinkRows:
         series = MessageSeries(
             survived[decided].astype(np.uint8),
             parts=int((decided & ~goes_on).sum()),
-            repeated=int((_flags(rows["again"])[order] & delivered).sum()),
+            repeated=int(delivered_again(records).sum()),
             seconds=apart or None,  # a wire that was suspended hears most of them at once
         )
         check_parts(name, series, "cuts, queues and limits hide what the loss model did in between")
         self._note_changes(rows)
         whole = int((delivered | corrupted).sum())
         corrupt = float(corrupted.sum()) / whole if corrupted.any() else None
-        return MessageRecording(name, series, _floats(rows["delay"])[order][delivered], corrupt)
+        return MessageRecording(name, series, records["delay"][delivered], corrupt)
 
     def _before(self, name: str, longest: float | None) -> MessageRecording:
         """What was lost before the wire heard it."""
@@ -125,15 +124,11 @@ class _LinkRows:
             self._no(
                 "has no publication with a number of its sender's, as rmw_zenoh and publishers with Zenoh's source info give it"
             )
-        streams, numbers, heard = (
-            self._streams(rows, key=str, source=str),
-            _numbers(rows["sequence"]),
-            _floats(rows["time"]),
-        )
+        records = records_of(rows, {})
         parts = []
-        for which in _groups(streams):
+        for which in _groups(self._streams(rows, key=str, source=str)):
             try:
-                parts.append(series_of(MessageArrivals(numbers[which], heard[which]), longest))
+                parts.append(series_of(MessageArrivals(records["sequence"][which], records["time"][which]), longest))
             except ValueError as error:
                 self._no(str(error), error)
         if len(parts) > 1:
@@ -188,11 +183,9 @@ class _LinkRows:
         """A number for each row, the same where the columns are. columns_as: column → the word for each of its words."""
         columns = []
         for name, word_for in columns_as.items():
-            texts = rows[name].cast(pa.string()).combine_chunks().dictionary_encode()
-            codes = texts.indices.fill_null(len(texts.dictionary)).to_numpy(zero_copy_only=False).astype(np.int64)
-            words = [word_for(text) for text in texts.dictionary.to_pylist()]
-            same = np.array([*(words.index(word) for word in words), len(words)], np.int64)
-            columns.append(same[codes])
+            texts = pc.unique(rows[name].cast(pa.string())).drop_null().to_pylist()
+            numbers = {word: number for number, word in enumerate(dict.fromkeys(map(word_for, texts)))}
+            columns.append(codes_of(rows[name], {text: numbers[word_for(text)] for text in texts}, len(numbers)))
         streams: NDArray[np.int64] = (
             np.unique(np.stack(columns), axis=1, return_inverse=True)[1].reshape(-1).astype(np.int64)
         )
@@ -225,30 +218,6 @@ def _groups(codes: NDArray[np.int64]) -> Iterator[NDArray[np.intp]]:
     """The places of each code, in order."""
     order = np.argsort(codes, kind="stable")
     yield from np.split(order, np.flatnonzero(np.diff(codes[order])) + 1)
-
-
-def _fates(rows: pa.Table) -> NDArray[np.uint8]:
-    """`WireFate` of each row."""
-    by_reason = {reason: fate for fate, reason in REASONS.items()}
-    texts = rows["reason"].cast(pa.string()).combine_chunks().dictionary_encode()
-    table = np.array([*(by_reason[text] for text in texts.dictionary.to_pylist()), WireFate.DELIVERED], np.uint8)
-    fates: NDArray[np.uint8] = table[texts.indices.fill_null(len(table) - 1).to_numpy(zero_copy_only=False)]
-    return fates
-
-
-def _numbers(column: Any) -> NDArray[np.int64]:
-    numbers: NDArray[np.int64] = column.to_numpy().astype(np.int64)
-    return numbers
-
-
-def _floats(column: Any) -> NDArray[np.float64]:
-    numbers: NDArray[np.float64] = column.to_numpy().astype(np.float64)
-    return numbers
-
-
-def _flags(column: Any) -> NDArray[np.bool_]:
-    flags: NDArray[np.bool_] = column.to_numpy().astype(np.bool_)
-    return flags
 
 
 def _some(names: Sequence[str]) -> str:

@@ -305,14 +305,14 @@ def records_of(table: pa.Table, links: Mapping[str, int], keys: Mapping[str, int
     for name, null in (("time", None), ("n", -1), ("sequence", -1), ("delay", None), ("size", None)):
         column = table[name] if null is None else table[name].fill_null(null)
         rows[name] = column.to_numpy()
-    rows["key"] = 0 if keys is None else _codes(table["key"], keys, 0)
-    rows["link"] = _codes(table["link"], links, UNLINKED)
-    rows["fate"] = _codes(table["reason"], _FATES, WireFate.DELIVERED)
-    rows["kind"] = _codes(table["kind"], _KINDS, Kind.PUT) | np.where(table["again"].to_numpy(), AGAIN, 0)
+    rows["key"] = 0 if keys is None else codes_of(table["key"], keys, 0)
+    rows["link"] = codes_of(table["link"], links, UNLINKED)
+    rows["fate"] = codes_of(table["reason"], _FATES, WireFate.DELIVERED)
+    rows["kind"] = codes_of(table["kind"], _KINDS, Kind.PUT) | np.where(table["again"].to_numpy(), AGAIN, 0)
     return rows
 
 
-def _codes(column: pa.ChunkedArray, codes: Mapping[str, int], none: int) -> NDArray[np.int64]:
+def codes_of(column: pa.ChunkedArray, codes: Mapping[str, int], none: int) -> NDArray[np.int64]:
     """The codes of the words of a dictionary column; none: of null, and of an unknown word."""
     parts = [np.empty(0, np.int64)]
     for chunk in column.chunks:
