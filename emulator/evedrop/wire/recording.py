@@ -8,7 +8,8 @@ Source: docs/wire/results.md, the view.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, final
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WIRE_FILE
-from evedrop.show.view.recording import RecordingThread
+from evedrop.show.view.recording import Chunk, RecordingThread
 from evedrop.system.world import world
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
@@ -37,8 +38,33 @@ _BATCH = 0.5  # seconds between two additions to the recording, each of which ta
 _JUMP = 1.0  # seconds by which the system's clock and a steady clock may differ
 
 
+class _WireRecording(RecordingThread[Chunk, Notice]):
+    """Writes the recording of a wire, from whatever its steps are made of. A subclass sets `_panels` first."""
+
+    _panels: WirePanels
+
+    @abstractmethod
+    def _steps(self, chunks: list[Chunk], notes: list[Notice]) -> Iterable[WireSteps]:
+        """The steps that follow from what came since the last call; may add notes before it gives the first of them."""
+
+    def _layout(self) -> rrb.Blueprint:
+        return self._panels.layout()
+
+    def _style(self, to: rr.RecordingStream) -> None:
+        self._panels.style(to)
+
+    def _send(self, chunks: list[Chunk], notes: list[Notice], to: rr.RecordingStream) -> bool:
+        every = [*self._steps(chunks, notes)]
+        self._panels.notes(notes, to)
+        for steps in every:
+            self._panels.send(steps, to)
+        if self._last:
+            self._panels.end(to)
+        return bool(every or notes or self._last)
+
+
 @final
-class WireView(RecordingThread[NDArray[Any], Notice]):
+class WireView(_WireRecording[NDArray[Any]]):
     """Writes the recording of a wire to `path`. No method waits, and none raises: see `failure`."""
 
     def __init__(
@@ -92,34 +118,21 @@ class WireView(RecordingThread[NDArray[Any], Notice]):
     def _elapsed(self, time: float) -> float:
         return max(0.0, time - self._start - self._shift)
 
-    def _layout(self) -> rrb.Blueprint:
-        return self._panels.layout()
-
-    def _style(self, to: rr.RecordingStream) -> None:
-        self._panels.style(to)
-
-    def _send(self, chunks: list[NDArray[Any]], notes: list[Notice], to: rr.RecordingStream) -> bool:
+    def _steps(self, chunks: list[NDArray[Any]], notes: list[Notice]) -> Iterator[WireSteps]:
         with self._changed:
             amended, self._amended = self._amended, []
         now = self._now(notes)
-        self._panels.notes(notes, to)
-        sent = bool(notes)
         for rows in chunks:
             timed = rows.copy()
             timed["time"] = np.minimum(rows["time"] - self._shift, now)  # rows from before the clock was set
-            for steps in self._counter.add(timed):
-                self._panels.send(steps, to)
-                sent = True
+            yield from self._counter.add(timed)
         for rows, fate in amended:
             self._counter.amend(rows, fate)
         if self._last or not 0.0 <= now - self._sent < _BATCH:
             self._sent = now
-            for steps in (*self._counter.close(now - _LATE), *(self._counter.finish() if self._last else ())):
-                self._panels.send(steps, to)
-                sent = True
-        if self._last:
-            self._panels.end(to)
-        return sent or self._last
+            yield from self._counter.close(now - _LATE)
+            if self._last:
+                yield from self._counter.finish()
 
     def _now(self, notes: list[Notice]) -> float:
         """The time as if the system's clock had never been set, in seconds since 1970; adds a note when it was set."""
@@ -177,7 +190,7 @@ def _seconds(folder: Path, history: WireHistory) -> float:
 
 
 @final
-class _Replay(RecordingThread[WireSteps, Notice]):
+class _Replay(_WireRecording[WireSteps]):
     """Writes the recording of a wire that is over. A disk that is slow or full cannot hang what reads the journal."""
 
     def __init__(self, path: Path, name: str, panels: WirePanels, notes: Sequence[Notice]) -> None:
@@ -188,19 +201,8 @@ class _Replay(RecordingThread[WireSteps, Notice]):
         """Record further steps; waits for a file that is far behind."""
         self._append(steps, len(steps.counts), _MOST_STEPS, _WRITE_SECONDS)
 
-    def _layout(self) -> rrb.Blueprint:
-        return self._panels.layout()
-
-    def _style(self, to: rr.RecordingStream) -> None:
-        self._panels.style(to)
-
-    def _send(self, chunks: list[WireSteps], notes: list[Notice], to: rr.RecordingStream) -> bool:
-        self._panels.notes(notes, to)
-        for steps in chunks:
-            self._panels.send(steps, to)
-        if self._last:
-            self._panels.end(to)
-        return bool(chunks or notes or self._last)
+    def _steps(self, chunks: list[WireSteps], _notes: list[Notice]) -> list[WireSteps]:
+        return chunks
 
 
 def _notices(plan: WirePlan, history: WireHistory) -> Iterator[Notice]:
