@@ -74,10 +74,6 @@ _TICK = 0.1  # seconds between two blocks for the listeners
 _PATIENCE = 10.0  # seconds after a full disk
 _NOT_HELD = ~HELD & 0xFF
 
-Listener = Callable[[Records], None]
-"""Gets each block of new records."""
-AmendmentListener = Callable[[Records, WireFate], None]
-"""Gets records that it got before, and the fate that they have now."""
 _P = ParamSpec("_P")
 
 
@@ -114,7 +110,9 @@ class WireJournal:
         self.folder = folder
         """The wire's folder."""
         self.listeners: Listeners[Records] = Listeners(tell)
+        """They get each block of new records."""
         self.amendment_listeners: Listeners[Records, WireFate] = Listeners(tell)
+        """They get records that they got before, and the fate that these have now."""
         self.event_listeners: Listeners[float, str] = Listeners(tell)
         """They get the time of an event, in seconds since 1970, and a line about it."""
         self._tell = tell
@@ -149,8 +147,7 @@ class WireJournal:
         admits = KeyLimit(plan.links, self.counts, self._tell).admits
         self.words = JournalWords(self.place.unfinished, self.history.start, self.place.miss, admits)
         self.place.begin()
-        files = PartFiles(self.place, self.history.start, self._links, self.words)
-        self.records = JournalRecords(files, part_rows, self.place.miss)
+        self.records = JournalRecords(self.place, self.history.start, self._links, self.words, part_rows)
 
     @property
     def seconds(self) -> float:
@@ -259,13 +256,18 @@ class JournalRecords:
     sent: (row) → None: a message whose row was recorded as `HELD` has been delivered.
     """
 
-    def __init__(self, files: PartFiles, part_rows: int, miss: Callable[[OSError], None]) -> None:
-        """part_rows: records in a part; miss: called when the disk has no room for a part. Raises OSError."""
+    def __init__(
+        self, place: JournalPlace, start: int, links: Sequence[str], words: JournalWords, part_rows: int
+    ) -> None:
+        """start: its number, from 1; links: their names, in the order of their codes; part_rows: records in a part.
+
+        Raises OSError.
+        """
         self.recorded = 0
         """The number of all records, after `end`."""
         self.missing = 0
         """The number of records that are not on the disk, because it had no room for them; listeners still got them."""
-        self._files, self._rows, self._miss = files, part_rows, miss
+        self._place, self._start, self._links, self._words, self._rows = place, start, links, words, part_rows
         self._lock = world().rlock()  # guards the parts
         self._parts: dict[int, JournalPart] = {}
         self._buffers: dict[int, Any] = {}
@@ -378,11 +380,12 @@ class JournalRecords:
                 try:
                     self._add_part(at)
                 except OSError as error:
-                    self._miss(error)
+                    self._place.miss(error)
                     self._add_part(at, in_memory=True)
 
     def _add_part(self, at: int, in_memory: bool = False) -> None:
-        self._parts[at] = part = JournalPart(None if in_memory else self._files.rows(at), self._rows)
+        path = None if in_memory else self._place.unfinished / f"{self._name(at)}.rows"
+        self._parts[at] = part = JournalPart(path, self._rows)
         self._buffers[at] = part.buffer
 
     def _convert(self, at: int) -> None:
@@ -393,7 +396,9 @@ class JournalRecords:
         part = self._parts[at]
         records = part.whole()
         try:
-            self._files.write(at, records)
+            if len(records):
+                path = parquet_path(self._place.folder, self._name(at))
+                write_parquet(path, table_of(records, self._words.words(self._links)))
             if part.path is None:
                 self.missing -= len(records)
         except OSError:
@@ -403,29 +408,9 @@ class JournalRecords:
             part.remove()
             del self._parts[at], self._buffers[at]
 
-
-@final
-class PartFiles:
-    """The files of one start: for each part the rows while they change, and then a Parquet file."""
-
-    def __init__(self, place: JournalPlace, start: int, links: Sequence[str], words: JournalWords) -> None:
-        """start: its number, from 1; links: their names, in the order of their codes."""
-        self._place, self._start, self._links, self._words = place, start, links, words
-
-    def rows(self, at: int) -> Path:
-        """The file of the rows of a part, from 0."""
-        return self._place.unfinished / f"{self._name(at)}.rows"
-
-    def write(self, at: int, records: Records) -> None:
-        """Make the Parquet file of a part; none for no records. Raises OSError if the disk is full."""
-        if len(records):
-            write_parquet(self._parquet(at), table_of(records, self._words.words(self._links)))
-
     def _name(self, at: int) -> str:
+        """The name of a part, from 0, as `part_names` finds it."""
         return f"{self._start:03d}-{at + 1:04d}"
-
-    def _parquet(self, at: int) -> Path:
-        return parquet_path(self._place.folder, self._name(at))
 
 
 _ROOM = 2**18  # bytes of the file that are mapped at once, unless a word is longer
@@ -694,7 +679,7 @@ def recover(journal: Path, history: WireHistory) -> int:
     """
     place = journal / UNFINISHED
     recovered, alive = 0, last_beat(place)
-    starts = {name: int(name.partition("-")[0]) for name in part_names(journal)}
+    starts = {name: _start_of(name) for name in part_names(journal)}
     if (latest := max(starts.values(), default=0)) > history.start:  # else the next start would write over them
         raise UsageError(
             f"{journal} has records of start {latest}, but its history lacks that start; give another folder"
@@ -824,8 +809,8 @@ class JournalOnDisk:
     """The journal of the latest start of a wire."""
 
     def __init__(self, folder: Path, plan: WirePlan) -> None:
-        self.listeners: list[Listener] = []
-        self.amendment_listeners: list[AmendmentListener] = []
+        self.listeners: list[Callable[[Records], None]] = []
+        self.amendment_listeners: list[Callable[[Records, WireFate], None]] = []
         self.recorded = 0
         self.completeness = JournalSummary(0, 0, None)
         self._folder = folder

@@ -5,6 +5,7 @@ Source: docs/wire/results.md, the journal.
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 
 import pyarrow as pa
@@ -28,16 +29,12 @@ def write_journal_csv(folder: Path, file: Path) -> int:
     Raises UsageError if the folder has no journal, or one that cannot be read, or the file cannot be written.
     """
     tables = journal_tables(folder)
-    rows: int = 0
-    table = next(tables)  # before a file is made
+    first, rows = next(tables), 0  # before a file is made
     try:
         with csv.CSVWriter(file, _PLAIN) as writer:
-            while True:
+            for table in chain([first], tables):
                 writer.write_table(table.cast(_PLAIN))
                 rows += table.num_rows
-                following = next(tables, None)
-                if following is None:
-                    return rows
-                table = following
+        return rows
     except OSError as error:
         raise UsageError(f"{file} cannot be written ({error.strerror or error}); give another file") from error
