@@ -22,7 +22,7 @@ from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.on_disk import scorekeeper_on_disk
-from evedrop.wire.publications import Message
+from evedrop.wire.publications import publish
 from evedrop.wire.records import WireFate
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.scorekeeper import WireScorekeeper
@@ -169,16 +169,16 @@ def test_each_message_to_a_side_that_has_stopped_has_a_fate(tmp_path: Path, monk
     """Those that find no room are congested; the summary of the wire is that of its journal, also at its end."""
     monkeypatch.setattr("evedrop.wire.relay.SendQueue", partial(SendQueue, most=8, patience=0.1))
     monkeypatch.setattr("evedrop.wire.relay.LAST_SECONDS", 0.1)
-    plan, takes, publish = plan_of(link("robot", "base"), link("robot", "third")), threading.Event(), Message.__call__
+    plan, takes = plan_of(link("robot", "base"), link("robot", "third")), threading.Event()
     with at_work(plan, tmp_path) as wire, wire.program("robot") as robot:
         third = wire.relay.sides["third"].session
 
-        def stops(message: Message) -> None:
-            if message._session is third:
+        def stops(session: zenoh.Session, *message: Any) -> None:
+            if session is third:
                 assert takes.wait(LIMIT)
-            publish(message)
+            publish(session, *message)
 
-        monkeypatch.setattr(Message, "__call__", stops)
+        monkeypatch.setattr("evedrop.wire.publications.publish", stops)
         scorekeeper = WireScorekeeper(plan, wire.journal)
         for _ in range(COUNT):
             robot.put("scan", b"", congestion_control=BLOCK)
@@ -224,18 +224,18 @@ CROWDED = """
 import sys, threading
 from pathlib import Path
 import zenoh
-from evedrop.wire.publications import Message
+from evedrop.wire import publications
 from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_at_work import at_work, link, plan_of
 
-goes_on, message = threading.Event(), Message.__call__
+goes_on, publish = threading.Event(), publications.publish
 
-def hangs(self):
-    if str(self._sample.key_expr) == "flood":
+def hangs(session, sample, *how):
+    if str(sample.key_expr) == "flood":
         assert goes_on.wait(LIMIT)
-    message(self)
+    publish(session, sample, *how)
 
-Message.__call__ = hangs
+publications.publish = hangs
 with at_work(plan_of(link("a", "b"), link("c", "d")), Path(sys.argv[1])) as wire:
     flooding = [wire.program("a") for _ in range(8)]
     with wire.program("c") as sender, wire.program("d") as receiver:

@@ -86,7 +86,8 @@ class _Way:
     ) -> Callable[[], object]:
         """What sends a message."""
         if publisher is None:
-            return Message(self._session, sample, sample.congestion_control if self.patient else _DROP, copies)
+            congestion = sample.congestion_control if self.patient else _DROP
+            return partial(publish, self._session, sample, congestion, copies)
         return partial(
             publisher.put,
             sample.payload,
@@ -354,31 +355,19 @@ class Publishers:
             self._count -= 1
 
 
-@final
-class Message:
-    """A message that is published whole, without a publisher, when it is called."""
-
-    __slots__ = ("_congestion", "_copies", "_sample", "_session")
-
-    def __init__(
-        self, session: zenoh.Session, sample: zenoh.Sample, congestion: zenoh.CongestionControl, copies: int
-    ) -> None:
-        self._session, self._sample, self._congestion, self._copies = session, sample, congestion, copies
-
-    def __call__(self) -> None:
-        """Publish all copies. Raises zenoh.ZError."""
-        sample = self._sample
-        how: dict[str, Any] = {
-            "congestion_control": self._congestion,
-            "priority": sample.priority,
-            "express": sample.express,
-            "attachment": sample.attachment,
-            "timestamp": sample.timestamp,
-            "allowed_destination": REMOTE,
-            "source_info": sample.source_info,
-        }
-        for _ in range(self._copies):
-            if sample.kind == zenoh.SampleKind.PUT:
-                self._session.put(sample.key_expr, sample.payload, encoding=sample.encoding, **how)
-            else:
-                self._session.delete(sample.key_expr, **how)
+def publish(session: zenoh.Session, sample: zenoh.Sample, congestion: zenoh.CongestionControl, copies: int) -> None:
+    """Publish some copies of a message, without a publisher. Raises zenoh.ZError."""
+    how: dict[str, Any] = {
+        "congestion_control": congestion,
+        "priority": sample.priority,
+        "express": sample.express,
+        "attachment": sample.attachment,
+        "timestamp": sample.timestamp,
+        "allowed_destination": REMOTE,
+        "source_info": sample.source_info,
+    }
+    for _ in range(copies):
+        if sample.kind == zenoh.SampleKind.PUT:
+            session.put(sample.key_expr, sample.payload, encoding=sample.encoding, **how)
+        else:
+            session.delete(sample.key_expr, **how)
