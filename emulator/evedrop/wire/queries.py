@@ -243,39 +243,17 @@ class QueryRelay:
     def _reply(self, asked: _Asked, source: str, reply: zenoh.Reply) -> None:
         """Bring a reply back over the link from the side that it comes from."""
         answer, error, query = reply.ok, reply.err, asked.query
-        if error is not None:
-            if _nobody_sent(reply.replier_id, error):
-                asked.tell(error)
-                return
-            self._cross(
-                Kind.REPLY,
-                asked,
-                (source, asked.side),
-                asked.key,
-                query.key_expr,
-                _Message(lambda: query.reply_err(error.payload, encoding=error.encoding), error.payload),
-                _now(),
-            )
+        if error is None:
+            assert answer is not None  # noqa: S101 - a reply without an error
+            key, expression = str(answer.key_expr), answer.key_expr
+            message = _answer(query, answer)
+        elif _nobody_sent(reply.replier_id, error):
+            asked.tell(error)
             return
-        assert answer is not None  # noqa: S101 - a reply without an error
-
-        def send() -> None:
-            if answer.kind == zenoh.SampleKind.PUT:
-                query.reply(
-                    answer.key_expr,
-                    answer.payload,
-                    encoding=answer.encoding,
-                    express=answer.express,
-                    attachment=answer.attachment,
-                    timestamp=answer.timestamp,
-                )
-            else:
-                query.reply_del(
-                    answer.key_expr, express=answer.express, attachment=answer.attachment, timestamp=answer.timestamp
-                )
-
-        message = _Message(send, answer.payload, answer.attachment, answer.source_info)
-        self._cross(Kind.REPLY, asked, (source, asked.side), str(answer.key_expr), answer.key_expr, message, _now())
+        else:
+            key, expression = asked.key, query.key_expr
+            message = _Message(lambda: query.reply_err(error.payload, encoding=error.encoding), error.payload)
+        self._cross(Kind.REPLY, asked, (source, asked.side), key, expression, message, _now())
 
     def _cross(
         self,
@@ -381,6 +359,23 @@ class _Message:
     ) -> None:
         self.send, self.attachment, self.source = send, attachment, source
         self.size = sum(len(part) for part in (payload, attachment) if part is not None)
+
+
+def _answer(query: zenoh.Query, answer: zenoh.Sample) -> _Message:
+    """A reply to a query that is no error."""
+
+    def send() -> None:
+        how: dict[str, Any] = {
+            "express": answer.express,
+            "attachment": answer.attachment,
+            "timestamp": answer.timestamp,
+        }
+        if answer.kind == zenoh.SampleKind.PUT:
+            query.reply(answer.key_expr, answer.payload, encoding=answer.encoding, **how)
+        else:
+            query.reply_del(answer.key_expr, **how)
+
+    return _Message(send, answer.payload, answer.attachment, answer.source_info)
 
 
 def _nobody_sent(replier: zenoh.EntityGlobalId | None, error: zenoh.ReplyError) -> bool:
