@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self, final
@@ -55,7 +55,15 @@ class SideSession:
         self.side = side
         self.name = side.name
         with contextlib.nullcontext() if side.users is None else users_file(side.users) as users:
-            self.session, self.endpoints = _opened(side, largest, None if users is None else str(users))
+            try:
+                self.session, self.endpoints = opened(
+                    side.listen,
+                    lambda listen: side_config(
+                        replace(side, listen=listen), largest, None if users is None else str(users)
+                    ),
+                )
+            except zenoh.ZError as error:
+                raise UsageError(_refusal(side, str(error))) from error
         """Its session, and where programs connect: with a free port where the plan has port 0."""
         self.zid = str(self.session.info.zid())
         self.duty = Duty(f"at the side {side.name}", ANSWER_SECONDS)
@@ -78,27 +86,22 @@ class SideSession:
         ).undeclare()
 
 
-def _opened(side: Side, largest: int, users: str | None) -> tuple[zenoh.Session, tuple[str, ...]]:
-    """The session of a side, and its endpoints. Raises UsageError."""
-    attempts = _ATTEMPTS
-    while True:
-        attempts -= 1
-        endpoints = tuple(_with_port(endpoint) for endpoint in side.listen)
-        config = side_config(replace(side, listen=endpoints), largest, users)
-        try:
-            return open_session(config), endpoints
-        except zenoh.ZError as error:
-            fixed = endpoints == side.listen or "in use" not in str(error)
-            if fixed or not attempts:
-                raise UsageError(_refusal(side, str(error))) from error
-
-
-def _with_port(endpoint: str) -> str:
-    """An endpoint with a free port in place of port 0.
+def opened(
+    listen: tuple[str, ...], config_of: Callable[[tuple[str, ...]], ZenohConfig]
+) -> tuple[zenoh.Session, tuple[str, ...]]:
+    """A session, and the endpoints at which it listens: with free ports in place of port 0. Raises zenoh.ZError.
 
     Zenoh, too, listens at any free port for port 0, but tells which only in its administration space, which is closed.
     """
-    return _PORT_0.sub(lambda _: f":{free_port()}", endpoint)
+    attempts = _ATTEMPTS
+    while True:
+        attempts -= 1
+        endpoints = tuple(_PORT_0.sub(lambda _: f":{free_port()}", endpoint) for endpoint in listen)
+        try:
+            return open_session(config_of(endpoints)), endpoints
+        except zenoh.ZError as error:
+            if not attempts or endpoints == listen or "in use" not in str(error):
+                raise
 
 
 def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...]:

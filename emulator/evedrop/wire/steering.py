@@ -14,11 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, final
 
-import zenoh
-
 from evedrop.errors import ScenarioError
 from evedrop.live.network.access import Grant, access_control, users_file
-from evedrop.live.network.connecting import open_session
 from evedrop.live.network.connection import Question, Questions
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.operator import Answer, Order
@@ -28,13 +25,14 @@ from evedrop.live.protocol.keys import RunKeys, ZenohConfig
 from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest, WireLinkStatus, WireStatus
 from evedrop.names import OPERATOR, RECORDER
 from evedrop.system.output import warn
-from evedrop.system.ports import free_port
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock, wait_for_thread
 from evedrop.system.world import world
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.scorekeeper import WireScorekeeper
+from evedrop.wire.side import opened
+from evedrop.wire.tables import FREE
 from evedrop.wire.timeline import moment_at, times, with_change, with_cut_ended, with_partition_ended
 
 
@@ -119,7 +117,6 @@ class WireConductor:
                 self._clock.wait(self._changed, max(0.0, following[0] - self.seconds) if following else None)
 
 
-_ATTEMPTS = 5  # another program may take a port between its choice and its use
 _TRANSPORT: ZenohConfig = {"link": {"rx": {"max_message_size": 2**20}}}
 
 
@@ -146,7 +143,11 @@ class WireControl:
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
             password = world().token(24).hex()
-            session, router = self._open(password)
+            access = access_control([Grant(OPERATOR, writes=(), reads=(), token=None, asks=(self._key,))])
+            with users_file({OPERATOR: password}) as users:
+                session, (router,) = opened(
+                    (FREE,), lambda listen: listening_config(listen[0], str(users), access, _TRANSPORT)
+                )
             stack.enter_context(session)
             Questions(self._key, Dropped("the wire"), self._answer).declare(session)
             stack.callback(remove_control, self._folder)
@@ -161,20 +162,6 @@ class WireControl:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
-
-    def _open(self, password: str) -> tuple[zenoh.Session, str]:
-        attempts = _ATTEMPTS
-        while True:
-            attempts -= 1
-            router = f"tcp/127.0.0.1:{free_port()}"
-            with users_file({OPERATOR: password}) as users:
-                access = access_control([Grant(OPERATOR, writes=(), reads=(), token=None, asks=(self._key,))])
-                config = listening_config(router, str(users), access, _TRANSPORT)
-                try:
-                    return open_session(config), router
-                except zenoh.ZError:
-                    if not attempts:
-                        raise
 
     def _answer(self, question: Question) -> None:
         """Carry out a request. Zenoh only logs what is raised here."""
