@@ -14,6 +14,7 @@ Source: docs/wire/semantics.md, what Zenoh drops by itself, and what programs ne
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, final
 
@@ -55,24 +56,14 @@ class FewLines:
 
 
 @final
-class _Count:
-    """A count that has begun."""
-
-    __slots__ = ("answer", "taken")
-
-    def __init__(self, answer: Callable[[int], None]) -> None:
-        self.answer = answer
-        self.taken = 0
-
-
-@final
 class Backlog:
     """The messages that a thread has not taken yet. `ask` may be called by any thread."""
 
     def __init__(self, handler: Any, most: int) -> None:
         """handler: of a subscriber with a channel; most: the messages that the channel has room for."""
         self._handler, self._most = handler, most
-        self._counts: list[_Count] = []
+        self._counts: list[tuple[Callable[[int], None], int]] = []
+        """Counts that have begun: who wants the answer, and how many messages were taken so far."""
         self._is_empty = False
         self._lock = world().lock()
 
@@ -80,7 +71,7 @@ class Backlog:
         """Let `answer` have the number of messages that wait now: at once if there is none, or else when they are taken."""
         with self._lock:
             if not self._is_empty:
-                self._counts.append(_Count(answer))
+                self._counts.append((answer, 0))
                 return
         answer(0)
 
@@ -106,20 +97,19 @@ class Backlog:
     def _count(self) -> None:
         """Count a message that was taken."""
         with self._lock:
-            for count in self._counts:
-                count.taken += 1
-            full = [count for count in self._counts if count.taken >= self._most]
-            self._counts[:] = [count for count in self._counts if count.taken < self._most]
-        for count in full:
-            count.answer(count.taken)
+            counts = [(answer, taken + 1) for answer, taken in self._counts]
+            self._counts[:] = [count for count in counts if count[1] < self._most]
+        for answer, taken in counts:
+            if taken == self._most:
+                answer(taken)
 
     def _note_empty(self) -> None:
         with self._lock:
             self._is_empty = True
             counts = [*self._counts]
             self._counts.clear()
-        for count in counts:
-            count.answer(count.taken)
+        for answer, taken in counts:
+            answer(taken)
 
 
 MANY: Final = 4096
@@ -129,18 +119,21 @@ MOST_GONE: Final = 1024
 
 
 @final
+@dataclass(slots=True)
 class _Gone:
     """A program whose connection ended."""
 
-    __slots__ = ("answers", "name", "side", "told", "waited", "waited_for", "when")
-
-    def __init__(self, name: str, side: str, when: float, waited_for: int, answers: int) -> None:
-        """waited_for: messages that waited for programs at its side; answers: the counts that are still to come."""
-        self.name, self.side, self.when, self.waited_for, self.answers = name, side, when, waited_for, answers
-        self.waited = 0
-        """Messages from its side that waited for the wire."""
-        self.told = False
-        """Whether it was named when its connection ended."""
+    name: str
+    side: str
+    when: float
+    waited_for: int
+    """Messages that waited for programs at its side."""
+    answers: int
+    """The counts that are still to come."""
+    waited: int = 0
+    """Messages from its side that waited for the wire."""
+    told: bool = False
+    """Whether it was named when its connection ended."""
 
     @property
     def circumstances(self) -> str:
