@@ -13,8 +13,8 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.loading import load, parse
 from evedrop.studies.matchups import ATTACKERS
 from evedrop.wire.file import example_wire, load_wire
-from evedrop.wire.running_link import KeyFates
 from tests.conftest import LIMIT
+from tests.wire.wire_links import key_fates
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -83,7 +83,7 @@ def test_what_the_radio_always_loses(tmp_path: Path) -> None:
     (tmp_path / "robot.toml").write_text(example_wire(), encoding="utf-8")
     plan = load_wire(tmp_path / "robot.toml")
     (radio,) = (link for link in plan.links if link.name == "radio")
-    fates = KeyFates(radio, "chatter/numbers", "put", plan.seed)
+    fates = key_fates(radio, "chatter/numbers", "put", plan.seed)
     lost = [number for number in range(77) if fates.next()[0] != 0]
     words = re.search(r"The first numbers missing are (\d+), (\d+) and (\d+) each time", README)
     assert words is not None

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from evedrop.wire.file import load_wire
-from evedrop.wire.running_link import KeyFates
 from tests.faults import wires
 from tests.faults.facilities import facilities, limited, process_group
 from tests.faults.programs import KEYS
 from tests.faults.wires import Start, lost_by_model
 from tests.privileged import CannotRun, skip
+from tests.wire.wire_links import key_fates
 
 HUNGRY = "x = bytes(500_000_000)"
 # The limit of an ordinary user is of all processes together: where others end theirs meanwhile, as many more can be started.
@@ -70,7 +70,7 @@ def test_the_fates_of_a_wire_are_those_of_its_model(key: str, tmp_path: Path) ->
     path = tmp_path / "robot.toml"
     path.write_text(wires.FILE)
     link = next(each for each in load_wire(path).links if each.name == key)
-    fates = KeyFates(link, key, "put", wires.SEED)
+    fates = key_fates(link, key, "put", wires.SEED)
     lost = lost_by_model(key, 3000)
     assert [bool(fates.next()[0]) for _ in range(3000)] == lost
     assert abs(sum(lost) / 3000 - (1.0 - wires.QUALITY[key])) < 0.05

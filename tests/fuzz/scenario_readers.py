@@ -24,10 +24,10 @@ from evedrop.scenario.recordings.process_fit import fit_process
 from evedrop.scenarios import shipped
 from evedrop.wire.deliveries import KeyDeliveries, bounds
 from evedrop.wire.file import example_wire, key_lines, load_wire, resolved_wire, warnings_of_wire, wire_lines, wire_of
-from evedrop.wire.running_link import KeyFates
 from evedrop.wire.timeline import moments
 from tests.fuzz.mutation import words_of
 from tests.fuzz.reader import Reader, as_json, as_toml, cells, parquet_of, raw, tried
+from tests.wire.wire_links import key_fates
 
 _EXAMPLES = Path(__file__).with_name("examples")
 _DOCUMENTS = Path(__file__).parents[2] / "docs"
@@ -103,7 +103,7 @@ def _wire(data: bytes, folder: Path) -> None:
     assert list(warnings_of_wire(plan)) is not None
     assert moments(plan)
     for link in plan.links:
-        KeyFates(link, "robot/scan", "put", plan.seed).next()
+        key_fates(link, "robot/scan", "put", plan.seed).next()
         bounds([KeyDeliveries(link.settings, [], [range(10)])], 10)
 
 

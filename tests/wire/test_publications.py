@@ -10,9 +10,9 @@ import pytest
 import zenoh
 
 from evedrop.wire.records import UNLINKED, Kind, WireFate
-from evedrop.wire.running_link import KeyFates
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import DEAD, LOSSY, PERFECT, WireAtWork, at_work, both_ways, link, plan_of
+from tests.wire.wire_links import key_fates
 
 
 def reader(session: zenoh.Session, key: str = "**") -> list[zenoh.Sample]:
@@ -109,7 +109,7 @@ def test_the_nth_message_of_a_key_has_the_fate_that_the_seed_gives(tmp_path: Pat
             return rows[rows["key"] == wire.journal.words.key_code("scan")]
 
         wait_until(lambda: len(rows()) == 200, "the wire hears all")
-        fates = KeyFates(plan.links[0], "scan", "put", plan.seed)
+        fates = key_fates(plan.links[0], "scan", "put", plan.seed)
         expected = [fates.next()[0] for _ in range(200)]
         assert rows()["n"].tolist() == list(range(200))
         assert rows()["fate"].tolist() == expected
@@ -213,6 +213,6 @@ def test_a_key_that_was_forgotten_goes_on_with_its_next_fate(tmp_path: Path, mon
         wait_until(lambda: len(wire.rows) == 120, "the wire hears all")
         for key in keys:
             rows = wire.rows_of(key)
-            fates = KeyFates(plan.links[0], key, "put", plan.seed)
+            fates = key_fates(plan.links[0], key, "put", plan.seed)
             assert rows["n"].tolist() == list(range(40))
             assert rows["fate"].tolist() == [fates.next()[0] for _ in range(40)]

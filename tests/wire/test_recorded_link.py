@@ -18,8 +18,8 @@ from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.recorded_link import journal_recording
 from evedrop.wire.records import AGAIN, Kind, WireFate
-from evedrop.wire.running_link import KeyFates
 from tests.conftest import Evedrop
+from tests.wire.wire_links import key_fates
 
 SETTINGS = {
     "loss": {"model": "gilbert-elliott", "p": 0.05, "r": 0.3},
@@ -54,7 +54,7 @@ def carried(
     (folder / "wire.toml").write_text(resolved_wire(plan))
     with WireJournal(folder, plan) as journal:
         for key, count in counts.items():
-            fates = KeyFates(plan.links[0], key, "put", plan.seed)
+            fates = key_fates(plan.links[0], key, "put", plan.seed)
             lossless = key in plan.lossless
             for n in range(count):
                 fate, delay, again = (WireFate.DELIVERED, 0.0, False) if lossless else fates.next()
@@ -103,7 +103,7 @@ def test_a_fitted_link_in_a_wire_loses_as_the_recorded_one(tmp_path: Path) -> No
     assert (link["from"], link["to"], link["keys"]) == ("robot", "base", "*/scan/**")
     sides = {"robot": {"listen": "tcp/127.0.0.1:0"}, "base": {"listen": "tcp/127.0.0.1:0"}}
     again = wire_of({"seed": 8, "side": sides, "link": [link]})
-    fates = KeyFates(again.links[0], "0/scan/b", "put", 8)
+    fates = key_fates(again.links[0], "0/scan/b", "put", 8)
     lost = np.array([fates.next()[0] == WireFate.LOST for _ in range(20_000)])
     recorded = result.recording.series.outcomes == 0
     assert lost.mean() == pytest.approx(recorded.mean(), rel=0.1)

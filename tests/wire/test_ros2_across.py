@@ -16,9 +16,9 @@ from evedrop.wire.file import load_wire
 from evedrop.wire.journal import WireJournal, journal_tables
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.relay import WireRelay
-from evedrop.wire.running_link import KeyFates
 from tests.conftest import LIMIT, wait_until
 from tests.wire.rmw import Node, ReceivedMessage, ros_context
+from tests.wire.wire_links import key_fates
 
 LOSSY = {"loss": {"model": "gilbert-elliott", "p": 0.2, "r": 0.4}}
 WHOLE = {"loss": {"model": "bernoulli", "quality": 1.0}}
@@ -74,7 +74,7 @@ def test_a_listener_lacks_what_the_seed_says(field: Field) -> None:
     sent = [publish(f"scan {n}") for n in range(200)]
     rows = wait_until(lambda: len(r := field.rows("scan", "put")) == 201 and r, "the journal has all messages")
     key = rows[0]["key"]
-    fates = KeyFates(LINKS[0], key, "put", PLAN.seed)
+    fates = key_fates(LINKS[0], key, "put", PLAN.seed)
     assert [row["sequence"] for row in rows] == [1, *sent]
     passed = [row["sequence"] for row in rows if fates.next()[0] == 0]
     assert 100 < len(passed) < 180
@@ -112,7 +112,7 @@ def test_a_lost_request_is_never_answered(field: Field) -> None:
     for n in range(40):
         send(n, 1)
     rows = wait_until(lambda: len(r := field.rows("lossy", "query")) == 40 and r, "the journal has all requests")
-    fates = KeyFates(LINKS[3], rows[0]["key"], "query", PLAN.seed)
+    fates = key_fates(LINKS[3], rows[0]["key"], "query", PLAN.seed)
     passed = [n for n in range(1, 41) if fates.next()[0] == 0]
     wait_until(lambda: len(responses) == len(passed), "the responses")
     assert (

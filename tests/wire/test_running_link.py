@@ -14,8 +14,9 @@ import pytest
 from evedrop.system.world import world
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.records import WireFate
-from evedrop.wire.running_link import Decision, KeyFates, RunningLink
+from evedrop.wire.running_link import Decision, RunningLink
 from tests.wire.wire_at_work import DEAD, LOSSY, PERFECT, both_ways, link, plan_of
+from tests.wire.wire_links import key_fates
 
 LARGEST = 100
 
@@ -31,7 +32,7 @@ def lossy(tmp_path: Path) -> Iterator[RunningLink]:
 def test_the_reasons_have_an_order(lossy: RunningLink) -> None:
     """Its queue, its size, a loop, a cut, and then the models; whatever it is, the next message has the next number."""
     decide = lossy.lane("put", "scan", lossless=False)
-    fates = KeyFates(lossy.link, "scan", "put", 7)
+    fates = key_fates(lossy.link, "scan", "put", 7)
     due = [fates.next()[0] for _ in range(100)]
     assert decide(0.0, 40)[:2] == (0, due[0])
     lossy.cut = lossy.looped = True
@@ -187,14 +188,14 @@ def test_a_key_that_comes_after_a_change_has_the_new_settings_alone(lossy: Runni
     for n, (settings, fates) in enumerate(changes):
         lossy.change(settings)
         keys = [f"key/{n}/{at}" for at in range(20)]
-        expected = [KeyFates(link("robot", "base", settings), key, "put", 7).next()[0] for key in keys]
+        expected = [key_fates(link("robot", "base", settings), key, "put", 7).next()[0] for key in keys]
         assert [lossy.lane("put", key, lossless=False)(float(n), 1)[1] for key in keys] == expected
         assert {*expected} == fates
 
 
 def test_two_who_ask_for_a_key_share_its_messages(lossy: RunningLink) -> None:
     """They have one sequence of numbers, with one sequence of fates."""
-    fates = KeyFates(lossy.link, "scan", "put", 7)
+    fates = key_fates(lossy.link, "scan", "put", 7)
     two = [lossy.lane("put", "scan", lossless=False) for _ in range(2)]
     decisions = [two[n % 2](float(n), 1)[:2] for n in range(20)]
     assert decisions == [(n, fates.next()[0]) for n in range(20)]
@@ -209,7 +210,7 @@ def test_a_key_that_was_forgotten_goes_on(lossy: RunningLink, lossless: bool) ->
     lossy.change({**LOSSY, "rate": 1000.0, "queue": 60})
     decide = lossy.lane("put", "scan", lossless)
     decisions = before + [decide(float(n), 1) for n in range(50, 100)]
-    fates = KeyFates(lossy.link, "scan", "put", 7)
+    fates = key_fates(lossy.link, "scan", "put", 7)
     assert [decision[:2] for decision in decisions] == [(n, 0 if lossless else fates.next()[0]) for n in range(100)]
     assert lossy.lane("query", "scan", lossless)(0.0, 1)[0] == 0
     assert lossy.lane("put", "pose", lossless)(0.0, 1)[0] == 0
@@ -223,7 +224,7 @@ def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
     monkeypatch.setattr(world(), "monotonic", lambda: now[0])
     settings = {**LOSSY, "delay": {"model": "normal", "mean": 0.05, "standard_deviation": 0.02}}
     plan = plan_of(link("robot", "base", settings, ordered=True), link("base", "robot"))
-    fates = KeyFates(plan.links[0], "scan", "put", plan.seed)
+    fates = key_fates(plan.links[0], "scan", "put", plan.seed)
     with WireJournal(tmp_path, plan) as journal:
         decide, latest = RunningLink(plan.links[0], plan, journal).lane("put", "scan", lossless=False), 0.0
         for n in range(200):
@@ -259,7 +260,7 @@ def test_the_keys_of_a_history_are_numbered_together(lossy: RunningLink) -> None
     """Whichever session they are of, and although one of them is forgotten; so do a change and the end of all of them."""
     first, second = "map/@adv/pub/aa/1/_", "map/@adv/pub/bb/1/_"
     lossy.change(LOSSY)
-    fates = KeyFates(lossy.link, "map/@adv/**", "put", 7)
+    fates = key_fates(lossy.link, "map/@adv/**", "put", 7)
     due = [fates.next()[0] for _ in range(40)]
     decide, other = lossy.lane("put", first, False), lossy.lane("put", second, False)
     decisions = [lane(0.0, 1) for _ in range(10) for lane in (decide, other)]
@@ -285,7 +286,7 @@ def test_a_key_that_only_the_journal_remembers_goes_on(lossy: RunningLink, tmp_p
     decide = lossy.lane("put", "scan", lossless)
     assert [decide(100.0 + n, 1)[:2] for n in range(50)] == [(50 + n, 0 if lossless else 1) for n in range(50)]
     lossy.change(dict(lossy.link.settings))
-    fates = KeyFates(lossy.link, "scan", "put", 7)
+    fates = key_fates(lossy.link, "scan", "put", 7)
     due = [fates.next()[0] for _ in range(150)]
     assert [decide(200.0 + n, 1)[1] for n in range(50)] == [0 if lossless else due[100 + n] for n in range(50)]
 

@@ -16,7 +16,7 @@ from evedrop.model.slot.link import Change, Link
 from evedrop.model.streams import Stream, normals, root_of_seed, stream_key, uniforms
 from evedrop.wire.running_link import KeyFates, MessageFate, PerKeyLinks
 from tests.examples import examples
-from tests.wire.wire_links import DELAYS, LOSSES, wire_link
+from tests.wire.wire_links import DELAYS, LOSSES, key_fates, wire_link
 
 SEED = 7
 FULL: dict[str, Any] = {
@@ -36,7 +36,7 @@ def taken(fates: KeyFates, count: int) -> list[MessageFate]:
 
 def of_scan(given: dict[str, Any], key: str = "robot/scan", **more: Any) -> KeyFates:
     """The fates of the puts of a key on the link scan."""
-    return KeyFates(wire_link(given), key, "put", SEED, **more)
+    return key_fates(wire_link(given), key, "put", SEED, **more)
 
 
 def test_every_model_is_among_them() -> None:
@@ -90,9 +90,9 @@ def test_other_keys_kinds_links_and_seeds_have_other_fates() -> None:
     several = [
         of_scan(FULL),
         of_scan(FULL, key="robot/pose"),
-        KeyFates(wire_link(FULL), "robot/scan", "query", SEED),
-        KeyFates(wire_link(FULL), "robot/scan", "put", SEED + 1),
-        KeyFates(wire_link(FULL, "other"), "robot/scan", "put", SEED),
+        key_fates(wire_link(FULL), "robot/scan", "query", SEED),
+        key_fates(wire_link(FULL), "robot/scan", "put", SEED + 1),
+        key_fates(wire_link(FULL, "other"), "robot/scan", "put", SEED),
     ]
     in_turn = list(zip(*([fates_.next() for fates_ in several] for _ in range(300)), strict=True))
     assert len(set(in_turn)) == 5
@@ -103,7 +103,7 @@ def test_other_keys_kinds_links_and_seeds_have_other_fates() -> None:
 def test_keys_that_share_their_links_have_fates_of_their_own(changes: tuple[Change, ...]) -> None:
     """However they come in turns: no key's losses go on with the memory of another one."""
     links = PerKeyLinks(wire_link(FULL), SEED, changes)
-    shared = [of_scan(FULL, key=f"robot/{n}", links=links) for n in range(4)]
+    shared = [KeyFates(links, "put", f"robot/{n}") for n in range(4)]
     in_turn = list(zip(*([fates.next() for fates in shared] for _ in range(100)), strict=True))
     assert [list(fates) for fates in in_turn] == [
         taken(of_scan(FULL, key=f"robot/{n}", changes=changes), 100) for n in range(4)
@@ -191,9 +191,9 @@ def test_changes_while_messages_pass(turns: list[tuple[int, int]]) -> None:
 def test_correlated_links_lose_together() -> None:
     """With strength 1 a link has the losses of the other one, for each key; with strength 0 it has its own."""
     loss = {"loss": {"model": "bernoulli", "quality": 0.5}}
-    other = taken(KeyFates(wire_link(loss, "other"), "k", "put", SEED), 500)
-    tied = {s: KeyFates(wire_link(loss, correlation=("other", s)), "k", "put", SEED) for s in (0.0, 0.5, 1.0)}
+    other = taken(key_fates(wire_link(loss, "other"), "k", "put", SEED), 500)
+    tied = {s: key_fates(wire_link(loss, correlation=("other", s)), "k", "put", SEED) for s in (0.0, 0.5, 1.0)}
     assert taken(tied[1.0], 500) == other
-    assert taken(tied[0.0], 500) == taken(KeyFates(wire_link(loss), "k", "put", SEED), 500)
+    assert taken(tied[0.0], 500) == taken(key_fates(wire_link(loss), "k", "put", SEED), 500)
     alike = np.mean([a == b for a, b in zip(taken(tied[0.5], 500), other, strict=True)])
     assert alike == pytest.approx(0.75, abs=0.1)

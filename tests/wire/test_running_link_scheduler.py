@@ -47,13 +47,13 @@ def test_messages_are_sent_when_they_are_due() -> None:
     held = Held()
     for delay, name in ((3.0, "a"), (1.0, "b"), (2.5, "c"), (1.0, "d")):
         assert held.hold(delay, name=name)
-    assert held.scheduler.held == 4
+    assert len(held.scheduler._heap) == 4
     held.let_go(lambda: len(held.sent) == 4)
     assert held.sent == [("b", 1.0), ("d", 1.0), ("c", 2.5), ("a", 3.0)]
     held.hold(0.5, name="e")
     held.let_go(lambda: len(held.sent) == 5)
     assert held.sent[-1] == ("e", 3.5)
-    assert held.scheduler.held == 0
+    assert len(held.scheduler._heap) == 0
     assert held.scheduler.close() == []
 
 
@@ -105,7 +105,7 @@ def test_what_was_not_sent_at_the_end_is_named() -> None:
     held.let_go(lambda: ended)
     closing.join()
     assert [row for row in ended[0] if row] == [2, 3, 1]
-    assert held.scheduler.held == 0
+    assert len(held.scheduler._heap) == 0
     assert held.sent == []
 
 

@@ -23,13 +23,13 @@ from evedrop.scenario.tables import Scenario
 from evedrop.simulate.montecarlo import Plan
 from evedrop.wire.file import wire_of
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.running_link import KeyFates
 from evedrop.wire.scenario_network import over_wire
 from evedrop.wire.timeline import moments
 from tests.builders import MARGINAL, listener, places_of, process_table, scenario_of
 from tests.conftest import wait_until
 from tests.golden.pages import Golden
 from tests.wire.wire_at_work import at_work
+from tests.wire.wire_links import key_fates
 
 PLAYER = Path(__file__).parents[2] / "docs" / "examples" / "csv_player.py"
 KEY = "robot/pose"
@@ -76,7 +76,7 @@ def delivered(results: Results, receiver: str) -> list[bool]:
 def fates_on(plan: WirePlan, name: str, slots: int) -> list[bool]:
     """The same of messages that a program publishes, one in each slot, by the wire's own fates."""
     link = next(link for link in plan.links if link.name == name)
-    fates, fates_of, before = KeyFates(link, KEY, "put", plan.seed), [], link.settings
+    fates, fates_of, before = key_fates(link, KEY, "put", plan.seed), [], link.settings
     for k in range(slots):
         now = [moment for moment in moments(plan) if moment.time <= k * SECONDS + 1e-9][-1]
         if now.settings[name] != before:

@@ -14,9 +14,8 @@ from evedrop.model.links.loss_model import Fate
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import Change
 from evedrop.wire.deliveries import KeyDeliveries, bounds, normal_bounds
-from evedrop.wire.running_link import KeyFates
 from tests.examples import mostly_long
-from tests.wire.wire_links import LOSSES, wire_link
+from tests.wire.wire_links import LOSSES, key_fates, wire_link
 
 SEED = 5
 TRIALS = 10_000
@@ -131,7 +130,7 @@ def test_measured_deliveries(model: str) -> None:
     changes = [Change(900, {"loss": LOSSES[model], "corrupt": 0.3}), Change(1400, POOR)]
     codes = np.empty((KEYS, 2000), np.uint8)
     for key in range(KEYS):
-        fates = KeyFates(wire_link(settings), f"key/{key}", "put", SEED, changes=changes)
+        fates = key_fates(wire_link(settings), f"key/{key}", "put", SEED, changes=changes)
         codes[key] = [fates.next()[0] for _ in range(2000)]
     for ranges in ([range(2000)], RANGES):
         stream = KeyDeliveries(settings, changes, ranges)

@@ -100,7 +100,7 @@ def test_an_operator_changes_the_wire_at_once() -> None:
         "5.8 s: partition robot, base",
         "6.8 s: heal robot, base",
     ]
-    assert [(event.start, event.stop) for event in conductor.plan.events] == [(3.25, 4.75), (5.75, 6.75)]
+    assert [(event.start, event.stop) for event in conductor._plan.events] == [(3.25, 4.75), (5.75, 6.75)]
 
 
 def test_an_event_that_is_due_comes_before_what_an_operator_does() -> None:

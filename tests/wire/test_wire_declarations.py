@@ -48,7 +48,7 @@ def test_more_tokens_cross_than_a_channel_of_zenoh_holds(tmp_path: Path) -> None
 
 def wire_knows(wire: WireAtWork, side: str) -> bool:
     """Whether the wire knows that a program at a side holds the token."""
-    return "both" in wire.relay.tokens[side]
+    return "both" in wire.relay._liveliness.tokens[side]
 
 
 def test_matching_status_is_always_true(tmp_path: Path) -> None:

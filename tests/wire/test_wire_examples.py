@@ -12,9 +12,9 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from evedrop.wire.running_link import KeyFates
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import LOSSY, WireAtWork, at_work, both_ways, is_declared
+from tests.wire.wire_links import key_fates
 
 EXAMPLES = Path(__file__).parent / "zenoh_examples"
 
@@ -76,7 +76,7 @@ def test_z_sub_hears_of_z_pub_exactly_what_the_link_lets_through(tmp_path: Path)
             def expected() -> list[str]:
                 """What arrives if the wire has heard all but the first messages, which nobody took yet."""
                 first = 60 - len(wire.rows)
-                fates = KeyFates(plan.links[0], key, "put", plan.seed)
+                fates = key_fates(plan.links[0], key, "put", plan.seed)
                 through = [first + n for n in range(60 - first) if fates.next()[0] == 0]
                 return [
                     f">> [Subscriber] Received SampleKind.PUT ('{key}': '[{n:4d}] Pub from Python!')" for n in through

@@ -10,10 +10,9 @@ import zenoh
 
 from evedrop.model.links.loss_model import Fate
 from evedrop.wire.deliveries import KeyDeliveries, bounds
-from evedrop.wire.running_link import KeyFates
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import at_work, link, plan_of
-from tests.wire.wire_links import LOSSES
+from tests.wire.wire_links import LOSSES, key_fates
 
 COUNT = 2000
 
@@ -26,7 +25,7 @@ def test_what_arrives_is_what_the_fates_say(tmp_path: Path) -> None:
     )
     due = {}
     for wire_link in plan.links:
-        fates = KeyFates(wire_link, f"{wire_link.name}/x", "put", plan.seed)
+        fates = key_fates(wire_link, f"{wire_link.name}/x", "put", plan.seed)
         due[wire_link.name] = [n for n in range(COUNT) if fates.next()[0] == Fate.DELIVERED]
     heard: dict[str, list[int]] = defaultdict(list)
 

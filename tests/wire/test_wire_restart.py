@@ -18,9 +18,9 @@ from evedrop.live.protocol.requests import StatusRequest
 from evedrop.wire.file import load_wire
 from evedrop.wire.journal import journal_tables
 from evedrop.wire.run import continuation, run_wire
-from evedrop.wire.running_link import KeyFates
 from tests.conftest import Evedrop, Live, wait_until
 from tests.wire.wire_at_work import program
+from tests.wire.wire_links import key_fates
 from tests.wire.wire_plans import wire_plan
 
 FILE = """
@@ -98,7 +98,7 @@ def test_a_wire_that_was_killed_goes_on_with_its_fates(evedrop: Evedrop) -> None
     )
     assert sentence in done.out
     (link, _) = load_wire(path).links
-    fates = KeyFates(link, "scan", "put", 7)
+    fates = key_fates(link, "scan", "put", 7)
     assert arrived == [n for n in range(2 * COUNT) if fates.next()[0] == 0]
     summary = json.loads((wire.folder / "summary.json").read_text())
     assert (summary["start"], summary["links"]["scan"]["heard"], summary["unaccounted"]) == (2, COUNT, 0)

@@ -22,12 +22,11 @@ from evedrop.wire.journal import WireJournal, journal_tables
 from evedrop.wire.on_disk import closing_lines, scorekeeper_on_disk
 from evedrop.wire.plan import Side, WirePlan
 from evedrop.wire.records import AGAIN, UNLINKED, Kind, WireFate
-from evedrop.wire.running_link import KeyFates
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.tables import WireExpectTable
 from evedrop.wire.tallies import WIRE_METRICS, LinkTally
 from tests.pages import checked, downloads
-from tests.wire.wire_links import LOSSES
+from tests.wire.wire_links import LOSSES, key_fates
 from tests.wire.wire_plans import wire_plan
 
 BURSTS = {"loss": {"model": "gilbert-elliott", "p": 0.02, "r": 0.2}}
@@ -42,7 +41,7 @@ def run(
         for link in (actual or plan).links:
             for at in range(3):
                 key = f"{link.name}/{at}"
-                fates = KeyFates(link, key, "put", plan.seed, journal.counts.get((link.name, key, "put"), 0))
+                fates = key_fates(link, key, "put", plan.seed, journal.counts.get((link.name, key, "put"), 0))
                 for n in range(fates.n, fates.n + messages):
                     fate, delay, again = fates.next()
                     kind = Kind.PUT | AGAIN if again else Kind.PUT
@@ -109,7 +108,7 @@ def test_changes_and_cuts_are_part_of_the_distribution(tmp_path: Path) -> None:
     other = {"loss": {"model": "bernoulli", "quality": 0.3}}
     with WireJournal(tmp_path, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
-        fates, key = KeyFates(plan.links[0], "link/1", "put", 7), journal.words.key_code("link/1")
+        fates, key = key_fates(plan.links[0], "link/1", "put", 7), journal.words.key_code("link/1")
         for n in range(4000):
             if n == 2000:
                 journal.change("link", other, {("link/1", "put"): fates.change(other)})
@@ -152,7 +151,7 @@ def test_a_link_on_many_of_whose_messages_no_model_decides_is_judged_as_a_sample
     plan, messages, quality = wire_plan(link={"loss": {"model": "bernoulli", "quality": 0.7}}), 12_000, 0.7
     with WireJournal(tmp_path, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
-        fates, key = KeyFates(plan.links[0], "link/1", "put", 7), journal.words.key_code("link/1")
+        fates, key = key_fates(plan.links[0], "link/1", "put", 7), journal.words.key_code("link/1")
         for n in range(messages):
             fate = fates.next()[0]
             fate = WireFate.CUT if n % 4 else fate
@@ -173,7 +172,7 @@ def test_the_keys_of_a_history_have_the_bounds_of_one_key(tmp_path: Path) -> Non
     results = []
     for name, shared in (("history", keys), ("single", keys[:1])):
         with WireJournal(tmp_path / name, plan) as journal:
-            keeper, fates = WireScorekeeper(plan, journal), KeyFates(plan.links[0], keys[0], "put", plan.seed)
+            keeper, fates = WireScorekeeper(plan, journal), key_fates(plan.links[0], keys[0], "put", plan.seed)
             for n in range(3000):
                 code = journal.words.key_code(shared[n % len(shared)])
                 journal.records.record(1.0 * n, n, -1, 0.0, code, 0, 1, 0, Kind.PUT, fates.next()[0])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from evedrop.model.slot.link import Change
 from evedrop.wire.plan import WireLink
+from evedrop.wire.running_link import KeyFates, PerKeyLinks
 
 LOSSES: dict[str, dict[str, Any]] = {
     name: {"model": name, **parameters}
@@ -26,3 +28,10 @@ def wire_link(settings: Mapping[str, Any], name: str = "scan", **fields: Any) ->
     return WireLink(
         **{"name": name, "number": 0, "source": "robot", "target": "base", "keys": "**", "settings": settings, **fields}
     )
+
+
+def key_fates(
+    link: WireLink, key: str, kind: str, seed: int, start: int = 0, changes: Iterable[Change] = ()
+) -> KeyFates:
+    """The fates of a key's messages on a link of a wire with this seed."""
+    return KeyFates(PerKeyLinks(link, seed, changes), kind, key, start)

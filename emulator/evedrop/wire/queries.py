@@ -173,11 +173,6 @@ class QueryRelay:
                 with self._lock:
                     mirrored[key] = (wanted[key], queryable)
 
-    def mirrored(self, side: str) -> frozenset[str]:
-        """The keys of the complete queryables at a side that stand for services of other sides."""
-        with self._lock:
-            return frozenset(self._mirrored[side])
-
     def _taker(self, name: str, key: str | None, earlier: Sequence[zenoh.KeyExpr] = ()) -> Any:
         """What takes the queries of a queryable, except those of queryables declared `earlier` with these expressions."""
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence
-from types import TracebackType
 from typing import Self, final
 
 from evedrop.live.network.connecting import LOGGED
@@ -73,24 +72,13 @@ class WireRelay:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._stack.close()
 
     @property
     def endpoints(self) -> Mapping[str, tuple[str, ...]]:
         """Side → where programs connect."""
         return {name: side.endpoints for name, side in self.sides.items()}
-
-    @property
-    def tokens(self) -> Mapping[str, frozenset[str]]:
-        """Side → the liveliness tokens that its programs hold, as far as the wire knows."""
-        return self._liveliness.tokens
-
-    def mirrored(self, side: str) -> frozenset[str]:
-        """The keys of the complete queryables that the wire offers at a side for services of other sides."""
-        return self._queries.mirrored(side)
 
     def apply(self, moment: Moment) -> None:
         """Cut the links that are cut from now on, restore the others, and give all of them their settings."""

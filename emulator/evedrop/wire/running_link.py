@@ -41,28 +41,16 @@ _PROMPT = tuple((code, 0.0, False) for code in range(256))  # shared by all mess
 class KeyFates:
     """The fates of one key's messages of one kind on one link, in order. All keys `KEY/@adv/…` count as one key.
 
-    kind: `put` (deletes are puts), `query` or `reply`; start: the number of the first message to decide; changes: earlier
-    changes of the settings, each at the number of the first message that had them.
-
-    links: made from the link, the seed and the changes; keys may share them.
+    links: of the link, which keys share; kind: `put` (deletes are puts), `query` or `reply`; start: the number of the first
+    message to decide.
 
     Only one thread may call its methods at a time: `RunningLink` holds its lock.
     """
 
     __slots__ = ("_block", "_key", "_kind", "_link", "_links_of_keys", "_ready", "_stop")
 
-    def __init__(
-        self,
-        link: WireLink,
-        key: str,
-        kind: str,
-        seed: int,
-        start: int = 0,
-        changes: Iterable[Change] = (),
-        links: PerKeyLinks | None = None,
-    ) -> None:
-        self._links_of_keys = links or PerKeyLinks(link, seed, changes)
-        self._kind, self._key = kind, numbered_as(key)
+    def __init__(self, links: PerKeyLinks, kind: str, key: str, start: int = 0) -> None:
+        self._links_of_keys, self._kind, self._key = links, kind, numbered_as(key)
         self._link: Link | None = None
         self._stop = start  # the end of the fates in `_ready`
         self._block = 0
@@ -113,7 +101,7 @@ class PerKeyLinks:
     """How a link decides on the messages of each key: what does not depend on the key is made once."""
 
     def __init__(self, link: WireLink, seed: int, changes: Iterable[Change]) -> None:
-        """changes: as for `KeyFates`."""
+        """changes: earlier changes of the settings, each at the number of the first message that had them."""
         schedule = _schedule_of(link, changes)
         self._long = Link(schedule, link.name, {}, _MESSAGES)
         self._short = Link(schedule, link.name, {}, _MESSAGES, SingleTrialReader)
@@ -130,7 +118,7 @@ class PerKeyLinks:
 
 
 def _schedule_of(link: WireLink, changes: Iterable[Change]) -> LinkSchedule:
-    """The schedule of a link for the messages of a key. changes: as for `KeyFates`."""
+    """The schedule of a link for the messages of a key. changes: as for `PerKeyLinks`."""
     # Of several changes at one message the last one counts, as with `KeyFates.change`.
     last = {change.at: change for change in sorted(changes, key=lambda change: change.at)}
     first = last.pop(0, Change(0))  # most keys have no other: a schedule without changes is quicker
@@ -242,11 +230,6 @@ class Scheduler:
             if self._heap[0] is held:
                 self._changed.notify()
         return True
-
-    @property
-    def held(self) -> int:
-        """How many messages wait."""
-        return len(self._heap)
 
     def close(self) -> list[int]:
         """End the thread. Returns the rows of the messages that were not sent."""
@@ -416,9 +399,7 @@ class RunningLink:
             changes = self._journal.history.changes_of(self.link.name, key, kind)
             if self._links_of_keys is None or self._links_of_keys[0] != changes:
                 self._links_of_keys = (changes, PerKeyLinks(self.link, self._seed, changes))
-            fates = self._fates[stream] = KeyFates(
-                self.link, key, kind, self._seed, start, links=self._links_of_keys[1]
-            )
+            fates = self._fates[stream] = KeyFates(self._links_of_keys[1], kind, key, start)
         return fates
 
     def _counted(self, stream: _Stream) -> int:

@@ -9,7 +9,6 @@ import contextlib
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from types import TracebackType
 from typing import Any, Self, final
 
 import zenoh
@@ -72,9 +71,7 @@ class SideSession:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         # Zenoh gives up after 10 s if a program that does not read keeps its connection: the process ends all the same.
         with self.duty.busy(), contextlib.suppress(zenoh.ZError):
             self.session.close()

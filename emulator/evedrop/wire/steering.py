@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, final
 
 from evedrop.errors import ScenarioError
@@ -58,9 +57,7 @@ class WireConductor:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -70,11 +67,6 @@ class WireConductor:
     def seconds(self) -> float:
         """How long the wire has been running."""
         return self._clock.monotonic() - self._begun
-
-    @property
-    def plan(self) -> WirePlan:
-        """The plan, with the events of operators."""
-        return self._plan
 
     def change(self, table: Mapping[str, Any]) -> str:
         """Carry out an event at once; returns what it does. table: as `[[event]]` without a time. Raises ScenarioError."""
@@ -158,9 +150,7 @@ class WireControl:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._stack.close()
 
     def _answer(self, question: Question) -> None:

@@ -54,12 +54,6 @@ class WireSteps:
     """Of the delays so far in each bucket, in seconds: exactly the delay where it is constant, (links + 1, buckets)."""
 
     @property
-    def heard(self) -> Counts:
-        """Messages that came, (c, links + 1)."""
-        heard: Counts = self.counts.sum(2)
-        return heard
-
-    @property
     def numbers(self) -> Counts:
         """Numbers of the steps, (c,)."""
         return np.arange(self.first, self.first + len(self.counts))

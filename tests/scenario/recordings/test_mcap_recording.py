@@ -21,10 +21,10 @@ from evedrop.model.links.loss_model import Fate
 from evedrop.scenario.recordings.link_fit import fit_messages
 from evedrop.scenario.recordings.mcap_recording import mcap_recording
 from evedrop.wire.file import wire_of
-from evedrop.wire.running_link import KeyFates
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
 from tests.scenario.recordings.recorded_messages import BURSTS, Recorded, heard, lossy, trimmed, write
+from tests.wire.wire_links import key_fates
 
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
@@ -248,7 +248,7 @@ def test_the_outcomes_are_saved_as_a_trace(evedrop: Evedrop) -> None:
     assert evedrop("links", "fit", "tuesday.mcap", "--save", "tuesday.csv").status == 0
     link = {"from": "robot", "to": "base", "loss": {"model": "trace", "file": "tuesday.csv", "column": "received"}}
     wire = wire_of({"side": {"robot": {}, "base": {}}, "link": [link]}, folder=evedrop.folder)
-    fates = KeyFates(wire.links[0], "0/scan/a", "put", 7)
+    fates = key_fates(wire.links[0], "0/scan/a", "put", 7)
     word = trimmed(outcomes)
     assert [int(fates.next()[0] == Fate.DELIVERED) for _ in word] == word
     done = evedrop("links", "fit", "tuesday.mcap", "--save", "missing/tuesday.csv")
