@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import accumulate, groupby, pairwise
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import accumulate, pairwise
 from typing import Any, final
 
 import numpy as np
@@ -21,6 +20,7 @@ import numpy as np
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.links import loss_of
 from evedrop.model.links.counts import Counted, Spectrum, Thinned
+from evedrop.model.links.loss_model import LossModel
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule
 from evedrop.model.slot.link_distribution import stretches
 
@@ -35,30 +35,18 @@ _MARGIN = 16  # points
 _MOST_PARTS, _POWERS = 2048, 16  # ranges of different streams, and how many of them the powers of a chain cost
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Consecutive messages between which the settings do not change."""
-
-    loss: int
-    """Which of the loss models decides on them: the number of the change that brought it."""
-    spec: Mapping[str, Any]
-    slots: range
-    passes: float
-    """Probability that a message that is not lost gets through."""
-
-
 @final
 class KeyDeliveries:
     """The number of messages of one key that get through.
 
-    settings: `WireLink.settings`; changes: as for `KeyFates`; ranges: the numbers of the messages, disjoint and ascending;
+    settings: `WireLink.settings`; changes: as for `PerKeyLinks`; ranges: the numbers of the messages, disjoint and ascending;
     sampled: how many of them count, picked at random; None: all.
 
     The variance is exact for losses without a memory, and for those of a Markov chain, whatever is left out. For other losses
     with a memory it is as exact as the model's `rate_variance` for a single range, and an upper bound for several.
     """
 
-    __slots__ = ("_groups", "mean", "parts", "sampled", "variance")
+    __slots__ = ("_pieces", "mean", "sampled", "variance")
 
     def __init__(
         self,
@@ -67,43 +55,51 @@ class KeyDeliveries:
         ranges: Iterable[range],
         sampled: int | None = None,
     ) -> None:
-        self.parts = list(_parts(settings, changes, ranges))
-        self._groups = [[*group] for _, group in groupby(self.parts, key=lambda part: part.loss)]
+        self._pieces = _pieces(settings, changes, ranges)
         self.sampled = sampled is not None
         self.mean = self.variance = 0.0
-        for parts in self._groups:
-            loss = loss_of(parts[0].spec)
+        for loss, parts in self._pieces:
             self.mean += sum_in_order(part.passes * loss.count_mean(part.slots) for part in parts)
-            self.variance += loss.count_variance([Thinned(part.slots, part.passes) for part in parts])
+            self.variance += loss.count_variance(parts)
         if sampled is not None:  # a sample of a known range: the range varies as a whole, and the sample within it
-            fraction = sampled / sum(len(part.slots) for part in self.parts)
+            fraction = sampled / sum(len(part.slots) for _, parts in self._pieces for part in parts)
             self.mean = min(self.mean * fraction, sampled)  # the product is rounded
             self.variance = self.variance * fraction**2 + self.mean * (1.0 - self.mean / sampled)
+
+    @property
+    def parts(self) -> int:
+        """How many times consecutive messages have the same settings."""
+        return sum(len(parts) for _, parts in self._pieces)
 
     def spectrum(self, z: Spectrum) -> Spectrum | None:
         """E[z^D] of the number D; None if it is not known, or too much work."""
         if self.sampled:
             return None
         spectrum = np.ones_like(z)
-        for parts in self._groups:
+        for loss, parts in self._pieces:
             factors = {passes: 1.0 + passes * (z - 1.0) for passes in {part.passes for part in parts}}
-            factor = loss_of(parts[0].spec).count_spectrum(
-                [Counted(part.slots, factors[part.passes]) for part in parts]
-            )
+            factor = loss.count_spectrum([Counted(part.slots, factors[part.passes]) for part in parts])
             if factor is None:
                 return None
             spectrum *= factor
         return spectrum
 
 
-def deliveries_between(streams: Sequence[KeyDeliveries], count: int) -> tuple[int, int] | None:
-    """The bounds of 99 % of all wires: the least and the most deliveries among `count` messages of independent streams.
-
-    At most 0.5 % of all wires deliver fewer, and at most 0.5 % more. None if the distribution is not known or too much work.
-    """
+def bounds(streams: Sequence[KeyDeliveries], count: int) -> tuple[float, float]:
+    """The least and the most deliveries among `count` messages of independent streams, in 99 % of all wires."""
     mean, variance = (sum_in_order(getattr(stream, name) for stream in streams) for name in ("mean", "variance"))
+    return _bounds_by_transform(streams, count, mean, variance) or normal_bounds(mean, variance, count)
+
+
+def _bounds_by_transform(
+    streams: Sequence[KeyDeliveries], count: int, mean: float, variance: float
+) -> tuple[int, int] | None:
+    """At most 0.5 % of all wires deliver fewer, and at most 0.5 % more; None if that is not known or too much work.
+
+    mean, variance: of all streams together.
+    """
     different = Counter(streams)
-    if variance <= 0.0 or sum(_POWERS + len(stream.parts) for stream in different) > _MOST_PARTS:
+    if variance <= 0.0 or sum(_POWERS + stream.parts for stream in different) > _MOST_PARTS:
         return None
     period = min(count + 1, math.ceil(2.0 * _FARTHEST * math.sqrt(variance)) + 2)
     points = min(_POINTS, 1 << (period - 1).bit_length())
@@ -127,28 +123,26 @@ def deliveries_between(streams: Sequence[KeyDeliveries], count: int) -> tuple[in
     return max(0, first + math.floor(low * step)), min(count, first + math.ceil(high * step))
 
 
-def bounds(streams: Sequence[KeyDeliveries], count: int) -> tuple[float, float]:
-    """Between which numbers the deliveries among `count` messages are in 99 % of all wires."""
-    between = deliveries_between(streams, count)
-    if between is not None:
-        return between
-    mean, variance = (sum_in_order(getattr(stream, name) for stream in streams) for name in ("mean", "variance"))
-    return normal_bounds(mean, variance, count)
-
-
 def normal_bounds(mean: float, variance: float, count: int) -> tuple[float, float]:
     """The same for a normal variable, with a correction for whole numbers."""
     reach = _STANDARD_DEVIATIONS * math.sqrt(variance) + (0.5 if variance > 0.0 else 1e-6 * max(1.0, mean))
     return max(0.0, mean - reach), min(float(count), mean + reach)
 
 
-def _parts(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Iterable[range]) -> Iterator[_Part]:
+def _pieces(
+    settings: Mapping[str, Any], changes: Iterable[Change], ranges: Iterable[range]
+) -> list[tuple[LossModel, list[Thinned]]]:
+    """The loss models in turn, each with the messages on which it decides, in parts between which no setting changes."""
     marks = stretches(LinkSchedule(settings, changes=tuple(changes)))
     models = accumulate((new["loss"] != old["loss"] for (_, old, _), (_, new, _) in pairwise(marks)), initial=0)
     ends = [*(start for start, _, _ in marks[1:]), NEVER]
-    parts = [*zip(models, marks, ends, strict=True)]
+    spans = [*zip(models, marks, ends, strict=True)]
+    pieces: dict[int, tuple[LossModel, list[Thinned]]] = {}
     for some in ranges:
-        for model, (start, new, _), stop in parts:
+        for model, (start, new, _), stop in spans:
             slots = range(max(some.start, start), min(some.stop, stop))
             if slots:
-                yield _Part(model, new["loss"], slots, 1.0 - new.get("corrupt", 0.0))
+                if model not in pieces:
+                    pieces[model] = (loss_of(new["loss"]), [])
+                pieces[model][1].append(Thinned(slots, 1.0 - new.get("corrupt", 0.0)))
+    return [*pieces.values()]
