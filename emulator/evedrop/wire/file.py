@@ -177,11 +177,10 @@ def wire_event(
     """The event of a table. settings: those of each link when the event begins; first: those at the start of the wire."""
     start = table.at if table.start is None else table.start
     assert start is not None  # noqa: S101 - checked when the table was read
-    side, other = table.partition or ("", "")
     changes = None
     if table.link is not None and table.set is not None:
         changes = changed_settings(settings[table.link], table.set, first[table.link])
-    partition = None if table.partition is None else (side, other)
+    partition = None if table.partition is None else (table.partition[0], table.partition[1])
     return WireEvent(start, table.to, partition, table.cut, table.link, changes, table.note)
 
 

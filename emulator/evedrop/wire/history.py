@@ -148,12 +148,11 @@ class WireHistory:
         for link, changes in self._settings.items():
             for change in changes:
                 mistakes = [
-                    (f"loss.{name}", sentence)
-                    for name, sentence in model_mistakes(change.settings["loss"], LOSS_MODELS)
+                    (f"{entry}.{name}", reason)
+                    for entry, models in (("loss", LOSS_MODELS), ("delay", DELAY_MODELS))
+                    if change.settings.get(entry) is not None
+                    for name, reason in model_mistakes(change.settings[entry], models)
                 ]
-                if change.settings.get("delay") is not None:
-                    wrong = model_mistakes(change.settings["delay"], DELAY_MODELS)
-                    mistakes += [(f"delay.{name}", reason) for name, reason in wrong]
                 mistakes += probability_mistakes(change.settings, "corrupt", "duplicate", "reorder")
                 for name, reason in mistakes:
                     raise UsageError(f"{self.folder / _FILE} has settings of the link {link} in which {name} {reason}")

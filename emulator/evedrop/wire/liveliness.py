@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import final
 
 import zenoh
@@ -57,7 +58,9 @@ class LivelinessRelay:
             (
                 name,
                 side.session.liveliness().declare_subscriber(
-                    expression, world().zenoh.handlers.Callback(self._heard(name), indirect=True), history=True
+                    expression,
+                    world().zenoh.handlers.Callback(partial(self._heard, name), indirect=True),
+                    history=True,
                 ),
             )
             for name, side in sides.items()
@@ -111,13 +114,10 @@ class LivelinessRelay:
                         token.undeclare()
                 mirrored.clear()
 
-    def _heard(self, name: str) -> Callable[[zenoh.Sample], None]:
-        def heard(sample: zenoh.Sample) -> None:
-            # Without the lock: a program that declares a token waits until Zenoh has reported it.
-            self._events.append((name, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
-            self._changed()
-
-        return heard
+    def _heard(self, name: str, sample: zenoh.Sample) -> None:
+        # Without the lock: a program that declares a token waits until Zenoh has reported it.
+        self._events.append((name, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+        self._changed()
 
     def _lives(self, name: str, key: str) -> bool:
         """Whether a token lives at a side at which the wire does not hold it: then a program there does."""

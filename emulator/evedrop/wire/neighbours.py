@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import combinations
 from typing import Any, final
 
@@ -49,7 +50,7 @@ class Bypasses:
         """Notice programs in mode peer from now on, and those that are there."""
         self._listeners += [
             side.session.info.declare_transport_events_listener(
-                self._scouted(side.name) if side.side.peers else self._listener(side.name), history=True
+                partial(self._scouted if side.side.peers else self._connected, side.name), history=True
             )
             for side in sides
         ]
@@ -72,33 +73,27 @@ class Bypasses:
             self._scout.stop()
             self._scout = None
 
-    def _listener(self, side: str) -> Callable[[zenoh.TransportEvent], None]:
-        def changed(event: zenoh.TransportEvent) -> None:
-            program = (side, str(event.transport.zid))
-            if event.kind != zenoh.SampleKind.PUT or event.transport.whatami != zenoh.WhatAmI.PEER:
-                return
-            if program not in self._programs and not self._lines.is_full:  # each once, however often it connects
-                self._programs.add(program)
-                self.add(
-                    f"the program {program[1]} at side {side} is in mode peer: such programs find each other past the wire, so "
-                    'the wire has no verdict; connect it with mode "client", or switch its multicast scouting off and set '
-                    f"side.{side}.peers = true"
-                )
+    def _connected(self, side: str, event: zenoh.TransportEvent) -> None:
+        """Tell a peer at a side that does not allow them."""
+        program = (side, str(event.transport.zid))
+        if event.kind != zenoh.SampleKind.PUT or event.transport.whatami != zenoh.WhatAmI.PEER:
+            return
+        if program not in self._programs and not self._lines.is_full:  # each once, however often it connects
+            self._programs.add(program)
+            self.add(
+                f"the program {program[1]} at side {side} is in mode peer: such programs find each other past the wire, so "
+                'the wire has no verdict; connect it with mode "client", or switch its multicast scouting off and set '
+                f"side.{side}.peers = true"
+            )
 
-        return changed
-
-    def _scouted(self, side: str) -> Callable[[zenoh.TransportEvent], None]:
-        """Notes the peers of a side that allows them, for `update`."""
-
-        def changed(event: zenoh.TransportEvent) -> None:
-            program = str(event.transport.zid)
-            if event.kind != zenoh.SampleKind.PUT:
-                self._allowed.pop(program, None)
-            elif event.transport.whatami == zenoh.WhatAmI.PEER:
-                self._allowed[program] = side
-                self._new = True
-
-        return changed
+    def _scouted(self, side: str, event: zenoh.TransportEvent) -> None:
+        """Note the peers of a side that allows them, for `update`."""
+        program = str(event.transport.zid)
+        if event.kind != zenoh.SampleKind.PUT:
+            self._allowed.pop(program, None)
+        elif event.transport.whatami == zenoh.WhatAmI.PEER:
+            self._allowed[program] = side
+            self._new = True
 
     def _answered(self, hello: zenoh.Hello) -> None:
         """Tell a program that answers multicast scouting, if it is at a side."""
@@ -133,7 +128,9 @@ class Neighbours:
         self._sent: dict[bytes, tuple[str, float]] = {}
         """Number in a probe → the side at which it was sent, and when."""
         self._subscribers = [
-            side.session.declare_subscriber(PROBES, self._listener(name), allowed_origin=zenoh.Locality.REMOTE)
+            side.session.declare_subscriber(
+                PROBES, partial(self._note_probe, name), allowed_origin=zenoh.Locality.REMOTE
+            )
             for name, side in sides.items()
         ]
 
@@ -177,15 +174,13 @@ class Neighbours:
             self._sent[nonce] = (name, now)
             side.session.put(self._probes[name], nonce)
 
-    def _listener(self, name: str) -> Callable[[zenoh.Sample], None]:
-        def heard(sample: zenoh.Sample) -> None:
-            if len(sample.payload) != _NONCE_BYTES:
-                return
-            source, _ = self._sent.get(sample.payload.to_bytes(), (name, 0.0))
-            if source != name:
-                self._heard[source, name] = world().monotonic()
-
-        return heard
+    def _note_probe(self, name: str, sample: zenoh.Sample) -> None:
+        """Take a probe that was heard at a side."""
+        if len(sample.payload) != _NONCE_BYTES:
+            return
+        source, _ = self._sent.get(sample.payload.to_bytes(), (name, 0.0))
+        if source != name:
+            self._heard[source, name] = world().monotonic()
 
     def _passes(self, first: str, second: str) -> bool:
         """Whether messages pass between two sides outside the wire, in either direction."""

@@ -24,7 +24,7 @@ from evedrop.wire.records import AGAIN, HELD, UNLINKED, Kind, WireFate
 from evedrop.wire.ros2 import SenderReader
 from evedrop.wire.running_link import Lane, RunningLink
 from evedrop.wire.send_queue import LONG_SECONDS, SendQueue, waiting_bytes
-from evedrop.wire.side import SideSession, expressions_of
+from evedrop.wire.side import SideSession, expressions_in_turn
 from evedrop.wire.watchdog import Duty
 
 WAITING = 8192
@@ -153,13 +153,11 @@ class PublicationRelay:
         self.backlogs: list[Backlog] = []
         """The messages of each subscription that wait for the wire."""
         self._until = math.inf
-        expressions = [zenoh.KeyExpr(text) for text in expressions_of(side.side, plan.links)]
         self._subscribers = []
         self._threads = []
-        for at, expression in enumerate(expressions):
+        for expression, earlier in expressions_in_turn(side.side, plan.links):
             channel: zenoh.handlers.FifoChannel[zenoh.Sample] = world().zenoh.handlers.FifoChannel(WAITING)
             subscriber = side.session.declare_subscriber(expression, channel, allowed_origin=REMOTE)
-            earlier = tuple(text for text in expressions[:at] if text.intersects(expression))
             self._subscribers.append(subscriber)
             self.duties.append(Duty(f"among the messages from the side {side.name}"))
             self.backlogs.append(Backlog(subscriber.handler, WAITING))
@@ -193,7 +191,6 @@ class PublicationRelay:
         take = self._taker()
 
         def take_own(sample: zenoh.Sample) -> None:
-            # A message that several subscriptions hear belongs to the first.
             if not any(expression.intersects(sample.key_expr) for expression in earlier):
                 take(sample)
 

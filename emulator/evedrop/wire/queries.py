@@ -26,7 +26,7 @@ from evedrop.wire.records import AGAIN, HELD, UNLINKED, Kind, WireFate
 from evedrop.wire.ros2 import SenderReader, reply_seconds
 from evedrop.wire.running_link import Decision, Lane, RunningLink, Scheduler
 from evedrop.wire.send_queue import SendQueue, waiting_bytes
-from evedrop.wire.side import SideSession, expressions_of
+from evedrop.wire.side import SideSession, expressions_in_turn
 from evedrop.wire.watchdog import Duty
 
 _REMOTE = zenoh.Locality.REMOTE
@@ -109,18 +109,14 @@ class QueryRelay:
         self.duty = Duty("among the queries")
         self._thread = world().thread(self._run, name="queries")
         self._queryables: list[tuple[str, Any]] = []
+        """Side and queryable: those for everything, under the side's key expressions."""
         for name, side in sides.items():
-            if any(state.link.source == name for state in self._states):
-                self._declare(name, [zenoh.KeyExpr(text) for text in expressions_of(side.side, plan.links)])
-
-    def _declare(self, name: str, expressions: Sequence[zenoh.KeyExpr]) -> None:
-        """Offer the queryables for everything at a side, under its key expressions."""
-        for at, expression in enumerate(expressions):
-            earlier = tuple(other for other in expressions[:at] if other.intersects(expression))
-            queryable = self._sides[name].session.declare_queryable(
-                expression, self._taker(name, None, earlier), allowed_origin=_REMOTE
-            )
-            self._queryables.append((name, queryable))
+            if not any(state.link.source == name for state in self._states):
+                continue
+            for expression, earlier in expressions_in_turn(side.side, plan.links):
+                taker = self._taker(name, None, earlier)
+                queryable = side.session.declare_queryable(expression, taker, allowed_origin=_REMOTE)
+                self._queryables.append((name, queryable))
 
     def start(self) -> None:
         """Begin to take queries."""

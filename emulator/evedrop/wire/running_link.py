@@ -14,6 +14,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from itertools import repeat
 from typing import Any, NamedTuple, final
 
@@ -81,19 +82,20 @@ class KeyFates:
 
     def _first(self) -> list[MessageFate]:
         """The fates of the first block, without a link that is kept: most keys of many have few messages."""
-        self._block = _FIRST_BLOCK
-        slots = range(self._stop, self._stop + self._block)
-        self._stop = slots.stop
+        slots = self._next_block(_FIRST_BLOCK)
         return _rows(self._links_of_keys.link(self._kind, self._key, slots.start, short=True).fates(slots))
 
     def _planned(self) -> list[MessageFate]:
         """The fates of the next block, the last one first."""
         if self._link is None:
             self._link = self._links_of_keys.link(self._kind, self._key, self._stop)
-        self._block = min(8 * self._block or _FIRST_BLOCK, _LARGEST_BLOCK)
-        slots = range(self._stop, self._stop + self._block)
-        self._stop = slots.stop
-        return _rows(self._link.planned(slots))
+        return _rows(self._link.planned(self._next_block(min(8 * self._block or _FIRST_BLOCK, _LARGEST_BLOCK))))
+
+    def _next_block(self, size: int) -> range:
+        """The numbers of the next messages that are decided together."""
+        self._block, start = size, self._stop
+        self._stop += size
+        return range(start, self._stop)
 
 
 @final
@@ -169,15 +171,13 @@ class _Held(NamedTuple):
 
 
 @final
+@dataclass(slots=True)
 class KeyOrder:
     """Messages of which none is sent before an earlier one, such as those of a key."""
 
-    __slots__ = ("_latest", "due")
-
-    def __init__(self) -> None:
-        self.due = 0.0
-        """When the latest decided message is due, in seconds of the monotonic clock."""
-        self._latest = 0.0
+    due: float = 0.0
+    """When the latest decided message is due, in seconds of the monotonic clock."""
+    _latest: float = 0.0
 
     def delay(self, delay: float, now: float) -> float:
         """The delay, in seconds, of the next message, which by itself has another one."""

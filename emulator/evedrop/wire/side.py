@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any, Self, final
 
@@ -112,6 +112,15 @@ def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...
     else:
         expressions += [f"{key}/@adv/**" for key in side.keys if key.endswith("**")]
     return tuple(dict.fromkeys(expressions))
+
+
+def expressions_in_turn(
+    side: Side, links: Iterable[WireLink]
+) -> Iterator[tuple[zenoh.KeyExpr, tuple[zenoh.KeyExpr, ...]]]:
+    """`expressions_of` a side, each with those before it that have common keys: a message belongs to the first of them."""
+    expressions = [zenoh.KeyExpr(text) for text in expressions_of(side, links)]
+    for at, expression in enumerate(expressions):
+        yield expression, tuple(earlier for earlier in expressions[:at] if earlier.intersects(expression))
 
 
 def side_config(side: Side, largest: int, users: str | None) -> ZenohConfig:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple, final
 
 import numpy as np
@@ -28,28 +29,25 @@ for _fate in WireFate:
 
 
 @final
+@dataclass(slots=True)
 class StreamTally:
     """The messages of one key and kind on one link."""
 
-    __slots__ = (
-        "_earlier", "_missing", "_since", "_start", "_stop", "longest", "passed", "scattered", "silence", "tried",
-    )  # fmt: skip
-
-    def __init__(self) -> None:
-        self.tried = 0
-        """Messages on which the link's models decided."""
-        self.passed = 0
-        """Those of them that the models let through."""
-        self.longest = 0
-        """The most messages in a row that were not delivered."""
-        self.silence = 0.0
-        """The longest time, in seconds, from a delivered message to the next one, if messages between them were not delivered."""
-        self.scattered = False
-        """Whether their numbers are too scattered to be kept: then `ranges` is one that contains all of them."""
-        self._start = self._stop = 0
-        self._earlier: list[tuple[int, int]] | None = None  # most streams have one range, and no need for a list
-        self._missing = 0
-        self._since: float | None = None  # when the latest delivered message was heard, or else the first message
+    tried: int = 0
+    """Messages on which the link's models decided."""
+    passed: int = 0
+    """Those of them that the models let through."""
+    longest: int = 0
+    """The most messages in a row that were not delivered."""
+    silence: float = 0.0
+    """The longest time, in seconds, from a delivered message to the next one, if messages between them were not delivered."""
+    scattered: bool = False
+    """Whether their numbers are too scattered to be kept: then `ranges` is one that contains all of them."""
+    _start: int = 0
+    _stop: int = 0
+    _earlier: list[tuple[int, int]] | None = None  # most streams have one range, and no need for a list
+    _missing: int = 0
+    _since: float | None = None  # when the latest delivered message was heard, or else the first message
 
     @property
     def ranges(self) -> list[tuple[int, int]]:

@@ -8,7 +8,7 @@ Source: docs/wire/file.md, events.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -130,7 +130,8 @@ def _begun(event: WireEvent) -> str:
     if event.cut is not None:
         return f"cut {event.cut}"
     if event.settings is not None:
-        return f"link {event.link}: {', '.join(_settings(event.settings))}"
+        settings = ", ".join(f"{name} = {as_toml(value)}" for name, value in event.settings.items())
+        return f"link {event.link}: {settings}"
     return f"{event.note}"
 
 
@@ -141,7 +142,3 @@ def _ended(event: WireEvent) -> str:
     if event.cut is not None:
         return f"heal {event.cut}"
     return f"link {event.link}: {', '.join(event.settings or ())} as before"
-
-
-def _settings(settings: Mapping[str, Any]) -> Iterator[str]:
-    return (f"{name} = {as_toml(value)}" for name, value in settings.items())

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import NoReturn, Self, final
 
 from evedrop.system.output import say
@@ -28,22 +29,20 @@ _LAST_SECONDS = 5.0  # for the last steps of a process that ends at once
 
 
 @final
+@dataclass(slots=True, eq=False)
 class Duty:
-    """The work of a thread. `in_hand` is a new object for each piece of work, and None while the thread waits for work."""
+    """The work of a thread."""
 
-    __slots__ = ("end_seconds", "in_hand", "seconds", "waits", "where")
-
-    def __init__(
-        self, where: str, seconds: float = WORK_SECONDS, end_seconds: float = END_SECONDS, waits: bool = False
-    ) -> None:
-        """where: the place in the words of a message, such as "in the journal".
-
-        seconds, end_seconds: how long it may have one thing in hand, before and after the wire is to end; waits: whether it waits
-        for the other duties, and so does not hang while any of them moves.
-        """
-        self.where, self.waits = where, waits
-        self.seconds, self.end_seconds = seconds, end_seconds
-        self.in_hand: object = None
+    where: str
+    """The place in the words of a message, such as "in the journal"."""
+    seconds: float = WORK_SECONDS
+    """How long it may have one thing in hand."""
+    end_seconds: float = END_SECONDS
+    """The same once the wire is to end."""
+    waits: bool = False
+    """Whether it waits for the other duties, and so does not hang while any of them moves."""
+    in_hand: object = None
+    """A new object for each piece of work, and None while the thread waits for work."""
 
     @contextlib.contextmanager
     def busy(self) -> Iterator[None]:
