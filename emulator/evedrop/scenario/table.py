@@ -79,6 +79,11 @@ def _no_class(name: Any, classes: Registry[Any]) -> str | None:
 def _process_name(name: str) -> str:
     if name in RESERVED:
         raise expected(f"any name but {listed(RESERVED)}, which are reserved")
+    return checked_name(name)
+
+
+def checked_name(name: str) -> str:
+    """The name, if it has the form `NAME`; otherwise raises the error of a check."""
     if not NAME.fullmatch(name):
         raise expected("a name of a lower-case letter, then up to 31 of a-z 0-9 _ -")
     return name

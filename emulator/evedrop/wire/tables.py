@@ -21,7 +21,7 @@ from evedrop.model.checks import as_toml
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.scenario.receivers import CorrelationTable, LinkTable
-from evedrop.scenario.table import NAME, Mistake, Table, expected, model_mistakes, refuse
+from evedrop.scenario.table import Mistake, Table, checked_name, expected, model_mistakes, refuse
 from evedrop.scenario.words import listed
 from evedrop.system.hints import near
 from evedrop.wire.tallies import WIRE_METRICS
@@ -278,12 +278,6 @@ def _key_expression(text: str) -> str:
     return text
 
 
-def _side_name(name: str) -> str:
-    if not NAME.fullmatch(name):
-        raise expected("a name of a lower-case letter, then up to 31 of a-z 0-9 _ -")
-    return name
-
-
 def _link_name(name: str) -> str:
     if not _LINK_NAME.fullmatch(name):
         raise expected("a name of a lower-case letter, then up to 79 of a-z 0-9 _ -")
@@ -492,7 +486,7 @@ class WireFile(Table):
 
     seed: Annotated[int, Field(ge=0, lt=2**256, strict=True, examples=[7])] = 0
     side: Annotated[
-        dict[Annotated[str, AfterValidator(_side_name)], SideTable],
+        dict[Annotated[str, AfterValidator(checked_name)], SideTable],
         Field(
             min_length=2,
             examples=[{"robot": {"listen": "tcp/127.0.0.1:7448"}, "base": {}}],

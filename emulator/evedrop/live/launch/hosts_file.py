@@ -17,19 +17,13 @@ from evedrop.live.launch.ports import RouterEndpoint, RouterEndpoints, router_en
 from evedrop.names import CONTROLLER, LEGITIMATE, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.scenario.line_numbers import with_line_numbers
 from evedrop.scenario.loading import tables_in
-from evedrop.scenario.table import NAME, Table, expected, sentences
+from evedrop.scenario.table import Table, checked_name, expected, sentences
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
 from evedrop.system.files import Unreadable, shown, text_of
 from evedrop.system.hints import near
 
 _MOST_BYTES = 2**20
-
-
-def _host_name(name: str) -> str:
-    if not NAME.fullmatch(name):
-        raise expected("a name of a lower-case letter, then up to 31 of a-z 0-9 _ -")
-    return name
 
 
 def _word(text: str) -> str:
@@ -84,7 +78,7 @@ class HostsFile(Table):
     router: Annotated[RouterTable, Field(examples=[{"listen": "tls/0.0.0.0:7447", "connect": "tls/alpha.lan:7447"}])]
     relay: RouterTable | None = None
     hosts: Annotated[
-        dict[Annotated[str, AfterValidator(_host_name)], HostTable],
+        dict[Annotated[str, AfterValidator(checked_name)], HostTable],
         Field(min_length=1, examples=[{"beta": {"address": "beta.lan", "processes": ["smart"]}}]),
     ]
 
