@@ -83,11 +83,11 @@ def test_an_operator_changes_the_wire_at_once() -> None:
         assert conductor.seconds == 3.25
         assert conductor.change({"cut": "robot-base"}) == "cut robot-base"
         clock.sleep(1.5)
-        assert conductor.end_cut("robot-base") == "heal robot-base"
+        assert conductor.change({"heal": "robot-base"}) == "heal robot-base"
         clock.sleep(1.0)
         assert conductor.change({"partition": ["robot", "base"]}) == "partition robot, base"
         clock.sleep(1.0)
-        assert conductor.end_partition("base", "robot") == "heal robot, base"
+        assert conductor.change({"join": ["base", "robot"]}) == "heal robot, base"
     assert links.at[2:] == [
         (3.25, CUT, ("cut robot-base",)),
         (4.75, WHOLE, ("heal robot-base",)),
@@ -110,7 +110,7 @@ def test_an_event_that_is_due_comes_before_what_an_operator_does() -> None:
     # Without its thread: nobody else looks at the time.
     conductor = WireConductor(plan_of({"at": 2, "cut": "robot-base"}), links, lines.append, clock)  # type: ignore[arg-type]
     clock.sleep(5.0)
-    conductor.end_cut("robot-base")
+    conductor.change({"heal": "robot-base"})
     assert lines == ["2.0 s: cut robot-base", "5.0 s: heal robot-base"]
     assert [(cut, lines) for _, cut, lines in links.at] == [
         (WHOLE, ()),

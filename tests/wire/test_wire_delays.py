@@ -138,7 +138,7 @@ def test_events_cut_and_part_links_and_change_them_while_the_wire_runs(tmp_path:
         assert conductor.change({"partition": ["robot", "base"]}) == "partition robot, base"
         wait_until(lambda: robot.put("x", b"") or WireFate.CUT in wire.fates(), "nothing passes")
         wait_until(lambda: robot.put("stop/now", b"") or got, "but what is lossless does")
-        conductor.end_partition("robot", "base")
+        conductor.change({"join": ["robot", "base"]})
         count = len(wire.fates())
         wait_until(lambda: robot.put("x", b"") or 0 in wire.fates()[count + 1 :], "it passes again")
         conductor.change({"link": "robot-base", "set": {"quality": 0.0}})

@@ -32,7 +32,7 @@ from evedrop.wire.relay import WireRelay
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.side import opened
 from evedrop.wire.tables import FREE
-from evedrop.wire.timeline import moment_at, times, with_change, with_cut_ended, with_partition_ended
+from evedrop.wire.timeline import moment_at, times, with_request
 
 
 @final
@@ -68,23 +68,12 @@ class WireConductor:
         """How long the wire has been running."""
         return self._clock.monotonic() - self._begun
 
-    def change(self, table: Mapping[str, Any]) -> str:
-        """Carry out an event at once; returns what it does. table: as `[[event]]` without a time. Raises ScenarioError."""
-        return self._now(lambda plan, now: with_change(plan, table, now))
-
-    def end_cut(self, link: str) -> str:
-        """End a cut at once; returns the line that says so. Raises ScenarioError if the link is not cut."""
-        return self._now(lambda plan, now: with_cut_ended(plan, link, now))
-
-    def end_partition(self, side: str, other: str) -> str:
-        """End a partition at once; returns the line that says so. Raises ScenarioError if the sides are not partitioned."""
-        return self._now(lambda plan, now: with_partition_ended(plan, side, other, now))
-
-    def _now(self, change: Callable[[WirePlan, float], tuple[WirePlan, str]]) -> str:
+    def change(self, event: Mapping[str, Any]) -> str:
+        """Carry out an operator's event, as `with_request` takes it, at once; returns what it does. Raises ScenarioError."""
         with self._changed:
             now = self.seconds
             self._carry_out(now)
-            self._plan, text = change(self._plan, now)
+            self._plan, text = with_request(self._plan, event, now)
             self._relay.apply(moment_at(self._plan, now))
             self._done = now
             self._say(f"{now:.1f} s: {text}")
@@ -173,11 +162,6 @@ class WireControl:
             return Answer(
                 refused=(f"a wire cannot be held: {why}; `evedrop link` cuts a link, `evedrop partition` two sides",)
             )
-        healed, joined = request.event.get("heal"), request.event.get("join")
-        if isinstance(healed, str):
-            return Answer(0, self._conductor.end_cut(healed))
-        if isinstance(joined, list) and len(joined) == 2:
-            return Answer(0, self._conductor.end_partition(*map(str, joined)))
         return Answer(0, self._conductor.change(request.event))
 
     def _status(self) -> WireStatus:

@@ -63,6 +63,19 @@ def moment_at(plan: WirePlan, time: float) -> Moment:
     return Moment(time, tuple(sentences), frozenset(cut), settings)
 
 
+def with_request(plan: WirePlan, event: Mapping[str, Any], time: float) -> tuple[WirePlan, str]:
+    """The plan after an operator's event at a time, and the line that says what it does. Raises ScenarioError.
+
+    event: `heal` with the name of a link that is cut, `join` with two sides that are partitioned, or as for `with_change`.
+    """
+    healed, joined = event.get("heal"), event.get("join")
+    if isinstance(healed, str):
+        return with_cut_ended(plan, healed, time)
+    if isinstance(joined, list) and len(joined) == 2:
+        return with_partition_ended(plan, str(joined[0]), str(joined[1]), time)
+    return with_change(plan, event, time)
+
+
 def with_change(plan: WirePlan, table: Mapping[str, Any], time: float) -> tuple[WirePlan, str]:
     """The plan with an event that begins at a time and lasts, and the line that says what it does.
 
