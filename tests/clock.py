@@ -74,7 +74,7 @@ class TestWorld(RealWorld):  # type: ignore[misc]  # which is final for programs
         """Let time pass at once."""
         self.clock.sleep(seconds)
 
-    def queue(self) -> Queue[Any]:
+    def queue(self) -> Queue[Any]:  # type: ignore[override]  # it stands for any queue
         """A queue without a limit."""
         return TestQueue(self.clock)
 
