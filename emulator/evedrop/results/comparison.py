@@ -362,24 +362,26 @@ class Comparison:
         return pa.Table.from_pylist([row for scheme in self.schemes.values() for row in _rows(scheme)])
 
 
+_NEEDS = (
+    "packet_bits",
+    "sent_fraction",
+    "encrypted_fraction",
+    "bits_per_slot",
+    "energy_per_slot",
+    "secret_bits_per_slot",
+    "acknowledgements",
+)
+
+
 def _rows(scheme: SchemeResult) -> Iterator[dict[str, Any]]:
     for adversary, cell in scheme.cells.items():
-        legitimate, other = cell.legitimate, cell.eavesdropper
         leak = None if cell.secrecy is None else cell.secrecy.leak
         yield {
             "scheme": scheme.name,
             "adversary": adversary,
             "not_defined": cell.match.not_defined,
-            "eavesdropper_error": None if other is None else other.mean,
-            "eavesdropper_standard_error": None if other is None else other.standard_error,
-            "eavesdropper_median": None if other is None else other.quantiles["0.5"],
-            "eavesdropper_theory": None if other is None or other.theory is None else other.theory.mean,
-            "eavesdropper_z": None if other is None else other.z,
-            "legitimate_error": None if legitimate is None else legitimate.mean,
-            "legitimate_standard_error": None if legitimate is None else legitimate.standard_error,
-            "legitimate_median": None if legitimate is None else legitimate.quantiles["0.5"],
-            "legitimate_theory": None if legitimate is None or legitimate.theory is None else legitimate.theory.mean,
-            "legitimate_z": None if legitimate is None else legitimate.z,
+            **_error_columns("eavesdropper", cell.eavesdropper),
+            **_error_columns("legitimate", cell.legitimate),
             "ratio": cell.ratio,
             "ratio_standard_error": cell.ratio_error,
             "verdict": None if cell.verdict is None else cell.verdict.value,
@@ -388,14 +390,18 @@ def _rows(scheme: SchemeResult) -> Iterator[dict[str, Any]]:
             "leaked_bits_standard_error": None if leak is None else leak.standard_error,
             "leaked_bits_theory": None if leak is None else leak.expected_bits,
             "leaked_bits_z": None if leak is None else leak.z,
-            "packet_bits": scheme.needs.packet_bits,
-            "sent_fraction": scheme.needs.sent_fraction,
-            "encrypted_fraction": scheme.needs.encrypted_fraction,
-            "bits_per_slot": scheme.needs.bits_per_slot,
-            "energy_per_slot": scheme.needs.energy_per_slot,
-            "secret_bits_per_slot": scheme.needs.secret_bits_per_slot,
-            "acknowledgements": scheme.needs.acknowledgements,
+            **{name: getattr(scheme.needs, name) for name in _NEEDS},
         }
+
+
+def _error_columns(whose: str, error: SimulatedError | None) -> dict[str, float | None]:
+    return {
+        f"{whose}_error": None if error is None else error.mean,
+        f"{whose}_standard_error": None if error is None else error.standard_error,
+        f"{whose}_median": None if error is None else error.quantiles["0.5"],
+        f"{whose}_theory": None if error is None or error.theory is None else error.theory.mean,
+        f"{whose}_z": None if error is None else error.z,
+    }
 
 
 def read_comparison(folder: Path) -> Comparison:
