@@ -135,7 +135,7 @@ def test_a_run_in_progress_is_only_looked_at(evedrop: Evedrop) -> None:
     scenario = load("eavesdroppers", {"slots": 12, "trials": 3, "record_trials": 2, "expect": []})
     write_resolved(run, scenario)
     named(run, ".")
-    with suppress(_Killed), ResultsWriter.of(run, scenario) as writer:
+    with suppress(_Killed), ResultsWriter(run, scenario) as writer:
         for receiver in scenario.receivers:
             writer.slot_rows(0, receiver, SlotSums(*(np.ones(1) for _ in fields(SlotSums))), np.zeros(1))
         writer.write_rows("slot 1")

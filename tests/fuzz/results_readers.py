@@ -54,7 +54,7 @@ def _cut_short() -> dict[str, bytes]:
         folder.mkdir(mode=0o700)
         scenario = load("eavesdroppers", {"slots": 12, "trials": 3, "record_trials": 2, "expect": []})
         write_resolved(folder, scenario)
-        with contextlib.suppress(_Killed), ResultsWriter.of(folder, scenario) as writer:
+        with contextlib.suppress(_Killed), ResultsWriter(folder, scenario) as writer:
             for first in range(3):
                 for receiver in scenario.receivers:
                     ones = SlotSums(*(np.ones(1) for _ in fields(SlotSums)))

@@ -277,7 +277,8 @@ def test_the_schemes_of_a_killed_comparison_are_on_disk(evedrop: Evedrop) -> Non
     assert json.loads((live.folder / "compare.json").read_text())["schemes"]
 
 
-NAMES = ("legitimate", "smart")
+SCENARIO = load("eavesdroppers")
+NAMES = SCENARIO.receivers
 
 
 def sums(count: int) -> SlotSums:
@@ -292,7 +293,7 @@ def test_a_writer_may_stop_at_any_byte(rounds: list[int], data: st.DataObject) -
     with TemporaryDirectory() as name:
         written = Path(name, "written")
         written.mkdir()
-        with ResultsWriter(written, NAMES, 2) as writer:
+        with ResultsWriter(written, SCENARIO) as writer:
             kept = [(0, sizes(written))]
             for count in rounds:
                 first = kept[-1][0]
@@ -330,7 +331,7 @@ def test_no_rows_are_on_disk_before_the_first_metrics(tmp_path: Path) -> None:
         return nothing
 
     write_resolved(tmp_path, scenario)
-    with ResultsWriter.of(tmp_path, scenario) as writer:
+    with ResultsWriter(tmp_path, scenario) as writer:
         for receiver in scenario.receivers:
             writer.slot_rows(0, receiver, sums(10), np.zeros(10))
 
@@ -357,7 +358,7 @@ def test_rows_whose_first_metrics_cannot_be_written_count_at_the_end(tmp_path: P
         return False
 
     write_resolved(tmp_path, scenario)
-    with suppress(OSError), ResultsWriter.of(tmp_path, scenario, full) as writer:
+    with suppress(OSError), ResultsWriter(tmp_path, scenario, full) as writer:
         before = sizes(tmp_path)["slots-0.arrows"]
         for receiver in scenario.receivers:
             writer.slot_rows(0, receiver, sums(10), np.zeros(10))
@@ -383,7 +384,7 @@ def test_a_score_is_saved_only_with_rows(tmp_path: Path) -> None:
         events.append("save without rows" if empty else "save")
 
     write_resolved(tmp_path, scenario)
-    with ResultsWriter.of(tmp_path, scenario, save) as writer:
+    with ResultsWriter(tmp_path, scenario, save) as writer:
         before = sizes(tmp_path)["slots-0.arrows"]
         for receiver in scenario.receivers:
             writer.slot_rows(0, receiver, sums(10), np.zeros(10))
@@ -403,7 +404,7 @@ def killed(folder: Path, work: Callable[[ResultsWriter], object]) -> Path:
 
         def record() -> None:
             write_resolved(disk.root, microgrid())
-            writer = ResultsWriter.of(disk.root, microgrid())
+            writer = ResultsWriter(disk.root, microgrid())
             work(writer)
             scheduler.end(task, -9)
 
@@ -506,7 +507,7 @@ def test_rows_follow_no_batch_that_was_cut(tmp_path: Path, monkeypatch: pytest.M
         write(file, data)
 
     monkeypatch.setattr(crash_proof_tables, "write_all", write_some)
-    with pytest.raises(OSError, match="an earlier part"), ResultsWriter(tmp_path, NAMES, 2) as writer:  # noqa: PT012
+    with pytest.raises(OSError, match="an earlier part"), ResultsWriter(tmp_path, SCENARIO) as writer:  # noqa: PT012
         for first, count in ((0, 100), (100, 200_000)):
             full[0] = first > 0
             with pytest.raises(OSError, match="space") if full[0] else nullcontext():
@@ -542,13 +543,13 @@ def test_a_reader_does_not_keep_a_run_from_its_lock(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(
         crash_proof_tables, "try_lock", lambda descriptor: not (readers and readers.pop()) and lock(descriptor)
     )
-    with ResultsWriter(tmp_path, NAMES, 2):
+    with ResultsWriter(tmp_path, SCENARIO):
         assert goes_on(tmp_path)
 
 
 def test_a_table_that_cannot_be_read_stays_a_stream(tmp_path: Path) -> None:
     """Its file `unfinished` has all that there is; a Parquet file would lack rows that the run counted."""
-    with suppress(OSError), ResultsWriter(tmp_path, NAMES, 2) as writer:
+    with suppress(OSError), ResultsWriter(tmp_path, SCENARIO) as writer:
         for first in (0, 100):
             writer.slot_rows(first, NAMES[0], sums(100), np.ones(100))
             writer.write_rows(f"slot {first + 100}")

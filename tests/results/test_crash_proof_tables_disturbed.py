@@ -69,7 +69,7 @@ def record(folder: Path, whole: list[int]) -> None:
     """Write the results of a run. whole: gets the number of slots of each round that is written."""
     make_private(folder)
     write_resolved(folder, scenario())
-    with ResultsWriter.of(folder, scenario()) as writer:
+    with ResultsWriter(folder, scenario()) as writer:
         whole.append(0)
         first = 0
         for count in ROUNDS:

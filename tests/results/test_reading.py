@@ -19,6 +19,7 @@ from evedrop.results.crash_proof_tables import TableRound, last_round
 from evedrop.results.folder import UNFINISHED
 from evedrop.results.reading import Results
 from evedrop.results.writer import ResultsWriter
+from evedrop.scenario.loading import load
 from evedrop.score.sums import SlotSums
 from tests.disturbed import LOOP, disturbed
 
@@ -50,7 +51,7 @@ def test_a_table_is_whole_although_the_run_ends_while_it_is_read(
 ) -> None:
     """Its stream becomes a Parquet file just before it is opened, or just after."""
     sums, find, stream_in = SlotSums(*(np.ones(5) for _ in fields(SlotSums))), last_round, crash_proof_tables._stream_in
-    writer = ResultsWriter(tmp_path, ("legitimate",), 2)
+    writer = ResultsWriter(tmp_path, load("eavesdroppers"))
     writer.slot_rows(0, "legitimate", sums, np.ones(5))
     writer.write_rows("slot 5")
 

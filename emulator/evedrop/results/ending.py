@@ -43,7 +43,7 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
             left_behind = False
             world().disk.remove_tree(folder / UNFINISHED, ignore_errors=True)
             if not any(folder.glob("*.parquet")):
-                with ResultsWriter.of(folder, scenario):
+                with ResultsWriter(folder, scenario):
                     pass
     if left_behind:
         # The recording lacks its end; `evedrop view` makes another one from the tables.

@@ -18,7 +18,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from evedrop.model.digest import DigestLog, Digests
-from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
 from evedrop.model.receiver import ACTIONS, MISLED, NOTHING, TYPES, Action, Codes, Flags, packed_flags
 from evedrop.names import CONTROLLER
@@ -29,7 +28,6 @@ from evedrop.results.summary_file import summary_text
 from evedrop.results.tables import DIGESTS, JOURNAL, SLOTS, input_columns, inputs_schema, rows_of, trials_schema
 from evedrop.scenario.closed_loop import monitor_of
 from evedrop.scenario.input_files import disturbances_of
-from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
@@ -51,38 +49,29 @@ class ResultsWriter:
     `write_summary` then completes the folder.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        receivers: tuple[str, ...],
-        n: int,
-        around: Sequence[float] | None = None,
-        loop: tuple[Plant, Floats] | None = None,
-        monitored: bool = False,
-        program: ProcessTable | None = None,
-    ) -> None:
-        """around: added to states and estimates, (n,); loop: plant and disturbances (slots, q) of a closed loop.
-
-        monitored: whether there are a watermark and a detector; program: a process whose states come from one.
+    def __init__(self, folder: Path, scenario: Scenario, with_metrics: Callable[[], None] = lambda: None) -> None:
+        """with_metrics: called before metrics are written; their rows are on disk by then.
 
         Raises OSError if the folder cannot be written.
         """
-        self._digested = receivers if loop is None else (*receivers, CONTROLLER)
-        self._around = None if around is None or not any(around) else np.array(around)
+        process, plant = scenario.process, None if scenario.controller is None else scenario.driven
+        self._digested = scenario.receivers if plant is None else (*scenario.receivers, CONTROLLER)
+        self._around = np.array(process.around) if any(process.around) else None
         self._held = HeldFolder(folder)
         self._unfinished = Unfinished(folder)
-        self._loop = loop
-        self._taken = None if program is None else TakenStates(folder, program)
+        self._loop = None if plant is None else (plant, disturbances_of(scenario))
+        self._taken = TakenStates(folder, process) if process.source == "zenoh" else None
         peers = {"peer": self._digested}
         words = {**peers, "sent": TYPES, "action": ACTIONS}
         self._kinds: dict[str, tuple[pa.Schema, Mapping[str, tuple[str, ...]]]] = {
             "slots": (SLOTS, peers),
-            "trials": (trials_schema(n), words),
-            "journal": (JOURNAL, {"link": receivers}),
+            "trials": (trials_schema(len(process.A)), words),
+            "journal": (JOURNAL, {"link": scenario.receivers}),
             "digests": (DIGESTS, peers),
         }
-        if loop is not None:
-            plant, disturbances = loop
+        if self._loop is not None:
+            plant, disturbances = self._loop
+            monitored = monitor_of(scenario) is not None
             self._kinds["inputs"] = (inputs_schema(plant.inputs, disturbances.shape[1], monitored), {})
         self._streams = {name: self._stream(name, 0) for name in self._kinds}
         self._outdated: list[TableStream] = []
@@ -90,29 +79,12 @@ class ResultsWriter:
         self._at = "slot 0"
         self._broken = self._metrics_before = False
         self._round_due = self._metrics_due = world().monotonic() + _ROUND_SECONDS
-        self._with_metrics: Callable[[], None] = lambda: None
+        self._with_metrics = with_metrics
         self._round()
 
     def _stream(self, name: str, number: int) -> TableStream:
         schema, names = self._kinds[name]
         return TableStream(self._held.now / UNFINISHED / f"{name}-{number}.arrows", schema, names)
-
-    @classmethod
-    def of(cls, folder: Path, scenario: Scenario, with_metrics: Callable[[], None] = lambda: None) -> Self:
-        """A writer for the results of a scenario.
-
-        with_metrics: called before metrics are written; their rows are on disk by then.
-        """
-        loop = (
-            None
-            if scenario.driven is None or scenario.controller is None
-            else (scenario.driven, disturbances_of(scenario))
-        )
-        states, around = len(scenario.process.A), scenario.process.around
-        program = scenario.process if scenario.process.source == "zenoh" else None
-        writer = cls(folder, scenario.receivers, states, around, loop, monitor_of(scenario) is not None, program)
-        writer._with_metrics = with_metrics
-        return writer
 
     def __enter__(self) -> Self:
         return self

@@ -408,14 +408,11 @@ def merged(parts: Sequence[Tally]) -> Tally:
         if part.delays.size:
             total.delays = part.delays + (total.delays if total.delays.size else 0)
     total.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
-    conditional = [part.conditional for part in parts if part.conditional is not None]
-    total.conditional = ConditionalError.merged(conditional) if conditional else None
     for name in parts[0].directions:
         total.directions[name] = DirectionTally.merged([part.directions[name] for part in parts])
-    distances = [part.distance for part in parts if part.distance is not None]
-    total.distance = DistanceTally.merged(distances) if distances else None
-    leaks = [part.leak for part in parts if part.leak is not None]
-    total.leak = LeakTally.merged(leaks) if leaks else None
+    for name in ("conditional", "distance", "leak"):
+        of_parts = [tally for part in parts if (tally := getattr(part, name)) is not None]
+        setattr(total, name, type(of_parts[0]).merged(of_parts) if of_parts else None)
     total.packets = np.concatenate([part.packets for part in parts], axis=1)
     traces = [part.traces for part in parts if part.traces is not None]
     total._finished = np.concatenate(traces) if len(traces) == len(parts) else None

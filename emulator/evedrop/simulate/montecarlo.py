@@ -106,16 +106,6 @@ class Crew:
             yield from in_processes(tasks, min(self.workers, len(tasks)), on_progress, stopped)
 
 
-@contextlib.contextmanager
-def crew_of(workers: int, scheduler: str | None = None, patience: float = REACH_SECONDS) -> Iterator[Crew]:
-    """A crew of this many workers here; with the address of a Dask scheduler, its cluster.
-
-    patience: seconds for the scheduler to answer. Raises UsageError if it does not.
-    """
-    with connected(scheduler, patience) as cluster:
-        yield Crew(workers, cluster)
-
-
 _WORTH_A_PROCESS = 2_000_000  # trial-slots and receivers: below, starting workers costs more than it saves
 _TELL_SECONDS = 0.1
 
@@ -166,8 +156,8 @@ class Plan:
         Raises UsageError if the scheduler does not answer, MemoryError if a limit leaves no room for what summaries need.
         """
         preload_within_limit()
-        with crew_of(max(map(self.workers_for, scenarios)), self.scheduler, self.patience) as crew:
-            yield crew
+        with connected(self.scheduler, self.patience) as cluster:
+            yield Crew(max(map(self.workers_for, scenarios)), cluster)
 
 
 def simulate(scenario: Scenario, folder: Path, on_event: OnEvent, plan: Plan = Plan(), *, resume: bool = False) -> int:
@@ -192,7 +182,7 @@ def simulate(scenario: Scenario, folder: Path, on_event: OnEvent, plan: Plan = P
         with contextlib.closing(HeldFolder(folder)) as held, disk_errors(folder):
             write_resolved(folder, scenario)
             with (
-                ResultsWriter.of(folder, scenario) as writer,
+                ResultsWriter(folder, scenario) as writer,
                 contextlib.closing(crew.results(tasks, on_progress, stop.is_set, finished)) as results,
             ):
                 try:

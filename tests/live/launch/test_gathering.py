@@ -18,11 +18,13 @@ from evedrop.live.launch.gathering import Gathered, Journals, Recorded, Statisti
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
 from evedrop.results.writer import ResultsWriter
+from evedrop.scenario.loading import load
 from evedrop.score.slots import Slots
 from evedrop.score.sums import slot_sums, squared_errors
 from tests.examples import examples
 
-NAMES = ("legitimate", "smart", "naive")
+SCENARIO = load("eavesdroppers")
+NAMES = SCENARIO.receivers
 N, SLOTS, TRIALS, RECORDED = 2, 40, 11, 5
 
 
@@ -64,7 +66,7 @@ def write(folder: Path, whole: Slots, trials: slice, recorded: int, ends: Sequen
     folder.mkdir()
     if not ends:
         return
-    with ResultsWriter(folder, NAMES, N) as writer:
+    with ResultsWriter(folder, SCENARIO) as writer:
         for first, end in zip([0, *ends], ends, strict=False):
             part = part_of(whole, slice(first, end), trials, recorded)
             errors = {name: squared_errors(part.sensor.x, receiver.x_hat) for name, receiver in part.receivers.items()}
@@ -80,7 +82,7 @@ def gathered(
 ) -> Iterator[tuple[str, pa.Table]]:
     """The tables of the run, put together this number of slots at a time."""
     folder.mkdir()
-    with ResultsWriter(folder, NAMES, N):
+    with ResultsWriter(folder, SCENARIO):
         pass
     made: dict[str, Gathered] = {
         "slots": Statistics(NAMES),

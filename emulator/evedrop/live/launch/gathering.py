@@ -109,7 +109,7 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
     cannot be written; the shards' folders are then unchanged.
     """
     write_resolved(folder, scenario)
-    with ResultsWriter.of(folder, scenario) as writer:
+    with ResultsWriter(folder, scenario) as writer:
         digests = {name: _digest(scenario, name, shards, writer) for name in scenario.digested}
     for name, gathered in _tables(scenario, shards).items():
         gathered.write([shard.folder / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")

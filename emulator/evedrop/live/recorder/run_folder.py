@@ -55,7 +55,7 @@ class RunFolder:
         scenario = self._score.scenario
         self._held = HeldFolder(self._place)
         try:
-            writer = ResultsWriter.of(self.now, scenario, self._dump_shard)
+            writer = ResultsWriter(self.now, scenario, self._dump_shard)
         except FileExistsError as error:
             raise FolderTaken(f"{self._place} is the results folder of another run; give another folder") from error
         with writer as self._writer:
