@@ -7,12 +7,17 @@ from __future__ import annotations
 
 import json
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, final
 
 import zenoh
+
+_Rules = Mapping[tuple[str, str], list[tuple[bool, str]]]
+"""Flow and message → whether they are allowed, and at which keys."""
 
 
 class Peer(NamedTuple):
@@ -49,7 +54,7 @@ class Access:
         self._control = control
         self._limits: Sequence[Mapping[str, Any]] = section(config, "low_pass_filter") or []
         self._users = _users(section(config, "transport/auth/usrpwd"))
-        self._rules: dict[Peer, list[tuple[bool, str, str, str]]] = {}
+        self._rules: dict[Peer, _Rules] = {}
         self._allowed: dict[tuple[Peer, str, str, str], bool] = {}
         self._most: dict[tuple[str, str], float] = {}
 
@@ -71,13 +76,8 @@ class Access:
         rules = self._rules.get(peer)
         if rules is None:
             rules = self._rules[peer] = self._of(peer)
-        allowed = self._default
-        for allows, at, kind, keys in rules:
-            if at == flow and kind == message and includes(keys, key):
-                if not allows:
-                    return False
-                allowed = True
-        return allowed
+        verdicts = [allows for allows, keys in rules.get((flow, message), ()) if includes(keys, key)]
+        return all(verdicts) if verdicts else self._default
 
     def has_room(self, message: str, key: str, size: int) -> bool:
         """Whether a message that comes in is small enough."""
@@ -91,19 +91,18 @@ class Access:
             most = self._most[message, key] = min(limits, default=math.inf)
         return size <= most
 
-    def _of(self, peer: Peer) -> list[tuple[bool, str, str, str]]:
+    def _of(self, peer: Peer) -> _Rules:
         subjects = {entry["id"] for entry in self._control["subjects"] if _matches(entry, peer)}
         ids = {
             rule for policy in self._control["policies"] if subjects & {*policy["subjects"]} for rule in policy["rules"]
         }
-        return [
-            (rule["permission"] == "allow", flow, message, keys)
-            for rule in self._control["rules"]
-            if rule["id"] in ids
-            for flow in rule["flows"] or ("ingress", "egress")
-            for message in rule["messages"]
-            for keys in rule["key_exprs"]
-        ]
+        rules = defaultdict[tuple[str, str], list[tuple[bool, str]]](list)
+        for rule in self._control["rules"]:
+            if rule["id"] in ids:
+                flows = rule["flows"] or ("ingress", "egress")
+                for flow, message, keys in product(flows, rule["messages"], rule["key_exprs"]):
+                    rules[flow, message].append((rule["permission"] == "allow", keys))
+        return rules
 
 
 def _matches(subject: Mapping[str, Any], peer: Peer) -> bool:

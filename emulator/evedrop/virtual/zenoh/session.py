@@ -390,17 +390,11 @@ class VirtualSession:
         if self._lets_in(end, frame, "put"):
             self._pass_on(end, frame)
 
-    def _take_connection(self, end: End, _: TransportFrame) -> None:
-        self.info.tell(zenoh.SampleKind.PUT, end)
-
     def _take_question(self, end: End, frame: TransportFrame) -> None:
         if self._lets_in(end, frame, frame.kind):
             self.questions.pass_from(end, frame)
         else:
             end.send(TransportFrame("final", "", b"", frame.number))
-
-    def _take_liveliness(self, end: End, frame: TransportFrame) -> None:
-        self._liveliness.take(end, frame)
 
     def _take_reply(self, end: End, frame: TransportFrame) -> None:
         if not frame.payload or self._lets_in(end, frame, "reply"):  # a token and the last word have no payload
@@ -430,7 +424,7 @@ class VirtualSession:
             # A router passes on what comes from a client, or goes to one: not from a router to a router.
             if end is source or (source is not None and not self.router):
                 continue
-            read = any(intersects(pattern, frame.key) for pattern in end.subscribed)
+            read = frame.key in end.subscribed or any(intersects(pattern, frame.key) for pattern in end.subscribed)
             if read and self.lets_out(end, "put", frame.key) and not end.send(frame, wait=frame.details.waits):
                 end.lose(frame, notes.NO_ROOM)
 
@@ -500,13 +494,11 @@ _DECLARED = {"declare_subscriber": "subscribed", "declare_queryable": "answers"}
 _WITHDRAWN = {f"no {kind}": kind for kind in _DECLARED}
 _TAKEN: Mapping[str, Callable[[VirtualSession, End, TransportFrame], object]] = {
     "put": VirtualSession._take_put,
-    "connected": VirtualSession._take_connection,
-    "token": VirtualSession._take_liveliness,
-    "no token": VirtualSession._take_liveliness,
-    "declare_liveliness_subscriber": VirtualSession._take_liveliness,
-    "query": VirtualSession._take_question,
-    "liveliness_query": VirtualSession._take_question,
-    "reply": VirtualSession._take_reply,
-    "error": VirtualSession._take_reply,
-    "final": VirtualSession._take_reply,
+    "connected": lambda session, end, _: session.info.tell(zenoh.SampleKind.PUT, end),
+    **dict.fromkeys(
+        ("token", "no token", "declare_liveliness_subscriber"),
+        lambda session, end, frame: session._liveliness.take(end, frame),
+    ),
+    **dict.fromkeys(("query", "liveliness_query"), VirtualSession._take_question),
+    **dict.fromkeys(("reply", "error", "final"), VirtualSession._take_reply),
 }
