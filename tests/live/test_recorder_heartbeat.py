@@ -22,15 +22,17 @@ import evedrop.live.launch.process_set as process_set
 import evedrop.live.launch.starter as starter
 import evedrop.live.network.launcher_pipe as heartbeat
 import evedrop.results.writer as results
+from evedrop.scenario.progress_events import Started
 
 def finish(folder, honest=results.finish):
     time.sleep({finish})
     honest(folder)
 
 def next_event(self, seconds, honest=children.Children.next_event):
-    if self.started:
+    event = honest(self, seconds)
+    if isinstance(event, Started):
         children.SILENCE_SECONDS = process_set.SILENCE_SECONDS = {silence}
-    return honest(self, seconds)
+    return event
 
 results.finish = finish
 children.GRACE_SECONDS = children._GONE_SECONDS = starter.GRACE_SECONDS = {grace}
