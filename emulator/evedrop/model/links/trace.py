@@ -18,6 +18,46 @@ from evedrop.model.links.loss_model import LossModel, fates_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 
+
+class Pattern(LossModel):
+    """Delivered in slot k where `outcomes`, repeated without end, has a 1 at place k; the same in every trial."""
+
+    parameters = MappingProxyType({"outcomes": "1101"})
+    uniforms_per_slot = 1
+
+    def __init__(self, outcomes: str) -> None:
+        self._lost = np.frombuffer(outcomes.encode(), np.uint8) == ord("0")
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """A word of zeros and ones."""
+        return word_mistakes(given, "outcomes")
+
+    @property
+    def quality(self) -> float:
+        """The fraction of ones."""
+        return float(1.0 - self._lost.mean())
+
+    @property
+    def memoryless(self) -> bool:
+        """True: nothing is random."""
+        return True
+
+    def quality_at(self, slots: range) -> Floats:
+        """0 or 1."""
+        return np.asarray(~self._lost[np.arange(slots.start, slots.stop) % len(self._lost)], np.float64)
+
+    def rate_variance(self, slots: range) -> float:  # noqa: ARG002 - no trial differs from another
+        """0, because all trials are equal."""
+        return 0.0
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:
+        """The outcomes of these slots, the same in every trial."""
+        slots, _, trials = uniforms.shape
+        places = np.arange(first, first + slots) % len(self._lost)
+        return fates_of(np.repeat(self._lost[places][:, None], trials, axis=1))
+
+
 MOST_OUTCOMES = 10_000_000
 MOST_BEGINNINGS = 4096
 """Of a recording whose distribution of counts is computed; times the ranges of packets that count."""
@@ -124,19 +164,3 @@ class RecordedLoss(LossModel):
         if self._once and stop > len(self._lost):
             raise ValueError(f"the recording has {len(self._lost)} outcomes and slot {stop - 1} was asked for")
         return np.arange(first, stop) % len(self._lost)
-
-
-class Pattern(RecordedLoss):
-    """Delivered in slot k where `outcomes`, repeated without end, has a 1 at place k; the same in every trial."""
-
-    parameters = MappingProxyType({"outcomes": "1101"})
-    optional = frozenset()
-    recorded = None
-
-    def __init__(self, outcomes: str) -> None:
-        super().__init__(outcomes)
-
-    @classmethod
-    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """A word of zeros and ones."""
-        return word_mistakes(given, "outcomes")
