@@ -200,6 +200,16 @@ def test_a_replayed_recording_is_in_the_verdict_and_warned_of() -> None:
         assert ("400 recorded" in " ".join(warnings_of(scenario, several=True))) == (not random_start)
 
 
+def test_a_pattern_is_no_recording() -> None:
+    """Nothing says that the verdict holds for recorded losses alone."""
+    link = {"loss": {"model": "pattern", "outcomes": "0111" * 100}}
+    scenario = load("vehicle", {"slots": 100, "trials": 30, "legitimate": {"link": link}})
+    *_, verdict = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
+    assert verdict is not None
+    assert "recording" not in verdict.sentence
+    assert "recorded outcomes" not in " ".join(warnings_of(scenario))
+
+
 def test_a_recording_on_the_link_of_an_eavesdropper_is_in_its_own_verdict() -> None:
     """And not in those on others."""
     link = {"loss": {"model": "trace", "outcomes": "0111" * 100}}
