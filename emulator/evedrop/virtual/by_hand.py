@@ -442,10 +442,10 @@ class RunByHand(ByHand):
     @staticmethod
     def _check_refusals(processes: Mapping[str, VirtualProcess]) -> None:
         """Who cannot read a message tells the recorder, which does not take it for cut off."""
-        said = processes[RECORDER].printed if RECORDER in processes else ""
+        printed = processes[RECORDER].printed if RECORDER in processes else ""
         for name, process in processes.items():
-            if "malformed message" in process.printed and f"{name} cut off" in said:
-                raise AssertionError(f"{name} has refused a message, and the recorder says: {said[-500:]}")
+            if "malformed message" in process.printed and f"{name} cut off" in printed:
+                raise AssertionError(f"{name} has refused a message, and the recorder says: {printed[-500:]}")
 
     @staticmethod
     def _check_recording(path: Path, done: bool) -> None:

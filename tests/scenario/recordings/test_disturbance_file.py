@@ -56,6 +56,13 @@ def test_slots_may_last_longer(tmp_path: Path) -> None:
     assert "expected 60 s, for slots of 60 s" in mistakes_of(read, path, 10, 60.0)[0]
 
 
+def test_a_number_that_is_too_large_in_the_unit_of_the_plant_is_said(tmp_path: Path) -> None:
+    """Its line is not left out, which would move all later ones forward by a slot."""
+    path = write(tmp_path, "P_solar [kW]\n1\n1e308\n2\n3\n")
+    with pytest.raises(DisturbanceError, match='line 3: P_solar is "1e308"; expected a finite number'):
+        read_disturbances(path, ["P_solar"], ["W"], 3)
+
+
 @pytest.mark.parametrize(
     ("text", "place"),
     [

@@ -63,7 +63,7 @@ def test_a_reader_that_left_has_no_place(tmp_path: Path) -> None:
 
 
 def threads_named(name: str) -> set[threading.Thread]:
-    """The threads of this name, of whichever test."""
+    """All threads with this name, also those that other tests started."""
     return {thread for thread in threading.enumerate() if thread.name == name}
 
 

@@ -238,7 +238,7 @@ class Conductor:
         return self._session.reaches(self._session.keys.control(name))
 
     def _next(self) -> tuple[str, bytes] | None:
-        """The next message with its sender, or None if there was none for a moment, or news of who is present."""
+        """The next message, with its sender; None if none came for a moment, or if a process came or left instead."""
         try:
             name, item = self._mailbox.get(timeout=_POLL_SECONDS)
         except Empty:

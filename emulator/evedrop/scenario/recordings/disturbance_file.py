@@ -71,14 +71,14 @@ def read_disturbances(
         )
     limit = _ROWS_UNASKED if slots is None else max(0, slots)
     head, rows = _begun(path, limit, len(names), _EXAMPLE)
-    found = _found(path, head, rows, names, units, limit)
-    if found.times is not None:
-        found.check_times(slot_seconds, recorded)
-    count = len(found.numbers)
+    series = _read_series(path, head, rows, names, units, limit)
+    if series.times is not None:
+        series.check_times(slot_seconds, recorded)
+    count = len(series.numbers)
     if slots is not None and count < slots:
         few = f"has {count} rows; expected slots, which is {slots}, or more"
         raise DisturbanceError(str(path), [f"{few}: a longer file, or slots = {count}" if count else few])
-    return found.numbers
+    return series.numbers
 
 
 @dataclass(frozen=True)
@@ -102,14 +102,14 @@ def recorded_states(path: Path, names: Sequence[str] | None = None) -> StateReco
     head, rows = _begun(path, MOST_NUMBERS, 1, "x, y")
     there = [match["name"] if (match := _HEADER.match(cell)) else cell for cell in head.cells]
     names = [name for name in there if name != _TIME] if names is None else names
-    found, seconds = _found(path, head, rows, names, None, None), None
-    if (times := found.times) is not None:
+    series, seconds = _read_series(path, head, rows, names, None, None), None
+    if (times := series.times) is not None:
         seconds = (times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.0
         if len(times) > 1 and not 0.0 < seconds < math.inf:
             raise DisturbanceError(str(path), ["has times that do not grow from line to line; expected seconds"])
-        found.check_times(seconds, recorded=True)
+        series.check_times(seconds, recorded=True)
     units = [match["unit"].strip() for cell in head.cells if (match := _HEADER.match(cell)) and match["name"] in names]
-    return StateRecording(str(path), names, units if len(units) == len(names) else None, found.numbers, seconds)
+    return StateRecording(str(path), names, units if len(units) == len(names) else None, series.numbers, seconds)
 
 
 def table_text(names: Sequence[str], units: Sequence[str] | None, rows: Sequence[Sequence[float]]) -> str:
@@ -145,7 +145,7 @@ class _Column:
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Series:
     """The contents of the lines after the first: numbers, line number and time of each."""
 
     path: Path
@@ -228,9 +228,9 @@ def _factor(unit: str | None, wanted: str | None) -> float | None:
     return None
 
 
-def _found(
+def _read_series(
     path: Path, head: _Row, rows: Iterable[_Row], names: Sequence[str], units: Sequence[str] | None, limit: int | None
-) -> _Found:
+) -> _Series:
     """The columns' values of every line, up to this limit, or to `MOST_NUMBERS`. Raises DisturbanceError with the mistakes."""
     columns, mistakes = _columns(head, names, units)
     if mistakes:
@@ -258,8 +258,8 @@ def _found(
     if mistakes := list(_few(_cell_mistakes(wrong, width, columns), f"{all_wrong} of {all_lines} lines")):
         raise DisturbanceError(str(path), mistakes)
     if timed:
-        return _Found(path, [row[1:] for row in numbers], lines, [row[0] for row in numbers])
-    return _Found(path, numbers, lines, None)
+        return _Series(path, [row[1:] for row in numbers], lines, [row[0] for row in numbers])
+    return _Series(path, numbers, lines, None)
 
 
 def _cell_mistakes(rows: Sequence[_Row], width: int, columns: Sequence[_Column]) -> Iterator[str]:
@@ -269,7 +269,7 @@ def _cell_mistakes(rows: Sequence[_Row], width: int, columns: Sequence[_Column])
             continue
         for column in columns:
             cell = row.cells[column.place]
-            if not _is_finite(cell):
+            if not _is_finite(cell, column.factor):
                 shown = f'"{cell[:40]}"' if cell else "empty"
                 yield f"line {row.line}: {column.name} is {shown}; expected a finite number"
 
@@ -303,8 +303,9 @@ def _few(mistakes: Iterator[str], where: str) -> Iterator[str]:
         yield mistake
 
 
-def _is_finite(cell: str) -> bool:
+def _is_finite(cell: str, factor: float) -> bool:
+    """Whether a cell is a number that is finite also in the unit of the plant."""
     try:
-        return math.isfinite(float(cell))
+        return math.isfinite(float(cell) * factor)
     except ValueError:
         return False
