@@ -425,7 +425,7 @@ class SimulatedNetwork(Network):
         """Wait for a condition; returns its value."""
         deadline = self._scheduler.now + limit
         while not (result := condition()):
-            assert self._scheduler.now < deadline, f"no {awaited}"
+            assert self._scheduler.now < deadline, f"within {limit:g} s: {awaited}"
             self._scheduler.sleep(_POLL_SECONDS)
         return result
 

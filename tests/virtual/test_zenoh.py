@@ -1298,7 +1298,7 @@ def expect_lost(net: Network, writer: Any, reader: Any, *, matching: bool, read_
     subscriber, free = channel(net, reader, read_as), channel(net, reader, "free")
     put = publisher(net, writer, "a/b") if matching else writer.declare_publisher("a/b", congestion_control=BLOCK)
     end = publisher(net, writer, "free")
-    assert bool(matches(put)) == matching
+    assert matches(put) == matching
     put.put(b"lost")
     end.put(END)
     assert read(net, free, 1) == [END]

@@ -1,4 +1,4 @@
-"""Somebody who writes briefs beside a run, also with wrong options, breaks some of them, and starts their processes by hand.
+"""Somebody who does something beside a run: writes briefs and breaks some, starts their processes, or gives wrong options.
 
 Source: docs/hosts.md, processes started by hand.
 """
@@ -17,7 +17,7 @@ from contextlib import suppress
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, ClassVar, final
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.hosts_file import load_hosts, processes_of
@@ -94,6 +94,14 @@ class ByHand(Disturbance):
     """Somebody does something beside the run, in a folder of its own."""
 
     harmless = True
+    drawn: ClassVar[Sequence[str]]
+    """What it may be in any run; what stands there twice is drawn twice as often."""
+
+    @classmethod
+    def targets(cls, scenario: Scenario) -> Sequence[str]:
+        """All that it may be."""
+        del scenario
+        return cls.drawn
 
     def strike(self, world: SimulatedWorld) -> bool:
         """Let somebody do it, who gives up if the disk does not take it."""
@@ -121,16 +129,11 @@ class WriteBriefs(ByHand):
 
     kind, share = "write", 5
     awaited_seconds = 60.0
-
-    @classmethod
-    def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """What is written: mostly what somebody could use."""
-        del scenario
-        return [*[*_OPTIONS] * 3, _CONTAINERS, _CONTAINERS, _REFUSED, _REFUSED]
+    drawn = (*[*_OPTIONS] * 3, _CONTAINERS, _CONTAINERS, _REFUSED, _REFUSED)
 
     def _act(self, world: SimulatedWorld, scenario: Scenario, folder: Path) -> None:
         some, deadline = random.Random(here().token(8)), here().monotonic() + _STARTING_SECONDS  # noqa: S311 - to be repeated
-        for number, written in enumerate([scenario, *(_any_scenario(some) for _ in range(1, _SCENARIOS))]):
+        for number, written in enumerate(_with_others(scenario, some)):
             own = folder / str(number)
             own.mkdir(0o700)
             write_resolved(own, written)
@@ -233,6 +236,11 @@ def _any_scenario(some: random.Random) -> Scenario:
     if scenario.process.source != "file":
         return scenario
     return DrawnProgram(listens=True, form=some.choice(FORMS)).scenario(scenario)
+
+
+def _with_others(scenario: Scenario, some: random.Random) -> list[Scenario]:
+    """The scenario of the run, and drawn ones."""
+    return [scenario, *(_any_scenario(some) for _ in range(1, _SCENARIOS))]
 
 
 def _start(world: SimulatedWorld, role: str, path: Path, clock: float, patience: float) -> None:
@@ -376,12 +384,7 @@ class RunByHand(ByHand):
     kind, share = "start by hand", 4
     awaited_seconds = 60.0
     """Its processes wait for one that is missing, or that an event has ended: no launcher starts it again."""
-
-    @classmethod
-    def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """Whole runs, and those in which a process or a brief is not the right one."""
-        del scenario
-        return [name for name in _RUNS if name != _WITHOUT_RECORDER]
+    drawn = tuple(name for name in _RUNS if name != _WITHOUT_RECORDER)
 
     def _act(self, world: SimulatedWorld, scenario: Scenario, folder: Path) -> None:
         if scenario.shards > 1 or scenario.slots > _MOST_SLOTS:
@@ -486,18 +489,14 @@ class RunWrongly(ByHand):
     """The same scenario is to be run beside the run, with options that no run may have, or files of hosts with mistakes."""
 
     kind, share = "run beside it with", 2
-
-    @classmethod
-    def targets(cls, scenario: Scenario) -> Sequence[str]:
-        """Both."""
-        del scenario
-        return [_BY_OPTIONS, _BY_HOSTS]
+    drawn = (_BY_OPTIONS, _BY_HOSTS)
 
     def _act(self, world: SimulatedWorld, scenario: Scenario, folder: Path) -> None:
         process, before = world.machine.current, 0
         some = random.Random(here().token(8))  # noqa: S311 - to be repeated, not to be secret
-        scenarios = [scenario, *(_any_scenario(some) for _ in range(1, _SCENARIOS))]
-        for run, said in (tried for drawn in scenarios for tried in self._runs(drawn, folder / "results")):
+        for run, said in (
+            tried for drawn in _with_others(scenario, some) for tried in self._runs(drawn, folder / "results")
+        ):
             status, printed = status_of(run), process.printed[before:]
             before += len(printed)
             refused = status == UsageError.exit_status and said in printed

@@ -60,7 +60,7 @@ class Disturbance(ABC):
     early: ClassVar[bool] = False
     """Whether it strikes before everything else."""
     loses: ClassVar[bool] = True
-    """Whether messages may be lost by it."""
+    """Whether even a brief one may cost more time than it lasts, because messages may be lost."""
     only_target: ClassVar[str]
     """What it hits, if that is the same in every run."""
     harmless: ClassVar[bool | None] = None

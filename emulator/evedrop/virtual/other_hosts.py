@@ -153,7 +153,7 @@ class OtherHost:
                 self.connection.answers.send(data)
             status = program.wait()
             self.connection.answers.send(program.printed)
-            self.connection.answers.send(cast(int, status))
+            self.connection.answers.send(cast("int", status))
             return 0
 
         machine.begin(part_on(SESSION, self.name), serve, server)
@@ -167,7 +167,7 @@ class OtherHost:
             if not data:
                 orders.close_writing()
             with suppress(OSError):
-                orders.write(cast(bytes, data))
+                orders.write(cast("bytes", data))
         self._machine.current.exit(_FAILED)
 
     def _program(self) -> int:

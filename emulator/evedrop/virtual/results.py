@@ -14,6 +14,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from evedrop.names import CONTROLLER
 from evedrop.results.crash_proof_tables import last_round, metrics_path
 from evedrop.virtual.metrics import unlike_digests, unlike_memory, unlike_rows
 from evedrop.virtual.reference import KEYS, RunReference
@@ -92,8 +93,6 @@ def lost_rows(folder: Path) -> Iterator[str]:
 
 
 _SHOWN = 2
-_BY_TRIAL = ("trials", "inputs", "digests")
-_CONTROLLER = "controller"
 
 
 def missing_rows(
@@ -131,7 +130,7 @@ def _ended(
 ) -> bool:
     """Whether a block of digests had ended when these slots were done."""
     peer, trial, block = key
-    if peer == _CONTROLLER and not complete:  # its reports may come later than the slots that are joined
+    if peer == CONTROLLER and not complete:  # its reports may come later than the slots that are joined
         return False
     ends = [other for name, number, other in wanted if (name, number) == (peer, trial) and other > block]
     return min(ends, default=int(reference.summary["slots"])) <= slots

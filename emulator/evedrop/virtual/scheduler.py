@@ -461,10 +461,10 @@ class VirtualLock:
         if me is None:  # the world itself, between the turns of threads
             return self._holder is None
         scheduler.interruptible()
-        seconds = 0.0 if not blocking else None if timeout < 0 else timeout
-        wait = partial(scheduler.wait, self.waiting)
-        if self._holder is not None and not scheduler.wait_for(self._is_free, wait, seconds):
-            return False
+        if self._holder is not None:
+            seconds = 0.0 if not blocking else None if timeout < 0 else timeout
+            if not scheduler.wait_for(self._is_free, partial(scheduler.wait, self.waiting), seconds):
+                return False
         self._holder, self._depth = me, self._depth + 1
         return True
 
