@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pytest
 import tomli_w
 
+from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.results.resolved_scenario import resolved
 from evedrop.scenario.loading import checked, parse
 from evedrop.scenario.tables import Scenario
@@ -42,6 +44,20 @@ def test_a_mistake_of_an_eavesdropper_is_named(table: dict[str, Any], places: li
     mistakes = mistakes_in_good({"eavesdroppers.eve": given})
     assert sorted(places_of(mistakes)) == sorted(f"eavesdroppers.eve.{place}" for place in places)
     golden("check", mistakes)
+
+
+class Named(Naive):
+    """Has parameters with the names of methods of the table."""
+
+    parameters = MappingProxyType({"entries": 1, "mistakes": 2})
+
+
+def test_parameters_may_have_any_name() -> None:
+    """What stands in the file reaches the class."""
+    given = {"entries": 5, "mistakes": 6}
+    eve = {"strategy": f"{__name__}:Named", "link": {"quality": 0.9}, **given}
+    scenario = parse(tomli_w.dumps(GOOD), "scenario", {"eavesdroppers": {"eve": eve}})
+    assert scenario.eavesdroppers["eve"].parameters == given
 
 
 def test_eavesdroppers_that_are_right_are_taken() -> None:

@@ -181,7 +181,7 @@ def _silent(scenario: Scenario) -> str:
 
 
 def _order_mistakes(name: str, acts: Sequence[Numbered]) -> Iterator[str]:
-    """Events that end a cut or an outage of a receiver that has not begun, or that begin one while another of its kind lasts.
+    """Events of one receiver that end a cut or an outage that has not begun, or begin one while another of its kind lasts.
 
     acts: those that concern it, in order of slots.
     """

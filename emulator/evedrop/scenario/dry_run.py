@@ -124,14 +124,18 @@ def _describes_models(settings: Mapping[str, Any]) -> bool:
 
 def _settings_mistakes(path: str, settings: Mapping[str, Any], problem: Problem) -> Iterator[str]:
     losses, delay = settings.get("loss"), settings.get("delay")
-    described: list[tuple[str, Registry[Any], Any, Mapping[str, Any]]]
-    described = [("loss", LOSS_MODELS, LossChecks, spec) for spec in (single_specs(losses) if losses else ())]
+    for spec in single_specs(losses) if losses else ():
+        yield from _model_mistakes(f"{path}.loss", LOSS_MODELS, LossChecks, spec, problem)
     if delay:
         in_slots = {name: value for name, value in delay.items() if name != "unit"}
-        described.append(("delay", DELAY_MODELS, DelayChecks, in_slots))
-    for entry, models, checks, spec in described:
-        if models.foreign(spec["model"]):
-            parameters = {name: value for name, value in spec.items() if name != "model"}
-            broken = how_broken(checks(models[spec["model"]], parameters).shapes, problem)
-            if broken is not None:
-                yield f"{path}.{entry}.model: is {as_toml(spec['model'])}; in a dry run: {broken}"
+        yield from _model_mistakes(f"{path}.delay", DELAY_MODELS, DelayChecks, in_slots, problem)
+
+
+def _model_mistakes(
+    path: str, models: Registry[Any], checks: type[LossChecks | DelayChecks], spec: Mapping[str, Any], problem: Problem
+) -> Iterator[str]:
+    if models.foreign(spec["model"]):
+        parameters = {name: value for name, value in spec.items() if name != "model"}
+        broken = how_broken(checks(models[spec["model"]], parameters).shapes, problem)
+        if broken is not None:
+            yield f"{path}.model: is {as_toml(spec['model'])}; in a dry run: {broken}"

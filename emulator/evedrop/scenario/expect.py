@@ -94,7 +94,7 @@ class ExpectTable(Table):
             meant = [kind for kind, entries in _ENTRIES.items() if any(name in given for name in entries)]
             kind = meant[0] if meant else "metric"
             others = ", or one of " + ", ".join(name for name in _ENTRIES if name != kind) if not meant else ""
-            return [(kind, f"is missing; expected {kind} = {self.example(kind)}{others}")]
+            return [(kind, f"is missing; expected {kind} = {self._example(kind)}{others}")]
         if len(kinds) > 1:
             one_each = f"expected one of {', '.join(_ENTRIES)} in a table"
             return [(kind, f"is given together with {kinds[0]}; {one_each}") for kind in kinds[1:]]

@@ -28,7 +28,7 @@ _TABLES = {"plant": ("disturbance", "disturbances", "disturbance_units"), "proce
 
 
 def _tables_with_files(tables: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """The tables that name a file of numbers: name, first word of the entries, and entries."""
+    """The tables that name a file of numbers: its name, the first word of its file entries, and the table."""
     for name, (kind, *_) in _TABLES.items():
         table = tables.get(name)
         if isinstance(table, dict) and isinstance(table.get(f"{kind}_file"), str):

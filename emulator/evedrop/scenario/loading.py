@@ -152,7 +152,7 @@ _PLACE = re.compile(r"\(at line (\d+), column (\d+)\)")
 
 
 def _no_toml(source: str, text: str, error: Exception) -> ScenarioError:
-    """Says why a text is not TOML, such as an entry that is given twice, with the line and a caret if the error has a place."""
+    """The error that says why a text is not TOML, with the line and a caret if the place is known."""
     place, problem, where = _PLACE.search(str(error)), str(error), ""
     if place is not None:
         line, column = int(place[1]), int(place[2])

@@ -67,7 +67,7 @@ class NemesisTable(Table):
         for name, fault in drawn.items():
             for entry, words in fault.needs.items():
                 if getattr(self, entry) is None:
-                    example = f"{entry} = {self.example(entry)}"
+                    example = f"{entry} = {self._example(entry)}"
                     yield entry, f"is missing, but the fault {name} is drawn; expected {words}: {example}"
         used = {entry for fault in drawn.values() for entry in fault.entries}
         for name, kind in EVENTS.items():

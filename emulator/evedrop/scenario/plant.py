@@ -19,7 +19,7 @@ from evedrop.model.plant import Plant
 from evedrop.model.process import MOST_STATES, Floats, Process
 from evedrop.model.slot.cores import LARGEST
 from evedrop.scenario.process import row_mistake, word_mistake
-from evedrop.scenario.table import Matrix, Mistake, Names, Number, Table, one_of, parameter_mistakes
+from evedrop.scenario.table import Labels, Matrix, Mistake, Number, Table, one_of, parameter_mistakes
 from evedrop.scenario.words import as_toml
 
 Numbers = list[Number]
@@ -28,21 +28,21 @@ Numbers = list[Number]
 class PlantTable(Table):
     """`[plant]`: inputs, disturbances, limits and noise of the true states."""
 
-    inputs: Annotated[Names, Field(examples=[["P_H", "P_grid"]])] = Field(default_factory=list)
+    inputs: Annotated[Labels, Field(examples=[["P_H", "P_grid"]])] = Field(default_factory=list)
     """The names of the m inputs u, which the controller decides."""
     input_matrix: Annotated[Matrix | None, Field(examples=[[[0.00156, 0.00156], [-0.00566, 0.0]]])] = None
     """B, n × m."""
-    input_units: Annotated[Names | None, Field(examples=[["kW", "kW"]])] = None
+    input_units: Annotated[Labels | None, Field(examples=[["kW", "kW"]])] = None
     """The units of the inputs."""
     input_lower: Annotated[Numbers | None, Field(examples=[[-1.5, -3.0]])] = None
     """Lower limits of the inputs. An input beyond its limits is clipped, and counted."""
     input_upper: Annotated[Numbers | None, Field(examples=[[1.5, 3.0]])] = None
     """Upper limits of the inputs."""
-    disturbances: Annotated[Names, Field(examples=[["P_solar", "P_load"]])] = Field(default_factory=list)
+    disturbances: Annotated[Labels, Field(examples=[["P_solar", "P_load"]])] = Field(default_factory=list)
     """The names of the q disturbances d, which also move the plant."""
     disturbance_matrix: Annotated[Matrix | None, Field(examples=[[[0.00156, -0.00156], [0.0, 0.0]]])] = None
     """B_d, n × q."""
-    disturbance_units: Annotated[Names | None, Field(examples=[["kW", "kW"]])] = None
+    disturbance_units: Annotated[Labels | None, Field(examples=[["kW", "kW"]])] = None
     """The units of the disturbances. Those of `disturbance_file` must be the same, except that W and kW are converted."""
     disturbance_file: Annotated[str | None, Field(strict=True, examples=["day.csv"])] = None
     """A CSV file, or a built-in one: a line of names, each with its unit, such as `P_load [kW]`, then a line for each slot."""
@@ -69,7 +69,7 @@ class PlantTable(Table):
         yield from limit_mistakes("input", self.input_lower, self.input_upper, count, "one for each of inputs", {})
         for entry, other in (("output_matrix", "measurement_noise"), ("measurement_noise", "output_matrix")):
             if getattr(self, entry) is not None and getattr(self, other) is None:
-                example = f"{other} = {self.example(other)}"
+                example = f"{other} = {self._example(other)}"
                 yield other, f"is missing, but {entry} is given; expected {example}, or neither"
         rows, disturbances = self.disturbance_values, len(self.disturbances)
         if disturbances and rows is None:

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field
 
 from evedrop.model.process import Process, mistakes_of
 from evedrop.model.slot.cores import LARGEST
-from evedrop.scenario.table import Matrix, Mistake, Names, Number, ProcessName, Table, expected
+from evedrop.scenario.table import Labels, Matrix, Mistake, Number, ProcessName, Table, expected
 from evedrop.scenario.words import as_toml, listed
 
 Source = Literal["model", "file", "zenoh"]
@@ -134,9 +134,9 @@ class ProcessTable(Table):
     """Whether Q may be singular. `Q = "filter"` implies it."""
     reference: Annotated[list[Number] | None, Field(examples=[[55.0, 50.0]])] = None
     """The public levels that states are deviations from: tables and view show `reference` + x; packets contain x."""
-    states: Annotated[Names | None, Field(examples=[["SOC", "LOH"]])] = None
+    states: Annotated[Labels | None, Field(examples=[["SOC", "LOH"]])] = None
     """The names of the states, for tables and view, and in files and messages of states."""
-    units: Annotated[Names | None, Field(examples=[["%", "%"]])] = None
+    units: Annotated[Labels | None, Field(examples=[["%", "%"]])] = None
     """The units of the states."""
 
     directions: Annotated[dict[ProcessName, list[Number]] | None, Field(examples=[{"sum": [1.0, 1.0]}])] = None
@@ -186,7 +186,7 @@ class ProcessTable(Table):
             return None
         count = "1 row" if len(rows) == 1 else f"{len(rows)} rows"
         shape = f"{count} of {listed([str(n) for n in sorted(lengths)])} numbers" if rows else "no rows"
-        return f"has {shape}; expected a square matrix, such as {self.example(name)}"
+        return f"has {shape}; expected a square matrix, such as {self._example(name)}"
 
     @property
     def around(self) -> list[float]:

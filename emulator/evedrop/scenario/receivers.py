@@ -337,7 +337,7 @@ class EavesdropperTable(Table):
         for name in fields:
             if name in wanted and name not in given:
                 of = "" if name == "link" else f"the strategy {self.strategy} needs it; "
-                yield name, f"is missing; {of}expected {name} = {self.example(name)}"
+                yield name, f"is missing; {of}expected {name} = {self._example(name)}"
             if name in given and name not in {"strategy", "window", *wanted}:
                 instead = "; its entry is links" if name == "link" else ""
                 yield name, f"is set, but the strategy {self.strategy} has no such parameter{instead}; remove the line"
@@ -355,7 +355,8 @@ class EavesdropperTable(Table):
         names = [*STRATEGIES[self.strategy].parameters]
         if self.reads_as is not None:
             names += READERS[self.reads_as].parameters
-        return {name: getattr(self, name) for name in names}
+        given = dict(self)  # not attributes: a parameter may have the name of a method
+        return {name: given[name] for name in names}
 
     @property
     def pool(self) -> LinkTable:

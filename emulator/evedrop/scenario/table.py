@@ -93,7 +93,7 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Probability = Annotated[float, Field(strict=True), AfterValidator(_probability)]
 ProcessName = Annotated[str, AfterValidator(_process_name)]
 Matrix = list[list[Number]]
-Names = list[Annotated[str, Field(strict=True, min_length=1)]]
+Labels = list[Annotated[str, Field(strict=True, min_length=1)]]
 Mistake = tuple[str, str]
 """A mistake in a table: the entry and a description."""
 
@@ -114,7 +114,7 @@ class Table(BaseModel):
         return cls.entries()
 
     @classmethod
-    def example(cls, entry: str) -> str:
+    def _example(cls, entry: str) -> str:
         """A value of an entry, as in a file."""
         return as_toml((cls.model_fields[entry].examples or [0])[0])
 

@@ -449,7 +449,7 @@ class Scenario(Table):
 
     def link_path(self, receiver: str) -> str:
         """The dotted key of a receiver's link."""
-        return "legitimate.link" if receiver == LEGITIMATE else f"eavesdroppers.{receiver}.link"
+        return f"{LEGITIMATE}.link" if receiver == LEGITIMATE else f"eavesdroppers.{receiver}.link"
 
     def window(self, receiver: str) -> int:
         """The number of slots by which a packet may be late for a receiver."""

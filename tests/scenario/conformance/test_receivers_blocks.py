@@ -13,7 +13,7 @@ from evedrop.model.eavesdroppers.eavesdropper import PacketReader, PacketTaker
 from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Reception
-from evedrop.model.schemes.plain import PlainEstimator
+from evedrop.model.schemes.plain import Plain, PlainEstimator
 from evedrop.scenario.conformance.receivers import divisions
 from tests.scenario.conformance.breaking import blocks_of_eavesdropper, blocks_of_scheme, broken, checks_of, plain_with
 
@@ -118,6 +118,24 @@ class Continues(PlainEstimator):
 def test_an_estimator_leaves_nothing_behind_in_what_it_is_given_or_in_itself(kind: Any, message: str) -> None:
     """Blocks may be asked for again, as slots may."""
     assert message in str(blocks_of_scheme(plain_with(estimator=kind)))
+
+
+class Forgetful(Plain):
+    """A scheme whose third estimator is off by one where it takes blocks."""
+
+    made = 0
+
+    def estimator(self, keys: Any, batch: Any) -> Any:
+        """The next one."""
+        del keys
+        self.made += 1
+        kind = Follows if self.made < 3 else type("Sure", (Follows,), {"spoil": staticmethod(FOLLOWS["Sure"][0])})
+        return kind(self.process, batch.trials)
+
+
+def test_a_scheme_keeps_nothing_from_one_estimator_to_the_next() -> None:
+    """All that are asked for blocks are of one scheme."""
+    assert " by Sure.follow() of slot" in str(blocks_of_scheme(Forgetful))
 
 
 class Counts(PacketReader):

@@ -55,7 +55,7 @@ class EavesdropperChecks(ReceiverChecks):
     """
 
     state = "keep no state outside of Belief, and take random numbers from the streams alone"
-    unpredictable = "let follows_gamma() return False"
+    actions_remedy = "let follows_gamma() return False"
     _kind: type[Eavesdropper]
 
     def __init__(
@@ -70,7 +70,7 @@ class EavesdropperChecks(ReceiverChecks):
         self._name, self._parameters = name, parameters
         self._scheme, self._scheme_parameters = scheme, scheme_parameters
         if issubclass(kind, PacketTaker):
-            self.unexpected = _TAKES_OTHERWISE
+            self.theory_remedy = _TAKES_OTHERWISE
 
     def verdicts(self) -> list[RuleVerdict]:
         """Check every rule, on small problems. Raises Broken if it is not told of a slot."""

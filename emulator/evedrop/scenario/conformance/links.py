@@ -203,7 +203,7 @@ class DelayChecks(_ModelChecks[DelayModel]):
         return judged((exact, small()), ([("delays agree with simulation", self.says)], large()))
 
     def _whole(self, problem: Problem, bounds: tuple[int, ...] = ()) -> Floats:
-        """As above; each call is to a new instance."""
+        """All delays, (slots, R); every call is to a new instance."""
         reader, parts = BlockReader(key("delay"), problem.batch, 1), []
         for first, stop in pairwise((0, *bounds, problem.slots)):
             slots = range(first, stop)

@@ -50,9 +50,9 @@ class ReceiverChecks(ABC):
 
     state: ClassVar[str]
     """What to do if another one of its kind makes a difference."""
-    unpredictable: ClassVar[str]
+    actions_remedy: ClassVar[str]
     """What to do if actions depend on more than γ."""
-    unexpected = "correct them, or return None: no closed form"
+    theory_remedy = "correct them, or return None: no closed form"
     """What to do if its errors contradict the outcomes that it states."""
 
     def __init__(self, kind: type) -> None:
@@ -62,7 +62,7 @@ class ReceiverChecks(ABC):
 
     @abstractmethod
     def played(self, problem: Problem, *, rubbish: float = 0.0) -> Iterator[Slot]:
-        """Every slot of a problem, with the receiver's beliefs; rubbish: the value in place of a lost packet."""
+        """Every slot of a problem, with the receiver's beliefs; rubbish: the value that it finds in place of a lost packet."""
 
     @abstractmethod
     def row(self, slot: Slot) -> Row:
@@ -156,7 +156,7 @@ class ReceiverChecks(ABC):
                 contradiction = f"act() says {_action_name(action[at])} and step() did {_action_name(after.action[at])}"
                 raise Broken(
                     f"slot {k}, trial {problem.batch.first_trial + at}: {contradiction}; make them agree, or "
-                    f"{self.unpredictable}"
+                    f"{self.actions_remedy}"
                 )
             P = update.reported_covariance(problem.process, k, slot.before.P, action)
             unlike = (P != after.P).any(axis=(0, 1))
@@ -164,7 +164,7 @@ class ReceiverChecks(ABC):
                 at = int(np.argmax(unlike))
                 raise Broken(
                     f"slot {k}, trial {problem.batch.first_trial + at}: Belief.P after {_action_name(action[at])} is not that "
-                    f"of update.reported_covariance; use that function, or {self.unpredictable}"
+                    f"of update.reported_covariance; use that function, or {self.actions_remedy}"
                 )
 
     def theory(self, problem: Problem) -> None:
@@ -172,6 +172,7 @@ class ReceiverChecks(ABC):
         outcomes_at = self.outcomes_at(problem)
         if outcomes_at is None:
             return
+        slots = self.slots(problem)
         outcomes = outcomes_at(QUALITY)
         parts = (outcomes.predicted, outcomes.decoded, outcomes.leaked, outcomes.state, outcomes.misled)
         if abs(sum_in_order(parts) - 1.0) > 1e-9 or min(parts) < 0.0:
@@ -179,7 +180,6 @@ class ReceiverChecks(ABC):
                 f"outcomes sum to {sum_in_order(parts):.6g}, the least is {min(parts):.3g}; expected probabilities that sum "
                 "to 1"
             )
-        slots = self.slots(problem)
         expected = TheoreticalCovariance(problem.process, outcomes).next_traces(len(slots))
         for slot, trace in zip(slots, expected.tolist(), strict=True):
             error = slot.squared_error
@@ -187,7 +187,7 @@ class ReceiverChecks(ABC):
             if abs(float(error.mean()) - trace) > chance:
                 raise Broken(
                     f"slot {slot.k}: the mean squared error is {error.mean():.4g}, and outcomes say {trace:.4g}; "
-                    f"{self.unexpected}"
+                    f"{self.theory_remedy}"
                 )
 
 

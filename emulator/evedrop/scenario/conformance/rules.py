@@ -189,13 +189,16 @@ def judged(*groups: tuple[Sequence[Rule], Sequence[Any]]) -> list[RuleVerdict]:
     verdicts: list[RuleVerdict] = []
     for rules, problems in groups:
         for title, check in rules:
-            broken = ((problem, how_broken(check, problem)) for problem in problems)
-            verdicts.append(
-                RuleVerdict(title, next((f"{problem}: {how}" for problem, how in broken if how is not None), None))
-            )
+            broken = next((how for problem in problems if (how := _how_broken(check, problem)) is not None), None)
+            verdicts.append(RuleVerdict(title, broken))
             if verdicts[0].broken is not None:
                 return verdicts
     return verdicts
+
+
+def _how_broken(check: Callable[[Any], None], problem: Any) -> str | None:
+    how = how_broken(check, problem)
+    return None if how is None else f"{problem}: {how}"
 
 
 def how_broken(check: Callable[[Any], None], problem: Any) -> str | None:

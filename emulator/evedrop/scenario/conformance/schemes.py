@@ -14,7 +14,7 @@ from evedrop.model.outcomes import legitimate_outcomes
 from evedrop.model.receiver import Receiver
 from evedrop.model.schemes.scheme import PacketBlock, Scheme
 from evedrop.model.theory.covariances import OutcomesAt
-from evedrop.scenario.conformance.problems import Problem, Slot, large, made, played, row_of, sent_of, small
+from evedrop.scenario.conformance.problems import Problem, Slot, large, made, played, row_of, sent_of, sides, small
 from evedrop.scenario.conformance.receivers import SIGMAS, BlockChecks, ReceiverChecks
 from evedrop.scenario.conformance.rules import (
     Broken,
@@ -38,7 +38,7 @@ class SchemeChecks(ReceiverChecks):
     """The rules, each checked on one problem. kind, parameters: the scheme's class, and its parameters."""
 
     state = "keep no state outside of what is made from the keys, and take random numbers from their streams alone"
-    unpredictable = "set reads_packets = True if it depends on more than γ"
+    actions_remedy = "set reads_packets = True if it depends on more than γ"
     _kind: type[Scheme]
 
     def __init__(self, kind: type[Scheme], parameters: Mapping[str, Any]) -> None:
@@ -131,8 +131,9 @@ class SchemeChecks(ReceiverChecks):
     def blocks(self, problem: Problem) -> None:
         """Blocks of slots give the same packets and beliefs as single slots."""
         scheme = made(self._kind, self._parameters, problem)
-        BlockChecks(self.slots(problem), problem, self._kind).expect_same_sides(scheme)
-        super().blocks(problem)
+        checks = BlockChecks(self.slots(problem), problem, self._kind)
+        checks.expect_same_sides(scheme)
+        checks.expect_same_beliefs(lambda: sides(scheme, problem, self._kind, apart=True)[1])
 
     def prediction(self, problem: Problem) -> None:
         """The estimator's mean error never exceeds that of a receiver that hears nothing."""

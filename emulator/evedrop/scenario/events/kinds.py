@@ -183,7 +183,8 @@ class Restart(EventKind):
         yield _act(Restart, self, self.first, _restarted(self.state))
 
 
-_CONTINUED = Return(Fate.PAUSED, ProcessAction.CONTINUE, "pause", keeps_state=True)
+def _continued() -> Return:
+    return Return(Fate.PAUSED, ProcessAction.CONTINUE, Pause.kind, keeps_state=True)
 
 
 class Pause(EventKind):
@@ -202,7 +203,7 @@ class Pause(EventKind):
         """The stop, and the continuation."""
         yield _act(Pause, self, self.first, Leave(Fate.PAUSED, ProcessAction.STOP, keeps_state=True))
         if self.to is not None:
-            yield _act(Resume, self, self.to, _CONTINUED)
+            yield _act(Resume, self, self.to, _continued())
 
 
 class Resume(EventKind):
@@ -217,7 +218,7 @@ class Resume(EventKind):
 
     def acts(self) -> Iterator[Act]:
         """The continuation."""
-        yield _act(Resume, self, self.first, _CONTINUED)
+        yield _act(Resume, self, self.first, _continued())
 
 
 class Attack(EventKind):

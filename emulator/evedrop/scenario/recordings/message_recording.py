@@ -65,7 +65,7 @@ class MessageSeries:
 
 
 COUNTS = ("parts", "repeated", "late", "restarts", "leaps")
-"""The numbers in a series."""
+"""The fields of a series that are counts, which add up."""
 
 
 def joined(series: Sequence[MessageSeries]) -> MessageSeries:
