@@ -359,7 +359,8 @@ def test_the_end_of_the_time_for_replies_is_no_message(tmp_path: Path) -> None:
         before = len(kinds(wire))
         for n in range(5):
             replies = [*asker.get("map", timeout=60.0)]
-            assert [reply.err.payload.to_bytes() for reply in replies if reply.err is not None] == [b"Timeout"]
+            # Zenoh itself sometimes says it twice, in a session without a wire, too.
+            assert {reply.err.payload.to_bytes() for reply in replies if reply.err is not None} == {b"Timeout"}
             assert len(held) == n + 1
         assert kinds(wire)[before:] == [(Kind.QUERY, 0)] * 5
         held.clear()

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from evedrop.errors import TraceError, UsageError
 from evedrop.scenario.recordings.link_fit import fit_messages
 from evedrop.wire.file import resolved_wire, wire_of
-from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal import JOURNAL_FOLDER, WireJournal
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.recorded_link import journal_recording
 from evedrop.wire.records import AGAIN, Kind, WireFate
@@ -193,6 +195,17 @@ def test_mistakes_are_said(evedrop: Evedrop, arguments: Iterable[str], message: 
     assert (done.status, done.out) == (2, "")
     (line,) = done.err.splitlines()
     assert message in line
+
+
+def test_a_reason_that_no_wire_writes_is_refused(tmp_path: Path) -> None:
+    """It does not count as delivered."""
+    carried(tmp_path, plan_of(SETTINGS), {"robot/scan/a": 50})
+    (part,) = (tmp_path / JOURNAL_FOLDER).glob("*.parquet")
+    table = pq.read_table(part)
+    reasons = pa.array(["vanished", *table["reason"].cast(pa.string()).to_pylist()[1:]]).dictionary_encode()
+    pq.write_table(table.set_column(table.schema.get_field_index("reason"), "reason", reasons), part)
+    with pytest.raises(TraceError, match="whose reason is 'vanished'"):
+        journal_recording(tmp_path, "scan")
 
 
 def test_a_folder_without_a_journal_is_refused(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ class KeyDeliveries:
 
     @property
     def parts(self) -> int:
-        """How many times consecutive messages have the same settings."""
+        """The number of stretches of messages within which no setting changes."""
         return sum(len(parts) for _, parts in self._pieces)
 
     def spectrum(self, z: Spectrum) -> Spectrum | None:
@@ -94,7 +94,7 @@ def bounds(streams: Sequence[KeyDeliveries], count: int) -> tuple[float, float]:
 def _bounds_by_transform(
     streams: Sequence[KeyDeliveries], count: int, mean: float, variance: float
 ) -> tuple[int, int] | None:
-    """At most 0.5 % of all wires deliver fewer, and at most 0.5 % more; None if that is not known or too much work.
+    """As `bounds`; None if the distribution is not known or too much work.
 
     mean, variance: of all streams together.
     """
@@ -124,7 +124,7 @@ def _bounds_by_transform(
 
 
 def normal_bounds(mean: float, variance: float, count: int) -> tuple[float, float]:
-    """The same for a normal variable, with a correction for whole numbers."""
+    """The bounds if the number of deliveries were normal, with a correction for whole numbers."""
     reach = _STANDARD_DEVIATIONS * math.sqrt(variance) + (0.5 if variance > 0.0 else 1e-6 * max(1.0, mean))
     return max(0.0, mean - reach), min(float(count), mean + reach)
 
@@ -132,7 +132,7 @@ def normal_bounds(mean: float, variance: float, count: int) -> tuple[float, floa
 def _pieces(
     settings: Mapping[str, Any], changes: Iterable[Change], ranges: Iterable[range]
 ) -> list[tuple[LossModel, list[Thinned]]]:
-    """The loss models in turn, each with the messages on which it decides, in parts between which no setting changes."""
+    """The loss models in turn, each with the messages on which it decides, in parts within which no setting changes."""
     marks = stretches(LinkSchedule(settings, changes=tuple(changes)))
     models = accumulate((new["loss"] != old["loss"] for (_, old, _), (_, new, _) in pairwise(marks)), initial=0)
     ends = [*(start for start, _, _ in marks[1:]), NEVER]

@@ -135,7 +135,7 @@ class WireHistory:
         )
 
     def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
-        """The settings of a stream's messages: the first from message 0 on, then the changes. For `KeyFates`."""
+        """The settings of a stream's messages: the first from message 0 on, then the changes. For `PerKeyLinks`."""
         stream, versions = (numbered_as(key), kind), self._settings.get(link, [])
         if any(stream in version.since for version in versions):
             return _changes((version.since.get(stream, 0), version.settings) for version in versions)

@@ -353,7 +353,7 @@ class _Message:
 
 
 def _answer(query: zenoh.Query, answer: zenoh.Sample) -> _Message:
-    """A reply to a query that is no error."""
+    """The message that answers a query with a reply that is not an error."""
 
     def send() -> None:
         how: dict[str, Any] = {

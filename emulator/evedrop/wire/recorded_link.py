@@ -30,7 +30,7 @@ from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import JOURNAL_FOLDER, journal_tables
 from evedrop.wire.plan import WirePlan, numbered_as
-from evedrop.wire.records import Kind, WireFate, codes_of, delivered_again, records_of
+from evedrop.wire.records import REASONS, Kind, WireFate, codes_of, delivered_again, records_of
 
 _COLUMNS = ["time", "link", "key", "size", "source", "sequence", "reason", "delay", "n", "kind", "again"]
 _MOST_SHOWN = 10  # links or keys that a message lists
@@ -64,6 +64,8 @@ class _LinkRows:
         rows = rows.unify_dictionaries().combine_chunks()
         if key is not None:
             rows = rows.filter(self._has_key(rows, key))
+        if unknown := {*pc.unique(rows["reason"].cast(pa.string())).drop_null().to_pylist()} - {*REASONS.values()}:
+            self._no(f"has messages whose reason is {min(unknown)!r}, which is none that a wire writes")
         self._keys = key
         self._rows = rows
         self._notes: list[str] = []

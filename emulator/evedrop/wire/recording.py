@@ -39,7 +39,7 @@ _JUMP = 1.0  # seconds by which the system's clock and a steady clock may differ
 
 
 class _WireRecording(RecordingThread[Chunk, Notice]):
-    """Writes the recording of a wire, from whatever its steps are made of. A subclass sets `_panels` first."""
+    """Writes the recording of a wire, from whatever its steps are made of. A subclass sets `_panels` before that."""
 
     _panels: WirePanels
 

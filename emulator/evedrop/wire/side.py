@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Self, final
 
@@ -53,17 +53,13 @@ class SideSession:
         """largest: bytes of the largest message. Raises UsageError if the side cannot listen or connect where it must."""
         self.side = side
         self.name = side.name
-        with contextlib.nullcontext() if side.users is None else users_file(side.users) as users:
-            try:
-                self.session, self.endpoints = opened(
-                    side.listen,
-                    lambda listen: side_config(
-                        replace(side, listen=listen), largest, None if users is None else str(users)
-                    ),
-                )
-            except zenoh.ZError as error:
-                raise UsageError(_refusal(side, str(error))) from error
-        """Its session, and where programs connect: with a free port where the plan has port 0."""
+        try:
+            self.session, self.endpoints = opened(
+                side.listen, side.users, lambda listen, users: side_config(replace(side, listen=listen), largest, users)
+            )
+            """Its session, and where programs connect: with a free port where the plan has port 0."""
+        except zenoh.ZError as error:
+            raise UsageError(_refusal(side, str(error))) from error
         self.zid = str(self.session.info.zid())
         self.duty = Duty(f"at the side {side.name}", ANSWER_SECONDS)
         """The work of the main thread on the session when the wire ends."""
@@ -84,9 +80,13 @@ class SideSession:
 
 
 def opened(
-    listen: tuple[str, ...], config_of: Callable[[tuple[str, ...]], ZenohConfig]
+    listen: tuple[str, ...],
+    users: Mapping[str, str] | None,
+    config_of: Callable[[tuple[str, ...], str | None], ZenohConfig],
 ) -> tuple[zenoh.Session, tuple[str, ...]]:
     """A session, and the endpoints at which it listens: with free ports in place of port 0. Raises zenoh.ZError.
+
+    users: name → password; config_of: makes the configuration from the endpoints and the path of the file of users.
 
     Zenoh, too, listens at any free port for port 0, but tells which only in its administration space, which is closed.
     """
@@ -94,11 +94,13 @@ def opened(
     while True:
         attempts -= 1
         endpoints = tuple(_PORT_0.sub(lambda _: f":{free_port()}", endpoint) for endpoint in listen)
-        try:
-            return open_session(config_of(endpoints)), endpoints
-        except zenoh.ZError as error:
-            if not attempts or endpoints == listen or "in use" not in str(error):
-                raise
+        # A file for each attempt: Zenoh has read it before it listens, and what opens the path may share its position.
+        with contextlib.nullcontext() if users is None else users_file(users) as file:
+            try:
+                return open_session(config_of(endpoints, None if file is None else str(file))), endpoints
+            except zenoh.ZError as error:
+                if not attempts or endpoints == listen or "in use" not in str(error):
+                    raise
 
 
 def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Self, final
 
 from evedrop.errors import ScenarioError
-from evedrop.live.network.access import Grant, access_control, users_file
+from evedrop.live.network.access import Grant, access_control
 from evedrop.live.network.connection import Question, Questions
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.operator import Answer, Order
@@ -125,10 +125,11 @@ class WireControl:
         with contextlib.ExitStack() as stack:
             password = world().token(24).hex()
             access = access_control([Grant(OPERATOR, writes=(), reads=(), token=None, asks=(self._key,))])
-            with users_file({OPERATOR: password}) as users:
-                session, (router,) = opened(
-                    (FREE,), lambda listen: listening_config(listen[0], str(users), access, _TRANSPORT)
-                )
+            session, (router,) = opened(
+                (FREE,),
+                {OPERATOR: password},
+                lambda listen, users: listening_config(listen[0], str(users), access, _TRANSPORT),
+            )
             stack.enter_context(session)
             Questions(self._key, Dropped("the wire"), self._answer).declare(session)
             stack.callback(remove_control, self._folder)

@@ -55,7 +55,7 @@ LANES: tuple[Colour, ...] = (
     palette.STATE, palette.DECODED, palette.DISCARDED, palette.MISLED, palette.DROPPED, palette.SILENT,
 )  # fmt: skip
 """The outcomes of a packet, brighter where more was used."""
-WIRE_LANES: tuple[Colour, ...] = (*LANES, palette.STEEL)
+WIRE_LANES: tuple[Colour, ...] = tuple(state.colour for state in LaneState)
 """The fates of the messages of a wire's link."""
 PANELS: dict[str, Iterable[Colour]] = {
     "plant": PLANT,

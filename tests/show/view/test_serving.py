@@ -82,6 +82,7 @@ def test_a_recording_is_found_although_its_folder_was_moved(tmp_path: Path) -> N
     """The first reader may come later than that."""
     others = threads_named("recording")
     followed = Followed(tmp_path / "run" / "r.rrd")
+    followed.open_early()
     (opener,) = threads_named("recording") - others
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "r.rrd").write_bytes(b"abc")

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -262,12 +263,15 @@ def test_another_user_at_the_port_of_a_page_serves_none(
     which: int, thief: Callable[[int], subprocess.Popen[str]], tmp_path: Path
 ) -> None:
     """Whether he has the port of the page or that of the recording, the command refuses, and serves neither."""
-    port = free_port()
+    port, before = free_port(), set(threading.enumerate())
     thief(port + which)
     with pytest.raises(UsageError, match=rf"127\.0\.0\.1:{port + which} cannot be used \(Address already in use\)"):
         Viewer.serve(WebAddress("127.0.0.1", port), tmp_path / "r.rrd")
     with socket.create_server(("127.0.0.1", port + 1 - which)):
         pass  # it is free again
+    assert "recording" not in {thread.name for thread in set(threading.enumerate()) - before}, (
+        "nobody waits for the files"
+    )
 
 
 def test_a_window_whose_port_is_free_at_the_second_try_opens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

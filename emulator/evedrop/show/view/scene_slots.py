@@ -70,7 +70,7 @@ class LoopValues:
 
     @classmethod
     def of(cls, scenario: Scenario) -> LoopValues | None:
-        """For the trial that the view shows; None without a controller."""
+        """An instance for the trial that the view shows; None without a controller."""
         loop = controlled_plant(scenario)
         return None if loop is None else cls(loop, scenario)
 

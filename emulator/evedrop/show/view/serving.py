@@ -50,8 +50,11 @@ class Followed:
         self._over = threading.Event()
         if complete:
             self._over.set()
-        elif self._begun() is None:
-            threading.Thread(target=self._open_early, name="recording", daemon=True).start()
+
+    def open_early(self) -> None:
+        """Open the files as soon as they exist, on a thread: the first reader may come after their folder was moved."""
+        if not self._over.is_set() and self._begun() is None:
+            threading.Thread(target=self._wait_for_files, name="recording", daemon=True).start()
 
     def complete(self) -> None:
         """Declare the recording complete: `pieces` then stops at its end."""
@@ -86,8 +89,7 @@ class Followed:
             else:
                 self._over.wait(_POLL_SECONDS)
 
-    def _open_early(self) -> None:
-        """Open the files as soon as they exist: a reader may come when their folder has been moved."""
+    def _wait_for_files(self) -> None:
         while self._files is None and not self._over.wait(_POLL_SECONDS):
             self._begun()
 

@@ -146,7 +146,7 @@ def spawn(
 
 
 def spawn_anywhere(arguments: Sequence[str], logs: Path, **options: Any) -> tuple[subprocess.Popen[bytes], int]:
-    """As `spawn`, at a free port, which is returned, too: at another one if another process takes it meanwhile."""
+    """As `spawn`, at a free port, which is also returned; tries another one if a process takes it meanwhile."""
 
     def spawned(port: int) -> tuple[subprocess.Popen[bytes], int]:
         return spawn(port, ["--port", str(port), *arguments], logs, **options), port
@@ -329,6 +329,7 @@ class Viewer:
     ) -> None:
         """process: a window's; servers and address: a page's."""
         self._followed = followed
+        followed.open_early()
         self._process = process
         self._servers = [*servers]
         self._stopped = threading.Event()
