@@ -24,7 +24,7 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], Session] =
     on_truth = part.acts_on == "truth"
     with connect(brief) as session:
         key, name = (session.keys.state, "x") if on_truth else (session.keys.estimate, "x_hat")
-        states = InOrder(session.subscribe(key), key, brief.flow.longest_outage)
+        messages = InOrder(session.subscribe(key), key, brief.flow.longest_outage)
         put = kept_decisive(session, session.keys.input, brief, assignment.period)
         # The recorder joins slots without the controller's reports, so all kept reports are sent again.
         kept = brief.flow.window + 1 + assignment.period
@@ -33,7 +33,7 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], Session] =
         session.ready()
         for k in range(0, brief.slots, assignment.period):
             session.status.slot = k
-            x = read_known(states.take(k), name, k, (process.n, brief.trials))
+            x = read_known(messages.take(k), name, k, (process.n, brief.trials))
             made = controller.decide(k, x)
             put(k, decided(k, made.u, made.failed))
             reporter.add_decision(k, *made)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from queue import Empty, SimpleQueue
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 from evedrop.system.threads import Condition, Queue
 from evedrop.system.world import RealWorld, inside, world
-
-T = TypeVar("T")
 
 
 class TestClock:
@@ -28,13 +26,6 @@ class TestClock:
     def sleep(self, seconds: float) -> None:
         """Let time pass at once."""
         self.now += seconds
-
-    def next(self, queue: Queue[T], timeout: float | None) -> T:
-        """The next item; if the queue is empty, the time limit passes at once."""
-        if queue.empty():
-            self.now += 0.0 if timeout is None else timeout
-            raise Empty
-        return queue.get()
 
     def wait(self, condition: Condition, timeout: float | None) -> None:
         """Let the time limit pass at once; without one, wait until the condition is notified."""
@@ -74,7 +65,7 @@ class TestWorld(RealWorld):  # type: ignore[misc]  # which is final for programs
         """Let time pass at once."""
         self.clock.sleep(seconds)
 
-    def queue(self) -> Queue[Any]:  # type: ignore[override]  # it stands for any queue
+    def queue(self) -> Queue[Any]:
         """A queue without a limit."""
         return TestQueue(self.clock)
 

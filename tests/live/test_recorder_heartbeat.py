@@ -36,7 +36,7 @@ def next_event(self, seconds, honest=children.Children.next_event):
 
 results.finish = finish
 children.GRACE_SECONDS = children._GONE_SECONDS = starter.GRACE_SECONDS = {grace}
-heartbeat.heartbeat.__wrapped__.__defaults__ = (0.1,)
+heartbeat._BEAT_SECONDS = 0.1
 children.Children.next_event = next_event
 """
 """How long a recorder takes to make Parquet files, after how long a silence in a run its launcher gives it up, and how long

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -99,6 +100,25 @@ def test_a_comparison_is_read_back_and_has_its_page(everything: Everything) -> N
     assert page.values("class").count("verdict") == len(comparison.schemes) * len(comparison.adversaries)
     for scheme in comparison.schemes.values():
         assert {verdict(cell) for cell in scheme.cells.values() if cell.verdict is not None} <= set(page.texts)
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"), [("relative", "nonsense"), ("perfect", "nonsense"), ("ratio_from", None), ("verdict", None)]
+)
+def test_a_comparison_with_an_entry_that_means_nothing_is_refused(
+    everything: Everything, tmp_path: Path, entry: str, value: str | None
+) -> None:
+    """Words that are no verdict, and entries that an older version did not write."""
+    data = json.loads((everything[1] / "compare.json").read_text())
+    cells = (cell for scheme in data["schemes"].values() for cell in scheme["against"].values())
+    secrecy = next(cell["secrecy"] for cell in cells if "secrecy" in cell)
+    if value is None:
+        del secrecy[entry]
+    else:
+        secrecy[entry] = value
+    (tmp_path / "compare.json").write_text(json.dumps(data))
+    with pytest.raises(UsageError, match=value or entry):
+        read_comparison(tmp_path)
 
 
 def test_the_matrix_leaves_out_adversaries_that_no_scheme_defines(everything: Everything) -> None:

@@ -41,7 +41,7 @@ def command(
     """
 
     def made(run: Callable[[argparse.Namespace], int]) -> Command:
-        sentence = str(run.__doc__).partition("\n")[0]
+        sentence = (run.__doc__ or run.__name__).partition("\n")[0]  # `python -OO` removes docstrings
         does = f"{sentence[0].lower()}{sentence[1:].removesuffix('.')}"
         return Command(name or run.__name__, run, does, options, **more)
 

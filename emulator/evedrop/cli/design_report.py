@@ -34,6 +34,8 @@ def print_designed(design: object, console: ReportConsole) -> None:
             _print_policies(design, console)
         case BudgetDesign():
             _print_budget(design, console)
+        case _:
+            raise TypeError(f"{type(design).__name__} is not a design")
 
 
 def _print_design(design: Design, console: ReportConsole) -> None:

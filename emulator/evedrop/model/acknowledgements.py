@@ -143,7 +143,8 @@ class AckChannelSpec:
     @property
     def memory(self) -> int:
         """How many packets before its own decide on an acknowledgement: those that the jammer may have missed in a row."""
-        return 0 if self.heed_rule is None else self.heed_rule.patience
+        rule = self.heed_rule
+        return 0 if rule is None else rule.patience
 
 
 @final

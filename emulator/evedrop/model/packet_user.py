@@ -1,4 +1,4 @@
-"""Receivers that use a packet as the state or ignore it: the paper's class of eavesdroppers; or read a state from each."""
+"""Receivers that use a packet as the state or ignore it (the paper's eavesdroppers), and those that read a state from each."""
 
 from __future__ import annotations
 

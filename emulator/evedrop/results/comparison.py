@@ -19,6 +19,7 @@ from pydantic import TypeAdapter
 from evedrop.errors import UsageError
 from evedrop.results.reading import ByName
 from evedrop.results.summary_file import plain
+from evedrop.score.secrecy import Claim
 from evedrop.score.summary import RARE_FRACTION, RareEvents, SecrecySummary
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.system.files import Unreadable, text_of
@@ -445,8 +446,11 @@ def _cell(scheme: str, adversary: str, data: Mapping[str, Any], trials: int) -> 
         return Cell(Match(scheme, adversary, not_defined=data["not_defined"]))
     match = Match(scheme, adversary, data["reads_as"], data["attack"], betrayed=bool(data["betrayed"]))
     secrecy = TypeAdapter(SecrecySummary).validate_python(data["secrecy"])
-    if secrecy.verdict is None:
-        raise KeyError("verdict")  # results of an older version
+    for entry in ("ratio_from", "verdict"):
+        if entry not in data["secrecy"]:
+            raise KeyError(entry)  # results of an older version
+    for word in (secrecy.relative, secrecy.perfect):
+        Claim(word)
     return Cell(match, _simulated_error(data["legitimate"]), _simulated_error(data["eavesdropper"]), secrecy, trials)
 
 

@@ -47,7 +47,11 @@ def difference(a: Results, b: Results) -> RunDifference:
     first = _first(a, b)
     if not common and first is None:
         return _by_rows_alone(a, b)
-    unequal = sorted((key[2], key[1], key[0]) for key in common if blocks_a[key] != blocks_b[key])
+    unequal = sorted(
+        (block, trial, peer)
+        for peer, trial, block in common
+        if blocks_a[peer, trial, block] != blocks_b[peer, trial, block]
+    )
     only = len(blocks_a) + len(blocks_b) - 2 * len(common)
     rest = f" ({only} blocks of up to 256 slots are in one run only)" if only else ""
     if first is not None and (not unequal or first.slot < unequal[0][0] + BLOCK_SLOTS):

@@ -125,7 +125,10 @@ class Results:
 
     @contextmanager
     def _opened(self, name: str) -> Iterator[tuple[pa.Schema, Iterator[pa.RecordBatch]] | None]:
-        """A table's stream, None for a Parquet file. Raises UsageError if it cannot be read, in the block either."""
+        """The stream of a table while the block runs; None if the table is a Parquet file.
+
+        Raises UsageError for any error on opening it, and for any error in the block, which reads it.
+        """
         try:
             with stream_of(self.folder, name) as stream:
                 if stream is None:

@@ -129,14 +129,15 @@ class Evidence:
             return None, None
         shown = str(entry.relative if relative else entry.perfect)
         value = _RUN.get(shown, f"the run has {shown}")
-        promised: bool | None = True
-        if not relative or isinstance(entry, SecrecySummary):
-            promised = (
-                entry.relative_by_theory if isinstance(entry, SecrecySummary) and relative else entry.perfect_by_theory
-            )
-            value = f"{_THEORY[promised]}, {value}"
         complete = all(tally.done == tally.slots for tally in self.tallies.values())
-        return value, promised is True and shown == Claim.HELD.value if complete else None
+        if not relative:
+            promised = entry.perfect_by_theory
+        elif isinstance(entry, SecrecySummary):
+            promised = entry.relative_by_theory
+        else:
+            return value, shown == Claim.HELD.value if complete else None
+        held = promised is True and shown == Claim.HELD.value
+        return f"{_THEORY[promised]}, {value}", held if complete else None
 
     def _synchronised(self, expect: ExpectTable) -> tuple[JudgedValue, bool | None]:
         """The slot by which it was synchronised in all trials; undecided if the run was cut short before `by`."""

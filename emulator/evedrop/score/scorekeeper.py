@@ -183,9 +183,9 @@ def verdicts(
     expected: Mapping[str, Expectation],
     true: Mapping[str, AfterStart] | None = None,
 ) -> tuple[dict[str, SecrecySummary], list[Compared], Verdict | None]:
-    """Secrecy against every eavesdropper, from all receivers' tallies and what theory expects of them, and the verdict on all.
+    """Secrecy against every eavesdropper, from all receivers' tallies and what theory expects of them.
 
-    Eavesdropper → its entry, the comparisons on which the verdicts rest, and the verdict on all.
+    Returns eavesdropper → its entry, the comparisons on which the verdicts rest, and the verdict on all.
 
     true: eavesdropper → the comparison of errors against the true state, for a sensor that sends an estimate.
     """

@@ -249,7 +249,10 @@ class MeanErrors:
 
 
 def _relative(means: MeanErrors, test: SignTestOf, slots: int) -> tuple[Claim, str, Claim | None]:
-    """As `relative_verdict`, and the verdict that the means of the trials would give if nothing else left it open."""
+    """The verdict on relative secrecy and its slots, as from `relative_verdict`.
+
+    Third: what the means of the trials alone would show, if only the larger means that theory allows leave it open; else None.
+    """
     difference = means.theirs - means.ours
     plain, windows = relative_verdict(difference, test, slots)
     if means.most_ours is None or means.most_theirs is None or plain is Claim.UNDECIDED:

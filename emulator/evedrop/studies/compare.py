@@ -50,7 +50,7 @@ from evedrop.studies.matchups import Group, Matchups
 from evedrop.system.signals import stop_on_signals
 
 _WRITE_SECONDS = 3.0  # from one compare.json to the next
-_WRITE_PAUSE = 50.0  # the same, as a multiple of the time to write one
+_WRITE_PAUSE = 50.0  # from one to the next, as a multiple of the time to write one
 
 
 def compare_all(matchups: Matchups, folder: Path, on_event: OnEvent, plan: Plan, *, resume: bool = False) -> Comparison:

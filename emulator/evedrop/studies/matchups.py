@@ -227,7 +227,7 @@ def _encoding(scenario: Scenario, scheme: str, parameters: Mapping[str, Any]) ->
 def with_encoding(
     scenario: Scenario, encoding: Tables, attack: str = "none", matches: Sequence[Match] = ()
 ) -> Scenario:
-    """The scenario with another encoding; its eavesdroppers are those of the matches, without other attacks than this one.
+    """The scenario with another encoding, the eavesdroppers of these matches, and no attack but this one.
 
     Events concern only the legitimate estimator. Raises ScenarioError if the encoding cannot be used.
     """

@@ -1,15 +1,15 @@
 """Waits, always with a limit: for the ends of threads, and by a clock.
 
-Tests pass another clock, which does not let them wait.
+Tests of a wire pass another clock, which does not let them wait.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, TypeVar, final
+from typing import Protocol, final
 
 from evedrop.errors import RunError
-from evedrop.system.threads import Condition, Queue, Thread, ThreadEvent
+from evedrop.system.threads import Condition, Thread, ThreadEvent
 from evedrop.system.world import world
 
 THREAD_SECONDS = 600.0
@@ -64,20 +64,11 @@ class Alarm:
         self._act()
 
 
-T = TypeVar("T")
-
-
 class Clock(Protocol):
     """Measures time, and lets it pass."""
 
     def monotonic(self) -> float:
         """Seconds since some moment."""
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass."""
-
-    def next(self, queue: Queue[T], timeout: float | None) -> T:
-        """Wait for the next item of a queue. Raises Empty after `timeout` seconds; None: waits as long as it takes."""
 
     def wait(self, condition: Condition, timeout: float | None) -> None:
         """Wait until a condition is notified, or for `timeout` seconds; None: waits as long as it takes."""
@@ -90,14 +81,6 @@ class SystemClock:
     def monotonic(self) -> float:
         """Seconds since some moment."""
         return world().monotonic()
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass."""
-        world().sleep(seconds)
-
-    def next(self, queue: Queue[T], timeout: float | None) -> T:
-        """Wait for the next item of a queue. Raises Empty."""
-        return queue.get(timeout=timeout)
 
     def wait(self, condition: Condition, timeout: float | None) -> None:
         """Wait until a condition is notified, or for some seconds."""

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from queue import SimpleQueue
-from typing import IO, TYPE_CHECKING, Any, Protocol, TypeVar, final
+from typing import IO, TYPE_CHECKING, Any, Protocol, final
 
 from evedrop.system.disk import REAL_DISK, Disk
 from evedrop.system.this_process import REAL_PROCESS, ThisProcess
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from evedrop.system.fork_channels import ForkChannel
     from evedrop.system.ssh_client import SshClient
 
-T = TypeVar("T")
 Address = tuple[str, int] | Path
 """Host and port, or the path of a Unix socket."""
 
@@ -122,7 +121,7 @@ class RealWorld(World):
     rlock = staticmethod(threading.RLock)
     condition = staticmethod(threading.Condition)
     event = staticmethod(threading.Event)
-    queue = staticmethod(SimpleQueue[Any])
+    queue: Callable[[], Queue[Any]] = staticmethod(SimpleQueue)
     process = REAL_PROCESS
     disk = REAL_DISK
 

@@ -232,11 +232,8 @@ def briefs_of(
         states=None if states is None else encoded(states),
         program=_program_of(public),
     )
-    made.append(
-        brief(
-            SENSOR, {**_sensor_keys(scenario, keys, monitor is not None), **keys.secret(scheme.secret_streams)}, sensor
-        )
-    )
+    own = _sensor_keys(scenario, keys, monitor is not None)
+    made.append(brief(SENSOR, {**own, **keys.secret(scheme.secret_streams)}, sensor))
     legitimate = LegitimatePart(
         scheme=spec,
         window=scenario.window(LEGITIMATE),

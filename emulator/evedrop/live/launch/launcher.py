@@ -57,7 +57,7 @@ def launch(
 
     this = world().process
     with this.stop_on_signals() as stop, this.told_when_suspended(suspended), process_starter(stop) as start:
-        run = Launch(scenario, folder, view, on_event, stop, start, ahead, paused)
+        run = Launch(scenario, folder, view, on_event, stop, start, ahead=ahead, paused=paused)
         if hosts is not None:
             return _on_hosts(run, hosts)
         if scenario.shards == 1:

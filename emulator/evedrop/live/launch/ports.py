@@ -200,11 +200,8 @@ class Routers:
 
     def endpoint(self, process: str) -> str:
         """The endpoint that a process connects to."""
-        return str(
-            (
-                self.endpoints.router if process in self.at_router else self.endpoints.relay or self.endpoints.router
-            ).connect
-        )
+        near, far = self.endpoints.router, self.endpoints.relay or self.endpoints.router
+        return str((near if process in self.at_router else far).connect)
 
     def password(self, process: str) -> str:
         """The password of a process."""

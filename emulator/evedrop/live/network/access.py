@@ -64,12 +64,12 @@ def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, rel
         *(keys.progress(name) for name in (*receivers, RECORDER)),
         *(keys.control(name) for name in (*reporters, *routers)),
     )
-    untold = {LEGITIMATE: keys.input} if loop is not None and not loop.knows_input else {}
+    withheld = (LEGITIMATE, keys.input) if loop is not None and not loop.knows_input else None
     table = [
         Grant(
             name,
             writes=tuple(key for key in all_keys if writer_of(key) == name),
-            reads=tuple(key for key in all_keys if reads(name, key) and key != untold.get(name)),
+            reads=tuple(key for key in all_keys if reads(name, key) and (name, key) != withheld),
             token=keys.alive(name),
             checks=(keys.alive(name),),
             watches=tuple(keys.alive(other) for other in (*reporters, *routers)) if name == RECORDER else (),

@@ -25,12 +25,12 @@ def emit(event: ProgressEvent) -> None:
 
 
 @contextmanager
-def heartbeat(seconds: float = _BEAT_SECONDS) -> Iterator[None]:
+def heartbeat() -> Iterator[None]:
     """Send the heartbeat to the launcher, every second while the block runs."""
     over = world().event()
 
     def beat() -> None:
-        while not over.wait(seconds):
+        while not over.wait(_BEAT_SECONDS):
             emit(Alive())
 
     thread = world().thread(beat, name="heartbeat")

@@ -614,7 +614,7 @@ def has_part(brief: AnyBrief, kind: type[P]) -> TypeGuard[Brief[P]]:
 
 
 def with_files_in(brief: AnyBrief, folder: Path) -> AnyBrief:
-    """The same brief with its process's own files in a folder: its last word and, if it goes away, its state meanwhile."""
+    """The brief with the files of its process in a folder: its last word and, if it is to go away, its state meanwhile."""
     brief = replace(brief, last_word=str(last_word_file(folder, brief.process)))
     if not isinstance(brief.part, ReceiverPart) or not brief.part.outages:
         return brief

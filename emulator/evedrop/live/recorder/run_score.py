@@ -27,7 +27,7 @@ class RunScore:
         self.scenario = scenario
         """With the operator's changes; it is the same for the slots so far."""
         self.started = self.ended = world().monotonic()
-        """When all processes were there, or before that, when the recorder began; and when it had come as far as the summary."""
+        """When all processes were there, or at first the recorder's beginning; and when the run was as the summary says."""
         self.events: Sequence[RunEvent] = ()
         self.outages: Sequence[ConnectionOutage] = ()
         self.misdelivered: Mapping[str, int] = {}

@@ -93,15 +93,15 @@ def count_variance(transitions: Floats, stationary: Floats, quality: Floats, slo
     centred = quality - mean
     # Without the stationary part the chain's powers decay, and no large numbers are subtracted from each other.
     fading = transitions - stationary
-    none = np.eye(len(stationary)) - np.outer(np.ones(len(stationary)), stationary)
-    _, _, total = _power_and_sums(fading, slots, none)
+    zeroth = np.eye(len(stationary)) - np.outer(np.ones(len(stationary)), stationary)
+    _, _, total = _power_and_sums(fading, slots, zeroth)
     together = float((stationary * centred) @ (2.0 * total @ centred)) - slots * float(stationary @ (centred * centred))
     return max(0.0, together) + slots * float(stationary @ (quality * (1.0 - quality)))
 
 
-def _power_and_sums(matrix: Floats, count: int, none: Floats) -> tuple[Floats, Floats, Floats]:
-    """Tⁿ, Σ_{j<n} T^j and Σ_{j<n} (n−j) T^j of a matrix T with n = `count`, by doubling; none: T⁰."""
-    power, partial, total = none, np.zeros_like(matrix), np.zeros_like(matrix)
+def _power_and_sums(matrix: Floats, count: int, zeroth: Floats) -> tuple[Floats, Floats, Floats]:
+    """Tⁿ, Σ_{j<n} T^j and Σ_{j<n} (n−j) T^j of a matrix T with n = `count`, by doubling; zeroth: T⁰."""
+    power, partial, total = zeroth, np.zeros_like(matrix), np.zeros_like(matrix)
     done = 0
     for bit in f"{count:b}":
         total = total + done * partial + power @ total

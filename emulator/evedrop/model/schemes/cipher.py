@@ -40,7 +40,7 @@ class CipherEstimator(StateReader):
         self._mask = mask
 
     def read(self, k: int, heard: Reception) -> Floats:
-        """Masked or unmasked, as the header says."""
+        """The packet, unmasked where its header says that it is masked."""
         encrypted = encrypted_packets(heard)
         masked = np.where(encrypted, heard.z, 0.0)
         return select(encrypted, lambda: self._mask.reveal(k, masked), lambda: heard.z)

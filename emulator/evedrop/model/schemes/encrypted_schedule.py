@@ -154,7 +154,7 @@ class QuantisedScheduleEstimator(StateReader):
         self._quantiser, self._pad = quantiser, pad
 
     def read(self, k: int, heard: Reception) -> Floats:
-        """The value of the level, masked or unmasked, as the header says."""
+        """The value of the level, which is unmasked first where the header says that it is masked."""
         encrypted = encrypted_packets(heard)
         masked = self._quantiser.levels_of(k, np.where(encrypted, heard.z, 0.0))
         return np.where(encrypted, self._quantiser.read(k, self._pad.reveal(k, masked)), heard.z)

@@ -72,7 +72,7 @@ class TwinTrackEstimator(StateReader):
         return Belief(x_hat, P, np.zeros(self.trials, np.uint8))
 
     def read(self, k: int, heard: Reception) -> Floats:
-        """Z or z − d_k."""
+        """The packet itself, or z − d_k where it is on the twin's track."""
         return select(self._tracks.on_twin(k), lambda: heard.z - self._tracks.distance(k), lambda: heard.z)
 
 

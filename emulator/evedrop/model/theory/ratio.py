@@ -280,7 +280,10 @@ def _logarithm(ratio: float) -> float:
 
 
 def edge(inside: float, outside: float, holds: Callable[[float], bool], within: float = _XTOL) -> float:
-    """The last number from `inside`, where something holds, towards `outside`, where it does not, at which it holds."""
+    """The last number on the way from `inside`, where something holds, to `outside`, where it does not, at which it holds.
+
+    By bisection, to `within`; it must change only once on the way.
+    """
     while abs(outside - inside) > within:
         middle = 0.5 * (inside + outside)
         if holds(middle):

@@ -216,7 +216,9 @@ def _batch_traces(
     root = root_of_seed(2022)
     encoder = policy.encoder(ReferenceCode(process, open_loop), process.n, batch, stream_key(root, "schedule"))
     channel = AckChannel(
-        AckChannelSpec(1.0, "flip", None, None, FLIP), stream_key(root, "link/acknowledgements"), batch
+        AckChannelSpec(1.0, "flip", jammer=None, spans=None, flip=FLIP),
+        stream_key(root, "link/acknowledgements"),
+        batch,
     )
     links = [
         deliveries(
