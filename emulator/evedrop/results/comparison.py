@@ -446,9 +446,10 @@ def _cell(scheme: str, adversary: str, data: Mapping[str, Any], trials: int) -> 
         return Cell(Match(scheme, adversary, not_defined=data["not_defined"]))
     match = Match(scheme, adversary, data["reads_as"], data["attack"], betrayed=bool(data["betrayed"]))
     secrecy = TypeAdapter(SecrecySummary).validate_python(data["secrecy"])
-    for entry in ("ratio_from", "verdict"):
-        if entry not in data["secrecy"]:
-            raise KeyError(entry)  # results of an older version
+    if "ratio_from" not in data["secrecy"]:
+        raise KeyError("ratio_from")  # results of an older version
+    if secrecy.verdict is None:
+        raise KeyError("verdict")  # the same
     for word in (secrecy.relative, secrecy.perfect):
         Claim(word)
     return Cell(match, _simulated_error(data["legitimate"]), _simulated_error(data["eavesdropper"]), secrecy, trials)
