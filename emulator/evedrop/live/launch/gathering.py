@@ -114,10 +114,10 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
     for name, gathered in _tables(scenario, shards).items():
         gathered.write([shard.folder / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")
     wall = 0.0 if started is None else world().monotonic() - started
-    scores = [load_score(shard.folder, shard.scenario) for shard in shards]
+    parts = _summaries(shards)
+    scores = [_score(shard, parts) for shard in shards]
     run_tally = RunTally.merged(scores)
     replay = replay_of(folder, scenario)
-    parts = _summaries(shards)
     ending = RunOutcome(
         wall,
         noted(how, _age_of_metrics(shards, scores, parts)),
@@ -169,6 +169,13 @@ def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
     starts, values = table["block"].to_numpy(), b"".join(table["digest"].to_pylist())
     digests = np.frombuffer(values, np.uint8).reshape(-1, DIGEST_BYTES)
     return {int(start): digests[starts == start] for start in np.unique(starts)}
+
+
+def _score(shard: Shard, summaries: Mapping[int, Summary]) -> RunTally:
+    """The tally of a shard's trials; an empty one if the disk became full before the rows of the tally counted."""
+    score = load_score(shard.folder, shard.scenario)
+    rows = summaries[shard.number].slots if shard.number in summaries else 0
+    return score if score.tallies[LEGITIMATE].done <= rows else RunTally.nothing(shard.scenario, shard.scenario.trials)
 
 
 def _age_of_metrics(shards: Sequence[Shard], scores: Sequence[RunTally], summaries: Mapping[int, Summary]) -> str:
