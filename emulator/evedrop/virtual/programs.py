@@ -18,6 +18,7 @@ import zenoh
 from evedrop.errors import ScenarioError
 from evedrop.results.folder import STATES
 from evedrop.scenario.loading import Scenario
+from evedrop.system.files import lines_in
 from evedrop.system.world import world as here
 from evedrop.virtual.disturbance import LAUNCHER
 from evedrop.virtual.notes import BY_HAND
@@ -223,8 +224,9 @@ def taken_states(folder: Path, scenario: Scenario, *, disturbed: bool) -> tuple[
 
     Without disturbance these are states that the program has published one after the other; otherwise some may be left out.
     """
-    lines = (folder / STATES).read_text().splitlines()[1:] if (folder / STATES).is_file() else []
-    taken = [[float(word) for word in line.split(",")] for line in lines]
+    # A full disk may have cut the last line short.
+    lines = lines_in(folder / STATES)[1:] if (folder / STATES).is_file() else []
+    taken = [[float(word) for word in line.split(b",")] for line in lines]
     published = [state(scenario, number) for number in range(len(taken) + _PLENTY * 500)]
     wrong, at = list[str](), -1
     for slot, row in enumerate(taken):
