@@ -35,7 +35,7 @@ def enumerated(process: Process, chain: Chain, outcomes_in: Callable[[int], Outc
     """The numbers and carried errors of `Streaks`, (3, SLOTS) each, from every course of the link's states and of outcomes."""
     number, carried = np.zeros((3, SLOTS)), np.zeros((3, SLOTS))
     sigma, remaining = [process.initial_covariance], RemainingCovariances(process)
-    M = [np.zeros_like(process.Q), *(remaining.next() for _ in range(1, SLOTS))]
+    M = [np.zeros_like(process.Q), *(remaining.next(1)[0] for _ in range(1, SLOTS))]
     for _ in range(1, SLOTS):
         sigma.append(process.A @ sigma[-1] @ process.A.T + process.Q)
     names = ("predicted", "decoded", "state", "misled", "leaked")

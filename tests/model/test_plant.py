@@ -203,7 +203,7 @@ def test_who_is_told_the_inputs_predicts_with_them() -> None:
         heard = Reception(random.random(5) < 0.5, packet.z)
         prior, other = aware.step(k, prior, heard), unaware.step(k, other, heard)
         u = random.normal(size=(2, 5))
-        assert np.allclose(prior.x_hat, other.x_hat + offset.next(other.action, u), atol=1e-12)
+        assert np.allclose(prior.x_hat, other.x_hat + offset.next(other.action[None], u[None])[0], atol=1e-12)
         assert np.array_equal(prior.P, other.P)
         if (prior.action == Action.STATE).all():
             assert np.array_equal(prior.x_hat, x)

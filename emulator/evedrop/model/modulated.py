@@ -18,10 +18,10 @@ import numpy as np
 from evedrop.model.links.chain import Chain
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link_distribution import LinkDistribution, Segment
+from evedrop.model.streams import BlockByBlock
 from evedrop.model.theory.covariances import (
     LARGEST_OPERATOR,
     NOBODY,
-    BlockByBlock,
     Outcomes,
     OutcomesAt,
     SlotOutcomes,
@@ -132,7 +132,7 @@ class ModulatedCovariance:
             if k == start > 0 and not keeps and self._before is not None and self._settled is not None:
                 self._settled = self._before[None] * segment.chain.stationary[:, None, None]
         fresh = k == segment.start and not segment.continues
-        remaining = self._remaining.next() if self._remaining is not None and k > 0 else None
+        remaining = self._remaining.next(1)[0] if self._remaining is not None and k > 0 else None
         slot = _Slot(k, segment, fresh, quality, self._before, remaining)
         self._before, self._k = sigma, k + 1
         if not self._link.window:
@@ -439,8 +439,7 @@ def _slot_distributions_of(
                 odds[name][k] = value
     noise = odds["predicted"][:, :, None] * process.Q.reshape(-1)
     if odds["leaked"].any():
-        remaining = RemainingCovariances(process)
-        M = np.array([np.zeros_like(process.Q), *(remaining.next() for _ in range(1, slots))])
+        M = np.concatenate([np.zeros_like(process.Q)[None], RemainingCovariances(process).next(slots - 1)])
         noise = noise + odds["leaked"][:, :, None] * M.reshape(slots, 1, -1)
     misled = misled_covariances(process, slots) if odds["misled"].any() else np.zeros((slots, process.n**2))
     return _SlotDistributions(transitions, stationary, odds, noise, misled.reshape(slots, -1))

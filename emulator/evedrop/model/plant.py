@@ -55,7 +55,7 @@ class Plant:
         return int(self.input_matrix.shape[1])
 
     def limited(self, u: Floats) -> Floats:
-        """The inputs u (m, R), clipped to their limits."""
+        """The inputs u (…, m, R), clipped to their limits."""
         return np.minimum(np.maximum(u, self._lower), self._upper)
 
     def clips(self, u: Floats) -> Flags:
@@ -67,7 +67,7 @@ class Plant:
         return self.limited(u + e) - self.limited(u)
 
     def moved(self, u: Floats) -> Floats:
-        """B u, (n, R), with the inputs u (m, R) clipped to their limits."""
+        """B u, (n, R) or (c, n, R), with the inputs u, (m, R) or (c, m, R), clipped to their limits."""
         return product(self.input_matrix, self.limited(u))
 
     @cached_property
@@ -174,8 +174,11 @@ class Offset:
         self._moved: Floats = self._c
 
     def next(self, action: Codes, u: Floats) -> Floats:
-        """The difference in the next slot, (n, R), from the estimator's action (R,); u (m, R): the inputs of this slot."""
-        c = product(self._A, self._c) + np.where(guessed(action), self._moved, 0.0)
-        self._c = np.where(action == int(Action.STATE), 0.0, c)
-        self._moved = self._plant.moved(u)
-        return self._c
+        """The difference in the next slots, (c, n, R), from the estimator's actions (c, R); u (c, m, R): their inputs."""
+        differences, moved = np.empty((len(u), *self._c.shape)), self._plant.moved(u)
+        predicts, resets = guessed(action), action == int(Action.STATE)
+        for row, difference in enumerate(differences):
+            c = product(self._A, self._c) + np.where(predicts[row], self._moved, 0.0)
+            difference[:] = np.where(resets[row], 0.0, c)
+            self._c, self._moved = difference, moved[row]
+        return differences

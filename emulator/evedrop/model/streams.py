@@ -278,6 +278,27 @@ class Ahead(Generic[Made]):
 
 
 @final
+class BlockByBlock:
+    """Numbers of slots from 0 on that are made a block at a time, and read any number of slots at a time."""
+
+    def __init__(self, first: Floats, following: Callable[[], Floats]) -> None:
+        """first, following: the first block, (c, …), and what makes the next one."""
+        self._block, self._following, self._next = first, following, 0
+
+    def next(self, slots: int) -> Floats:
+        """Those of the next slots, (slots, …)."""
+        parts = [self._block[:0]]
+        while slots > 0:
+            if self._next == len(self._block):
+                self._block, self._next = self._following(), 0
+            part = self._block[self._next : self._next + slots]
+            self._next += len(part)
+            slots -= len(part)
+            parts.append(part)
+        return np.concatenate(parts)
+
+
+@final
 class Recurrence(Generic[Value]):
     """Values of the slots from 0 on, each made from the one before; slots in order are quick, any other order is correct."""
 

@@ -108,9 +108,7 @@ class LoopTally:
         self.of_trials[1:3] += np.count_nonzero(failed, axis=0), np.count_nonzero(clipped, axis=0)
         if self._offset is None:
             return
-        error = sensor.x - estimates[LEGITIMATE]
-        for row, (action_of_slot, u_of_slot) in enumerate(zip(action, u, strict=True)):
-            error[row] -= self._sign * self._offset.next(action_of_slot, u_of_slot)
+        error = sensor.x - estimates[LEGITIMATE] - self._sign * self._offset.next(action, u)
         error *= error
         self.other_error += float(error.sum(axis=(1, 2)).sum())
         self.of_trials[3] += error.sum(axis=(0, 1))

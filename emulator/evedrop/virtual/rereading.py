@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 _MOST = 60
 """How many messages to the recorder, and to all others, are read again."""
-_TIMES = 60
+_TIMES = 30
 """How often those to the recorder, and to all others, are read, each time with one wrong."""
 _NAMED = (MalformedMessage, Gap, Contradiction, Refusal)
 """The errors that name the sender of a wrong message."""
@@ -115,25 +115,24 @@ class _MessageReader:
 
     def read(self) -> None:
         """Read them, each time with one of them wrong. Raises any error of a reader that names no sender."""
+        alike = _alike(self._of_recorder)
         for _ in range(_TIMES if self._of_recorder else 0):
-            at, messages = self._any_of(self._of_recorder), [*self._of_recorder]
+            at, messages = self._any_of(alike), [*self._of_recorder]
             messages[at] = broken(self._random, messages[at], harmless=True)
             with suppress(*_NAMED):
                 self._record(messages)
+        alike = _alike(self._of_others)
         for _ in range(_TIMES if self._of_others else 0):
-            message = self._of_others[self._any_of(self._of_others)]
+            message = self._of_others[self._any_of(alike)]
             with suppress(*_NAMED):
                 read = _READERS[_within(message).partition("/")[0]]
                 read(
                     self._scenario, self._brief, _reader(message), _reader(broken(self._random, message, harmless=True))
                 )
 
-    def _any_of(self, messages: Sequence[bytes]) -> int:
+    def _any_of(self, alike: Sequence[Sequence[int]]) -> int:
         """The place of any message, of each key with some fields as often as of any other."""
-        at: dict[tuple[str, ...], list[int]] = {}
-        for place, message in enumerate(messages):
-            at.setdefault((_within(message), *map(str, _reader(message).fields)), []).append(place)
-        return self._random.choice(at[self._random.choice([*at])])
+        return self._random.choice(self._random.choice(alike))
 
     def _record(self, messages: Sequence[bytes]) -> None:
         """Take messages as a recorder does."""
@@ -144,6 +143,14 @@ class _MessageReader:
             source = writer_of(message.key)
             if status_in(message, source, scenario.slots) is None and EndReport.read(message) is None:
                 intake.take(source, message, steering)
+
+
+def _alike(messages: Sequence[bytes]) -> Sequence[Sequence[int]]:
+    """The places of the messages with the same key and fields."""
+    at: dict[tuple[str, ...], list[int]] = {}
+    for place, message in enumerate(messages):
+        at.setdefault((_within(message), *map(str, _reader(message).fields)), []).append(place)
+    return [*at.values()]
 
 
 def _within(message: bytes) -> str:

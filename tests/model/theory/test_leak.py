@@ -87,7 +87,7 @@ def test_the_leak_by_triangularisation_is_the_leak(process: Process) -> None:
         sigma, (gain, M) = state_covariances(process, k + 1)[k], conditioned(process, k)
         leak, scale = leaks.at(k), np.abs(process.Q).max()
         assert np.allclose(leak.remaining, M, rtol=1e-8, atol=1e-9 * scale)
-        assert np.allclose(remaining.next(), M, rtol=1e-8, atol=1e-9 * scale)
+        assert np.allclose(remaining.next(1)[0], M, rtol=1e-8, atol=1e-9 * scale)
         white = leak.white(z)
         assert np.allclose((white * white).sum(axis=0), (z * np.linalg.solve(sigma, z)).sum(axis=0), rtol=1e-8)
         assert np.allclose(leak.innovation(white), gain @ z, rtol=1e-8, atol=1e-9)
@@ -120,7 +120,7 @@ def test_the_leak_where_the_state_covariance_cannot_be_inverted() -> None:
     leaks, remaining = Leaks(EXAMPLE), RemainingCovariances(EXAMPLE)
     for k in range(1, 91):
         M = leaks.at(k).remaining
-        assert np.allclose(M, remaining.next(), rtol=0, atol=1e-14 * 1e-3)
+        assert np.allclose(M, remaining.next(1)[0], rtol=0, atol=1e-14 * 1e-3)
         assert np.linalg.eigvalsh(EXAMPLE.Q - M)[0] > -1e-16
 
 
@@ -173,7 +173,7 @@ def test_the_limit_is_where_it_goes(process: Process) -> None:
     """The expectation of slot 600 is the limit, to 1e-9; the leak ends in unstable directions, and goes on in stable ones."""
     remaining = RemainingCovariances(process)
     for _ in range(600):
-        M = remaining.next()
+        M = remaining.next(1)[0]
     assert np.allclose(M, remaining_limit(process), rtol=0, atol=1e-12 * np.abs(process.Q).max())
     leaks = np.linalg.eigvalsh(process.Q - M)
     assert (leaks[-1] > 1e-3) == (process is MIXED)

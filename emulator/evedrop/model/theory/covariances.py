@@ -16,6 +16,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from evedrop.model.process import MARGINAL, Floats, Process, eigenvalues, modulus_in
+from evedrop.model.streams import BlockByBlock
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 
 _BLOCK = 256  # slots computed from one starting point: long enough to hide Python's overhead, quick to set up (3 ms)
@@ -180,27 +181,6 @@ def misled_covariances(process: Process, slots: int) -> Floats:
 
 
 @final
-class BlockByBlock:
-    """Numbers of slots from 0 on that are made a block at a time, and read any number of slots at a time."""
-
-    def __init__(self, first: Floats, following: Callable[[], Floats]) -> None:
-        """first, following: the first block, (c, …), and what makes the next one."""
-        self._block, self._following, self._next = first, following, 0
-
-    def next(self, slots: int) -> Floats:
-        """Those of the next slots, (slots, …)."""
-        parts = [self._block[:0]]
-        while slots > 0:
-            if self._next == len(self._block):
-                self._block, self._next = self._following(), 0
-            part = self._block[self._next : self._next + slots]
-            self._next += len(part)
-            slots -= len(part)
-            parts.append(part)
-        return np.concatenate(parts)
-
-
-@final
 class TheoreticalCovariance:
     """E P_k of a receiver, a number of slots at a time from k = 0.
 
@@ -270,9 +250,9 @@ class TheoreticalCovariance:
 
     def _slot_by_slot(self, E: Floats, remaining: RemainingCovariances) -> Floats:
         block, outcomes, A = np.empty(self._powers.shape), self._outcomes, self._process.A
-        noise = outcomes.predicted * self._process.Q
+        added = outcomes.predicted * self._process.Q + outcomes.leaked * remaining.next(len(block))
         for j in range(len(block)):
-            E = block[j] = outcomes.propagated * (A @ E @ A.T) + noise + outcomes.leaked * remaining.next()
+            E = block[j] = outcomes.propagated * (A @ E @ A.T) + added[j]
         return block
 
 

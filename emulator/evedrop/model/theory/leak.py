@@ -22,7 +22,7 @@ from evedrop.model.kernels.mixtures import Leak
 from evedrop.model.process import MARGINAL, Floats, Process, StateFactors, modulus_in, product
 from evedrop.model.schedule import NoiseDistribution, state_factors
 from evedrop.model.staircase import Staircase
-from evedrop.model.streams import Ahead
+from evedrop.model.streams import Ahead, BlockByBlock
 
 _SLOTS_AT_ONCE, _NUMBERS_AT_ONCE = 64, 1 << 16  # read ahead of need
 _AS_GOOD_AS_INFINITE = 1e60  # a standard deviation of the state, in those of the noise: its square is far from overflow
@@ -30,20 +30,26 @@ _AS_GOOD_AS_INFINITE = 1e60  # a standard deviation of the state, in those of th
 
 @final
 class RemainingCovariances:
-    """M_k for k = 1, 2, … in this order, for the theory: in slots beyond the horizon too, where Σ_k exceeds double precision."""
+    """M_k, a number of slots at a time from k = 1, for the theory: beyond the horizon too, where Σ_k exceeds double precision."""
 
     def __init__(self, process: Process) -> None:
         self._A, self._noise = process.A, process.noise_factor
-        self._state = cholesky(process.initial_covariance)
+        self._carried = product(self._A, cholesky(process.initial_covariance))
         self._largest = _AS_GOOD_AS_INFINITE * float(np.abs(self._noise).max()) or math.inf
+        growth = math.log(max(float(np.abs(self._A).sum(axis=1).max()), math.e))
+        self._at_once = max(1, min(_SLOTS_AT_ONCE, int(math.log(_AS_GOOD_AS_INFINITE) / growth)))
+        self._blocks = BlockByBlock(np.empty((0, *self._A.shape)), self._following)
 
-    def next(self) -> Floats:
-        """M_k of the next slot, (n, n)."""
-        joint = _triangularised(product(self._A, self._state)[None], self._noise, self._noise)[0]
-        n = len(self._noise)
+    def next(self, slots: int) -> Floats:
+        """M_k of the next slots, (slots, n, n)."""
+        return self._blocks.next(slots)
+
+    def _following(self) -> Floats:
+        n, before = len(self._A), self._carried[None]
+        carried = np.concatenate([before, kernels.carried_factors(self._A, self._noise, before[0], self._at_once)])
         # A column that is scaled down still means a variance that is as good as infinite, compared with which M_k is the same.
-        self._state = joint[:n, :n] / np.maximum(1.0, np.abs(joint[:n, :n]).max(axis=0) / self._largest)
-        return _squared(joint[n:, n:])
+        self._carried = carried[-1] / np.maximum(1.0, np.abs(carried[-1]).max(axis=0) / self._largest)
+        return _squared(_triangularised(carried[:-1], self._noise, self._noise)[:, n:, n:])
 
 
 def remaining_limit(process: Process) -> Floats:
@@ -76,8 +82,9 @@ def _remaining_limit(A: Floats, Q: Floats, noise: Floats) -> Floats:
         return Q
     dynamics = T[:stable, :stable].T
     seen = Z[:, :stable].T @ noise
-    joint = _triangularised((dynamics @ _stationary_factor(dynamics, seen))[None], seen, noise)[0]
-    return _squared(joint[stable:, stable:])
+    joint = _triangularised((dynamics @ _stationary_factor(dynamics, seen))[None], seen, noise)
+    limit: Floats = _squared(joint[:, stable:, stable:])[0]
+    return limit
 
 
 def _stationary_factor(F: Floats, G: Floats) -> Floats:
@@ -103,8 +110,8 @@ def _triangularised(carried: Floats, seen: Floats, noise: Floats) -> Floats:
 
 
 def _squared(L: Floats) -> Floats:
-    """L Lᵀ, (n, n), of L (n, n)."""
-    return np.asarray(L @ L.T)
+    """L Lᵀ, (c, n, n), of L (c, n, n)."""
+    return np.asarray(L @ L.swapaxes(1, 2))
 
 
 @final

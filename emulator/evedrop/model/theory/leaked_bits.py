@@ -21,7 +21,8 @@ import numpy as np
 from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.process import Floats, Process, product
-from evedrop.model.theory.covariances import BlockByBlock, block_length
+from evedrop.model.streams import BlockByBlock
+from evedrop.model.theory.covariances import block_length
 
 # A standard deviation of the state relative to the noise's, with which a packet reveals nothing.
 _AS_GOOD_AS_INFINITE = 1e60

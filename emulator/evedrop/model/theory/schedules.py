@@ -43,11 +43,9 @@ class SlotRecursion:
         self.initial: Floats = always.initial * process.initial_covariance
         """E P_0, (n, n): the first packet is always the state."""
         self._misled = misled_covariances(process, slots)
-        remaining = RemainingCovariances(process) if never.leaked else None
         self._remaining = np.zeros_like(self._misled)
-        if remaining is not None:
-            for k in range(1, slots):
-                self._remaining[k] = remaining.next()
+        if never.leaked:
+            self._remaining[1:] = RemainingCovariances(process).next(slots - 1)
 
     def next(self, k: int, E: Floats, mu_d: Floats) -> Floats:
         """E P_k, (S, n, n), from E P_{k−1}, (S, n, n), with μ_d(k), (S,)."""

@@ -50,7 +50,7 @@ def test_the_other_loop_is_the_one_that_sees_the_truth() -> None:
     x, u = loop(noise, 10.0 * seen, d)
     _, wanted = loop(noise, 0.0 * seen, d)
     other = PerfectLoop(GIVEN.process, PLANT, CONTROLLERS["lqr"](GIVEN, 3), PERIOD, d)
-    inputs_ = np.array([other.follow(state, inputs) for state, inputs in zip(x, u, strict=True)])
+    inputs_ = np.concatenate([other.follow(x[:3], u[:3]), other.follow(x[3:], u[3:])])
     assert np.abs(u - wanted).max() > 0.1
     assert np.allclose(inputs_, wanted, atol=1e-10)
 
@@ -61,7 +61,7 @@ def test_a_loop_that_sees_the_truth_is_its_own_other() -> None:
     noise, d = 0.05 * rng.standard_normal((SLOTS, 2, 2)), rng.uniform(0.0, 2.0, (SLOTS, 2))
     x, u = loop(noise, 0.0 * noise, d)
     other = PerfectLoop(GIVEN.process, PLANT, CONTROLLERS["lqr"](GIVEN, 2), PERIOD, d)
-    assert np.array_equal([other.follow(state, inputs) for state, inputs in zip(x, u, strict=True)], u)
+    assert np.array_equal(other.follow(x, u), u)
 
 
 @pytest.mark.parametrize("sun", [0, None])

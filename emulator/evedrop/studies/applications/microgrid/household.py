@@ -138,11 +138,7 @@ class HousePower(PowerFeed):
 
     def take(self, x: Floats, u: Floats) -> tuple[Floats, Floats]:
         """Add the next slots."""
-        grid, other = np.empty(u[:, 0].shape), np.empty(u[:, 0].shape)
-        for row, (state, inputs) in enumerate(zip(x, u, strict=True)):
-            other[row] = self._perfect.follow(state, inputs)[self._grid]
-            grid[row] = self._plant.limited(inputs)[self._grid]
-        return grid, other
+        return self._plant.limited(u)[:, self._grid], self._perfect.follow(x, u)[:, self._grid]
 
 
 @final
@@ -247,7 +243,7 @@ def _mean(values: Floats) -> float | None:
 
 @final
 class PerfectLoop:
-    """The other loop, slot by slot; slots come in order from 0.
+    """The other loop; slots come in order from 0.
 
     controller: a new one, used by nothing else; period: slots between its decisions; disturbances: (slots, q).
     """
@@ -261,16 +257,19 @@ class PerfectLoop:
         self._next = 0
         self._e: Floats = np.zeros((process.n, controller.trials))
         self._u: Floats = np.zeros((plant.inputs, controller.trials))
+        self._moved = self._e
 
     def follow(self, x: Floats, u: Floats) -> Floats:
-        """The other loop's inputs of the next slot, (m, R), within their limits; x (n, R) and u (m, R): those of this loop."""
-        if self._next % self._period == 0:
-            decided = self._controller.decide(self._next, x - self._e, self._disturbances[self._next])
-            self._u = self._plant.limited(decided)
-        apart = self._plant.moved(u) - self._plant.moved(self._u)
-        self._e = self._process.predict(self._e) + apart
-        self._next += 1
-        return self._u
+        """The other loop's inputs of the next slots, (c, m, R), within their limits; x (c, n, R), u (c, m, R): of this loop."""
+        others, moved = np.empty(u.shape), self._plant.moved(u)
+        for row, state in enumerate(x):
+            if self._next % self._period == 0:
+                decided = self._controller.decide(self._next, state - self._e, self._disturbances[self._next])
+                self._u, self._moved = self._plant.limited(decided), self._plant.moved(decided)
+            others[row] = self._u
+            self._e = self._process.predict(self._e) + (moved[row] - self._moved)
+            self._next += 1
+        return others
 
 
 _TRUSTED_FRACTION = 0.9
