@@ -20,8 +20,8 @@ from evedrop.names import CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, ROUTER, SE
 
 KINDS = ("uplink", "downlink", "ack", "estimate", "state", "input", "telemetry", "journal", "progress", "control")
 """The kinds of a run's keys, as they follow the run's name."""
-MOST_PARTS = 4096
-"""How many lists and maps a message of more than 64 KiB may have; enough for many processes."""
+MOST_PARTS = 20_480
+"""How many lists and maps a message of more than 64 KiB may have; enough for all packets of the longest window, each twice."""
 
 
 @final
