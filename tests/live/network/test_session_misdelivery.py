@@ -25,10 +25,11 @@ from evedrop.live.network.operator import Answer, ask
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import Reader, enclosed, head_of, named_in
-from evedrop.live.protocol.commands import EndRun, Start
+from evedrop.live.protocol.commands import EndRun, LinkChange, Start
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.notices import Progress
 from evedrop.live.protocol.requests import StatusRequest
+from evedrop.model.slot.link import Change
 from evedrop.system.ports import free_port
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import is_matched, small_network
@@ -125,6 +126,16 @@ def test_commands_that_name_another_process_are_dropped(stage: Stage) -> None:
         stage.put(key, [enclosed(other, EndRun().pack()), enclosed(key, Start().pack())])
         assert session.command() == Start()
         assert session.dropped.count == 1
+
+
+def test_a_command_with_all_changes_of_a_link_is_read(stage: Stage) -> None:
+    """An operator changes a link that has thousands of events, and the router gets them all."""
+    key = stage.keys.control("eve")
+    settings = {"loss": {"model": "bernoulli", "quality": 0.5}}
+    change = LinkChange("eve", tuple(Change(k % 20, settings) for k in range(20_000)))
+    with Session(stage.eve) as session:
+        stage.put(key, [enclosed(key, change.pack())])
+        assert session.command() == change
 
 
 def test_a_question_that_names_another_key_is_not_answered(stage: Stage) -> None:

@@ -31,6 +31,12 @@ def test_a_status_is_read_as_it_was_sent() -> None:
     assert read_answer(KEY, Answer(status=STATUS).pack()).status == STATUS
 
 
+def test_a_status_after_ten_thousands_of_events_is_read() -> None:
+    """A scenario may have 10 000, each with a beginning and an end, and operators add more."""
+    status = replace(STATUS, events=[*STATUS.events] * 30_000)
+    assert read_answer(KEY, Answer(status=status).pack()).status == status
+
+
 @pytest.mark.parametrize(
     ("entry", "value", "message"),
     [

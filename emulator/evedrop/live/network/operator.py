@@ -79,7 +79,7 @@ class Order:
 
 def read_answer(key: str, payload: bytes) -> Answer:
     """Decode an answer. Raises MalformedMessage if the message is not an answer."""
-    return Reader(key, payload).read(Answer)
+    return Reader(key, payload, parts=len(payload)).read(Answer)  # it has a map for each event so far
 
 
 def ask(control: Control, request: OperatorRequest, patience: float) -> Answer | None:

@@ -379,7 +379,8 @@ class Session:
         self._commands.put(payload)
 
     def _read(self, payload: bytes, receivers: Collection[str] | None = None) -> ControlCommand:
-        return read_command(Reader(self._control, payload), Bounds(self._slots, receivers))
+        # Changes of a link are as many as its events, and each has several lists and maps.
+        return read_command(Reader(self._control, payload, parts=len(payload)), Bounds(self._slots, receivers))
 
     def wait_for(self, kind: type[ControlCommand]) -> None:
         """Wait for one command of the conductor: `Start` or `EndRun`."""
