@@ -47,6 +47,22 @@ class InPlace(Bernoulli):
         return fates_of(lost)
 
 
+class Forgetful(Bernoulli):
+    """Remembers in place only whether the last packet was lost, which most copies do not show."""
+
+    def __init__(self, quality: float) -> None:
+        super().__init__(quality)
+        self.lost = np.zeros(1000, np.bool_)
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:
+        """After a loss, every second packet is lost."""
+        lost, last = np.empty((len(uniforms), uniforms.shape[2]), np.bool_), self.lost[: uniforms.shape[2]]
+        for row, numbers in enumerate(uniforms[:, 0]):
+            lost[row] = last[:] = numbers >= np.where(last, 0.5, self.quality)
+        del first
+        return fates_of(lost)
+
+
 class Whole(Bernoulli):
     """Loses the last of the slots that it is asked for."""
 
@@ -63,6 +79,7 @@ class Whole(Bernoulli):
         (Better, {"quality": 0.8}, "quality agrees with simulation", "quality_at() says 0.8"),
         (Unsteady, {"p": 0.05, "r": 0.1}, "quality agrees with simulation", "give `chain`"),
         (InPlace, {"quality": 0.9}, "independent copies", "never change an array of it in place"),
+        (Forgetful, {"quality": 0.9}, "independent copies", "a copy made before slot 2"),
         (Whole, {"quality": 0.9}, "blocks of any length", "not on how many slots"),
     ],
 )

@@ -161,14 +161,15 @@ class LossChecks(_ModelChecks[LossModel]):
 
     def copied(self, problem: Problem) -> None:
         """A shallow copy continues from where it was made, whatever the original does meanwhile."""
-        once, model = self._whole(problem), self._made()
-        uniforms = self._uniforms(model, problem)
-        self._fates(model, 0, uniforms[:5])
-        other = copy.copy(model)
-        self._fates(model, 5, uniforms[5:])
-        fates = np.concatenate([once[:5], self._fates(other, 5, uniforms[5:])])
+        once, uniforms = self._whole(problem), self._uniforms(self._made(), problem)
         remedy = "replace what the model remembers, and never change an array of it in place"
-        self._same(once, fates, problem, "{0!r}, and {1!r} of a copy made before slot 5", remedy)
+        for k in range(1, min(problem.slots, 16)):  # what a model remembers shows only in some slots
+            model = self._made()
+            self._fates(model, 0, uniforms[:k])
+            other = copy.copy(model)
+            self._fates(model, k, uniforms[k:])
+            fates = np.concatenate([once[:k], self._fates(other, k, uniforms[k:])])
+            self._same(once, fates, problem, f"{{0!r}}, and {{1!r}} of a copy made before slot {k}", remedy)
 
     def rate(self, problem: Problem) -> None:
         """The fraction delivered has the mean and the variance over trials that the model states."""
