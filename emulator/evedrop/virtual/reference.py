@@ -59,8 +59,12 @@ class RunReference:
         return self.scenario.shards
 
     def of_folders(self, folder: Path) -> Mapping[Path, RunReference]:
-        """The folders in which a run has left its results → what those must come to: one, or that of each shard."""
-        shards = [shard for shard in shards_of(self.scenario, folder) if shard.folder.is_dir()]
+        """The folders in which a run has left its results → what those must come to: one, or that of each shard.
+
+        Once the run has a summary, its own tables are complete, and those of shards may be removed.
+        """
+        merged = (folder / "summary.json").exists()
+        shards = [] if merged else [shard for shard in shards_of(self.scenario, folder) if shard.folder.is_dir()]
         if not shards:
             return {folder: self} if folder.is_dir() else {}
         with tempfile.TemporaryDirectory() as memory:

@@ -103,7 +103,7 @@ _RECORDING = "recording.rrd"
 
 
 def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: float | None, how: str) -> Summary:
-    """Fill a run's folder from those of its shards, which are then removed; returns the run's summary.
+    """Fill a run's folder from those of its shards, which are then removed if they can be; returns the run's summary.
 
     started: when the first shard began, by the monotonic clock, if one did; how: as in `RunOutcome`. Raises OSError if the folder
     cannot be written; the shards' folders are then unchanged.
@@ -128,7 +128,8 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
     )
     summary = summary_of(scenario, run_tally, digests, ending)
     write_summary(folder, summary)
-    _tidy(folder, shards)
+    with suppress(OSError):  # the results are complete: what cannot be moved or removed stays with its shard
+        _tidy(folder, shards)
     return summary
 
 
