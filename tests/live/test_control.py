@@ -14,7 +14,7 @@ import pytest
 from evedrop import load_results
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
-from evedrop.live.network.control_file import Control, read_control
+from evedrop.live.network.control_file import Control, read_control, remove_control
 from tests.builders import digests_of
 from tests.conftest import Done, Evedrop, Live, wait_until
 from tests.examples import mostly_long
@@ -278,6 +278,14 @@ def test_no_run_is_said(evedrop: Evedrop, tmp_path: Path) -> None:
     done = evedrop("link", str(folder), "smart", "cut")
     assert (done.status, len(done.err.splitlines())) == (2, 1)
     assert "no router answers at tcp/127.0.0.1:9: it was killed, or" in done.err
+
+
+def test_a_control_file_whose_writer_was_killed_is_removed(tmp_path: Path) -> None:
+    """A run that is over leaves no part of it, whose password would stay in the results."""
+    Control("r0", "tcp/127.0.0.1:9", "operator", "secret").write(tmp_path)
+    (tmp_path / "control.json").rename(tmp_path / "control.json.new")
+    remove_control(tmp_path)
+    assert not any(tmp_path.iterdir())
 
 
 def test_the_control_file_is_nobody_elses(tmp_path: Path) -> None:

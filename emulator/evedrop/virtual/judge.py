@@ -66,7 +66,7 @@ _HUBS = frozenset({*ROUTERS, EVERYBODY, LAUNCHER, *FORK_SERVERS})
 """Whose faults hit all others."""
 _SILENT = "stopped responding"
 """What a run that fails says of a process that fell silent for a reason it does not know."""
-_GOES_ON = ("control.json", "unfinished")
+_GOES_ON = ("control.json", "control.json.new", "unfinished")
 """What the folder of a run that goes on has, and that of a run that has ended has not."""
 
 

@@ -19,6 +19,7 @@ from evedrop.system.files import Unreadable, is_folder, is_there, text_of
 from evedrop.system.world import world
 
 _NAME = "control.json"
+_UNFINISHED = f"{_NAME}.new"
 _MOST_BYTES = 2**20
 
 
@@ -36,15 +37,18 @@ class Control:
 
     def write(self, folder: Path) -> None:
         """Write the file into a results folder, readable by its owner only."""
-        unfinished = folder / f"{_NAME}.new"
+        unfinished = folder / _UNFINISHED
         world().disk.write(unfinished, json.dumps(asdict(self), indent=1).encode())
         world().disk.replace(unfinished, folder / _NAME)
 
 
 def remove_control(folder: Path) -> None:
-    """Remove the control file of a run that is over."""
+    """Remove the control file of a run that is over, also one whose writer was killed or had no room."""
     with suppress(OSError):  # the disk may not be writable any more; the password is useless after the run
         world().disk.remove(folder / _NAME)
+    with suppress(OSError):
+        if (folder / _UNFINISHED).exists():
+            world().disk.remove(folder / _UNFINISHED)
 
 
 def no_run(folder: Path, why: str) -> UsageError:
