@@ -17,7 +17,7 @@ import pytest
 from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.results.diff import difference
-from evedrop.results.reading import Results
+from evedrop.results.reading import Results, as_of
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 
@@ -236,6 +236,8 @@ def test_what_a_detector_says_is_compared(tmp_path: Path) -> None:
     result = difference(original, Results.read(changed))
     assert not result.same
     assert result.text.startswith("the digest of integrity differs, in trials not recorded; record all trials")
+    lacking = replace(Results.read(changed), summary={**summary, "ended": f"killed{as_of('slot 0 in shard 1')}"})
+    assert difference(original, lacking).same
     rows = original.inputs
     assert rows is not None
     place = rows.column_names.index("statistic")

@@ -309,9 +309,13 @@ def _metrics(folder: Path, rows: TableRound) -> dict[str, Any] | None:
     return metrics if metrics["slots"] <= rows.slots else None
 
 
+METRICS_AS_OF = " (the metrics are as of "
+"""What `ended` has if metrics are of an earlier moment than the rows."""
+
+
 def as_of(moment: str, more: bool = True) -> str:
     """What `ended` adds if metrics are of an earlier moment. more: whether the tables have slots that the metrics lack."""
-    return f" (the metrics are as of {moment}{'; the tables have more' if more else ''})"
+    return f"{METRICS_AS_OF}{moment}{'; the tables have more' if more else ''})"
 
 
 def _no_metrics(folder: Path) -> dict[str, Any]:
