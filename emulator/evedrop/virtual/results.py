@@ -32,6 +32,7 @@ def wrong_tables(
     if tables["slots"].num_rows:
         yield from (f"there is no table {name}" for name in sorted(reference.tables.keys() - tables.keys()))
     yield from missing_rows(tables, summary, reference, done)
+    yield from _uncounted(tables["slots"], summary)
     yield from unlike_digests(summary, tables["digests"])
     yield from unlike_rows(summary, tables, reference.shards)
 
@@ -123,6 +124,14 @@ def missing_rows(
     yield from _uneven(
         tables, slots, recorded > int(reference.summary["trials"]) * (reference.shards - 1) // reference.shards
     )
+
+
+def _uncounted(table: pa.Table, summary: Mapping[str, Any]) -> Iterator[str]:
+    """A slot of which all trials of all receivers have rows, although the summary says that it was not reached."""
+    columns = (table[name].to_pylist() for name in ("slot", "trials"))
+    whole = sum(row == (summary["slots"], summary["trials"]) for row in zip(*columns, strict=True))
+    if whole == len(summary["peers"]):
+        yield f"all trials have rows of slot {summary['slots']}, and the summary has {summary['slots']} slots"
 
 
 def _ended(

@@ -18,7 +18,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, final
@@ -126,7 +126,9 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
         outages=_outages(parts),
         misdelivered=_misdelivered(parts),
     )
-    summary = summary_of(scenario, run_tally, digests, ending)
+    # All have rows of these, also where metrics are earlier.
+    slots = min(parts[shard.number].slots if shard.number in parts else 0 for shard in shards)
+    summary = replace(summary_of(scenario, run_tally, digests, ending), slots=slots)
     write_summary(folder, summary)
     with suppress(OSError):  # the results are complete: what cannot be moved or removed stays with its shard
         _tidy(folder, shards)
