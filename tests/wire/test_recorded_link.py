@@ -133,6 +133,17 @@ def test_what_hides_the_loss_model_cuts_the_messages_into_parts(tmp_path: Path) 
         journal_recording(tmp_path / "all", "scan")
 
 
+def test_messages_that_the_wire_dropped_are_neither_damaged_nor_duplicated(tmp_path: Path) -> None:
+    """They passed the link's models: most being held up changes no probability."""
+    fates = {n: WireFate.CORRUPTED if n % 10 == 1 else WireFate.HELD_UP for n in range(6000) if n % 4}
+    fates |= dict.fromkeys(range(5, 6000, 100), WireFate.LOST)
+    carried(tmp_path, plan_of({"duplicate": 0.2}), {"0/scan/a": 6000}, fates)
+    settings = fit_messages(journal_recording(tmp_path, "scan")).settings
+    damaged = sum(fate is WireFate.CORRUPTED for fate in fates.values())
+    assert settings["corrupt"] == pytest.approx(damaged / (6000 - 60), abs=1e-4)
+    assert settings["duplicate"] == pytest.approx(0.2, abs=0.05)
+
+
 def test_missing_numbers_are_what_was_lost_before_the_wire(tmp_path: Path) -> None:
     """By sender and key: the second sender is the first after a restart, and its numbers begin again."""
     plan = plan_of(SETTINGS)

@@ -114,9 +114,10 @@ class _LinkRows:
         )
         check_parts(name, series, "cuts, queues and limits hide what the loss model did in between")
         self._note_changes(rows)
-        whole = int((delivered | corrupted).sum())
-        corrupt = float(corrupted.sum()) / whole if corrupted.any() else None
-        return MessageRecording(name, series, records["delay"][delivered], corrupt)
+        kept = int((decided & survived).sum())  # and not only what arrived: the wire itself may have dropped the rest
+        corrupt = float(corrupted.sum()) / kept if corrupted.any() else None
+        dropped = kept - int((delivered | corrupted).sum())
+        return MessageRecording(name, series, records["delay"][delivered], corrupt, dropped)
 
     def _before(self, name: str, longest: float | None) -> MessageRecording:
         """What was lost before the wire heard it."""

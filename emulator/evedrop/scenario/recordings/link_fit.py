@@ -688,7 +688,8 @@ class MessageFit:
     @property
     def _chances(self) -> dict[str, float]:
         series, corrupt = self.recording.series, self.recording.corrupt or 0.0
-        whole = float(series.outcomes.sum()) * (1.0 - corrupt)  # a damaged message does not arrive twice
+        # A message that was damaged or dropped does not arrive twice.
+        whole = float(series.outcomes.sum()) * (1.0 - corrupt) - self.recording.dropped
         chances = {"duplicate": series.repeated / whole if whole else 0.0, "corrupt": corrupt}
         return {name: rounded(value) for name, value in chances.items() if value}
 

@@ -212,6 +212,8 @@ class MessageRecording:
     """Seconds, of each message that was delivered and whose delay is known, (d,)."""
     corrupt: float | None = None
     """The fraction of messages that were damaged among those that were not lost; None: nothing would show it."""
+    dropped: int = 0
+    """How many messages were neither lost nor damaged, but did not arrive for other reasons."""
     notes: tuple[str, ...] = ()
     """What was left out or assumed, in sentences."""
     source: str = "robot"
