@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER
+from evedrop.wire import journal as journal_of_wire
 from evedrop.wire.journal import WireJournal, journal_tables, part_names, unfinished_table
 from evedrop.wire.records import (
     AGAIN,
@@ -486,6 +488,53 @@ def test_on_a_full_disk_the_wire_goes_on(then: str, tmp_path: Path) -> None:
     assert "No space left on device" in incomplete
     assert all("its records stay in" in line for line in last)
     assert len(last) == (then == "full")
+
+
+@pytest.mark.parametrize("place", ["its records are read", "its parts are listed", "its parts are looked for"])
+@pytest.mark.parametrize("happens", ["a new key", "the end", "the next start"])
+def test_a_journal_is_read_whole_whatever_its_wire_does_meanwhile(
+    place: str, happens: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new key has its name, and no part is lost or refused."""
+    journals = [WireJournal(tmp_path, wire_plan(), part_rows=100)]
+    put(journals[0], 0)
+
+    def meanwhile() -> None:
+        monkeypatch.undo()
+        if happens != "a new key":
+            journals[-1].close()
+        if happens == "the next start":
+            journals.append(WireJournal(tmp_path, wire_plan(), part_rows=100))
+        if happens != "the end":
+            put(journals[-1], 0, key="scan/2")
+
+    def records(path: Path, killed: bool = False) -> Records:
+        if happens == "a new key":
+            meanwhile()
+            return records_in(path, killed)
+        found = records_in(path, killed)
+        meanwhile()
+        return found
+
+    def names(folder: Path) -> list[str]:
+        meanwhile()
+        return part_names(folder)
+
+    def look(folder: Path, pattern: str) -> Iterator[Path]:
+        found = [*glob(folder, pattern)]
+        meanwhile()
+        return iter(found)
+
+    glob = Path.glob
+    if place == "its records are read":
+        monkeypatch.setattr(journal_of_wire, "records_in", records)
+    elif place == "its parts are listed":
+        monkeypatch.setattr(journal_of_wire, "part_names", names)
+    else:
+        monkeypatch.setattr(Path, "glob", look)
+    keys = [row["key"] for row in rows_of(tmp_path)]
+    assert keys in (["scan/1"], ["scan/1", "scan/2"])
+    journals[-1].close()
 
 
 def records_file(folder: Path, **changes: Any) -> Path:

@@ -735,8 +735,8 @@ def journal_tables(folder: Path | str, start: int | None = None, killed: bool = 
         raise UsageError(
             f"{folder} is not the folder of a wire: it has no folder {JOURNAL_FOLDER}; give the results folder of a wire"
         )
-    links = WireHistory.read(journal).links
     names = [name for name in part_names(journal) if start in {None, _start_of(name)}]
+    links = WireHistory.read(journal).links  # after the names: a start is in it before its parts are there
     if not names:
         yield PARQUET.empty_table()
     for name in names:
@@ -747,11 +747,13 @@ def journal_tables(folder: Path | str, start: int | None = None, killed: bool = 
 
 
 def _table(journal: Path, name: str, links: dict[int, list[str]], killed: bool) -> pa.Table:
-    path = journal / UNFINISHED / f"{name}.rows"
+    path, parquet = journal / UNFINISHED / f"{name}.rows", parquet_path(journal, name)
     with contextlib.suppress(FileNotFoundError):  # a running wire may just have made the Parquet file
-        if not parquet_path(journal, name).exists():
-            return unfinished_table(path, links, killed)
-    table = pq.read_table(parquet_path(journal, name), schema=PARQUET)
+        if not parquet.exists():
+            table = unfinished_table(path, links, killed)
+            if not parquet.exists():  # or else the words may be gone already
+                return table
+    table = pq.read_table(parquet, schema=PARQUET)
     table.validate(full=True)  # a damaged column of words may name words that are not there
     return table
 
@@ -773,8 +775,8 @@ def unfinished_table(path: Path, links: Mapping[int, list[str]], killed: bool) -
 
     links: as in `WireHistory`; killed: as for `records_in`.
     """
-    start = _start_of(path.stem)
-    words, records = words_in(path.parent, start, links.get(start, [])), records_in(path, killed)
+    start, records = _start_of(path.stem), records_in(path, killed)
+    words = words_in(path.parent, start, links.get(start, []))  # after the records: a word is there before its records
     wrong = ~np.isin(records["fate"], [*WireFate]) | ((records["kind"] & 0x7F) > max(Kind)) | (records["n"] >= NEVER)
     wrong |= (records["link"] != UNLINKED) & (records["link"] >= len(words.links))
     for name in ("time", "delay"):
@@ -786,7 +788,8 @@ def unfinished_table(path: Path, links: Mapping[int, list[str]], killed: bool) -
 
 def part_names(journal: Path) -> list[str]:
     """The names of all parts of a journal, such as 001-0002 for the second part of the first start, in order."""
-    names_ = {path.stem for path in (*journal.glob("*.parquet"), *(journal / UNFINISHED).glob("*.rows"))}
+    # In this order: a running wire makes the Parquet file of a part before it removes the part's rows.
+    names_ = {path.stem for path in (*(journal / UNFINISHED).glob("*.rows"), *journal.glob("*.parquet"))}
     parts = [name for name in names_ if re.fullmatch(r"\d{3,}-\d{4,}", name)]  # a user may keep files of others there
     return sorted(parts, key=lambda name: [int(number) for number in name.split("-")])
 
