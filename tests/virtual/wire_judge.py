@@ -10,6 +10,7 @@ from __future__ import annotations
 import signal
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any, Protocol, final
 
 import zenoh
@@ -34,7 +35,9 @@ from evedrop.virtual.run import SimulatedRun
 from evedrop.virtual.world import EPOCH
 from evedrop.virtual.zenoh.access import intersects
 from evedrop.wire.file import load_wire, resolved_wire
-from evedrop.wire.journal import journal_tables
+from evedrop.wire.history import WireHistory
+from evedrop.wire.journal import JOURNAL_FOLDER, journal_tables
+from evedrop.wire.on_disk import summary_of_wire
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import REASONS, WireFate
 from tests.faults.wires import wrong_numbers, wrong_summary
@@ -117,6 +120,7 @@ class WireJudge:
             if not self._disk:
                 yield f"the journal cannot be read: {error}"
             return
+        yield from self._of_latest()
         if self._disk:  # which may not have the name of a key
             rows = {number: [row for row in some if not _has_no_name(row)] for number, some in rows.items()}
         flat = [row for some in rows.values() for row in some]
@@ -138,6 +142,14 @@ class WireJudge:
             yield from self._of_readers(len(flat))
             if (REPLAY, 0) in [(name, status) for name, status, _ in course.read]:
                 yield from wrong_recording(run.folder.parent / REPLAY_FILE, rows[len(rows)])
+
+    def _of_latest(self) -> Iterator[str]:
+        """What commands say of the folder is about the latest start, whatever became of it."""
+        with suppress(UsageError):
+            latest = WireHistory.read(self._run.folder / JOURNAL_FOLDER).start
+            start = summary_of_wire(self._run.folder).start
+            if start != latest:
+                yield f"the summary is said to be that of start {start}, and the latest one is {latest}"
 
     def _of_summary(self, rows: Mapping[int, list[Row]]) -> Iterator[str]:
         """The summary and the recording are those of the latest start."""

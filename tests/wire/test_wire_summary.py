@@ -19,7 +19,7 @@ from evedrop.show.report.wire import NOTHING_HEARD, WITHOUT_MODEL, wire_failures
 from evedrop.show.report.writing import write_report
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal, journal_tables
-from evedrop.wire.on_disk import closing_lines, scorekeeper_on_disk
+from evedrop.wire.on_disk import closing_lines, scorekeeper_on_disk, summary_of_wire
 from evedrop.wire.plan import Side, WirePlan
 from evedrop.wire.records import AGAIN, UNLINKED, Kind, WireFate
 from evedrop.wire.scorekeeper import WireScorekeeper
@@ -518,6 +518,18 @@ def test_the_exit_status_tells_of_an_incomplete_journal_and_of_unaccounted_messa
     journal.records.recorded += 1
     assert keeper.finish(tmp_path) == 3
     assert "unaccounted for: 1 message; this is a fault of Evedrop" in wire_failures(keeper.summary())
+
+
+def test_the_summary_of_an_earlier_start_is_not_that_of_a_wire_that_was_killed(tmp_path: Path) -> None:
+    """A power cut may bring it back; without a history that can be read, it is all that there is."""
+    plan = wire_plan(radio=BURSTS)
+    run(tmp_path, plan)
+    (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
+    journal = WireJournal(tmp_path, plan)
+    assert (summary_of_wire(tmp_path).start, summary_of_wire(tmp_path).state) == (2, "running")
+    journal.close()
+    (tmp_path / "journal" / "history.jsonl").write_text("{\n")
+    assert summary_of_wire(tmp_path).start == 1
 
 
 def test_a_metric_of_a_link_is_one_line_of_the_registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

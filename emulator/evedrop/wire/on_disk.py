@@ -9,17 +9,20 @@ from __future__ import annotations
 
 import io
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console
 
+from evedrop.errors import UsageError
 from evedrop.results.reading import results_of_this_version
 from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, WireSummary
 from evedrop.show.report.wire import wire_sentences, wire_table
 from evedrop.show.terminal_tables import fitted
 from evedrop.system.output import columns_of
 from evedrop.wire.file import load_wire
-from evedrop.wire.journal import JournalOnDisk
+from evedrop.wire.history import WireHistory
+from evedrop.wire.journal import JOURNAL_FOLDER, JournalOnDisk
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.scorekeeper import WireScorekeeper
 
@@ -29,10 +32,22 @@ def summary_of_wire(folder: Path) -> WireSummary:
 
     Raises UsageError if neither can be read.
     """
+    ended = ended_summary(folder)
+    return scorekeeper_on_disk(folder, load_wire(folder / WIRE_FILE)).summary() if ended is None else ended
+
+
+def ended_summary(folder: Path) -> WireSummary | None:
+    """The summary that the latest start of a wire wrote when it ended; None if there is none. Raises UsageError.
+
+    That of an earlier start may still be there, because it could not be removed, or because a power cut brought it back.
+    """
     path = folder / WIRE_SUMMARY_FILE
-    if path.exists():
-        return WireSummary.read(path)
-    return scorekeeper_on_disk(folder, load_wire(folder / WIRE_FILE)).summary()
+    if not path.exists():
+        return None
+    summary, latest = WireSummary.read(path), 0
+    with suppress(UsageError):
+        latest = WireHistory.read(folder / JOURNAL_FOLDER).start
+    return summary if summary.start >= latest else None
 
 
 def scorekeeper_on_disk(folder: Path, plan: WirePlan) -> WireScorekeeper:

@@ -24,7 +24,7 @@ from evedrop.live.network.control_file import no_run, read_control
 from evedrop.live.network.operator import Answer, ask
 from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest, WireStatus
 from evedrop.results.folder import claimed, default_folder, write_private
-from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
+from evedrop.results.wire_summary import WireSummary
 from evedrop.scenario.words import listed
 from evedrop.show.report.wire import expectation_failures, wire_faults
 from evedrop.system.killable import KillableProcess
@@ -33,7 +33,7 @@ from evedrop.system.processes import kill, wait_for
 from evedrop.system.world import world
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.journal import journal_tables
-from evedrop.wire.on_disk import scorekeeper_on_disk
+from evedrop.wire.on_disk import ended_summary, scorekeeper_on_disk
 from evedrop.wire.plan import WirePlan
 
 if TYPE_CHECKING:
@@ -233,10 +233,8 @@ class RunningWire:
 
     def typed_summary(self) -> WireSummary:
         """What became of the messages so far, with types. Raises UsageError if it cannot be read."""
-        path = self.folder / WIRE_SUMMARY_FILE
-        if not self.is_running and path.is_file():
-            return WireSummary.read(path)
-        return scorekeeper_on_disk(self.folder, self.plan).summary()
+        ended = None if self.is_running else ended_summary(self.folder)
+        return scorekeeper_on_disk(self.folder, self.plan).summary() if ended is None else ended
 
     def expect(self, metric: str | None = None, **bounds: Any) -> None:
         """Raise ExpectationFailed if an expectation fails so far.
