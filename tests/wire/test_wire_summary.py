@@ -14,7 +14,7 @@ import pyarrow as pa
 import pytest
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.results.wire_summary import WIRE_FILE, WireLinkSummary, WireSummary
+from evedrop.results.wire_summary import WIRE_FILE, JournalSummary, WireLinkSummary, WireSummary
 from evedrop.show.report.wire import NOTHING_HEARD, WITHOUT_MODEL, wire_failures, wire_sentences, wire_table
 from evedrop.show.report.writing import write_report
 from evedrop.wire.file import resolved_wire, wire_of
@@ -25,6 +25,7 @@ from evedrop.wire.records import AGAIN, UNLINKED, Kind, WireFate
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.tables import WireExpectTable
 from evedrop.wire.tallies import WIRE_METRICS, LinkTally
+from tests.conftest import wait_until
 from tests.pages import checked, downloads
 from tests.wire.wire_links import LOSSES, key_fates
 from tests.wire.wire_plans import wire_plan
@@ -518,6 +519,22 @@ def test_the_exit_status_tells_of_an_incomplete_journal_and_of_unaccounted_messa
     journal.records.recorded += 1
     assert keeper.finish(tmp_path) == 3
     assert "unaccounted for: 1 message; this is a fault of Evedrop" in wire_failures(keeper.summary())
+
+
+def test_a_journal_without_a_summary_says_what_it_lacks(tmp_path: Path) -> None:
+    """And how long its wire ran, although nothing was heard at last; of a next start, what it recovered."""
+    plan = wire_plan(radio=BURSTS)
+    (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
+    with WireJournal(tmp_path, plan) as journal:
+        journal.place.incomplete_since, journal.records.missing = 5.0, 7
+        wait_until(lambda: journal.seconds > 0.3, "a part of a second")
+    summary = summary_of_wire(tmp_path)
+    assert (summary.state, summary.journal) == ("ended", JournalSummary(0, 7, 5.0))
+    assert summary.seconds == pytest.approx(journal.seconds, abs=0.25)
+    assert [*wire_failures(summary)] == ["the journal lacks 7 messages, because its folder could not be written"]
+    with WireJournal(tmp_path, plan) as journal:
+        journal.history.begin(plan, time.time(), 12)
+        assert summary_of_wire(tmp_path).journal == JournalSummary(12, 0, None)
 
 
 def test_the_summary_of_an_earlier_start_is_not_that_of_a_wire_that_was_killed(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, final
 
@@ -20,6 +20,7 @@ from evedrop.model.checks import probability_mistakes
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.slot.link import NEVER, Change
+from evedrop.results.wire_summary import JournalSummary
 from evedrop.scenario.table import model_mistakes
 from evedrop.system.files import LineFile, lines_in
 from evedrop.system.world import world
@@ -28,6 +29,7 @@ from evedrop.wire.plan import WirePlan, numbered_as
 Numbered = tuple[str, str, str]
 """Link, key as in `numbered_as`, and kind: the messages that share these are numbered from 0."""
 _FILE = "history.jsonl"
+_COMPLETE = JournalSummary(0, 0, None)
 
 
 class NotedEvent(NamedTuple):
@@ -67,6 +69,10 @@ class WireHistory:
     """Start → the names of its links, in the order of their codes."""
     began: float = 0.0
     """When the latest start began, in seconds since 1970."""
+    over: float = 0.0
+    """When the latest start ended, in seconds since 1970; 0 if it has not."""
+    completeness: JournalSummary = _COMPLETE
+    """What the latest start found of an earlier one, and, if it ended, what it could not write."""
     noted: list[NotedEvent] = field(default_factory=list)
     """The events since the latest start."""
     _seed: int | None = None
@@ -102,10 +108,14 @@ class WireHistory:
         with self._lock:
             return [event._replace(time=round(event.time - self.began, 3)) for event in self.noted]
 
-    def begin(self, plan: WirePlan, now: float) -> None:
-        """Begin the next start, which has the seed of the earlier ones. Raises OSError if the disk is full."""
+    def begin(self, plan: WirePlan, now: float, recovered: int = 0) -> None:
+        """Begin the next start, which has the seed of the earlier ones. Raises OSError if the disk is full.
+
+        recovered: the number of records that an earlier start left behind.
+        """
         links = {link.name: dict(link.settings) for link in plan.links}
-        self._write({"start": self.start + 1, "time": now, "seed": plan.seed, "links": links})
+        start = {"start": self.start + 1, "time": now, "seed": plan.seed, "links": links}
+        self._write({**start, "recovered": recovered})
 
     def change(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int], now: float) -> None:
         """Note other settings of a link. since: (key, kind of stream) → the first number that has them. Raises OSError."""
@@ -123,14 +133,15 @@ class WireHistory:
         """Note an event. Raises OSError."""
         self._write({"event": line, "time": now, **({"bypass": True} if bypass else {})})
 
-    def end(self, counts: Mapping[Numbered, int], now: float, missing: int = 0) -> None:
-        """End the latest start. missing: the number of rows for which the disk had no room. Raises OSError."""
+    def end(self, counts: Mapping[Numbered, int], now: float, completeness: JournalSummary = _COMPLETE) -> None:
+        """End the latest start. completeness: what could not be written. Raises OSError."""
         self._write(
             {
                 "end": self.start,
                 "time": now,
                 "counts": [[*numbered, n] for numbered, n in counts.items()],
-                "missing": missing,
+                "missing": completeness.missing,
+                "incomplete_since": completeness.incomplete_since,
             }
         )
 
@@ -180,7 +191,8 @@ class WireHistory:
     def _take(self, entry: Mapping[str, Any]) -> None:
         if "start" in entry:
             self.start, self.ended, self._seed = _number(entry["start"]), False, int(entry["seed"])
-            self.began, self.noted = float(entry["time"]), []
+            self.began, self.over, self.noted = float(entry["time"]), 0.0, []
+            self.completeness = JournalSummary(_number(entry.get("recovered", 0)), 0, None)
             self.links[self.start] = list(entry["links"])
             for name, settings in entry["links"].items():
                 self._add(name, settings, {})
@@ -191,7 +203,13 @@ class WireHistory:
         elif "event" in entry:
             self.noted.append(NotedEvent(float(entry["time"]), str(entry["event"]), bool(entry.get("bypass"))))
         elif int(entry["end"]) == self.start:
-            self.ended = True
+            self.ended, self.over = True, float(entry["time"])
+            since = entry.get("incomplete_since")
+            self.completeness = replace(
+                self.completeness,
+                missing=_number(entry.get("missing", 0)),
+                incomplete_since=None if since is None else float(since),
+            )
             self.counts = {(str(link), str(key), str(kind)): _number(n) for link, key, kind, n in entry["counts"]}
 
     def _add(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int]) -> None:

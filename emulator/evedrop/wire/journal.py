@@ -142,7 +142,7 @@ class WireJournal:
         """The number of records that an earlier start left behind, because it was killed or the disk was full."""
         self.counts: dict[Numbered, int] = dict(self.history.counts)
         """(link, key, kind of stream) → the number of its next message, as of the records handed to the listeners."""
-        self.history.begin(plan, world().time())
+        self.history.begin(plan, world().time(), self.recovered)
         self._began = world().monotonic()  # the recovery of an earlier start does not count
         admits = KeyLimit(plan.links, self.counts, self._tell).admits
         self.words = JournalWords(self.place.unfinished, self.history.start, self.place.miss, admits)
@@ -219,7 +219,7 @@ class WireJournal:
     def _finish(self) -> None:
         try:
             self.records.write_all()
-            self.history.end(self.counts, world().time(), self.records.missing)
+            self.history.end(self.counts, world().time(), self.completeness)
             world().disk.remove_tree(self.place.unfinished)
         except OSError as error:
             self._tell(
@@ -815,12 +815,11 @@ class JournalOnDisk:
         self.listeners: list[Callable[[Records], None]] = []
         self.amendment_listeners: list[Callable[[Records, WireFate], None]] = []
         self.recorded = 0
-        self.completeness = JournalSummary(0, 0, None)
         self._folder = folder
         self._links = {link.name: link.number for link in plan.links}
         self.history = WireHistory.read(folder / JOURNAL_FOLDER)
         self.seconds = 0.0
-        """Until the wire was last alive, or heard its last message, as far as these were read."""
+        """Until the wire ended, was last alive, or heard its last message, as far as these were read."""
         self.state: JournalState = "ended"
         if not self.history.ended:
             self.state = "running" if is_locked(folder / JOURNAL_FOLDER) else "killed"
@@ -854,6 +853,12 @@ class JournalOnDisk:
         # Again, because a change may have come in between; it is written before the first record that it concerns.
         self.history = WireHistory.read(self._folder / JOURNAL_FOLDER)
         self.history.expect_settings()
+        self._is_alive_at(self.history.over)
+
+    @property
+    def completeness(self) -> JournalSummary:
+        """What an earlier start left behind, and what is not on the disk, if the wire could say so."""
+        return self.history.completeness
 
     def _is_alive_at(self, time: float) -> None:
         self.seconds = max(self.seconds, time - self.history.began)
