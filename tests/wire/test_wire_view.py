@@ -23,6 +23,7 @@ from evedrop.wire.plan import WireEvent
 from evedrop.wire.recording import WireView, replay_wire
 from evedrop.wire.records import WireFate
 from evedrop.wire.run import live_view, run_wire
+from evedrop.wire.time_steps import LaneState
 from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_at_work import LOSSY, both_ways, sending
 from tests.wire.wire_recordings import CUT, RATES, SECONDS, shown, texts
@@ -279,6 +280,23 @@ def test_amended_fates_are_in_the_table(tmp_path: Path) -> None:
     assert view.close()
     table = shown(tmp_path / "r.rrd", "table", "TextDocument:text")[-1][1][0]
     assert "5 underway" in table
+
+
+@pytest.mark.parametrize("by", [3600.0, -3600.0])
+def test_fates_that_change_after_the_clock_was_set_are_in_their_steps(by: float, tmp_path: Path) -> None:
+    """And not in a time that has not come, nor in one that is over."""
+    clocks, rows = Clocks(), traffic(robot_plan(), 2.0, {"scan": 100.0})
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
+    clocks.advance(2.0)
+    clocks.set(by)
+    clocks.wait_for_rounds(1)
+    rows["time"] += by
+    view.add(rows)
+    late = rows[(rows["fate"] == 0) & (rows["time"] >= START + by + 1.8)]
+    view.amend(late, WireFate.CONGESTED)
+    assert view.close()
+    assert shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")[-1][0] < 3.0
+    assert states(tmp_path / "r.rrd", "1_scan", 0.2, 10)[-1] == LaneState.OWN.word
 
 
 @pytest.mark.thorough

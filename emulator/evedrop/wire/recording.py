@@ -123,16 +123,20 @@ class WireView(_WireRecording[NDArray[Any]]):
             amended, self._amended = self._amended, []
         now = self._now(notes)
         for rows in chunks:
-            timed = rows.copy()
-            timed["time"] = np.minimum(rows["time"] - self._shift, now)  # rows from before the clock was set
-            yield from self._counter.add(timed)
+            yield from self._counter.add(self._timed(rows, now))
         for rows, fate in amended:
-            self._counter.amend(rows, fate)
+            self._counter.amend(self._timed(rows, now), fate)
         if self._last or not 0.0 <= now - self._sent < _BATCH:
             self._sent = now
             yield from self._counter.close(now - _LATE)
             if self._last:
                 yield from self._counter.finish()
+
+    def _timed(self, rows: NDArray[Any], now: float) -> NDArray[Any]:
+        """The rows with times as if the system's clock had never been set; those from before it was set are not after `now`."""
+        timed = rows.copy()
+        timed["time"] = np.minimum(rows["time"] - self._shift, now)
+        return timed
 
     def _now(self, notes: list[Notice]) -> float:
         """The time as if the system's clock had never been set, in seconds since 1970; adds a note when it was set."""
