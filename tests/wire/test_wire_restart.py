@@ -8,6 +8,7 @@ import os
 import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from unittest.mock import patch
 
 import pyarrow as pa
 import pytest
@@ -16,7 +17,8 @@ from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.wire.file import load_wire
-from evedrop.wire.journal import journal_tables
+from evedrop.wire.journal import JournalRecords, WireJournal, journal_tables
+from evedrop.wire.records import Kind, WireFate
 from evedrop.wire.run import continuation, run_wire
 from tests.conftest import Evedrop, Live, wait_until
 from tests.wire.wire_at_work import program
@@ -79,6 +81,22 @@ def test_a_first_start_and_one_without_messages_continue_nothing(tmp_path: Path)
     )
 
 
+def test_records_of_a_wire_that_ended_on_a_full_disk_are_not_said_to_be_of_a_killed_one(tmp_path: Path) -> None:
+    """The next start makes their Parquet file, and names both ways in which they may have been left."""
+    plan, said = wire_plan(), list[str]()
+    with (
+        patch.object(JournalRecords, "write_all", side_effect=OSError(28, "No space left on device")),
+        WireJournal(tmp_path / "out", plan, tell=said.append) as journal,
+    ):
+        journal.records.record(1.0, 0, -1, 0.0, journal.words.key_code("scan"), 0, 1, 0, Kind.PUT, WireFate.DELIVERED)
+    assert "its records stay in" in said[0]
+    assert run_wire(plan, tmp_path / "out", seconds=0.01, say=said.append) == 0
+    sentence = (
+        "1 messages were recovered from an earlier start, which was killed or had a full disk; their numbers go on"
+    )
+    assert sentence in said
+
+
 def test_a_wire_that_was_killed_goes_on_with_its_fates(evedrop: Evedrop) -> None:
     """Kill -9 of the command between two starts: what arrives is what one wire would have let through."""
     path = evedrop.folder / "robot.toml"
@@ -92,7 +110,10 @@ def test_a_wire_that_was_killed_goes_on_with_its_fates(evedrop: Evedrop) -> None
     os.kill(wire.process.pid, signal.SIGINT)
     done = wire.end()
     assert done.status == 0, done.err
-    assert "messages were recovered from an earlier start, which was killed; their numbers go on" in done.out
+    assert (
+        "messages were recovered from an earlier start, which was killed or had a full disk; their numbers go on"
+        in done.out
+    )
     sentence = (
         f"start 2 continues start 1: message {COUNT + 1} of scan on the link scan is next, and likewise for 1 more; "
     )

@@ -83,7 +83,8 @@ def run_wire(
             _begin_results(out, plan)
             if journal.recovered:
                 say(
-                    f"{journal.recovered:,} messages were recovered from an earlier start, which was killed; their numbers go on"
+                    f"{journal.recovered:,} messages were recovered from an earlier start, which was killed or had a full disk; "
+                    "their numbers go on"
                 )
             if journal.history.start > 1:
                 say(continuation(journal.history.start, journal.counts))
