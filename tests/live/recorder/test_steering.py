@@ -420,3 +420,29 @@ def test_a_hold_lasts_as_long_as_an_outage_may(
     wait(patience - 3.0)
     with pytest.raises(RunError, match=f"^{patience:.0f} s after the run was held before slot 5, smart did not report"):
         wait(3.0)
+
+
+def waits_in_vain(run: Run, clock: TestClock, reported: int, places: dict[str, int]) -> None:
+    """Nothing happens for longer than a hold may last."""
+    for _ in range(70):
+        clock.now += 0.5
+        run.steering.carry_on(reported, lambda: places)
+
+
+@pytest.mark.parametrize(
+    ("confirmed", "why"),
+    [(True, "not done yet; look at logs/smart.log"), (False, "the launcher has not confirmed that")],
+)
+def test_a_process_is_blamed_only_for_what_has_happened_to_it(
+    monkeypatch: pytest.MonkeyPatch, confirmed: bool, why: str
+) -> None:
+    """Not if the launcher, which may be suspended, has not killed it."""
+    clock = TestClock()
+    monkeypatch.setattr(steering, "world", lambda: clock)
+    run = Run({"from": 5, "to": 8, "kill": "smart", "state": "prior"})
+    run.steering.left("smart", 5)
+    run.holds(5)
+    if confirmed:
+        run.steering.done(1)
+    with pytest.raises(RunError, match=f"before slot 5, kill smart: {why}"):
+        waits_in_vain(run, clock, 5, {})

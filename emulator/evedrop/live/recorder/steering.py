@@ -185,7 +185,12 @@ class Steering:
                 self._conductor.absent -= set(act.names)
             self._waiting = None
             return True
-        self._fail(f"{act.text}: not done yet; look at logs/{act.names[0]}.log")
+        if self._confirmed:
+            self._fail(f"{act.text}: not done yet; look at logs/{act.names[0]}.log")
+        else:  # nothing has happened to the process, which is not to blame
+            self._fail(
+                f"{act.text}: the launcher has not confirmed that; it, or the host of {act.names[0]}, may be suspended"
+            )
         return False
 
     def _fail(self, problem: str) -> None:
