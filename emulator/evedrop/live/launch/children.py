@@ -283,7 +283,10 @@ class Children:
         suspects, accused = ([], []) if ending is None else (list(ending.suspects), list(ending.accused))
         why = ending.how if ending is not None and ending.status not in {0, 1, INTERRUPTED} else ""
         first, suspects = self._at_fault(first, suspects)
-        if first is not None and self._missed_recorder(first.process):
+        missed = first is not None and self._missed_recorder(first.process)
+        if missed and RELAY in self._processes and suspects == [ROUTER]:
+            first = None  # the recorder is there, and misses the router: their link is cut
+        elif missed:
             return "\n".join(
                 [f"{RECORDER}: {why}" if why else f"{RECORDER} did not appear", *self._log_lines(RECORDER)]
             )
