@@ -238,6 +238,13 @@ def test_a_run_that_is_held_gives_up_in_time(tmp_path: Path) -> None:
     assert miss not in judged(tmp_path / "go", hangs, put=[*put, PutMessage(0.6, "control/sensor", "go 5")], ended=36.0)
 
 
+def test_who_reports_nothing_because_another_process_hangs_is_not_to_blame(tmp_path: Path) -> None:
+    """While the run is held."""
+    said = "evedrop: the run failed: 30 s after the run was held, router and legitimate did not report all slots"
+    broken = judged(tmp_path, {HangProcess("router", 60): 0.5}, status=3, said=said)
+    assert f"legitimate is blamed, and router hangs: {said}" in broken
+
+
 def test_who_gets_a_broken_message_is_not_to_blame(tmp_path: Path) -> None:
     """Whoever sent it is."""
     said = "evedrop: legitimate broke the protocol: refuses = 'input'"

@@ -446,3 +446,22 @@ def test_a_process_is_blamed_only_for_what_has_happened_to_it(
         run.steering.done(1)
     with pytest.raises(RunError, match=f"before slot 5, kill smart: {why}"):
         waits_in_vain(run, clock, 5, {})
+
+
+@pytest.mark.parametrize(
+    ("places", "named"),
+    [
+        ({"sensor": 5, "router": 5, "smart": 4, "controller": 0}, "smart"),
+        ({"sensor": 5, "router": 3, "smart": 3, "controller": 0}, "router"),
+    ],
+)
+def test_nobody_is_blamed_who_need_not_report_or_has_nothing_to_report(
+    monkeypatch: pytest.MonkeyPatch, places: dict[str, int], named: str
+) -> None:
+    """A controller reports whole batches, and receivers what the router passes on to them."""
+    clock = TestClock()
+    monkeypatch.setattr(steering, "world", lambda: clock)
+    run = Run()
+    run.steering.held(5)
+    with pytest.raises(RunError, match=f"before slot 5, {named} did not report"):
+        waits_in_vain(run, clock, 3, places)

@@ -23,7 +23,7 @@ from evedrop.live.protocol.requests import LinkRequest, PauseRequest, ResumeRequ
 from evedrop.live.recorder.conductor import Conductor
 from evedrop.model.checks import LAST_SLOT
 from evedrop.model.slot.link import Change
-from evedrop.names import ROUTER, SENSOR, ProcessAction
+from evedrop.names import CONTROLLER, ROUTER, SENSOR, ProcessAction
 from evedrop.scenario.events.event import Act
 from evedrop.scenario.loading import with_event
 from evedrop.scenario.progress_events import Held, OnEvent, RunEvent
@@ -141,7 +141,9 @@ class Steering:
         if self.at is None:
             return
         if reported < self.at:
-            behind = [name for name, k in places().items() if k < self.at]
+            # A controller does not report at barriers, and receivers to which a router passes nothing on have nothing to report.
+            behind = [name for name, k in places().items() if k < self.at and name != CONTROLLER]
+            behind = [ROUTER] if ROUTER in behind else behind
             self._fail(f"{' and '.join(behind)} did not report all slots before it")
             return
         while self._settled():
