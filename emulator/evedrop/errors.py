@@ -124,6 +124,8 @@ class RunError(EvedropError):
 
     at_fault: tuple[str, ...] = ()
     """The processes at fault, if known."""
+    missing: tuple[str, ...] = ()
+    """The processes that were not on the network, if it is about them."""
 
 
 class MalformedMessage(RunError):

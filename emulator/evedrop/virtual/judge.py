@@ -167,10 +167,10 @@ def _of_blame(
     for fault in fatal if len(struck) == 1 else ():
         if isinstance(fault, ShortenMessage) and f"{fault.target} broke the protocol" in complaint:
             yield f"{fault.target} is blamed for a message that it got: {complaint}"
-        if isinstance(fault, HangProcess) and "did not report" in complaint:
-            named = {*processes_of(case.scenario)}.intersection(complaint.replace(",", " ").split())
-            for name in sorted(named - {fault.target}):
-                yield f"{name} is blamed, and {fault.target} hangs: {complaint}"
+        processes = {*processes_of(case.scenario)}
+        if fault.target in processes and fault.cuts_off and ("did not report" in complaint or _SILENT in complaint):
+            for name in sorted(processes.intersection(complaint.replace(",", " ").split()) - {*fault.blamed}):
+                yield f"{name} is blamed for {fault}: {complaint}"
     if not any(word in said for word in blamed):
         yield f"the failure names none of {', '.join(blamed)}: {complaint or '(nothing was said)'}"
 

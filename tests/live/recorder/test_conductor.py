@@ -86,6 +86,7 @@ def test_who_does_not_appear_is_named_after_the_patience(unread: tuple[str, ...]
     with pytest.raises(RunError) as raised:
         conducted(network).assemble()
     assert str(raised.value) == message
+    assert raised.value.missing == (unread or ("sensor", "smart"))
     assert 30.0 < network.clock.now - 1000.0 < 30.2
     assert not network.opened
 

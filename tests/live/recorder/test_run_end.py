@@ -21,6 +21,17 @@ def test_nobody_is_blamed_for_a_disk(error: RunError, suspects: tuple[str, ...])
     assert end.suspects == suspects
 
 
+@pytest.mark.parametrize(
+    ("named", "suspects"), [(("sensor",), ("sensor",)), ((), ("sensor", "eve")), (("sensor", "router"), ("router",))]
+)
+def test_who_waits_for_a_missing_process_is_not_to_blame(named: tuple[str, ...], suspects: tuple[str, ...]) -> None:
+    """Nor who is missing just now, if the error names others."""
+    end, error = RunEnd(), RunError("why")
+    error.missing = named
+    end.blame(["sensor", "eve"], error)
+    assert end.suspects == suspects
+
+
 @pytest.mark.parametrize(("unexplained", "status"), [(0, 0), (1, 3)])
 def test_a_run_with_packets_that_are_unaccounted_for_has_failed(unexplained: int, status: int) -> None:
     """Even if all its slots are done."""

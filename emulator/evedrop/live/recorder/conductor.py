@@ -120,7 +120,9 @@ class Conductor:
                 names = [name for name in self.missing if not self._reaches(name)]
                 names = names or self.missing
                 do = "start it, or look at its log" if len(names) == 1 else "start them, or look at their logs"
-                raise RunError(f"{', '.join(names)} did not appear within {self._session.patience:.0f} s; {do}")
+                failure = RunError(f"{', '.join(names)} did not appear within {self._session.patience:.0f} s; {do}")
+                failure.missing = tuple(names)
+                raise failure
             self._next()
         self._session.ready()
         self._router = self._session.router_id
@@ -140,7 +142,9 @@ class Conductor:
     def fail_cut_off(self, names: Collection[str], patience: float) -> NoReturn:
         """Raise RunError: these processes have been missing for `patience` seconds. Raises Interrupted if told to end now."""
         self._stop.check(AFTERTHOUGHT_SECONDS)
-        raise RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
+        failure = RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
+        failure.missing = tuple(names)
+        raise failure
 
     def send_to(self, name: str, command: ControlCommand) -> None:
         """Send a command to one process."""

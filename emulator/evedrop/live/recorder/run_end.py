@@ -46,6 +46,8 @@ class RunEnd:
 
     def blame(self, missing: list[str], error: EvedropError) -> None:
         """Note which processes are at fault for the error; missing: those that are not on the network."""
+        if isinstance(error, RunError) and error.missing:  # others may be waiting for these, or missing just now
+            missing = [*error.missing]
         # Without the router no other process can be seen.
         missing = next(([name] for name in (RELAY, ROUTER) if name in missing), missing)
         # Some may be missing just now, too: a cut connection does not fill the disk.
