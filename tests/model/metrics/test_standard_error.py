@@ -305,6 +305,14 @@ def test_a_standard_error_needs_finite_trials() -> None:
     assert z_of(some, 2.0) == pytest.approx(0.0, abs=1e-12)
 
 
+def test_trials_that_are_all_equal_have_no_z_score() -> None:
+    """Although the mean of as many equal numbers is rounded, and theory's expectation is rounded in another way."""
+    for trials in (3, 100, 1500):
+        for value in (0.1, 0.3, 1.7, math.pi):
+            assert standard_error(np.full(trials, value)) == 0.0
+            assert z_of(np.full(trials, value), value * (1.0 + 2e-16)) is None
+
+
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_z_score_is_that_of_the_textbook(sign: float) -> None:
     """For skewed trials and for others, on both sides; it has the sign of the distance however far the mean is off."""

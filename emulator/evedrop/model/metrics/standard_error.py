@@ -20,6 +20,8 @@ def standard_error(of_trials: Floats | None) -> float | None:
     """
     if of_trials is None or len(of_trials) < 2 or not np.isfinite(of_trials).all():
         return None
+    if (of_trials == of_trials[0]).all():
+        return 0.0  # their mean is rounded, and the distance from it is not always 0
     with np.errstate(over="ignore"):
         error = float(np.std(of_trials, ddof=1)) / math.sqrt(len(of_trials))
     return error if math.isfinite(error) else None
