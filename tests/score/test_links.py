@@ -182,6 +182,14 @@ def test_bursts_and_delays_stand_beside_their_models() -> None:
     assert slow.delay_quantiles == {"0.5": 1, "0.9": 3, "0.99": 4}
 
 
+def test_no_burst_is_expected_of_a_sensor_that_stays_silent() -> None:
+    """A slot without a packet ends a burst, which would last for 1/0.3 slots otherwise."""
+    right = linked(3)
+    tally = tally_of(right, "bursts")
+    tally.unsent += 1
+    assert link_summary_of(right, "bursts", tally).expected_mean_burst is None
+
+
 def test_nothing_is_said_of_what_was_not_measured() -> None:
     """Of a run that did not begin."""
     right = linked(1)

@@ -55,7 +55,7 @@ def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSumm
             lost_by={reason: count for reason, count in sorted(lost.items()) if count},
             bursts=np.trim_zeros(tally.bursts, "b").tolist(),
             mean_burst=_mean_burst(tally),
-            expected_mean_burst=None if tally.lost.get("overflow") else _expected_burst(pieces),
+            expected_mean_burst=None if tally.unsent or tally.lost.get("overflow") else _expected_burst(pieces),
         ),
         schedule,
         tally,
