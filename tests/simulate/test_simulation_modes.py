@@ -19,6 +19,7 @@ from evedrop.cli.api import montecarlo
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.model import streams
 from evedrop.model.process import Process
+from evedrop.model.receiver import Action
 from evedrop.model.theory.covariances import Outcomes, theoretical_traces
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load
@@ -50,6 +51,13 @@ def studied(A: list[list[float]], slots: int, mu_d: float = 0.6, **eavesdroppers
         encoding={"scheme": "innovation", "state_probability": mu_d},
         eavesdroppers=eavesdroppers,
     )
+
+
+def twin_tracks(**entries: Any) -> Scenario:
+    """A marginally stable process of twin tracks behind a link of quality 0.5."""
+    process = Process(np.array(MARGINAL), 1e-2 * np.eye(2), np.eye(2))
+    table = {"encoding": {"scheme": "twin-track"}, "legitimate": {"link": {"quality": 0.5}}, **entries}
+    return scenario_of(process, slots=12, seed=3, trials=4000, **table)
 
 
 SMART = {"strategy": "smart", "link": {"quality": 0.85}}
@@ -114,6 +122,14 @@ def test_error_coordinates_are_the_ordinary_errors(A: list[list[float]]) -> None
         difference = np.abs(np.sqrt(exact[name]["error"]) - np.sqrt(errors[name]["error"]))
         assert np.all(difference <= 1e-11 * state)
         assert np.max(difference) <= 1e-9 * max(1.0, float(np.sqrt(exact[name]["error"]).max()))
+
+
+def test_who_knows_the_start_has_no_error_from_it() -> None:
+    """The legitimate estimator of twin tracks predicts from x_0 in every mode, also where it loses the first packets."""
+    of = twin_tracks()
+    exact, errors = played(of, Mode.EXACT, 60)["legitimate"], played(of, Mode.ERROR_COORDINATES, 60)["legitimate"]
+    assert (exact["action"][0] == int(Action.LOST)).any()
+    np.testing.assert_allclose(errors["error"], exact["error"], rtol=1e-9, atol=1e-20)
 
 
 def test_covariances_alone_see_the_same_events() -> None:

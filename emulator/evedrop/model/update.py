@@ -62,7 +62,7 @@ def actual_covariance(process: Process, k: int, P: Floats, action: Codes, nu: Fl
 def error(process: Process, e: Floats, action: Codes, nu: Flags, w: Floats, misled: Callable[[], Floats]) -> Floats:
     """e_k (n, R) from e_{k−1}, the actions (R,), ν (R,), w_{k−1} (n, R), and A x_{k−1} − χ_k (n, R) for a misled receiver.
 
-    Nothing cancels, so it is accurate even where x exceeds all precision. Before slot 0, e is 0, and w is then x_0.
+    Nothing cancels, so it is accurate even where x exceeds all precision. Before slot 0, e is 0; w is then x_0 less its estimate.
     """
 
     def predicted() -> Floats:

@@ -172,7 +172,8 @@ class Simulation:
         misleads = bool(self._misled())
         trajectory = Trajectory(self._process, self._keys.process, self._batch, self._initial) if misleads else None
         errors = {name: np.zeros((n, trials)) for name in self._receivers}
-        covariances = {name: receiver.prior().P for name, receiver in self._receivers.items()}
+        priors = {name: receiver.prior() for name, receiver in self._receivers.items()}
+        covariances = {name: belief.P for name, belief in priors.items()}
 
         # The square of an error may leave double precision; then it is inf, as it should be.
         @np.errstate(over="ignore")
@@ -194,7 +195,7 @@ class Simulation:
                         errors[name],
                         action,
                         nu,
-                        w,
+                        w if k else w - priors[name].x_hat,
                         lambda k=k: trajectory.predicted - self._chi(k),  # type: ignore[misc, union-attr]
                     )
                     covariances[name] = update.reported_covariance(self._process, k, covariances[name], action)
