@@ -360,3 +360,24 @@ def test_many_states_are_followed_slot_by_slot() -> None:
         for a in rates
     ]
     assert np.allclose(next_traces, sum(chain.next_traces(400) for chain in one_by_one), rtol=1e-10)
+
+
+def test_a_known_start_is_known_again_after_a_restart() -> None:
+    """While the receiver is down nobody predicts from x_0, in slot 0 too; restarted, it does so as if it had heard nothing."""
+    a, q, p0 = 1.1, 0.5, 2.0
+    process = Process(np.array([[a]]), np.array([[q]]), np.array([[p0]]))
+
+    def twin_tracks(quality: float) -> Outcomes:
+        return Outcomes(1.0 - quality, 0.4 * quality, misled=0.0, decoded=0.6 * quality, initial=0.0)
+
+    chain, slots, down = Chain(np.ones((1, 1)), np.ones(1), np.array([0.7])), 10, [*range(2), *range(5, 8)]
+    link = LinkDistribution(LinkDistribution.steady(chain).segments, ((0, 2, False), (5, 8, False)))
+    known, sigma, E, expected = 0.0, p0, 0.0, []
+    for k in range(slots):
+        if k:
+            before = known if k - 1 in down else E  # x_0 is the only state that it can predict from when it is back
+            E = 0.72 * a * a * before + 0.3 * q
+            known, sigma = a * a * known + q, a * a * sigma + q
+        expected.append(sigma if k in down else E)
+    found = ModulatedCovariance(process, link, twin_tracks).next_traces(slots)
+    assert found == pytest.approx(expected, rel=1e-12)

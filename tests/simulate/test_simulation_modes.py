@@ -26,6 +26,7 @@ from evedrop.scenario.loading import checked, load
 from evedrop.scenario.receivers import LinkTable
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.theory import expectations_of
 from evedrop.score.scorekeeper import RunOutcome
 from evedrop.simulate.montecarlo import Merger, Plan, check_mode
 from evedrop.simulate.simulation import Mode, Simulation
@@ -130,6 +131,14 @@ def test_who_knows_the_start_has_no_error_from_it() -> None:
     exact, errors = played(of, Mode.EXACT, 60)["legitimate"], played(of, Mode.ERROR_COORDINATES, 60)["legitimate"]
     assert (exact["action"][0] == int(Action.LOST)).any()
     np.testing.assert_allclose(errors["error"], exact["error"], rtol=1e-9, atol=1e-20)
+
+
+@pytest.mark.parametrize("kills", [[(3, 6)], [(0, 4), (6, 7)]])
+def test_an_estimator_that_restarts_with_a_known_start_agrees_with_theory(kills: list[tuple[int, int]]) -> None:
+    """Of twin tracks: while it is down nobody predicts from x_0, and afterwards it does so again."""
+    of = twin_tracks(event=[{"from": start, "to": stop, "kill": "legitimate"} for start, stop in kills])
+    error = played(of, Mode.EXACT, 4000)["legitimate"]["error"]
+    agrees(error, expectations_of(of)["legitimate"].traces(of.slots))
 
 
 def test_covariances_alone_see_the_same_events() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
@@ -29,6 +29,7 @@ from evedrop.model.theory.covariances import (
     lyapunov,
     misled_covariances,
     radius,
+    theoretical_covariances,
     without_cancellation,
 )
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
@@ -136,8 +137,8 @@ class ModulatedCovariance:
         slot = _Slot(k, segment, fresh, quality, self._before, remaining)
         self._before, self._k = sigma, k + 1
         if not self._link.window:
-            self._settled = self._step(self._settled, slot, 0)
-            return self._settled
+            after = self._settled = self._step(self._settled, slot, 0)
+            return after if self._whole.base["initial"] else self._of_start(k, after, segment.chain)
         if len(self._window) == self._link.window:
             self._settled = self._step(self._settled, self._window[0], self._link.window)
         self._window.append(slot)
@@ -145,6 +146,20 @@ class ModulatedCovariance:
         for earlier in self._window:
             states = self._step(states, earlier, k - earlier.k)
         assert states is not None  # noqa: S101 - the window contains slot k
+        return states
+
+    def _of_start(self, k: int, states: Floats, chain: Chain) -> Floats:
+        """E(s) after slot k of a receiver that knows the first state without a packet, from E(s) without outages in that slot.
+
+        While it is down, nobody predicts from that state, in slot 0 too. When it restarts from the prior, it knows it again.
+        """
+        weights = chain.stationary[:, None, None]
+        down = [(start, stop) for start, stop, keeps in self._link.outages if not keeps]
+        if k == 0 and any(start == 0 for start, _ in down):
+            states = self._settled = weights * self._process.initial_covariance
+        if any(stop == k + 1 for _, stop in down):
+            known = theoretical_covariances(self._process, replace(NOBODY, initial=0.0), k + 1)[-1]
+            self._settled = weights * known
         return states
 
     def _step(self, states: Floats | None, slot: _Slot, lag: int) -> Floats:
