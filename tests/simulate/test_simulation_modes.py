@@ -141,6 +141,23 @@ def test_an_estimator_that_restarts_with_a_known_start_agrees_with_theory(kills:
     agrees(error, expectations_of(of)["legitimate"].traces(of.slots))
 
 
+@pytest.mark.parametrize("scheme", ["acknowledged", "open-loop"])
+def test_no_theory_of_an_estimator_that_forgot_what_it_acknowledged(scheme: str) -> None:
+    """After a restart from the prior it cannot read packets that refer to a state it had; with its last state it can."""
+    for state in ("prior", "last"):
+        of = twin_tracks(
+            encoding={"scheme": scheme},
+            acknowledgements={"link": {"quality": 0.9}},
+            event=[{"from": 4, "to": 6, "kill": "legitimate", "state": state}],
+        )
+        error, theory = played(of, Mode.EXACT, 1000)["legitimate"]["error"], expectations_of(of)["legitimate"]
+        plain = expectations_of(twin_tracks(encoding={"scheme": "plain"}, event=of.as_tables()["event"]))["legitimate"]
+        assert theory.known == (state == "last")
+        if theory.known:
+            agrees(error, theory.traces(of.slots))
+        assert (error[6:].mean() < 1.2 * plain.traces(of.slots)[6:].mean()) == theory.known
+
+
 def test_covariances_alone_see_the_same_events() -> None:
     """Actions and reported covariances of the covariance-only mode are those of the ordinary one, to the bit."""
     of = studied(MARGINAL, 120, **ALL)

@@ -337,11 +337,17 @@ def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
 
 def _outcomes_of(scenario: Scenario, receiver: str, scheme: Scheme) -> OutcomesAt | None:
     if receiver == LEGITIMATE:
-        table = scenario.acknowledgements
-        forged = table is not None and table.attack in FORGING and LEGITIMATE in scheme.closed_forms
-        return None if forged else legitimate_outcomes(scheme)
+        loses = LEGITIMATE in scheme.closed_forms and _may_lose_reference(scenario)
+        return None if loses else legitimate_outcomes(scheme)
     eavesdropper = scenario.eavesdroppers[receiver]
     return eavesdropper_outcomes(scheme, eavesdropper.strategy, eavesdropper.parameters)
+
+
+def _may_lose_reference(scenario: Scenario) -> bool:
+    """Whether the legitimate estimator may lack what the sensor takes it to have: by forged acknowledgements, or a restart."""
+    table = scenario.acknowledgements
+    forged = table is not None and table.attack in FORGING
+    return forged or any(not away.keeps_state for away in scenario.timeline.outages[LEGITIMATE])
 
 
 def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
