@@ -415,6 +415,26 @@ def test_both_estimators_are_reported(tmp_path: Path) -> None:
     assert digests(runs[True])["legitimate"] != digests(runs[False])["legitimate"]
 
 
+def test_the_other_estimator_is_unknown_if_acknowledgements_are_forged(tmp_path: Path) -> None:
+    """One that lacks a reference corrects its estimate by packets, so that the two differ by more than what inputs do."""
+    for attack in ("none", "forge"):
+        acknowledgements = {"link": {"quality": 0.9}, "attack": attack}
+        results = in_memory(
+            tmp_path / attack,
+            encoding={"scheme": "open-loop"},
+            eavesdroppers={},
+            controller__acts_on="truth",
+            legitimate__knows_input=True,
+            acknowledgements=acknowledgements,
+        )
+        summary = results.summary["controller"]
+        for errors in (summary["mean_squared_errors"], summary["standard_errors"]["mean_squared_errors"]):
+            assert None not in errors.values() or attack == "forge"
+        in_loop = results.summary["peers"]["legitimate"]["mean_squared_error"]
+        assert summary["mean_squared_errors"]["knowing_input"] == in_loop
+        assert (summary["mean_squared_errors"]["ignoring_input"] is None) == (attack == "forge")
+
+
 def test_inputs_are_held_between_decisions(tmp_path: Path) -> None:
     """A decision every period slots."""
     results = in_memory(tmp_path / "run", controller__period=7)

@@ -12,6 +12,7 @@ from typing import final
 
 import numpy as np
 
+from evedrop.model.acknowledgements import FORGING
 from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.plant import Offset, Plant
 from evedrop.model.process import Floats, Process
@@ -82,7 +83,10 @@ class LoopTally:
         loop = controlled_plant(scenario)
         if loop is None:
             return None
-        comparable = scenario.window(LEGITIMATE) == 0 and not scenario.timeline.outages[LEGITIMATE]
+        acknowledgements = scenario.acknowledgements
+        # An estimator that never had the reference of a packet also corrects its estimate by it: `Offset` does not know how.
+        forged = acknowledgements is not None and acknowledgements.attack in FORGING
+        comparable = scenario.window(LEGITIMATE) == 0 and not scenario.timeline.outages[LEGITIMATE] and not forged
         tally = cls(loop.process, loop.plant, trials, scenario.legitimate.knows_input, comparable)
         tally.applications = {
             name: APPLICATIONS[name].tally(loop, table, trials) for name, table in scenario.applications.items()
