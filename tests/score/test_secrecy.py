@@ -186,6 +186,20 @@ def test_the_first_loss_of_a_recording() -> None:
         assert first == pytest.approx(expected, nan_ok=True)
 
 
+def test_a_late_first_packet_is_not_lost() -> None:
+    """It counts if it comes within the window, unless the receiver is down; one that comes later is as good as lost."""
+    link = {"quality": 0.875, "delay": {"model": "constant", "value": 1.0}}
+    down = [{"from": 0, "to": 2, "kill": "legitimate"}]
+    timely = {"quality": 0.875}
+    for expected, table, event in (
+        (0.125, {"link": link, "window": 1}, []),
+        (1.0, {"link": link}, []),
+        (1.0, {"link": timely, "window": 1}, down),
+    ):
+        scenario = load("vehicle", {"legitimate": table, "event": event})
+        assert expectations_of(scenario)["legitimate"].first_loss == pytest.approx(expected)
+
+
 def test_a_replayed_recording_is_in_the_verdict_and_warned_of() -> None:
     """Intervals of trials with the same losses hold for these; a random start has neither, nor a single trial."""
     trace = {"model": "trace", "outcomes": "0111" * 100}

@@ -8,7 +8,7 @@ Source: docs/mathematics/schemes.md, acknowledged references, schedules by holdi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol, final
 
@@ -192,8 +192,12 @@ class Expectation:
 
     @property
     def first_loss(self) -> float:
-        """The probability that the packet of slot 0 is not delivered; NaN if it is not known."""
-        return self.recorded_loss if self.link is None else 1.0 - float(self.link.rates(range(1))[0])
+        """The probability that the packet of slot 0 is not delivered, in time or late; NaN if it is not known."""
+        if self.link is None:
+            return self.recorded_loss
+        first = self.link.segments[0]
+        in_the_end = replace(self.link, segments=(replace(first, arrived=first.arrived[-1:]),))
+        return 1.0 - float(in_the_end.rates(range(1))[0])
 
     @property
     def _known(self) -> tuple[LinkDistribution, OutcomesAt] | None:
