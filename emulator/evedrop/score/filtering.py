@@ -18,6 +18,7 @@ from evedrop.model.metrics.standard_error import ratio_error, standard_error, z_
 from evedrop.model.process import Floats
 from evedrop.model.streams import Batch
 from evedrop.names import LEGITIMATE, SENSOR
+from evedrop.scenario.closed_loop import monitor_of
 from evedrop.scenario.tables import Scenario
 from evedrop.score.after_start import AfterStart, BatchMeans, ratio_interval
 from evedrop.score.summary import FilterSummary, TrueRatio
@@ -131,7 +132,11 @@ class FilterTally:
             name: standard_error(values / self.slots) if alike else None for name, values in self.of_trials.items()
         }
         error, own_of_trials = spread.pop(SENSOR, None), self.of_trials.get(SENSOR)
-        z = z_of(own_of_trials / self.slots, mean_trace) if alike and self.slots and own_of_trials is not None else None
+        plan = monitor_of(scenario)
+        # Theory expects the error of a filter that gets the true measurements.
+        attacked = plan is not None and plan.attack is not None and any(start < self.slots for start, _ in plan.spans)
+        comparable = alike and self.slots and not attacked
+        z = z_of(own_of_trials / self.slots, mean_trace) if comparable and own_of_trials is not None else None
         of_mean = {"mean_squared_error": error, "mean_true_squared_errors": spread}
         ratios = {
             name: TrueRatio(values.ratio, values.interval)

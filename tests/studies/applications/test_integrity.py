@@ -56,6 +56,21 @@ def test_its_metrics_are_those_of_the_recorded_trials(tmp_path: Path) -> None:
     assert integrity["expected_delay"] == pytest.approx(8.0 / integrity["divergence"])
 
 
+def test_a_filter_that_is_deceived_is_not_compared_with_theory() -> None:
+    """Theory expects the error of one that gets the true measurements."""
+    for begins in (20, None):
+        event = [
+            {"note": "no attack", "at": 20} if begins is None else {"from": begins, "to": 40, "spoof": "measurements"}
+        ]
+        attack = {} if begins is None else {"integrity.attack": ATTACK}
+        scenario = load(
+            "replay-attack", {"slots": 40, "trials": 40, "event": event, "integrity.attack": None, **attack}
+        )
+        z = montecarlo(scenario, trials=40, **SHORT).summary["filter"]["z"]
+        assert (z is None) == (begins is not None)
+        assert z is None or abs(z) < 5.0
+
+
 @pytest.mark.long
 def test_totals_of_parts_are_the_totals(tmp_path: Path) -> None:
     """600 trials are two blocks; whichever worker has them, the entry is the same, and the digest that of all trials."""
