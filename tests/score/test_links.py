@@ -190,6 +190,15 @@ def test_no_burst_is_expected_of_a_sensor_that_stays_silent() -> None:
     assert link_summary_of(right, "bursts", tally).expected_mean_burst is None
 
 
+def test_no_delays_are_expected_of_packets_to_a_receiver_that_is_away_at_times() -> None:
+    """Those that meet an outage on their way are missing, and slow ones meet one more often."""
+    right = linked(5, [{"from": k, "to": k + 2, "pause": "slow"} for k in range(4, 396, 6)])
+    slow = link_summary_of(right, "slow", tally_of(right, "slow"))
+    assert slow.lost_by["paused"] > 0
+    assert slow.delays is not None
+    assert slow.expected_delays is None
+
+
 def test_nothing_is_said_of_what_was_not_measured() -> None:
     """Of a run that did not begin."""
     right = linked(1)

@@ -159,7 +159,8 @@ def _with_delays(link: LinkSummary, schedule: LinkSchedule, tally: Tally) -> Lin
     return replace(
         link,
         delays=fractions.tolist(),
-        expected_delays=_expected_delays(schedule),
+        # Slow packets meet an outage of the receiver more often, and then have no delay: the rest is not a fair sample.
+        expected_delays=None if schedule.outages else _expected_delays(schedule),
         delay_quantiles={f"{level:g}": _quantile(np.cumsum(fractions), level) for level in QUANTILES},
     )
 
