@@ -180,7 +180,7 @@ def test_a_part_of_a_run_is_not_promised_again(study: Path, tmp_path: Path) -> N
     """The command runs all of it; one that estimated rare events does so again."""
     shutil.copytree(study, tmp_path / "run")
     summary = json.loads((study / "summary.json").read_text())
-    summary["ended"] = "interrupted"
+    summary |= {"ended": "interrupted", "trials": 12}
     rare: dict[str, Any] = {
         "mean_error": 1.0,
         "standard_error": 0.1,

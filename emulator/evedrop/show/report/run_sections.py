@@ -433,7 +433,9 @@ def _repeat(of: RunSource) -> Iterator[Markup]:
         yield from input_files(of.folder)
         if "secret_file" in of.tables:
             yield made("paragraph", "Its secret is in a file, which does not travel with this page.")
-        command = repeating(Path(SCENARIO), summary.trials, summary.mode)
+        planned = of.tables.get("trials")  # of which a study that was interrupted has only some
+        trials = planned if type(planned) is int else summary.trials
+        command = repeating(Path(SCENARIO), trials, summary.mode)
         if any(peer.rare_estimate is not None for peer in summary.peers.values()):
             command += " --rare"
         yield made("code", f"{command} --out again\nevedrop view again")
