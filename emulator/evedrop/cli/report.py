@@ -79,7 +79,7 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None, verb
         console.say(expectation.sentence)
         if expectation.replay is not None:
             console.command(f"    see it again: {expectation.replay}")
-    console.say(f"results: {folder}; to look at them: evedrop view {folder}")
+    console.say(f"results: {folder}; to look at them: {closing.looking(folder, summary.mode)}")
 
 
 def _print_details(console: ReportConsole, summary: Summary, replay: str | None) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import shlex
 
 import pytest
 from PIL import Image
 
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
+from tests.pages import checked
 
 SMALL = ("--slots", "20", "--trials", "2", "--out", "study")
 STUDIES = {
@@ -66,3 +68,17 @@ def test_what_cannot_be_exported(evedrop: Evedrop) -> None:
     assert evedrop("export", "study", "out.mcap", "--width", "column").status == 2
     assert evedrop("export", "nowhere", "out.pdf").status == 2
     assert evedrop("export", "study", "nowhere/out.pdf").status == 2
+
+
+@pytest.mark.parametrize("mode", ["", "--covariance-only", "--error-coordinates"])
+def test_the_command_that_shows_results_shows_them(mode: str, evedrop: Evedrop) -> None:
+    """Both that of the closing report and that of the page: only some modes have a trial to view, and a name may have spaces."""
+    made = ("montecarlo", "eavesdroppers", "--slots", "20", "--trials", "2", "--out", "my study", *filter(None, [mode]))
+    [line] = [line for line in evedrop(*made).out.splitlines() if line.startswith("results: ")]
+    shown = f"evedrop view 'my study'{' --table' if mode else ''}"
+    assert line == f"results: my study; to look at them: {shown}"
+    texts = checked(evedrop.folder / "my study").texts
+    assert any(text.endswith(f"\nevedrop view again{' --table' if mode else ''}") for text in texts)
+    if mode:
+        done = evedrop(*shlex.split(shown)[1:])
+        assert (done.status, "receiver" in done.out) == (0, True)

@@ -6,6 +6,7 @@ Source: docs/results.md; docs/montecarlo.md, sweeps.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -47,6 +48,14 @@ def heading(summary: Summary) -> str:
     if summary.failed_expectations:
         title += f" · {summary.failed_expectations} of {len(summary.expectations)} expectations FAILED"
     return title
+
+
+def looking(folder: str, mode: str) -> str:
+    """The command that shows the results in a folder: their view, or their table in a mode without a recorded trial.
+
+    mode: as in the summary.
+    """
+    return f"evedrop view {shlex.quote(folder)}{'' if mode in {'live', 'exact'} else ' --table'}"
 
 
 def outcome(summary: Summary) -> tuple[str, bool | None]:

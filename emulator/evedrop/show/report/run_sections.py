@@ -438,7 +438,7 @@ def _repeat(of: RunSource) -> Iterator[Markup]:
         command = repeating(Path(SCENARIO), trials, summary.mode)
         if any(peer.rare_estimate is not None for peer in summary.peers.values()):
             command += " --rare"
-        yield made("code", f"{command} --out again\nevedrop view again")
+        yield made("code", f"{command} --out again\n{closing.looking('again', summary.mode)}")
     else:
         yield made("paragraph", f"The run cannot be repeated: its folder has no {SCENARIO} that can be read.")
     versions = of.tables.get("made_with", {})
