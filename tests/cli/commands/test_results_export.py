@@ -7,7 +7,10 @@ import shlex
 
 import pytest
 from PIL import Image
+from pyarrow import parquet
 
+from evedrop.cli.api.results import SweepResults, study_in
+from evedrop.results.tables import swept_strategies
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
 from tests.pages import checked
@@ -82,3 +85,13 @@ def test_the_command_that_shows_results_shows_them(mode: str, evedrop: Evedrop) 
     if mode:
         done = evedrop(*shlex.split(shown)[1:])
         assert (done.status, "receiver" in done.out) == (0, True)
+
+
+def test_a_sweep_has_the_colours_of_its_own_picture_again(evedrop: Evedrop) -> None:
+    """The strategies of its receivers, which their colours say, are in its table's metadata."""
+    values = ("--over", "seed=1,2", "--set", "eavesdroppers.antenna={strategy='smart', link={quality=0.5}}")
+    assert evedrop("sweep", "eavesdroppers", *values, *SMALL).status == 0
+    read = study_in(evedrop.folder / "study")
+    assert isinstance(read, SweepResults)
+    assert swept_strategies(read.table)["antenna"] == "smart"
+    assert read.table.equals(parquet.read_table(evedrop.folder / "study" / "sweep.parquet"), check_metadata=True)

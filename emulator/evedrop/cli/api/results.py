@@ -303,5 +303,5 @@ def study_in(folder: Path) -> RunResults | SweepResults | ComparisonResults:
         from evedrop.show.report.sweep_sections import SweepSource  # templates, which no other results need
 
         source = SweepSource.read(folder)
-        return SweepResults(folder, pa.Table.from_pylist(list(source.rows)), tuple(source.grid))
+        return SweepResults(folder, source.table, tuple(source.grid))
     return load_results(folder)

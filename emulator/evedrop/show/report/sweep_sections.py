@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 from markupsafe import Markup, escape
 
@@ -45,7 +46,9 @@ class SweepSource:
     """The folder of a sweep, read."""
 
     folder: Path
+    table: pa.Table
     rows: Sequence[Mapping[str, Any]]
+    """Of the table."""
     scenario: str
     changes: Mapping[str, Any]
     grid: Mapping[str, Sequence[Any]]
@@ -71,7 +74,7 @@ class SweepSource:
             amount = " · ".join((f"{done:,} points of {', '.join(grid)}", *sizes))
             outcome = "; ".join(sweep_outcome(table.to_pylist(), list(grid), done, planned))
             changes, mode = entries["changes"], entries["mode"]
-            return cls(folder, rows, entries["scenario"], changes, grid, mode, amount, outcome, inks)
+            return cls(folder, table, rows, entries["scenario"], changes, grid, mode, amount, outcome, inks)
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{folder} cannot be read as a sweep ({error}); run the sweep again") from error
 
