@@ -657,3 +657,15 @@ def test_a_verdict_of_secret_says_what_theory_promises_beyond_it() -> None:
     lines = {line.split()[2]: line for _, line in closing.verdict_lines(summary) if line.startswith("✓")}
     assert lines["smart"].endswith("(by means of infinite variance); perfect by theory, which trials may never show")
     assert lines["equal"].endswith("its squared error (by means of infinite variance)")
+
+
+def test_a_sweep_without_a_point_is_told_to_go_on(evedrop: Evedrop) -> None:
+    """The report of a sweep that was interrupted so early is not what the error advises."""
+    made = ("sweep", "eavesdroppers", "--over", "seed=1,2", "--slots", "12", "--trials", "2", "--out", "study")
+    assert evedrop(*made).status == 0
+    (evedrop.folder / "study" / "sweep.parquet").unlink()
+    for words in (("report", "study"), ("export", "study", "study.csv")):
+        done = evedrop(*words)
+        assert done.status == 2
+        assert "no point of its sweep is done" in done.err
+        assert "evedrop report" not in done.err

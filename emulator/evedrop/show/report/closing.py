@@ -29,6 +29,8 @@ from evedrop.score.summary import (
 from evedrop.score.verdict import SecrecyOutcome, times_text
 from evedrop.show.report.text_table import TextColumn, TextTable
 
+SWEEP_FILE = "sweep.json"
+"""The file that says what a sweep is; its folder has it from the beginning."""
 SWEEP_TABLE = "sweep.parquet"
 """The file that has the results of a sweep."""
 

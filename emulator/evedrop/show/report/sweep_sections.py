@@ -28,7 +28,7 @@ from evedrop.results.tables import swept_strategies
 from evedrop.scenario.loading import value_of
 from evedrop.score.verdict import SecrecyOutcome, weakest
 from evedrop.show.report.chart import Curve, LogChart
-from evedrop.show.report.closing import SWEEP_TABLE, sweep_table
+from evedrop.show.report.closing import SWEEP_FILE, SWEEP_TABLE, sweep_table
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.travel import OF_PAGE, SCENARIO, circumstances, download
 from evedrop.show.view.axis_name import axis_name
@@ -63,9 +63,13 @@ class SweepSource:
 
     @classmethod
     def read(cls, folder: Path) -> SweepSource:
-        """Read a folder. Raises UsageError if it is not that of a sweep."""
+        """Read a folder. Raises UsageError if it is not that of a sweep, or none of its points is done."""
+        if not (folder / SWEEP_TABLE).exists() and (folder / SWEEP_FILE).exists():
+            raise UsageError(
+                f"{folder} has nothing yet: no point of its sweep is done; go on with the sweep (--resume)"
+            )
         try:
-            entries = json.loads(text_of(folder / "sweep.json", _MOST_BYTES))
+            entries = json.loads(text_of(folder / SWEEP_FILE, _MOST_BYTES))
             table, grid = pq.read_table(folder / SWEEP_TABLE), entries["over"]
             rows = table.to_pylist()
             inks = paper_inks(dict.fromkeys(row["peer"] for row in rows), swept_strategies(table))

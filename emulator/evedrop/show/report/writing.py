@@ -16,7 +16,7 @@ from evedrop.results.comparison import COMPARISON
 from evedrop.results.folder import replace_private
 from evedrop.results.reading import Results, results_of_this_version
 from evedrop.results.wire_summary import WIRE_FILE
-from evedrop.show.report.closing import SWEEP_TABLE, amount, outcome
+from evedrop.show.report.closing import SWEEP_FILE, amount, outcome
 from evedrop.show.report.comparison import comparison_heading
 from evedrop.show.report.page import Page, parts_of
 from evedrop.show.report.run_sections import RUN_SECTIONS, RunSource
@@ -64,7 +64,7 @@ def _wire_page_of(folder: Path) -> Page:
 
 
 KINDS: Mapping[str, Callable[[Path], Page]] = {
-    SWEEP_TABLE: sweep_page,
+    SWEEP_FILE: sweep_page,
     COMPARISON: comparison_page,
     WIRE_FILE: _wire_page_of,
 }
