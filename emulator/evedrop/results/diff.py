@@ -52,8 +52,12 @@ def difference(a: Results, b: Results) -> RunDifference:
         for peer, trial, block in common
         if blocks_a[peer, trial, block] != blocks_b[peer, trial, block]
     )
-    only = len(blocks_a) + len(blocks_b) - 2 * len(common)
-    rest = f" ({only} blocks of up to 256 slots are in one run only)" if only else ""
+    in_both = len(blocks_a.keys() & blocks_b.keys())
+    apart = {
+        "are in one run only": len(blocks_a) + len(blocks_b) - 2 * in_both,
+        "may lack slots in a run, and were not compared": in_both - len(common),
+    }
+    rest = "".join(f" ({count} blocks of up to 256 slots {which})" for which, count in apart.items() if count)
     if first is not None and (not unequal or first.slot < unequal[0][0] + BLOCK_SLOTS):
         return RunDifference(False, first.text + rest)
     if not unequal:
