@@ -93,6 +93,16 @@ def test_the_fit_is_a_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert np.shape(fit_["standard_errors"]["A"]) == (2, 2)
 
 
+def test_each_state_has_its_own_unit(tmp_path: Path) -> None:
+    """In the order in which the states are asked for, which need not be that of the columns; none if one has no unit."""
+    path = tmp_path / "pose.csv"
+    lines = "".join(f"{x},{y},{k}\n" for k, (x, y) in enumerate(path_of(1)))
+    path.write_text(f"a [W],b [kW],c\n{lines}")
+    table = fit_process(path, ["b", "a"]).table
+    assert (table["states"], table["units"]) == (["b", "a"], ["kW", "W"])
+    assert "units" not in fit_process(path, ["c", "a"]).table
+
+
 def test_a_state_without_noise_is_found(tmp_path: Path) -> None:
     """A position that sums up a speed: Q is singular, and Σ0 is not."""
     speed = path_of(2)[:, :1]

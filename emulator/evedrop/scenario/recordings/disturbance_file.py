@@ -108,8 +108,9 @@ def recorded_states(path: Path, names: Sequence[str] | None = None) -> StateReco
         if len(times) > 1 and not 0.0 < seconds < math.inf:
             raise DisturbanceError(str(path), ["has times that do not grow from line to line; expected seconds"])
         series.check_times(seconds, recorded=True)
-    units = [match["unit"].strip() for cell in head.cells if (match := _HEADER.match(cell)) and match["name"] in names]
-    return StateRecording(str(path), names, units if len(units) == len(names) else None, series.numbers, seconds)
+    given = {match["name"]: match["unit"].strip() for cell in head.cells if (match := _HEADER.match(cell))}
+    units = [given[name] for name in names] if all(name in given for name in names) else None
+    return StateRecording(str(path), names, units, series.numbers, seconds)
 
 
 def table_text(names: Sequence[str], units: Sequence[str] | None, rows: Sequence[Sequence[float]]) -> str:
