@@ -228,6 +228,19 @@ def test_resumed_tests_keep_only_complete_results_in_memory(ended: str, mode: st
     assert (again.outcome, again.folder) == (Outcome.PASSED, tmp_path / "out" / "one-2")
 
 
+def test_resumed_tests_are_run_again_if_a_file_of_the_scenario_has_changed(tmp_path: Path) -> None:
+    """The scenario is the same to the letter, but its states are others."""
+    process = HOLDS[HOLDS.index("[process]") : HOLDS.index("[encoding]")]
+    given = f'{process}states = ["x", "y"]\nsource = "file"\nstate_file = "path.csv"\n'
+    written(tmp_path, one=HOLDS.replace(process, given).replace("slots = 60", "slots = 50"))
+    manner = Manner(in_memory=True, trials=3, out=tmp_path / "out", resume=True)
+    folders = []
+    for speed in (0.0, 0.0, 1.0):
+        (tmp_path / "path.csv").write_text("x,y\n" + "".join(f"{speed * k},0.0\n" for k in range(60)))
+        folders.append(testing.carry_out(str(tmp_path / "one.toml"), manner).folder)
+    assert folders == [tmp_path / "out" / name for name in ("one", "one", "one-2")]
+
+
 TALKS = """
 import numpy as np
 from evedrop.extend import PacketTaker

@@ -27,7 +27,7 @@ from evedrop.live.launch.launcher import launch
 from evedrop.live.network.launcher_pipe import when_launcher_is_gone
 from evedrop.results.folder import claimed, default_folder
 from evedrop.results.reading import Results
-from evedrop.results.resolved_scenario import resolved
+from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario.discovery import scenarios_in
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import silent
@@ -205,10 +205,10 @@ def _folder_for(scenario: str, made: Scenario, manner: Manner) -> Path:
         return claimed(default_folder(scenario))
     wanted = manner.out / Path(scenario).stem
     if manner.resume:
-        text = resolved(made)
+        texts = {**input_texts(made), "scenario.toml": resolved(made)}
         for folder in (wanted, *sorted(manner.out.glob(f"{glob.escape(wanted.name)}-*"))):
             with contextlib.suppress(OSError, ValueError):
-                same = (folder / "scenario.toml").read_text(encoding="utf-8") == text
+                same = all((folder / name).read_text(encoding="utf-8") == text for name, text in texts.items())
                 if same and ((folder / TASKS).exists() or _is_complete(folder)):
                     return folder
     return claimed(wanted)
