@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.model.delays import Normal
+from evedrop.model.delays import DelayModel, Normal
 from evedrop.model.links.loss_model import Bernoulli, fates_of
 from evedrop.model.links.markov import GilbertElliott
 from evedrop.model.process import Floats
@@ -28,6 +28,15 @@ class Unsteady(GilbertElliott):
     """Has bursts, and says that it has none."""
 
     chain = None  # type: ignore[assignment]  # the lie
+
+
+class Seesaw(Bernoulli):
+    """Is better in every second slot, and says the mean of all slots."""
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:
+        """By the slot."""
+        odd = np.arange(first, first + len(uniforms)) % 2
+        return fates_of(uniforms[:, 0] >= (self.quality + 0.2 - 0.4 * odd)[:, None])
 
 
 class InPlace(Bernoulli):
@@ -77,6 +86,7 @@ class Whole(Bernoulli):
     ("kind", "parameters", "rule", "message"),
     [
         (Better, {"quality": 0.8}, "quality agrees with simulation", "quality_at() says 0.8"),
+        (Seesaw, {"quality": 0.7}, "quality agrees with simulation", "slot 0: delivers 0.9"),
         (Unsteady, {"p": 0.05, "r": 0.1}, "quality agrees with simulation", "give `chain`"),
         (InPlace, {"quality": 0.9}, "independent copies", "never change an array of it in place"),
         (Forgetful, {"quality": 0.9}, "independent copies", "a copy made before slot 2"),
@@ -98,7 +108,26 @@ class Early(Normal):
         return super().arrived(lag + 1)
 
 
-def test_a_delay_model_that_breaks_a_rule_is_told_which() -> None:
+class Uneven(DelayModel):
+    """Is slow in every second slot, and states the mean of all slots."""
+
+    def delays(self, first: int, numbers: Floats) -> Floats:
+        """By the slot."""
+        odd = np.arange(first, first + len(numbers)) % 2
+        return np.where(numbers < (0.8 - 0.6 * odd)[:, None], 0.5, 3.5)
+
+    def arrived(self, lag: int) -> float | None:
+        """Half of them after the first slot."""
+        return 0.5 if lag < 3 else 1.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "message"),
+    [
+        (Early, {"mean": 2.0, "standard_deviation": 1.0}, "and arrived("),
+        (Uneven, {}, "return None if slots differ"),
+    ],
+)
+def test_a_delay_model_that_breaks_a_rule_is_told_which(kind: Any, parameters: dict[str, float], message: str) -> None:
     """As a loss model is."""
-    result = broken(DelayChecks(Early, {"mean": 2.0, "standard_deviation": 1.0}).verdicts())
-    assert "and arrived(" in result["delays agree with simulation"]
+    assert message in broken(DelayChecks(kind, parameters).verdicts())["delays agree with simulation"]

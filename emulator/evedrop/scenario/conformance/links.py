@@ -18,7 +18,7 @@ from evedrop.model.delays import DelayModel
 from evedrop.model.links.chain import Chain
 from evedrop.model.links.loss_model import Fate, LossModel
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Codes
+from evedrop.model.receiver import Codes, Flags
 from evedrop.model.streams import BlockReader
 from evedrop.scenario.conformance.problems import Problem, large, small
 from evedrop.scenario.conformance.receivers import SIGMAS
@@ -172,14 +172,22 @@ class LossChecks(_ModelChecks[LossModel]):
             self._same(once, fates, problem, f"{{0!r}}, and {{1!r}} of a copy made before slot {k}", remedy)
 
     def rate(self, problem: Problem) -> None:
-        """The fraction delivered has the mean and the variance over trials that the model states."""
-        delivered = (self._whole(problem) == Fate.DELIVERED).mean(axis=0)
+        """The fraction delivered has the mean, in every slot, and the variance over trials that the model states."""
+        arrived = self._whole(problem) == Fate.DELIVERED
+        delivered, each = arrived.mean(axis=0), arrived.mean(axis=1)
         model, slots = self._made(), range(problem.slots)
-        expected, variance = float(model.quality_at(slots).mean()), model.rate_variance(slots)
+        stated = model.quality_at(slots)
+        expected, variance = float(stated.mean()), model.rate_variance(slots)
         scatter = max(variance, float(delivered.var()))
         if abs(delivered.mean() - expected) > SIGMAS * np.sqrt(scatter / len(delivered)) + 1e-9:
             raise Broken(
                 f"delivers {delivered.mean():.4f} of the packets, and quality_at() says {expected:.4f}; correct it"
+            )
+        far = _far(each, stated, problem.batch.trials)
+        if far.any():
+            k = int(np.argmax(far))
+            raise Broken(
+                f"slot {k}: delivers {each[k]:.4f} of the packets, and quality_at() says {stated[k]:.4f}; correct it"
             )
         if delivered.var() > 1.6 * variance + 1e-9:
             raise Broken(
@@ -237,17 +245,30 @@ class DelayChecks(_ModelChecks[DelayModel]):
             )
 
     def says(self, problem: Problem) -> None:
-        """The fraction of packets in time is the stated one."""
+        """The fraction of packets in time is the stated one in every slot."""
         delays = self._whole(problem)
         for lag in range(4):
             promised = self._made().arrived(lag)
-            fraction = float((delays < lag + 1).mean())
-            if promised is not None and abs(fraction - promised) > SIGMAS * np.sqrt(
-                max(promised * (1.0 - promised), 1e-3) / delays.size
-            ):
+            if promised is None:
+                continue
+            fraction, each = float((delays < lag + 1).mean()), (delays < lag + 1).mean(axis=1)
+            if abs(fraction - promised) > SIGMAS * np.sqrt(max(promised * (1.0 - promised), 1e-3) / delays.size):
                 raise Broken(
                     f"{fraction:.4f} of the delays are below {lag + 1} slots, and arrived({lag}) is {promised:.4f}"
                 )
+            far = _far(each, np.full(len(each), promised), problem.batch.trials)
+            if far.any():
+                k = int(np.argmax(far))
+                raise Broken(
+                    f"slot {k}: {each[k]:.4f} of the delays are below {lag + 1} slots, and arrived({lag}) is {promised:.4f}; "
+                    "return None if slots differ"
+                )
+
+
+def _far(fractions: Floats, stated: Floats, trials: int) -> Flags:
+    """Where the fraction of so many independent trials contradicts a stated probability not only by chance."""
+    scatter = np.maximum(fractions * (1.0 - fractions), stated * (1.0 - stated)) / trials
+    return np.asarray(np.abs(fractions - stated) > SIGMAS * np.sqrt(scatter) + 1e-9)
 
 
 def _long(problem: Problem) -> Problem:
