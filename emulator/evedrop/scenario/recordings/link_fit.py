@@ -36,6 +36,7 @@ _ENOUGH = 0.002  # remaining gain in log-likelihood at which to stop
 _NOTHING = 2e-5  # gain in log-likelihood of a step that counts as none
 _IN_A_ROW = 4  # such steps before stopping: while a fast gain gives way to a slow one, the estimate is too small
 _LEAST = 1e-9
+_NEWTON = 20  # steps of Newton's method, which doubles the digits in each of the last ones
 _RESCALED = 8  # steps between rescalings of a product of probabilities
 
 
@@ -291,23 +292,10 @@ def _rounded(parameter: str, value: float) -> float:
 
 def delay_candidates(delays: Floats) -> list[Candidate]:
     """Models for delays in slots, (packets,): constant if all are equal, otherwise normal, or Pareto if none is 0."""
-    count, least, mean = len(delays), float(delays.min()), float(delays.mean())
+    count, least = len(delays), float(delays.min())
     if least == float(delays.max()):
         return [Candidate("constant", {"model": "constant", "value": least}, 0.0, 1)]
-    standard_deviation = float(delays.std())
-    spread = -0.5 * count * (math.log(2.0 * math.pi * standard_deviation * standard_deviation) + 1.0)
-    candidates = [
-        Candidate(
-            "normal",
-            {"model": "normal", "mean": mean, "standard_deviation": standard_deviation},
-            spread,
-            2,
-            {
-                "mean": normal_interval(mean, standard_deviation / math.sqrt(count)),
-                "standard_deviation": normal_interval(standard_deviation, standard_deviation / math.sqrt(2.0 * count)),
-            },
-        )
-    ]
+    candidates = [_normal(delays)]
     if least > 0.0:
         logs = float(np.log(delays / least).sum())
         shape = count / logs
@@ -322,6 +310,68 @@ def delay_candidates(delays: Floats) -> list[Candidate]:
             )
         )
     return candidates
+
+
+def _normal(delays: Floats) -> Candidate:
+    """The most likely normal model, whose delays are 0 where the normal number is not above 0."""
+    count, mean, standard_deviation = len(delays), float(delays.mean()), float(delays.std())
+    likelihood = -0.5 * count * (math.log(2.0 * math.pi * standard_deviation * standard_deviation) + 1.0)
+    errors = standard_deviation / math.sqrt(count), standard_deviation / math.sqrt(2.0 * count)
+    above = delays[delays > 0.0]
+    if len(above) < count:
+        scaled, zeros = above / standard_deviation, count - len(above)
+        (place, scale), covariance, likelihood = _cut_at_zero(scaled, zeros, mean / standard_deviation)
+        likelihood -= len(above) * math.log(standard_deviation)
+        mean, standard_deviation = place / scale * standard_deviation, standard_deviation / scale
+        to_both = standard_deviation * np.array([[1.0, -place / scale], [0.0, -1.0 / scale]])
+        errors = tuple(np.sqrt(np.diag(to_both @ covariance @ to_both.T)).tolist())
+    intervals = [normal_interval(*pair) for pair in zip((mean, standard_deviation), errors, strict=True)]
+    names = ("mean", "standard_deviation")
+    return Candidate(
+        "normal",
+        {"model": "normal", "mean": mean, "standard_deviation": standard_deviation},
+        likelihood,
+        2,
+        {name: (max(0.0, low), high) for name, (low, high) in zip(names, intervals, strict=True)},
+    )
+
+
+def _cut_at_zero(above: Floats, zeros: int, place: float) -> tuple[Floats, Floats, float]:
+    """The most likely mean / sd, at least 0, and 1 / sd of normal numbers of which some are not above 0; the others are these.
+
+    zeros: how many are not above 0; place: a guess of mean / sd, where the sd is about 1. By Newton's method, with steps that
+    are halved until the log-likelihood grows, which is concave. Returns also the covariance of both, and the log-likelihood.
+
+    Source: Olsen (1978).
+    """
+    from scipy.special import log_ndtr  # noqa: PLC0415 - 0.2 s that only this needs
+
+    count, half = len(above), 0.5 * math.log(2.0 * math.pi)
+
+    def likelihood(at: Floats) -> float:
+        if at[1] <= 0.0:
+            return -math.inf
+        away = at[1] * above - at[0]
+        return float(zeros * log_ndtr(-at[0]) + count * (math.log(at[1]) - half) - 0.5 * (away * away).sum())
+
+    def derivatives(at: Floats) -> tuple[Floats, Floats]:
+        away = at[1] * above - at[0]
+        hazard = math.exp(-0.5 * at[0] * at[0] - half - float(log_ndtr(-at[0])))
+        slope = np.array([away.sum() - zeros * hazard, count / at[1] - (above * away).sum()])
+        mixed, own = -float(above.sum()), count / (at[1] * at[1]) + float((above * above).sum())
+        return slope, np.array([[count + zeros * hazard * (hazard - at[0]), mixed], [mixed, own]])
+
+    at = np.array([place, 1.0])
+    for _ in range(_NEWTON):
+        slope, bend = derivatives(at)
+        step = np.linalg.solve(bend, slope)
+        while likelihood(at + step) < likelihood(at):
+            step *= 0.5
+        at = at + step
+    if at[0] < 0.0:  # the model has no mean below 0
+        at = np.array([0.0, math.sqrt(count / float((above * above).sum()))])
+    covariance = np.asarray(np.linalg.inv(derivatives(at)[1]), np.float64)
+    return at, covariance, likelihood(at)
 
 
 def bernoulli(outcomes: Outcomes) -> Candidate:
