@@ -169,6 +169,16 @@ def test_none_removes_an_entry() -> None:
     assert [*prepared("vehicle", {"eavesdroppers.naive": None}).eavesdroppers] == ["suspicious", "smart"]
 
 
+def test_none_removes_entries_of_lists_too() -> None:
+    """By their numbers, which are those before any is removed; what is not there needs no removing."""
+    kill = {"from": 5, "to": 8, "kill": "smart", "state": "last"}
+    scenario = vehicle(event=[kill, *({"at": at, "note": "a word"} for at in range(10, 35, 5))])
+    keys = ["event.1", "event.3", "event.7", "event.x", "event.2.at.x", "event.0.state"]
+    fewer = scenario.replace(dict.fromkeys(keys))
+    assert [event.first for event in fewer.event] == [5, 15, 25, 30]
+    assert fewer.event[0] == vehicle(event=[{**kill, "state": None}]).event[0]
+
+
 @pytest.mark.thorough
 def test_a_class_of_a_module_is_named_and_its_folder_known(own: Any, tmp_path: Path) -> None:
     """Worker processes import it from there: the same digests as in this process, and as by name."""

@@ -453,14 +453,27 @@ def _without_value(changes: Mapping[str, Any]) -> list[str]:
 
 
 def _remove(tables: dict[str, Any], keys: Collection[str]) -> None:
-    """Remove entries by dotted key, in place; those that are not there, too."""
-    for key in keys:
+    """Remove entries by dotted key, in place, those of lists by number; those that are not there, too."""
+
+    def numbered(key: str) -> list[tuple[int, str]]:
+        return [(int(name) if name.isdecimal() else -1, name) for name in key.split(".")]
+
+    for key in sorted(keys, key=numbered, reverse=True):  # the last one of a list first: that changes no other's number
         *above, last = key.split(".")
         inner: Any = tables
         for name in above:
-            inner = inner.get(name, {}) if isinstance(inner, dict) else {}
+            inner = _entry(inner, name)
         if isinstance(inner, dict):
             inner.pop(last, None)
+        elif _entry(inner, last) is not None:
+            del inner[int(last)]
+
+
+def _entry(table: Any, name: str) -> Any:
+    """An entry of a table, or of a list by its number; None if it is not there."""
+    if isinstance(table, list):
+        return table[int(name)] if name.isdecimal() and int(name) < len(table) else None
+    return table.get(name) if isinstance(table, dict) else None
 
 
 Scenario.builders = Builders(built, partial(prepared, beyond_horizon=True), changed)
