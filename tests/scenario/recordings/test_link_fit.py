@@ -201,6 +201,20 @@ def test_the_distribution_of_runs(spec: dict[str, Any]) -> None:
             assert other < 1e-9
 
 
+def test_a_correct_hidden_chain_is_seldom_doubted() -> None:
+    """The p-values of its bursts and gaps are below 0.05 in at most as many recordings as they say, not in two of ten."""
+    loss = {"model": "gilbert-elliott", "p": 0.02, "r": 0.1, "good": 0.01, "bad": 0.7}
+    low = {"bursts": 0, "gaps": 0}
+    for seed in range(40):
+        lost = loss_of(loss).fates(0, np.random.default_rng(seed).random((1500, 2, 1)))[:, 0]
+        fitted = link_fit.fit_outcomes("walk", (lost == 0).astype(np.uint8), np.empty(0))
+        assert fitted.chosen.name == "gilbert-elliott"
+        for name in low:
+            chance = getattr(fitted, name).p_value
+            low[name] += chance is not None and chance < 0.05
+    assert max(low.values()) <= 4, low
+
+
 def test_runs_at_the_ends_do_not_count() -> None:
     """Their lengths are unknown."""
     word = np.array([int(c) for c in "0011101000110"], np.uint8)
