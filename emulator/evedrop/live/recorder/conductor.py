@@ -174,7 +174,7 @@ class Conductor:
         others = [name for name in self.present if name not in {ROUTER, RELAY} and name not in self.absent]
         told: set[str] = set()
         deadline = world().monotonic() + patience
-        sent = 0.0
+        sent = -math.inf
         while world().monotonic() < deadline:
             left = [name for name in others if not self._has_ended(name, told)]
             if not left and self.present[ROUTER]:
@@ -203,7 +203,7 @@ class Conductor:
     def _end_router(self, name: str) -> None:
         """Tell a router that the run is over until it confirms it: the router by a message, the relay by its token."""
         deadline = world().monotonic() + _ROUTERS_SECONDS
-        sent, cut_off = 0.0, -math.inf
+        sent = cut_off = -math.inf
         while world().monotonic() < deadline and name not in self.misdelivered:
             # All tokens vanish with the connection, and return one after the other.
             if not (self._session.linked() and self.present[ROUTER]):

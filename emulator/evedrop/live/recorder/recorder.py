@@ -25,6 +25,7 @@ from evedrop.live.protocol.launcher_events import SaveStarted, SlotsDone
 from evedrop.live.recorder.conductor import Conductor, Stop
 from evedrop.live.recorder.direction import Direction
 from evedrop.live.recorder.recorded_run import RecordedRun
+from evedrop.live.recorder.recovery import LEAST_SECONDS
 from evedrop.live.recorder.run_end import RunEnd, reason_of
 from evedrop.model.eavesdroppers import REMOTE_CALLS
 from evedrop.results.folder import new_folder
@@ -125,7 +126,7 @@ def _conduct(
             run.score.end()
         emit(SlotsDone())
         try:
-            conductor.end(brief.flow.longest_outage)
+            conductor.end(max(LEAST_SECONDS, brief.flow.longest_outage))
         except EvedropError as error:  # a message that breaks the protocol, although all slots are there
             end.blame([], error)
             raise
