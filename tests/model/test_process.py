@@ -164,6 +164,8 @@ MISTAKES = {
     "asymmetric Q": (np.eye(2), [[1.0, 0.1], [0.0, 1.0]], np.eye(2), "Q", "symmetric"),
     "indefinite Σ0": (np.eye(2), np.eye(2), [[1.0, 2.0], [2.0, 1.0]], "initial_covariance", "positive definite"),
     "singular Q": (np.eye(2), [[1.0, 1.0], [1.0, 1.0]], np.eye(2), "Q", "positive definite"),
+    "too small a Q": (np.eye(2), 1e-200 * np.eye(2), np.eye(2), "Q", "variance 1e-200"),
+    "too large a Σ0": (np.eye(2), np.eye(2), np.diag([1.0, 1e154]), "initial_covariance", r"from 1e-100 to 1e[+]100"),
     "uncontrollable": (np.eye(2), [[1.0, 0.0], [0.0, 0.0]], np.eye(2), "Q", "controllable"),
 }
 
@@ -181,6 +183,12 @@ def test_mistakes_are_named(name: str) -> None:
 def test_a_process_has_no_mistakes(process: Process) -> None:
     """The examples pass."""
     assert mistakes_of(process.A, process.Q, process.initial_covariance) == []
+
+
+@pytest.mark.parametrize("scale", [1e-100, 1e100])
+def test_units_of_the_states_may_be_far_apart(scale: float) -> None:
+    """The largest variance counts."""
+    assert mistakes_of(np.eye(2), np.diag([scale, 1e-5 * scale]), scale * np.eye(2)) == []
 
 
 def test_a_process_of_too_many_states_is_refused() -> None:

@@ -33,6 +33,7 @@ MOST_STATES = 64
 _SLOTS_AT_ONCE = 1024  # whose factors are passed over
 _ALLOWS_SINGULAR = "; or singular_noise = true, which allows a Q without variance in some directions"
 _REACHED = 1e-12  # a smaller singular value of what noise reaches, relative to the largest, is rounding
+_LEAST_VARIANCE, _LARGEST_VARIANCE = 1e-100, 1e100  # whose squares, summed over trials, are within double precision
 _SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that is not mere rounding
 
 
@@ -281,6 +282,10 @@ def _covariance_mistakes(M: Floats) -> list[str]:
     if asymmetry.size:
         i, j = asymmetry[0]
         return [f"entry [{i}][{j}] is {M[i, j]} but [{j}][{i}] is {M[j, i]}; expected a symmetric matrix"]
+    largest = float(np.abs(np.diag(M)).max())
+    if largest and not _LEAST_VARIANCE <= largest <= _LARGEST_VARIANCE:
+        span = f"from {_LEAST_VARIANCE:g} to {_LARGEST_VARIANCE:g}"
+        return [f"has the variance {largest:g} as its largest; expected one {span}: choose other units of the states"]
     scale = np.sqrt(np.abs(np.diag(M)))
     lowest = float(np.linalg.eigvalsh(M)[0])
     if not np.all(np.diag(M) > 0.0):
