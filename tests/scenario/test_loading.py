@@ -201,6 +201,16 @@ def test_large_results_are_a_warning() -> None:
     assert any("GB" in warning for warning in warnings_of(scenario))
 
 
+def test_the_last_trial_has_a_number_that_a_shard_may_begin_with() -> None:
+    """A shard is a run whose first trial is one of these."""
+    last = 2**48
+    assert load("vehicle", {"trials": 4, "shards": 4, "first_trial": last - 3}).first_trial == last - 3
+    with pytest.raises(
+        ScenarioError, match=f"first_trial: is {last - 2}, and the last trial {last + 1}; expected at most"
+    ):
+        load("vehicle", {"trials": 4, "shards": 4, "first_trial": last - 2})
+
+
 @pytest.mark.parametrize(
     ("dotted", "message"),
     [

@@ -30,6 +30,8 @@ Value = TypeVar("Value")
 
 MOST_SLOTS = 100_000_000
 """The most slots of a run."""
+LAST_TRIAL = 2**48
+"""The largest number of a trial."""
 KEY_BYTES = 32
 _AES_BLOCK = 16
 _WORD = np.dtype("<u8")

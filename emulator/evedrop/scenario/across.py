@@ -25,6 +25,7 @@ from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_distribution import distribution_of
+from evedrop.model.streams import LAST_TRIAL
 from evedrop.model.theory.horizon import horizon
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.application import APPLICATIONS, Application, Kind
@@ -344,6 +345,10 @@ def mistakes_across(scenario: Scenario, beyond_horizon: bool) -> list[str]:
         mistakes += horizon_mistakes(scenario.process.process, slots)
     if scenario.record_trials > trials:
         mistakes.append(f"record_trials: is {scenario.record_trials}; expected at most trials, which is {trials}")
+    if (last := scenario.first_trial + trials - 1) > LAST_TRIAL:
+        mistakes.append(
+            f"first_trial: is {scenario.first_trial}, and the last trial {last}; expected at most {LAST_TRIAL}"
+        )
     if scenario.shards > trials:
         most = f"expected at most trials, which is {trials}: a shard has one trial or more"
         mistakes.append(f"shards: is {scenario.shards}; {most}")

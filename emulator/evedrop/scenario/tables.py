@@ -27,7 +27,7 @@ from evedrop.model.schedule import StateProbability, mean_of
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import LinkSchedule
-from evedrop.model.streams import MOST_SLOTS
+from evedrop.model.streams import LAST_TRIAL, MOST_SLOTS
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.arguments import CHANGES, table_argument
@@ -221,7 +221,7 @@ class Scenario(Table):
     """The seed of all random numbers: the same seed gives the same digests."""
     trials: Annotated[int, Field(ge=1, le=1_000_000, strict=True, examples=[1])] = 1
     """The number of independent repetitions, computed in one batch."""
-    first_trial: Annotated[int, Field(ge=0, le=2**48, strict=True, examples=[0])] = 0
+    first_trial: Annotated[int, Field(ge=0, le=LAST_TRIAL, strict=True, examples=[0])] = 0
     """The number of the first trial. Trial 17 is the same alone or among a thousand."""
     record_trials: Annotated[int, Field(ge=1, strict=True, examples=[1])] = 1
     """How many trials, from the first on, are recorded slot by slot. At most `trials`."""

@@ -44,7 +44,7 @@ from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import Link, LinkSchedule, streams_of
 from evedrop.model.staircase import Staircase
-from evedrop.model.streams import KEY_BYTES, MOST_SLOTS, Batch
+from evedrop.model.streams import KEY_BYTES, LAST_TRIAL, MOST_SLOTS, Batch
 from evedrop.names import ACKNOWLEDGEMENTS
 from evedrop.system.fields import Finite, NotNegative, Probability, Slot
 from evedrop.system.files import Unreadable, opened, why_of
@@ -542,7 +542,7 @@ class Brief(Generic[P_co]):
     password: str = field(repr=False)
     slots: Annotated[int, Meta(ge=1, le=MOST_SLOTS)]
     trials: Trials
-    first_trial: Annotated[int, Meta(ge=0, le=2**48)]
+    first_trial: Annotated[int, Meta(ge=0, le=LAST_TRIAL)]
     recorded: Trials
     """How many of the first trials are recorded in full."""
     flow: Flow
