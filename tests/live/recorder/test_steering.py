@@ -140,6 +140,19 @@ def test_two_operators_are_served_in_the_order_they_came() -> None:
     assert third.answers[0].refused == ("cut: smart is cut already, from slot 8 on; expected a heal before",)
 
 
+def test_changes_that_do_not_fit_into_a_message_are_refused() -> None:
+    """With all changes of links that operators have changed before: a router drops larger messages."""
+    loss = {"model": "trace", "outcomes": "10" * 2**22}
+    run = Run(*({"at": k, "link": "legitimate", "set": {"loss": loss}} for k in range(50, 53)))
+    first = run.asks("link", event={"link": "legitimate", "set": {"duplicate": 0.5}})
+    assert [type(sent) for _, sent in run.holds(7)] == [LinkChange, Go, Go]
+    second = run.asks("link", event={"link": "smart", "set": {"loss": loss}})
+    assert run.holds(8) == go(8)
+    assert first.answers[0].refused == ()
+    assert second.answers[0].refused[0].startswith("the changes of legitimate and smart have more than 33554432 bytes")
+    assert (len(run.events), len(run.saved)) == (1, 1)
+
+
 @pytest.mark.parametrize(
     ("event", "places"),
     [

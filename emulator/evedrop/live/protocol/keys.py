@@ -113,7 +113,8 @@ ZenohConfig = dict[str, Any]
 
 _FRAME_BYTES = 4096
 """Room for the other parts of a message: its key, field names, and additions of later versions."""
-_COMMAND_BYTES = 32 * 2**20  # changes of links contain their settings, such as recorded losses
+COMMAND_BYTES = 32 * 2**20
+"""The largest command: changes of links contain their settings, such as recorded losses."""
 _QUESTION_BYTES = 2**20
 _NAME_BYTES = 128  # of a key in a list
 _LATE_BYTES = 32  # of the slots of a late packet, besides its columns
@@ -164,7 +165,7 @@ class Sizes:
             "telemetry": max(report, truth, leaving, decisions, waits),
             "journal": max(self.receivers * link, waits),
             "progress": 0,
-            "control": _COMMAND_BYTES,
+            "control": COMMAND_BYTES,
         }
         return {kind: kinds[kind] + _FRAME_BYTES for kind in KINDS}
 
@@ -180,5 +181,5 @@ def low_pass(run: str, kinds: Mapping[str, int]) -> list[ZenohConfig]:
     return [
         *(rule(kind, under[kind], size, ["put", "delete"]) for kind, size in kinds.items()),
         rule("question", asked, _QUESTION_BYTES, ["query"]),
-        rule("answer", asked, _COMMAND_BYTES, ["reply"]),
+        rule("answer", asked, COMMAND_BYTES, ["reply"]),
     ]

@@ -10,14 +10,15 @@ Source: docs/control.md.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, final
 
 from evedrop.errors import RunError, ScenarioError
 from evedrop.live.network.operator import Order
 from evedrop.live.network.session import READY_SECONDS
-from evedrop.live.protocol.commands import Go, Hold, LinkChange
+from evedrop.live.protocol.commands import Again, Go, Hold, LinkChange
+from evedrop.live.protocol.keys import COMMAND_BYTES
 from evedrop.live.protocol.launcher_events import ProcessRequest
 from evedrop.live.protocol.requests import LinkRequest, PauseRequest, ResumeRequest, StepRequest
 from evedrop.live.recorder.conductor import Conductor
@@ -255,6 +256,14 @@ class Steering:
             order.refuse(*error.mistakes)
             return
         act = next(changed.event[-1].acts())
+        names = self._changed | set(act.names)
+        # If a connection is lost later, all of them are sent in one message.
+        if len(Again(LAST_SLOT, LAST_SLOT, _changes_of(changed, names)).pack()) > COMMAND_BYTES:
+            order.refuse(
+                f"the changes of {' and '.join(sorted(names))} have more than {COMMAND_BYTES} bytes, and the router would not "
+                "get them: each event of a link contains its recorded losses; expected fewer events, or a shorter recording"
+            )
+            return
         self._scenario = changed
         self._note(k, act.text, "operator")
         self._keep(changed)
@@ -298,8 +307,7 @@ class Steering:
     @property
     def changes(self) -> dict[str, tuple[Change, ...]]:
         """Link that the operator has changed → all its changes."""
-        timeline = self._scenario.timeline.changes
-        return {name: tuple(timeline[name]) for name in sorted(self._changed)}
+        return _changes_of(self._scenario, self._changed)
 
     def restart_limit(self) -> None:
         """Let processes have the whole time limit of the hold, such as those that were cut off."""
@@ -313,3 +321,9 @@ class Steering:
         self._go()
         if self._asked:
             self._conductor.send_to(SENSOR, Hold())
+
+
+def _changes_of(scenario: Scenario, names: Collection[str]) -> dict[str, tuple[Change, ...]]:
+    """Link → all its changes, of these receivers."""
+    timeline = scenario.timeline.changes
+    return {name: tuple(timeline[name]) for name in sorted(names)}
