@@ -231,6 +231,15 @@ def test_a_riccati_equation_without_a_solution_is_said_to_have_none() -> None:
         )
 
 
+def test_weights_that_leave_double_precision_are_refused() -> None:
+    """No regulator decides inputs that are not numbers."""
+    A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.1], [0.0]])
+    asked = replace(assignment(A, plant(B)), state_weights=np.array([1e308, 1.0]))
+    with pytest.raises(ValueError, match="the weights leave double precision"):
+        gain(asked)
+    assert [entry for entry, _ in Lqr.objections(asked)] == ["state_weights"]
+
+
 def test_the_inputs_change_nothing_of_what_an_estimator_does() -> None:
     """Its action is that of the estimator without them."""
     process, batch = Process(np.eye(2), np.eye(2), np.eye(2)), Batch(3, 4)

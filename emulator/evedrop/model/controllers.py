@@ -106,7 +106,7 @@ _SETTLED = 1e-13
 def gain(assignment: Assignment) -> Floats:
     """K (m, n + m) of u = −K [x; u′].
 
-    Raises ValueError if no input keeps the weighted states from growing.
+    Raises ValueError if no input keeps the weighted states from growing, or numbers leave double precision.
     """
     return riccati(assignment)[0]
 
@@ -132,6 +132,8 @@ def riccati(assignment: Assignment) -> tuple[Floats, Floats]:
     carried = product(G_u.T, P)
     K = product(inverse(both + product(carried, G_u)), product(carried, F))
     K[:, n:] -= part
+    if not np.isfinite(K).all():
+        raise ValueError("the weights leave double precision")
     return K, P
 
 
