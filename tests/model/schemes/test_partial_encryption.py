@@ -299,6 +299,9 @@ def test_costs_and_states_that_are_not_there() -> None:
     assert not scheme(DRIFTING, [], 0.5).encrypted(packets).any()
     assert PartialEncryption.mistakes_with(DRIFTING, {"encrypted": [0, 2]}) == []
     assert "has 3" in PartialEncryption.mistakes_with(DRIFTING, {"encrypted": [0, 3]})[0][1]
+    assert PartialEncryption.mistakes({"encrypted": [62]}) == []
+    ((_, sentence),) = PartialEncryption.mistakes({"encrypted": [63]})
+    assert "to 62, the last that a header has a bit for" in sentence
     floor, grows = scheme(MARGINAL, [0], 1.0).error_floor(10)
     np.testing.assert_array_equal(floor, form(MARGINAL, [0], 1.0, slots=10).traces)
     assert grows

@@ -94,9 +94,10 @@ class PartialEncryption(Scheme):
         states = given.get("encrypted", [])
         valid = isinstance(states, list) and all(type(state) is int and 0 <= state <= _LAST for state in states)
         if not valid or len(set(states)) < len(states):
-            sentence = (
-                f"is {as_toml(states)}; expected a list of different numbers of states, 0 for the first, such as [0]"
+            numbers = (
+                f"different numbers of states from 0, for the first, to {_LAST}, the last that a header has a bit for"
             )
+            sentence = f"is {as_toml(states)}; expected a list of {numbers}, such as [0]"
             mistakes.append(("encrypted", sentence))
         return mistakes
 
