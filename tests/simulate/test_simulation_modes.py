@@ -158,6 +158,20 @@ def test_no_theory_of_an_estimator_that_forgot_what_it_acknowledged(scheme: str)
         assert (error[6:].mean() < 1.2 * plain.traces(of.slots)[6:].mean()) == theory.known
 
 
+@pytest.mark.parametrize("scheme", ["acknowledged", "open-loop"])
+@pytest.mark.parametrize(("start", "stop"), [(0, 4), (4, 12)])
+def test_an_estimator_that_had_acknowledged_nothing_forgets_nothing(scheme: str, start: int, stop: int) -> None:
+    """One that is down from slot 0 on had no state to forget; one that is down until the end of the run needs none."""
+    of = twin_tracks(
+        encoding={"scheme": scheme},
+        acknowledgements={"link": {"quality": 0.9}},
+        event=[{"from": start, "to": stop, "kill": "legitimate"}],
+    )
+    error, theory = played(of, Mode.EXACT, 1000)["legitimate"]["error"], expectations_of(of)["legitimate"]
+    assert theory.known
+    agrees(error, theory.traces(of.slots))
+
+
 def test_covariances_alone_see_the_same_events() -> None:
     """Actions and reported covariances of the covariance-only mode are those of the ordinary one, to the bit."""
     of = studied(MARGINAL, 120, **ALL)

@@ -348,10 +348,14 @@ def _outcomes_of(scenario: Scenario, receiver: str, scheme: Scheme) -> OutcomesA
 
 
 def _may_lose_reference(scenario: Scenario) -> bool:
-    """Whether the legitimate estimator may lack what the sensor takes it to have: by forged acknowledgements, or a restart."""
+    """Whether the legitimate estimator may lack what the sensor takes it to have: by forged acknowledgements, or a restart.
+
+    A restart loses nothing if it had acknowledged nothing yet, and one at the end of the run needs nothing any more.
+    """
     table = scenario.acknowledgements
     forged = table is not None and table.attack in FORGING
-    return forged or any(not away.keeps_state for away in scenario.timeline.outages[LEGITIMATE])
+    restarts = [away for away in scenario.timeline.outages[LEGITIMATE] if not away.keeps_state]
+    return forged or any(away.start > 0 and away.stop < scenario.slots for away in restarts)
 
 
 def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
