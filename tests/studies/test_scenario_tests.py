@@ -241,6 +241,18 @@ def test_resumed_tests_are_run_again_if_a_file_of_the_scenario_has_changed(tmp_p
     assert folders == [tmp_path / "out" / name for name in ("one", "one", "one-2")]
 
 
+def test_resumed_tests_with_a_secret_from_a_file_are_run_again(tmp_path: Path) -> None:
+    """The scenario only names the file, and complete results do not say of which secret they are."""
+    key = tmp_path / "key"
+    written(tmp_path, one=HOLDS.replace("[process]", f'secret_file = "{key}"\n\n[process]', 1))
+    manner, folders = Manner(in_memory=True, trials=3, out=tmp_path / "out", resume=True), []
+    for number in range(2):
+        key.write_bytes(bytes([number]) * 32)
+        key.chmod(0o600)
+        folders.append(testing.carry_out(str(tmp_path / "one.toml"), manner).folder)
+    assert folders == [tmp_path / "out" / name for name in ("one", "one-2")]
+
+
 TALKS = """
 import numpy as np
 from evedrop.extend import PacketTaker

@@ -199,7 +199,7 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
 def _folder_for(scenario: str, made: Scenario, manner: Manner) -> Path:
     """The results folder of a scenario: a new one, or when tests are resumed the one with the test of this very scenario.
 
-    That of a live run, or of one that failed, is left as it is.
+    That of a live run, of one that failed, or of a complete one with a secret from a file, is left as it is.
     """
     if manner.out is None:
         return claimed(default_folder(scenario))
@@ -209,7 +209,9 @@ def _folder_for(scenario: str, made: Scenario, manner: Manner) -> Path:
         for folder in (wanted, *sorted(manner.out.glob(f"{glob.escape(wanted.name)}-*"))):
             with contextlib.suppress(OSError, ValueError):
                 same = all((folder / name).read_text(encoding="utf-8") == text for name, text in texts.items())
-                if same and ((folder / TASKS).exists() or _is_complete(folder)):
+                # Complete results do not say of which secret they are; those that are not complete do.
+                reusable = (folder / TASKS).exists() or (made.secret_file is None and _is_complete(folder))
+                if same and reusable:
                     return folder
     return claimed(wanted)
 
