@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 _MOST = 60
 """How many messages to the recorder, and to all others, are read again."""
-_TIMES = 30
+_TIMES = 60
 """How often those to the recorder, and to all others, are read, each time with one wrong."""
 _NAMED = (MalformedMessage, Gap, Contradiction, Refusal)
 """The errors that name the sender of a wrong message."""
