@@ -299,6 +299,23 @@ def test_fates_that_change_after_the_clock_was_set_are_in_their_steps(by: float,
     assert states(tmp_path / "r.rrd", "1_scan", 0.2, 10)[-1] == LaneState.OWN.word
 
 
+@pytest.mark.parametrize("by", [3600.0, -3600.0])
+def test_fates_of_messages_from_before_the_clock_was_set_are_in_their_steps(by: float, tmp_path: Path) -> None:
+    """They have the time of the clock as it was."""
+    clocks, rows = Clocks(), traffic(robot_plan(), 2.0, {"scan": 100.0})
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
+    view.add(rows)
+    clocks.advance(2.0)
+    clocks.wait_for_rounds(2)
+    clocks.set(by)
+    clocks.advance(0.1)
+    clocks.wait_for_rounds(1)
+    view.amend(rows[(rows["fate"] == 0) & (rows["time"] >= START + 1.8)], WireFate.CONGESTED)
+    assert view.close()
+    assert shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")[-1][0] < 2.1
+    assert states(tmp_path / "r.rrd", "1_scan", 0.2, 10)[-1] == LaneState.OWN.word
+
+
 @pytest.mark.thorough
 def test_a_view_follows_a_running_wire(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """With `--view FILE.rrd`, the file has what crossed and the events; the journal, too, keeps the events."""

@@ -8,6 +8,7 @@ Source: docs/wire/results.md, the view.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
@@ -88,6 +89,8 @@ class WireView(_WireRecording[NDArray[Any]]):
         self._start, self._clocks, self._most_rows = start, clocks, most_rows
         now, steady = clocks()
         self._ahead, self._shift = now - steady, 0.0
+        # By how much the clock was set before it was last set, and until when messages have the time of before.
+        self._shift_before, self._until = 0.0, -math.inf
         self._amended: list[tuple[NDArray[Any], int]] = []
         self._sent = 0.0
         super().__init__(path, name, [Notice(0.0, "INFO", introduction(plan))])
@@ -133,9 +136,10 @@ class WireView(_WireRecording[NDArray[Any]]):
                 yield from self._counter.finish()
 
     def _timed(self, rows: NDArray[Any], now: float) -> NDArray[Any]:
-        """The rows with times as if the system's clock had never been set; those from before it was set are not after `now`."""
-        timed = rows.copy()
-        timed["time"] = np.minimum(rows["time"] - self._shift, now)
+        """The rows with times as if the system's clock had never been set, and not after `now`."""
+        timed, times = rows.copy(), rows["time"] - self._shift
+        before = (rows["time"] < self._until) | (times > now + _JUMP)  # heard before the clock was set forward, or back
+        timed["time"] = np.minimum(np.where(before, rows["time"] - self._shift_before, times), now)
         return timed
 
     def _now(self, notes: list[Notice]) -> float:
@@ -143,7 +147,8 @@ class WireView(_WireRecording[NDArray[Any]]):
         now, steady = self._clocks()
         by = now - steady - self._ahead
         if abs(by - self._shift) >= _JUMP:
-            moved, self._shift = by - self._shift, by
+            moved, self._shift_before, self._shift = by - self._shift, self._shift, by
+            self._until = now - moved / 2.0 if moved > 0 else -math.inf
             way = "forward" if moved > 0 else "back"
             text = f"the system's clock was set {abs(moved):.1f} s {way}; the view goes on"
             notes.append(Notice(self._elapsed(now), "WARN", text))
