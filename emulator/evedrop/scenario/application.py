@@ -241,7 +241,7 @@ class PanelFeed(ABC):
 
     @abstractmethod
     def take(self, first: int, u: Floats, estimates: Mapping[str, Floats]) -> Mapping[str, Floats]:
-        """Add slots from `first` on: inputs within their limits, (c, m), and estimates as deviations, (c, n).
+        """Add slots from `first` on: inputs and watermark, within their limits, (c, m); estimates as deviations, (c, n).
 
         Returns PATH/CURVE → slots and values of its g new points, (2, g).
         """
@@ -254,6 +254,10 @@ class PanelFeed(ABC):
 
 class PowerFeed(ABC):
     """The power that an application takes from the grid in a set of trials, whose slots come in order."""
+
+    def take_monitored(self, sensor: SensorSlots) -> None:
+        """Take watermark and detector of the next c slots, before these go to `take`; by default nothing."""
+        del sensor
 
     @abstractmethod
     def take(self, x: Floats, u: Floats) -> tuple[Floats, Floats]:

@@ -106,7 +106,7 @@ class LoopTally:
             application.add(sensor.states, u, estimates)
         self.trial_slots += failed.size
         self.failed += int(np.count_nonzero(failed))
-        clipped = self._plant.clips(u)
+        clipped = self._plant.clips(u if sensor.watermark is None else u + sensor.watermark)
         self.clipped += int(np.count_nonzero(clipped))
         self.of_trials[0] += len(clipped)
         self.of_trials[1:3] += np.count_nonzero(failed, axis=0), np.count_nonzero(clipped, axis=0)

@@ -165,6 +165,8 @@ def _powers(scenario: Scenario, trials: range) -> Iterator[tuple[Floats, Floats]
         slots = chunk.slots
         assert slots is not None  # noqa: S101 - there are states in this mode
         assert slots.sensor.u is not None  # noqa: S101 - there is a controller
+        if slots.sensor.watermark is not None:
+            feed.take_monitored(slots.sensor)
         yield feed.take(slots.sensor.states, slots.sensor.u)
 
 

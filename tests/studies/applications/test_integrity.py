@@ -16,6 +16,7 @@ from evedrop.scenario.loading import load
 from evedrop.show.view.scene_slots import LoopValues, driven_scene, replay
 from evedrop.simulate.montecarlo import Plan
 from evedrop.studies.applications.integrity import Integrity
+from evedrop.studies.secrecy_cost import secrecy_cost
 from tests.builders import places_of
 from tests.examples import mostly_long
 from tests.golden.pages import Golden
@@ -54,6 +55,40 @@ def test_its_metrics_are_those_of_the_recorded_trials(tmp_path: Path) -> None:
     assert abs(integrity["watermark_cost_z"]) < 4.0
     assert integrity["divergence"] == pytest.approx(0.74, rel=1e-2)
     assert integrity["expected_delay"] == pytest.approx(8.0 / integrity["divergence"])
+
+
+HEATED: dict[str, Any] = {
+    "slots": 80, "slot_seconds": 60.0, "event": [], "integrity": {"policy": "always", "threshold": 8.0, "watermark": [[1.0]]},
+    "plant__input_lower": [-1.0], "plant__input_upper": [1.0], "plant__disturbances": ["load"],
+    "plant__disturbance_matrix": [[0.1]], "plant__disturbance_values": [[0.5]] * 80, "process__A": [[0.9]],
+    "controller__input_weights": [1.0],
+    "comfort": {"temperature": "level", "heater": "valve", "lowest": -1.0, "highest": 1.0},
+    "household": {"grid": "valve", "load": "load", "battery": "level"},
+}  # fmt: skip
+"""A room whose heater has a watermark, which its limits often clip."""
+
+
+def test_the_watermark_is_power_too(tmp_path: Path) -> None:
+    """Clipped inputs, heating and grid power are those of inputs with the watermark, as they enter the plant."""
+    scenario = load("replay-attack", {name.replace("__", "."): value for name, value in HEATED.items()})
+    results = montecarlo(scenario, trials=5, record_trials=5, out=tmp_path / "run", **SHORT)
+    assert results.inputs is not None
+    columns = results.inputs.to_pydict()
+    asked = np.array(columns["u"])[:, 0] + np.array(columns["watermark"])[:, 0]
+    power = np.clip(asked, -1.0, 1.0)
+    summary = results.summary
+    assert columns["clipped"] == (power != asked).tolist()
+    assert summary["controller"]["clipped_fraction"] == np.mean(power != asked) > 0.1
+    assert summary["comfort"]["heating_energy"] == pytest.approx(power.sum() / 60.0 / 5)
+    assert summary["household"]["bought_energy"] == pytest.approx(power.clip(0.0).sum() / 60.0 / 5)
+    assert summary["household"]["sold_energy"] == pytest.approx((-power).clip(0.0).sum() / 60.0 / 5)
+    # Over a perfect link the controllers differ by the filter's error alone, and have the same watermark.
+    assert summary["household"]["summed_difference"] < 0.5
+    cost = secrecy_cost(scenario.model_copy(update={"trials": 5}), lambda _: None, ALONE).differences
+    assert cost["scheme_from_truth"]["summed"].mean == pytest.approx(summary["household"]["summed_difference"])
+    recording = replay(results.folder, tmp_path / "run.rrd")
+    energy = rows(recording, "heating/energy", "Scalars:scalars")
+    assert energy[79] == pytest.approx([power[::5].sum() / 60.0])
 
 
 def test_a_filter_that_is_deceived_is_not_compared_with_theory() -> None:

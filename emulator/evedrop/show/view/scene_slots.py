@@ -77,15 +77,20 @@ class LoopValues:
     def take(self, sensor: SensorSlots, estimates: Mapping[str, Floats]) -> Moved:
         """The view's values of the next slots, from the sensor in this trial alone, and estimates as deviations, (c, n)."""
         assert sensor.u is not None  # noqa: S101 - there is a controller
-        limited = self._plant.limited(sensor.u[:, :, 0].T).T
+        limited = self._entered(sensor.u)
         first, self._next = self._next, self._next + len(limited)
         values = np.hstack([self._disturbances[first : self._next], limited])
+        entered = limited if sensor.watermark is None else self._entered(sensor.u + sensor.watermark)
         curves: dict[str, Floats] = {}
         for feed in self._feeds:
             if sensor.statistic is not None:
                 curves |= feed.take_monitored(first, sensor)
-            curves |= feed.take(first, limited, estimates)
+            curves |= feed.take(first, entered, estimates)
         return Moved(values, curves)
+
+    def _entered(self, u: Floats) -> Floats:
+        """The inputs u (c, m, 1) within their limits, (c, m)."""
+        return self._plant.limited(u[:, :, 0].T).T
 
 
 @final

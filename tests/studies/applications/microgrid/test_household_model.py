@@ -55,6 +55,21 @@ def test_the_other_loop_is_the_one_that_sees_the_truth() -> None:
     assert np.allclose(inputs_, wanted, atol=1e-10)
 
 
+def test_the_other_loop_has_the_same_watermark() -> None:
+    """A loop that sees the truth is its own other with a watermark, too: its inputs are those with it, within their limits."""
+    rng = np.random.default_rng(4)
+    e, d = 0.5 * rng.standard_normal((SLOTS, 2, 2)), rng.uniform(0.0, 2.0, (SLOTS, 2))
+    controller, state = CONTROLLERS["lqr"](GIVEN, 2), np.ones((2, 2))
+    x, u = np.zeros(e.shape), np.zeros(e.shape)
+    for k in range(SLOTS):
+        x[k] = state
+        u[k] = controller.decide(k, state, d[k]) if k % PERIOD == 0 else u[k - 1]
+        state = A @ state + PLANT.moved(u[k] + e[k]) + (B_D @ d[k])[:, None]
+    other = PerfectLoop(GIVEN.process, PLANT, CONTROLLERS["lqr"](GIVEN, 2), PERIOD, d)
+    assert np.allclose(other.follow(x, u, e), PLANT.limited(u + e), atol=1e-10)
+    assert PLANT.clips(u + e).any()
+
+
 def test_a_loop_that_sees_the_truth_is_its_own_other() -> None:
     """Nothing differs, to the last bit."""
     rng = np.random.default_rng(2)

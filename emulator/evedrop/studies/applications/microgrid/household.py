@@ -25,6 +25,7 @@ from evedrop.model.metrics.text import estimate
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Flags
+from evedrop.model.slot.records import SensorSlots
 from evedrop.scenario.application import (
     RECEIVERS,
     STANDARD_ERRORS,
@@ -136,9 +137,17 @@ class HousePower(PowerFeed):
         self._plant, self._grid = loop.plant, loop.input(table.grid)
         self._perfect = PerfectLoop(loop.process, loop.plant, own, loop.period, loop.disturbances)
 
+        self._watermark: Floats | None = None
+
+    def take_monitored(self, sensor: SensorSlots) -> None:
+        """Both loops have the watermark."""
+        self._watermark = sensor.watermark
+
     def take(self, x: Floats, u: Floats) -> tuple[Floats, Floats]:
         """Add the next slots."""
-        return self._plant.limited(u)[:, self._grid], self._perfect.follow(x, u)[:, self._grid]
+        e = self._watermark
+        entered = self._plant.limited(u if e is None else u + e)
+        return entered[:, self._grid], self._perfect.follow(x, u, e)[:, self._grid]
 
 
 @final
@@ -157,6 +166,11 @@ class HouseholdTally(ApplicationTally):
         self._guessed: dict[str, list[Floats]] = {name: [] for name in loop.receivers}
         self.meter = Meter.zero(trials)
         self.done = 0
+
+    def add_monitored(self, x: Floats, u: Floats, sensor: SensorSlots) -> None:
+        """The grid gives the watermark, too."""
+        del x, u
+        self._power.take_monitored(sensor)
 
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
         """Add the next slots: states (c, n, R), inputs as decided (c, m, R), and every receiver's estimates, (c, n, R)."""
@@ -257,15 +271,23 @@ class PerfectLoop:
         self._next = 0
         self._e: Floats = np.zeros((process.n, controller.trials))
         self._u: Floats = np.zeros((plant.inputs, controller.trials))
+        self._decided = self._u
         self._moved = self._e
 
-    def follow(self, x: Floats, u: Floats) -> Floats:
-        """The other loop's inputs of the next slots, (c, m, R), within their limits; x (c, n, R), u (c, m, R): of this loop."""
-        others, moved = np.empty(u.shape), self._plant.moved(u)
+    def follow(self, x: Floats, u: Floats, e: Floats | None = None) -> Floats:
+        """The other loop's inputs of the next slots, (c, m, R), within their limits.
+
+        x (c, n, R), u (c, m, R): of this loop, u as decided; e (c, m, R): the watermark, which is added to the inputs of both.
+        """
+        others, moved = np.empty(u.shape), self._plant.moved(u if e is None else u + e)
         for row, state in enumerate(x):
             if self._next % self._period == 0:
                 decided = self._controller.decide(self._next, state - self._e, self._disturbances[self._next])
                 self._u, self._moved = self._plant.limited(decided), self._plant.moved(decided)
+                self._decided = decided
+            if e is not None:
+                asked = self._decided + e[row]
+                self._u, self._moved = self._plant.limited(asked), self._plant.moved(asked)
             others[row] = self._u
             self._e = self._process.predict(self._e) + (moved[row] - self._moved)
             self._next += 1
