@@ -172,6 +172,27 @@ def test_errors_against_the_true_state_are_given_beside_those_of_the_transmitted
         assert summary_["mean_true_squared_errors"][name] > transmitted
 
 
+def test_a_legitimate_error_of_0_has_no_true_ratio() -> None:
+    """Of a sensor that measures exactly, over a perfect link: the run ended in a division by zero, and had no results."""
+    exact = {"output_matrix": [[1.0]], "measurement_noise": [[0.0]], "noise": [[0.1]]}
+    scenario = {
+        "title": "Exact", "slots": 40, "seed": 15, "encoding": {"scheme": "plain"}, "plant": exact,
+        "process": {"A": [[0.5]], "Q": [[0.1]], "initial_covariance": [[0.1]]}, "legitimate": {"link": {"quality": 1.0}},
+        "eavesdroppers": {"deaf": {"strategy": "naive", "link": {"quality": 0.8}},
+                          "next_door": {"strategy": "naive", "link": {"quality": 1.0}}},
+    }  # fmt: skip
+    summary = montecarlo(checked(scenario, "file"), trials=5, plan=Plan(workers=1)).summary
+    assert (
+        summary["filter"]["mean_true_squared_errors"]["legitimate"]
+        == 0.0
+        < summary["peers"]["deaf"]["mean_squared_error"]
+    )
+    ratios = summary["filter"]["true_ratios"]
+    assert "deaf" not in ratios
+    assert ratios["next_door"]["ratio"] == 1.0
+    assert summary["verdict"]["eavesdropper"] == "next_door"
+
+
 def test_a_verdict_says_what_errors_are_measured_against(tmp_path: Path) -> None:
     """Its ratio is against the transmitted estimate; that against the truth is said beside it, with its interval."""
     results = RunResults.read(in_memory(tmp_path / "run", trials=60, **MEASURED).folder)

@@ -104,7 +104,9 @@ class FilterTally:
         if name not in sums or not self._alike:
             return AfterStart(math.nan)
         over, under = sums[name], sums[LEGITIMATE]
-        ratio = float(np.mean(over)) / float(np.mean(under))
+        theirs, ours = float(np.mean(over)), float(np.mean(under))
+        # Over a perfect link the legitimate error is 0 where measurements are exact.
+        ratio = theirs / ours if ours > 0.0 else math.inf if theirs > 0.0 else 1.0
         error = None if infinite_variance or self.slots < self._run else ratio_error(over, under)
         return AfterStart(ratio, ratio_interval(ratio, error, len(over)))
 
