@@ -265,10 +265,7 @@ class Expectation:
         outcomes = None if self.closed is not None else self._outcomes
         if outcomes is None:
             return None
-        stream, variances = TheoreticalCovariance(self.process, outcomes), np.empty(slots)
-        for part in parts_of(range(slots)):
-            variances[part.start : part.stop] = np.einsum("i,kij,j->k", v, stream.next(len(part)), v)
-        return variances
+        return variances_along(TheoreticalCovariance(self.process, outcomes), v, slots)
 
     def is_rounding(self, error: float, slots: int) -> bool:
         """Whether a mean squared error over slots 0 … slots−1 is only rounding: below 1e-24 of the state's own square."""
@@ -445,3 +442,11 @@ def _bound(scheme: Scheme, quality: float) -> Outcomes:
 def theoretical_traces_of(scenario: Scenario) -> dict[str, Floats]:
     """Receiver → trace of the theoretical error covariance in every slot, (slots,); NaN without a theory."""
     return {name: expectation.traces(scenario.slots) for name, expectation in expectations_of(scenario).items()}
+
+
+def variances_along(stream: TheoreticalCovariance, v: Floats, slots: int) -> Floats:
+    """The expected squared error of vᵀx, v (n,), in the next `slots` slots of a stream."""
+    variances = np.empty(slots)
+    for part in parts_of(range(slots)):
+        variances[part.start : part.stop] = np.einsum("i,kij,j->k", v, stream.next(len(part)), v)
+    return variances

@@ -15,7 +15,7 @@ from evedrop.model.metrics.standard_error import standard_error
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.theory import Expectation
 from evedrop.score.rare_events import rare_events_of, z_of_error
-from evedrop.score.secrecy import Claim, perfect_verdict, relative_verdict, sign_of_mean, sign_of_median
+from evedrop.score.secrecy import Claim, largest_means, perfect_verdict, relative_verdict, sign_of_mean, sign_of_median
 from evedrop.score.summary import DirectionSummary, RareEvents
 from evedrop.score.sums import DirectionTally, Tally, window_means
 
@@ -67,7 +67,12 @@ def _judged(
         heavy = any(each.infinite_variance for each in expected)
         test = sign_of_median if heavy else sign_of_mean
         means, other = (window_means(each) for each in errors)
-        relative, _ = relative_verdict(other - means, test, errors[0].slots)
+        least = most = None
+        if not heavy and means.shape[1] > 1:
+            slots, v = errors[0].slots, errors[0].v
+            ours, theirs = (largest_means(*each, slots, v) for each in zip(expected, (means, other), strict=True))
+            least, most = other - ours, theirs - means
+        relative, _ = relative_verdict(other - means, test, errors[0].slots, least, most)
         if promised is not False:
             series = None if expected[0].of_model else expected[0].along(errors[0].v, errors[0].slots)
             bound = math.inf if series is None or legitimate.unbounded else float(np.max(series))

@@ -19,7 +19,7 @@ from evedrop.model.process import Floats, parts_of
 from evedrop.model.theory.covariances import NOBODY, TheoreticalCovariance
 from evedrop.model.theory.rare_events import RARE
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.theory import Alike, Expectation, TheoreticalTraceStream
+from evedrop.scenario.theory import Alike, Expectation, TheoreticalTraceStream, variances_along
 from evedrop.score.after_start import AS_MUCH, ERROR_RATE, AfterStart, ratio_interval
 from evedrop.score.rare_events import rare_events_of
 from evedrop.score.summary import RARE_FRACTION, SecrecySummary
@@ -344,7 +344,7 @@ def ratio_of(of_legitimate: tuple[Tally, Expectation], other: Tally) -> tuple[fl
     return over / under, ratio_error(theirs, ours) if alike else None, first
 
 
-def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
+def largest_means(theory: Expectation, means: Floats, slots: int, v: Floats | None = None) -> Floats:
     """What a receiver's mean errors by window may be, given those of the trials, (WINDOWS, R): (WINDOWS, 1).
 
     Theory's expectation where it is known. Where theory only knows a model of what moves the states, the mean of the trials and
@@ -352,11 +352,13 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
     it has a probability of at most 4.6/R, or one of them would have met it in 99 of 100 studies. The error is then taken to be
     that of the heaviest trial, or, where too few trials lose the first packet, that of a receiver without packets.
 
+    v: the direction of the errors, (n,), whose expectation may be unknown although that of the whole error is known; None: all.
+
     Source: docs/mathematics/verdicts.md, verdicts.
     """
     trials = means.shape[1]
-    if theory.known:
-        expected = _expected_averages(theory.alike, slots)
+    expected = _expected(theory, slots, v)
+    if expected is not None:
         if not theory.of_model:
             return expected
         streaks = theory.streaks(slots)
@@ -365,8 +367,27 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
     heaviest = means.max(axis=1, keepdims=True)
     lost = theory.first_loss
     if math.isnan(lost) or 0.0 < lost * trials < RARE:
-        heaviest = np.maximum(heaviest, _window_averages(TheoreticalCovariance(theory.process, NOBODY), slots))
+        nobody = TheoreticalCovariance(theory.process, NOBODY)
+        unheard = _window_averages(nobody, slots) if v is None else _averages_of(variances_along(nobody, v, slots))
+        heaviest = np.maximum(heaviest, unheard)
     return np.asarray(means.mean(axis=1, keepdims=True) - math.log(ERROR_RATE) / trials * heaviest)
+
+
+def _expected(theory: Expectation, slots: int, v: Floats | None) -> Floats | None:
+    """What theory expects in each window, (WINDOWS, 1), of all errors, or of those along v; None if that is not known."""
+    if v is None:
+        return _expected_averages(theory.alike, slots) if theory.known else None
+    series = theory.along(v, slots)
+    return None if series is None else _averages_of(series)
+
+
+def _averages_of(series: Floats) -> Floats:
+    """The mean of a value of each slot, (slots,), over the slots of each window, (WINDOWS, 1); NaN for windows without slots."""
+    sums, slots = np.zeros(WINDOWS + 1), len(series)
+    np.add.at(sums, window_of(np.arange(slots), slots), series)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        averages: Floats = (sums[:WINDOWS] / np.diff(window_bounds(slots)))[:, None]
+    return averages
 
 
 def _latest_bound(theory: Expectation, slots: int) -> float:
