@@ -11,6 +11,7 @@ import pytest
 from evedrop.cli.api import montecarlo, run
 from evedrop.errors import ScenarioError
 from evedrop.model.slot.records import SensorSlots
+from evedrop.scenario.application import ApplicationTally, PowerFeed
 from evedrop.scenario.closed_loop import controlled_plant, monitor_of
 from evedrop.scenario.loading import load
 from evedrop.show.view.scene_slots import LoopValues, driven_scene, replay
@@ -89,6 +90,14 @@ def test_the_watermark_is_power_too(tmp_path: Path) -> None:
     recording = replay(results.folder, tmp_path / "run.rrd")
     energy = rows(recording, "heating/energy", "Scalars:scalars")
     assert energy[79] == pytest.approx([power[::5].sum() / 60.0])
+
+
+def test_an_application_may_have_no_use_for_a_watermark() -> None:
+    """By default, neither a tally nor a power feed takes it."""
+    sensor = SensorSlots(0, np.zeros((1, 1, 1)), np.zeros((1, 1), np.bool_), np.ones((1, 1), np.bool_))
+    nothing: Any = None
+    ApplicationTally.add_monitored(nothing, sensor.states, sensor.states, sensor)
+    PowerFeed.take_monitored(nothing, sensor)
 
 
 def test_a_filter_that_is_deceived_is_not_compared_with_theory() -> None:

@@ -136,7 +136,6 @@ class HousePower(PowerFeed):
         own = loop.strategy(loop.assignment, trials)
         self._plant, self._grid = loop.plant, loop.input(table.grid)
         self._perfect = PerfectLoop(loop.process, loop.plant, own, loop.period, loop.disturbances)
-
         self._watermark: Floats | None = None
 
     def take_monitored(self, sensor: SensorSlots) -> None:
