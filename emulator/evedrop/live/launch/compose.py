@@ -231,12 +231,15 @@ def _check(scenario: Scenario) -> None:
 
 
 def _services(scenario: Scenario) -> list[_Service]:
-    """The processes, routers first; the name of a service is that of its process unless another service has it."""
+    """The processes, routers first; the name of a service is that of its process unless another service has it.
+
+    Or if it has one letter: Compose v2 takes a volume of that name for a drive of Windows, and mounts nothing at the path.
+    """
     processes = [*processes_of(scenario), RECORDER]
     services = []
     for process in processes:
         name = process
-        while name in _OTHERS or (name != process and name in processes):
+        while name in _OTHERS or len(name) == 1 or (name != process and name in processes):
             name = f"eavesdropper-{name}"
         role = "eavesdropper" if process in scenario.eavesdroppers else process
         services.append(_Service(name, process, role, scenario.relayed and process not in {ROUTER, RELAY, SENSOR}))
