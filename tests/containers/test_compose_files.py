@@ -84,7 +84,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tables = "".join(f'[eavesdroppers.{name}]\nstrategy = "naive"\nlink.quality = 0.5\n' for name in NAMES)
     (folder / "$own.toml").write_text(OWN + tables)
     written = write_compose(load(folder / "$own.toml"), str(folder / "$own.toml"), False, folder / "made", False)
-    assert [path.name for path in written] == ["docker-compose.yml", "-own.toml"]
+    assert [path.name for path in written] == ["docker-compose.yml", "own.toml"]
     return folder / "made"
 
 

@@ -280,5 +280,5 @@ def _key(name: str) -> str:
 
 
 def _plain(stem: str) -> str:
-    """A file name without characters that Compose would expand."""
-    return re.sub(r"[^A-Za-z0-9._-]", "-", stem)
+    """A file name without characters that Compose would expand, and no dash at its beginning: it is no option."""
+    return re.sub(r"[^A-Za-z0-9._-]", "-", stem).lstrip("-") or "own"
