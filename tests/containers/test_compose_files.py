@@ -189,3 +189,30 @@ def test_a_scenario_beside_its_files_is_used_as_it_is(evedrop: Evedrop) -> None:
     done = evedrop("brief", "mine.toml", "--slots", "7", "--compose", "other")
     assert done.out.split() == ["other/docker-compose.yml", "other/mine.toml"]
     assert load(evedrop.folder / "other" / "mine.toml").slots == 7
+
+
+@pytest.mark.parametrize(
+    ("states", "losses", "outside"),
+    [("../states.csv", "losses.csv", 0), ("states.csv", "../losses.csv", 1), ("linked.csv", "losses.csv", 0)],
+)
+def test_a_scenario_beside_its_files_needs_all_of_them(states: str, losses: str, outside: int, tmp_path: Path) -> None:
+    """A file elsewhere, by its name or by a link, is in no container; another folder gets a copy of everything."""
+    folder = tmp_path / "own"
+    folder.mkdir()
+    for place in (tmp_path, folder):
+        (place / "states.csv").write_text("x\n" + "0.5\n" * 20)
+        (place / "losses.csv").write_text("lost\n" + "1\n0\n" * 10)
+    (folder / "linked.csv").symlink_to(tmp_path / "states.csv")
+    text = OWN.partition("[plant]")[0].replace("network.routers = 2", "")
+    text = text.replace("[encoding]", f'source = "file"\nstates = ["x"]\nstate_file = "{states}"\n[encoding]')
+    text = text.replace("quality = 0.9", f'loss = {{ model = "trace", file = "{losses}", lost = "lost" }}')
+    own = folder / "mine.toml"
+    own.write_text(text)
+    given = (load(own), str(own), False)
+    with pytest.raises(UsageError, match=rf"mine\.toml names {re.escape((states, losses)[outside])}, which the"):
+        write_compose(*given, folder, True)
+    assert not (folder / "docker-compose.yml").exists()
+    written = write_compose(*given, tmp_path / "copy", False)
+    assert [path.name for path in written] == ["docker-compose.yml", "mine.toml", "states.csv"]
+    own.write_text(text.replace((states, losses)[outside], ("states.csv", "losses.csv")[outside]))
+    assert write_compose(*given, folder, True) == [folder / "docker-compose.yml"]

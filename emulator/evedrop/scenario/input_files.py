@@ -35,6 +35,15 @@ def _tables_with_files(tables: Mapping[str, Any]) -> Iterator[tuple[str, str, di
             yield name, kind, table
 
 
+def named_files(tables: Mapping[str, Any]) -> Iterator[str]:
+    """The names of all files of states, disturbances and recordings in tables whose files were not located yet."""
+    for _, kind, table in _tables_with_files(tables):
+        yield table[f"{kind}_file"]
+    for _, trace, _ in _recorded(tables):
+        if isinstance(trace.get("file"), str):
+            yield trace["file"]
+
+
 def locate_tables(tables: Mapping[str, Any], folder: Path) -> None:
     """Replace the names of the files of states and disturbances with their paths, in place; folder: that of the scenario."""
     for _, kind, table in _tables_with_files(tables):

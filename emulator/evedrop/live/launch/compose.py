@@ -18,6 +18,8 @@ from evedrop.live.launch.hosts_file import processes_of
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import make_private, write_private
 from evedrop.results.resolved_scenario import input_texts, resolved
+from evedrop.scenario.input_files import named_files
+from evedrop.scenario.loading import read, tables_in
 from evedrop.scenario.tables import Scenario
 from evedrop.scenarios import shipped
 
@@ -161,7 +163,7 @@ def write_compose(scenario: Scenario, source: str, changed: bool, folder: Path, 
 
     source: the scenario as the user named it, a built-in name or a file; changed: whether options change it; overwrite:
     whether the folder may contain files; those with the same names are then replaced. Raises UsageError if it may not,
-    if the folder cannot be written, and for a scenario that containers cannot run.
+    if the folder cannot be written, and for a scenario that containers cannot run, or that is in the folder without its files.
     """
     _check(scenario)
     try:
@@ -178,6 +180,11 @@ def write_compose(scenario: Scenario, source: str, changed: bool, folder: Path, 
         if not built_in and own.exists() and os.path.samefile(own, source):
             if changed:
                 raise UsageError(f"{own} is the scenario itself, and would be replaced; give another --compose DIR")
+            if (outside := _outside(own)) is not None:
+                raise UsageError(
+                    f"{own} names {outside}, which the containers cannot find; put it into {folder}, and name it by its path "
+                    "from there, or give another --compose DIR, which gets a copy"
+                )
         else:
             texts = {own.name: resolved(scenario), **input_texts(scenario)}
             for name, text in texts.items():
@@ -228,6 +235,17 @@ def _check(scenario: Scenario) -> None:
     expect_no_launcher_needed(scenario)
     if scenario.process.source == "zenoh":
         raise UsageError(f"process.zenoh: no container can reach the program that gives the states; {remedy}")
+
+
+def _outside(scenario: Path) -> str | None:
+    """The first file that a scenario file names elsewhere than in its own folder, which alone the containers see."""
+    folder = scenario.parent
+    for name in named_files(tables_in(read(scenario), str(scenario))):
+        path = folder / name
+        within = not Path(name).is_absolute() and path.resolve().is_relative_to(folder.resolve())
+        if not within and path.exists():
+            return name
+    return None
 
 
 def _services(scenario: Scenario) -> list[_Service]:
