@@ -270,6 +270,7 @@ address = "-oProxyCommand=x"
 port = 0
 processes = ["router"]
 speed = 3
+command = "evedrop"
 """
 UNFIT = """
 [router]
@@ -289,7 +290,7 @@ processes = ["router"]
 @pytest.mark.parametrize(
     ("text", "places"),
     [
-        (WRONG, ["hosts.alpha.address", "hosts.alpha.port", "hosts.alpha.speed"]),
+        (WRONG, ["hosts.alpha.address", "hosts.alpha.port", "hosts.alpha.command", "hosts.alpha.speed"]),
         (UNFIT, ["hosts.alpha.processes", "hosts.alpha.processes", "hosts.beta.processes", "router.listen", "relay"]),
     ],
     ids=["wrong", "unfit"],

@@ -182,6 +182,7 @@ _EXPECTED: Mapping[str, str] = {
     "string_type": "a string",
     "string_too_short": "a string of at least one character",
     "list_type": "a list",
+    "tuple_type": "a list",
     "dict_type": "a table",
     "model_type": "a table",
     "bool_type": "true or false",
