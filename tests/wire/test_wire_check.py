@@ -95,9 +95,13 @@ def test_warnings(golden: Golden) -> None:
     warnings = list(warnings_of_wire(plan))
     assert len(warnings) == 4
     golden("wire", warnings)
+    tls = {"certificate": "a", "key": "b", "authority": "c"}
+    mixed = plan_of(TO_BASE, listen=["tls/0.0.0.0:6", "tcp/0.0.0.0:7"], tls=tls)
+    assert [warning for warning in warnings_of_wire(mixed) if "tls/" in warning] == []
+    assert warnings[1] in warnings_of_wire(mixed), "nobody shows a certificate at tcp/"
+    assert "certificates required" not in "".join(wire_lines(mixed))
     back = {"from": "base", "to": "robot"}
     tap = {"from": "robot", "to": "third", "tap": True}
-    tls = {"certificate": "a", "key": "b", "authority": "c"}
     assert not list(
         warnings_of_wire(plan_of({**TO_BASE, "keys": "a/**"}, TO_BASE, back, tap, listen="tls/[::]:7", tls=tls))
     )

@@ -515,13 +515,18 @@ def _effects(link: WireLink) -> str:
 def _guards(side: Side) -> str:
     """Who may use a side, if not every client that can reach it."""
     guards = [] if side.users is None else [f"users {', '.join(side.users)}"]
-    if side.tls is not None and side.tls.authority is not None:
+    if side.listen and all(_certified(side, endpoint) for endpoint in side.listen):
         guards.append("certificates required")
     if side.keys != ("**",):
         guards.append(f"only {', '.join(side.keys)}")
     if side.peers:
         guards.append("mode peer allowed")
     return f"  ({'; '.join(guards)})" if guards else ""
+
+
+def _certified(side: Side, endpoint: str) -> bool:
+    """Whether programs need a certificate at an endpoint: only encrypted ones ask for it."""
+    return endpoint.partition("/")[0] in ENCRYPTED and side.tls is not None and side.tls.authority is not None
 
 
 def _openness(side: Side) -> Iterator[str]:
@@ -531,7 +536,7 @@ def _openness(side: Side) -> Iterator[str]:
         if place is None or place.loopback:
             continue
         lacking = [] if place.protocol in ENCRYPTED else ["encryption (tls)"]
-        if side.users is None and (side.tls is None or side.tls.authority is None):
+        if side.users is None and not _certified(side, endpoint):
             lacking.append("users or an authority")
         if lacking:
             without = " and without ".join(lacking)
