@@ -390,6 +390,8 @@ def test_one_mistake(text: str, place: str | None, golden: Golden) -> None:
         (BASE.replace("[side.base]", "[side.base]\nkeys = []"), "side.base.keys"),
         (BASE.replace("[side.base]", '[side.base]\nusers = { ada = "a\\nb:c" }'), "side.base.users.ada"),
         (BASE.replace("[side.base]", '[side.base]\nusers = { "a\\tb" = "c" }'), "side.base.users.a\tb"),
+        (BASE.replace("[side.base]", '[side.base]\nusers = { ada = " a b " }'), "side.base.users.ada"),
+        (BASE.replace("[side.base]", '[side.base]\nusers = { "ada " = "b" }'), "side.base.users.ada "),
         (f"{BASE}ordered = true\ndelay = {{ model = 'constant', value = 1 }}\n"
          "[[event]]\nat = 1\nlink = 'robot-base'\nset = { reorder = 0.5 }", "event.0.set.reorder"),
     ],

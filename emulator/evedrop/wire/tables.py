@@ -297,6 +297,8 @@ def _user(name: str) -> str:
 def _in_a_line(text: str) -> str:
     if any(unicodedata.category(character) == "Cc" for character in text):
         raise expected("text without control characters")  # Zenoh reads a line for each user
+    if text != text.strip():
+        raise expected("text without spaces at its ends")  # which Zenoh leaves out: nobody could log in with them
     return text
 
 
