@@ -26,6 +26,8 @@ from evedrop.live.launch.ports import RouterEndpoint, router_endpoint
         ("tls/router.lan", None, "is not an endpoint"),
         ("tls/router.lan:0", None, "names no port"),
         ("tls/router..lan:7447", None, "names no host"),
+        ("tls/127.1:7447", None, "names no host"),
+        ("tls/router.lan:7447", "tls/192.168.1.256:7447", "names no host"),
         ("tls/[12]:7447", None, "names no address"),
         ("quic/router.lan:7447", None, "is not an endpoint"),
         ("tls/0.0.0.0:7447", "router.lan", "--connect router.lan is not an endpoint"),

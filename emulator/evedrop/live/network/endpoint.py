@@ -44,7 +44,10 @@ class Endpoint:
             raise ValueError(f"{text} names no port")
         if sixth is not None and endpoint.address is None:
             raise ValueError(f"{text} names no address")
-        if any(not 0 < len(label) <= _MOST_LABEL for label in endpoint.host.split(".")) and sixth is None:
+        labels = endpoint.host.split(".")
+        # The system takes 127.1 and 2130706433 for addresses, and TLS for names that no certificate can have.
+        no_name = labels[-1].isdecimal() and endpoint.address is None
+        if sixth is None and (no_name or any(not 0 < len(label) <= _MOST_LABEL for label in labels)):
             raise ValueError(f"{text} names no host")
         return endpoint
 
