@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -393,6 +394,36 @@ USUAL = [
     "noise-before/deaf",
 ]
 """Briefs that have between them every entry that a brief of each role has, and one of a strategy with parameters."""
+
+
+@pytest.mark.parametrize(
+    ("name", "path"),
+    [
+        ("replay-attack/controller", "part.assignment.parameters"),
+        ("replay-attack/sensor", "part.monitor.parameters"),
+        ("replay-attack/sensor", "part.monitor.attack_data"),
+        ("eavesdroppers/suspicious", "part.parameters"),
+        ("colluding/equal", "part.parameters"),
+        ("eavesdroppers/suspicious", "part"),
+    ],
+)
+def test_an_entry_that_is_not_known_is_refused(name: str, path: str, tmp_path: Path) -> None:
+    """Another version may mean something by it; also where a class reads the table."""
+    brief = json.loads(json.dumps(BRIEFS[name]))
+    table = brief
+    for part in path.split("."):
+        table = table[part]
+    table["newer"] = 1
+    assert re.search(
+        rf"{re.escape(path)}\.newer is not|unknown field `newer` - at `\$\.{path}`", str(refusal(brief, tmp_path))
+    )
+
+
+def test_a_detector_without_an_attack_can_be_used(tmp_path: Path) -> None:
+    """And has no data of one."""
+    brief = json.loads(json.dumps(BRIEFS["replay-attack/sensor"]))
+    brief["part"]["monitor"] |= {"attack": None, "attack_data": {}}
+    assert refusal(brief, tmp_path) is None
 
 
 @pytest.mark.parametrize("name", mostly_long(BRIEFS, USUAL))

@@ -35,7 +35,7 @@ from evedrop.model.detection import Chart
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
 from evedrop.model.eavesdroppers.readers import READERS
-from evedrop.model.integrity import POLICIES
+from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
 from evedrop.model.integrity.monitor import Monitor, MonitorPlan
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, mistakes_of
@@ -258,9 +258,11 @@ class SensorPart:
                 if self.plant is None or self.plant.output_matrix is None:
                     raise ValueError("there is no filter whose innovations could be tested")
                 self.monitor.expect_sizes(len(self.plant.output_matrix), self.plant.inputs)
-                _expect_right(
-                    "part.monitor.parameters", POLICIES[self.monitor.policy].mistakes(self.monitor.parameters)
-                )
+                policy, attack, data = POLICIES[self.monitor.policy], self.monitor.attack, self.monitor.attack_data
+                _expect_no_more("part.monitor.parameters", self.monitor.parameters, policy.parameters)
+                _expect_right("part.monitor.parameters", policy.mistakes(self.monitor.parameters))
+                known = {} if attack is None else SENSOR_ATTACKS[attack].read(data).plain
+                _expect_no_more("part.monitor.attack_data", data, known)
                 Monitor(self.monitor, bytes(KEY_BYTES), brief.batch)
                 self.monitor.spoofing(bytes(KEY_BYTES), brief.batch)
         with _using("part.states"):
@@ -325,8 +327,12 @@ class EavesdropperPart:
         kind, n, noise = STRATEGIES[self.strategy], brief.model.process.n, self.noise_distribution
         with _using("part.parameters"):
             self._expect_parameters(kind)
+            known = {*kind.parameters}
             if "reads_as" in kind.parameters:
-                self._expect_parameters(READERS[self.parameters["reads_as"]])
+                reader = READERS[self.parameters["reads_as"]]
+                self._expect_parameters(reader)
+                known |= {*reader.parameters}
+            _expect_no_more("part.parameters", self.parameters, known)
             streams = kind.streams(self.parameters)
         brief.expect_keys(streams)
         if kind.reads_leaks:
@@ -366,8 +372,10 @@ class ControllerPart:
             given, own = brief.model.process, self.assignment.process
             if not all(np.array_equal(*two) for two in zip(given.matrices, own.matrices, strict=True)):
                 raise ValueError("its process is not that of the model")
-            _expect_right("part.assignment.parameters", CONTROLLERS[self.strategy].mistakes(self.assignment.parameters))
-            objections = CONTROLLERS[self.strategy].objections(self.assignment)
+            kind, parameters = CONTROLLERS[self.strategy], self.assignment.parameters
+            _expect_no_more("part.assignment.parameters", parameters, kind.parameters)
+            _expect_right("part.assignment.parameters", kind.mistakes(parameters))
+            objections = kind.objections(self.assignment)
         if objections:
             raise BriefError(f"part: the {objections[0][0]} {objections[0][1]}")
 
@@ -432,6 +440,12 @@ def _expect_right(path: str, mistakes: Iterable[tuple[str, str]]) -> None:
     """Raise BriefError for the first mistake that a class has found in its parameters."""
     for parameter, problem in mistakes:
         raise BriefError(f"{path}.{parameter} {problem}; {WRITE_AGAIN}")
+
+
+def _expect_no_more(path: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Raise BriefError for an entry that a class does not know: that of another version may mean something by it."""
+    for name in sorted({*given} - {*known}):
+        raise BriefError(f"{path}.{name:.40} is not an entry that is known here; {WRITE_AGAIN}")
 
 
 def _expect_plant(brief: AnyBrief, path: str, plant: Plant, disturbances: str | None = None) -> None:
