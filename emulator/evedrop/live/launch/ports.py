@@ -97,8 +97,8 @@ def router_endpoint(
     listening, connecting = options
     here = _endpoint(listening, listen)
     there = here if connect is None else _endpoint(connecting, connect)
+    asked = listening if connect is None else connecting
     if there.everywhere:
-        asked = listening if connect is None else connecting
         raise UsageError(
             f"{asked} {there} means every address of a host, so nothing can connect to it; add {connecting} {there.protocol}/"
             f"HOST:{there.port} with the name or address by which the others reach it"
@@ -109,7 +109,7 @@ def router_endpoint(
         )
     if there.secure and there.address is not None and there.address.version == 6:
         raise UsageError(
-            f"{connecting} {there}: no certificate can be checked against an IPv6 address; give the host's name"
+            f"{asked} {there}: no certificate can be checked against an IPv6 address; give the host's name"
         )
     if not here.secure and not insecure and not here.loopback:
         raise UsageError(
