@@ -164,7 +164,7 @@ def launch_shards(run: Launch) -> FinishedRun:
         now = held.now
         if now != folder:
             on_event(FolderMoved(str(now)))
-            shards = [replace(shard, folder=now / SHARDS_FOLDER / str(shard.number)) for shard in shards]
+            shards = [_moved(shard, now) for shard in shards]
         return FinishedRun(_made_one(scenario, now, shards, state, progress.started), state.viewer, now)
     except BaseException as error:
         if state.viewer is not None:
@@ -176,6 +176,12 @@ def launch_shards(run: Launch) -> FinishedRun:
         raise
     finally:
         held.close()
+
+
+def _moved(shard: Shard, now: Path) -> Shard:
+    """A shard of a run whose folder has moved; now: where that is. A shard that began after the move is at the old place."""
+    folder = now / SHARDS_FOLDER / str(shard.number)
+    return replace(shard, folder=folder) if folder.is_dir() else shard
 
 
 def _endpoints(shards: int) -> list[RouterEndpoints | None]:
