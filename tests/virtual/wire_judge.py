@@ -141,7 +141,9 @@ class WireJudge:
         if not self._killed:
             yield from self._of_readers(len(flat))
             if (REPLAY, 0) in [(name, status) for name, status, _ in course.read]:
-                yield from wrong_recording(run.folder.parent / REPLAY_FILE, rows[len(rows)])
+                # A start that was interrupted at once may not have come as far as the history.
+                latest = WireHistory.read(run.folder / JOURNAL_FOLDER).start
+                yield from wrong_recording(run.folder.parent / REPLAY_FILE, rows[latest])
 
     def _of_latest(self) -> Iterator[str]:
         """What commands say of the folder is about the latest start, whatever became of it."""
