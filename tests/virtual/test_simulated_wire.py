@@ -23,6 +23,7 @@ import zenoh
 from evedrop import wire
 from evedrop.cli.simulated import program
 from evedrop.errors import RunError, ScenarioError, UsageError
+from evedrop.system.disk import REAL_DISK
 from evedrop.virtual import caller
 from evedrop.virtual.simulated_wire import SimulatedClock, SimulatedWire, SimulatedWires
 from evedrop.wire.running import ExpectationFailed
@@ -188,6 +189,23 @@ def test_two_wires_share_a_world(evedrop_simulated_wire: Opener) -> None:
     passed_on = [row["n"] for row in first.rows().to_pylist() if row["fate"] == "delivered"]
     arrived = [row["n"] for row in second.rows().to_pylist() if row["fate"] == "delivered"]
     assert heard == [passed_on[n] for n in arrived][:30]
+
+
+def test_wires_of_two_tests_at_once_are_in_different_places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two worlds of the same order make the same random names."""
+    made, make = list[Path](), type(REAL_DISK).make_folder
+
+    def make_folder(disk: Any, folder: Path, *rest: Any, **entries: Any) -> None:
+        made.append(folder)
+        make(disk, folder, *rest, **entries)
+
+    monkeypatch.setattr(type(REAL_DISK), "make_folder", make_folder)
+    for number in range(2):
+        with SimulatedWires(program) as wires:
+            wires.open(**WIRE, out=tmp_path / str(number))
+    first, second = (folder for folder in made if folder.name.startswith("evedrop-wire-"))
+    assert first.name == second.name
+    assert first != second
 
 
 @pytest.mark.campaign

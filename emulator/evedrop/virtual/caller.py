@@ -14,6 +14,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TextIO, cast, final
 from unittest.mock import patch
 
@@ -74,6 +76,7 @@ class CallerWorld:
         self.machine.adopt(self._process)
         self.scheduler.hub = hub = greenlet(self._let_others_go_on)
         with contextlib.ExitStack() as stack:
+            self.world.temporary = Path(stack.enter_context(TemporaryDirectory(prefix="evedrop-")))
             stack.enter_context(inside(self.world))
             stack.enter_context(self._instead(zenoh, "open", self._open))
             for name in ("FifoChannel", "RingChannel", "Callback"):

@@ -46,6 +46,8 @@ class VirtualWorld(World):
         self._zenoh = zenoh
         self.client: Callable[[Sequence[str]], SshClient] | None = None
         """Starts ssh, if there are other hosts."""
+        self.temporary: Path | None = None
+        """In place of the temporary folder of the environment, where another world may make the same names."""
         self.disks: dict[str, VirtualDisk] = {}
         """Other host → its disk."""
 
@@ -133,7 +135,7 @@ class VirtualWorld(World):
     def temporary_folder(self) -> Path:
         """That of the machine of the current process."""
         disk = self._other_disk
-        return Path(tempfile.gettempdir()) if disk is None else disk.root / TEMPORARY
+        return self.temporary or Path(tempfile.gettempdir()) if disk is None else disk.root / TEMPORARY
 
     @property
     def process(self) -> ThisProcess:
