@@ -379,5 +379,5 @@ def test_a_known_start_is_known_again_after_a_restart() -> None:
             E = 0.72 * a * a * before + 0.3 * q
             known, sigma = a * a * known + q, a * a * sigma + q
         expected.append(sigma if k in down else E)
-    found = ModulatedCovariance(process, link, twin_tracks).next_traces(slots)
-    assert found == pytest.approx(expected, rel=1e-12)
+    traces = ModulatedCovariance(process, link, twin_tracks).next_traces(slots)
+    assert traces == pytest.approx(expected, rel=1e-12)

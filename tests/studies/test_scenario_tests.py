@@ -242,7 +242,7 @@ def test_resumed_tests_are_run_again_if_a_file_of_the_scenario_has_changed(tmp_p
 
 
 def test_resumed_tests_with_a_secret_from_a_file_are_run_again(tmp_path: Path) -> None:
-    """The scenario only names the file, and complete results do not say of which secret they are."""
+    """The scenario names only the file of the secret, and the results of a complete run do not record the secret."""
     key = tmp_path / "key"
     written(tmp_path, one=HOLDS.replace("[process]", f'secret_file = "{key}"\n\n[process]', 1))
     manner, folders = Manner(in_memory=True, trials=3, out=tmp_path / "out", resume=True), []

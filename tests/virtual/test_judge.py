@@ -240,9 +240,9 @@ def test_a_run_that_is_held_gives_up_in_time(tmp_path: Path) -> None:
 
 def test_who_reports_nothing_because_another_process_hangs_is_not_to_blame(tmp_path: Path) -> None:
     """While the run is held."""
-    said = "evedrop: the run failed: 30 s after the run was held, router and legitimate did not report all slots"
-    broken = judged(tmp_path, {HangProcess("router", 60): 0.5}, status=3, said=said)
-    assert f"legitimate is blamed for hang router for good after 60 events: {said}" in broken
+    failure = "evedrop: the run failed: 30 s after the run was held, router and legitimate did not report all slots"
+    broken = judged(tmp_path, {HangProcess("router", 60): 0.5}, status=3, said=failure)
+    assert f"legitimate is blamed for hang router for good after 60 events: {failure}" in broken
 
 
 def test_who_gets_a_broken_message_is_not_to_blame(tmp_path: Path) -> None:

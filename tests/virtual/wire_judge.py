@@ -146,12 +146,12 @@ class WireJudge:
                 yield from wrong_recording(run.folder.parent / REPLAY_FILE, rows[latest])
 
     def _of_latest(self) -> Iterator[str]:
-        """What commands say of the folder is about the latest start, whatever became of it."""
+        """Commands tell of the latest start of the wire, even if that start failed."""
         with suppress(UsageError):
             latest = WireHistory.read(self._run.folder / JOURNAL_FOLDER).start
             start = summary_of_wire(self._run.folder).start
             if start != latest:
-                yield f"the summary is said to be that of start {start}, and the latest one is {latest}"
+                yield f"commands tell of start {start}, and the latest start is {latest}"
 
     def _of_summary(self, rows: Mapping[int, list[Row]]) -> Iterator[str]:
         """The summary and the recording are those of the latest start."""

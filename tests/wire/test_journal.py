@@ -512,18 +512,18 @@ def test_a_journal_is_read_whole_whatever_its_wire_does_meanwhile(
         if happens == "a new key":
             meanwhile()
             return records_in(path, killed)
-        found = records_in(path, killed)
+        records = records_in(path, killed)
         meanwhile()
-        return found
+        return records
 
     def names(folder: Path) -> list[str]:
         meanwhile()
         return part_names(folder)
 
     def look(folder: Path, pattern: str) -> Iterator[Path]:
-        found = [*glob(folder, pattern)]
+        paths = [*glob(folder, pattern)]
         meanwhile()
-        return iter(found)
+        return iter(paths)
 
     glob = Path.glob
     if place == "its records are read":

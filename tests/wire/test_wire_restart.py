@@ -83,18 +83,18 @@ def test_a_first_start_and_one_without_messages_continue_nothing(tmp_path: Path)
 
 def test_records_of_a_wire_that_ended_on_a_full_disk_are_not_said_to_be_of_a_killed_one(tmp_path: Path) -> None:
     """The next start makes their Parquet file, and names both ways in which they may have been left."""
-    plan, said = wire_plan(), list[str]()
+    plan, sentences = wire_plan(), list[str]()
     with (
         patch.object(JournalRecords, "write_all", side_effect=OSError(28, "No space left on device")),
-        WireJournal(tmp_path / "out", plan, tell=said.append) as journal,
+        WireJournal(tmp_path / "out", plan, tell=sentences.append) as journal,
     ):
         journal.records.record(1.0, 0, -1, 0.0, journal.words.key_code("scan"), 0, 1, 0, Kind.PUT, WireFate.DELIVERED)
-    assert "its records stay in" in said[0]
-    assert run_wire(plan, tmp_path / "out", seconds=0.01, say=said.append) == 0
+    assert "its records stay in" in sentences[0]
+    assert run_wire(plan, tmp_path / "out", seconds=0.01, say=sentences.append) == 0
     sentence = (
         "1 messages were recovered from an earlier start, which was killed or had a full disk; their numbers go on"
     )
-    assert sentence in said
+    assert sentence in sentences
 
 
 def test_a_wire_that_was_killed_goes_on_with_its_fates(evedrop: Evedrop) -> None:

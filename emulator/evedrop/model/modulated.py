@@ -158,8 +158,8 @@ class ModulatedCovariance:
         if k == 0 and any(start == 0 for start, _ in down):
             states = self._settled = weights * self._process.initial_covariance
         if any(stop == k + 1 for _, stop in down):
-            known = theoretical_covariances(self._process, replace(NOBODY, initial=0.0), k + 1)[-1]
-            self._settled = weights * known
+            predicted = theoretical_covariances(self._process, replace(NOBODY, initial=0.0), k + 1)[-1]
+            self._settled = weights * predicted
         return states
 
     def _step(self, states: Floats | None, slot: _Slot, lag: int) -> Floats:

@@ -147,16 +147,16 @@ def _length_in(schema: pa.Schema, name: str) -> int:
 def input_columns(slots: Slots, plant: Plant, disturbances: Floats, first_trial: int) -> list[NDArray[Any]]:
     """A row per slot and recorded trial, from first_trial on; disturbances (slots, q) are of the whole run."""
     sensor, recorded = slots.sensor, slots.recorded
-    assert sensor.u is not None  # noqa: S101 - asked by the caller
+    applied = sensor.applied
+    assert sensor.u is not None and applied is not None  # noqa: S101, PT018 - asked by the caller
     u, some = sensor.u[:, :, :recorded], slice(slots.first, slots.first + slots.count)
-    watermark = sensor.watermark
     return [
         np.repeat(np.arange(some.start, some.stop), recorded),
         np.tile(np.arange(first_trial, first_trial + recorded), slots.count),
         np.stack([plant.limited(inputs) for inputs in u]).transpose(0, 2, 1).reshape(slots.count * recorded, -1),
         *([np.repeat(disturbances[some], recorded, axis=0)] if disturbances.shape[1] else []),
         *rows_of(sensor, ("failed",), recorded),
-        plant.clips(u if watermark is None else u + watermark[:, :, :recorded]).reshape(-1),
+        plant.clips(applied[:, :, :recorded]).reshape(-1),
         *rows_of(sensor, _OF_A_MONITOR, recorded),
     ]
 

@@ -128,10 +128,10 @@ class ApplicationTally(ABC):
 
     @abstractmethod
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
-        """Add the next c slots: true states (c, n, R), inputs as decided (c, m, R), and every receiver's estimates, (c, n, R)."""
+        """Add the next c slots: true states (c, n, R), inputs with the watermark (c, m, R), and all estimates, (c, n, R)."""
 
     def add_monitored(self, x: Floats, u: Floats, sensor: SensorSlots) -> None:
-        """Add watermark and detector of the next c slots, before these go to `add`; by default nothing. x and u as there."""
+        """Add watermark and detector of the next c slots, before these go to `add`; by default nothing. u: as decided."""
         del x, u, sensor
 
     @classmethod
@@ -261,7 +261,7 @@ class PowerFeed(ABC):
 
     @abstractmethod
     def take(self, x: Floats, u: Floats) -> tuple[Floats, Floats]:
-        """Add the next c slots: true states (c, n, R), and inputs as decided (c, m, R).
+        """Add the next c slots: true states (c, n, R), and inputs with the watermark (c, m, R).
 
         Returns its power in each of them, and that of a controller that sees the truth, in kW, (c, R) each; negative if sold.
         """

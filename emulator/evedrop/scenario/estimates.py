@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from evedrop.model.acknowledgements import FORGING, rates_of
+from evedrop.model.acknowledgements import rates_of
 from evedrop.model.local_filter import settled
 from evedrop.model.schemes import scheme_of
 from evedrop.model.theory.covariances import stability_bound
@@ -69,7 +69,7 @@ def _reference_warnings(scenario: Scenario, mu: float) -> list[str]:
     Source: docs/mathematics/attacks.md, flipped acknowledgements.
     """
     table = scenario.acknowledgements
-    if table is None or table.attack not in FORGING or mu == 0.0:
+    if table is None or not scenario.forges_acknowledgements or mu == 0.0:
         return []
     rates = rates_of(table.attack, mu, 1.0, table.link.quality, table.flip or 0.0)
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)

@@ -18,6 +18,7 @@ from pydantic import AfterValidator, ConfigDict, Field, PlainValidator, Serializ
 from pydantic_core import PydanticCustomError, PydanticKnownError
 
 from evedrop.errors import NotRegistered, UsageError
+from evedrop.model.acknowledgements import FORGING
 from evedrop.model.controllers import Assignment
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.energy import EnergyModel
@@ -376,6 +377,11 @@ class Scenario(Table):
         if not isinstance(entries, Mapping):
             return entries
         return {name: value if name in cls.model_fields else (name, value) for name, value in entries.items()}
+
+    @property
+    def forges_acknowledgements(self) -> bool:
+        """Whether an attack makes the sensor believe in acknowledgements that nobody has sent."""
+        return self.acknowledgements is not None and self.acknowledgements.attack in FORGING
 
     @property
     def scheme(self) -> type[Scheme]:

@@ -15,7 +15,7 @@ from typing import Protocol, final
 import numpy as np
 
 from evedrop.model import modulated
-from evedrop.model.acknowledgements import FORGING, heed_rule_of, rates_of
+from evedrop.model.acknowledgements import heed_rule_of, rates_of
 from evedrop.model.links import loss_of
 from evedrop.model.links.trace import RecordedLoss
 from evedrop.model.modulated import modulated_streaks
@@ -61,7 +61,6 @@ def _of_scheme(scenario: Scenario, receiver: str) -> ClosedForm | None:
 
 def conditions_of(scenario: Scenario, receiver: str) -> ReceiverConditions:
     """What theory knows of a receiver's link and of the acknowledgements."""
-    table = scenario.acknowledgements
     eavesdropper = None if receiver == LEGITIMATE else scenario.eavesdroppers[receiver]
     return ReceiverConditions(
         slots=scenario.slots,
@@ -69,7 +68,7 @@ def conditions_of(scenario: Scenario, receiver: str) -> ReceiverConditions:
         received=scenario.quality[receiver] if _independent(scenario, receiver) else None,
         uses=None if eavesdropper is None else uses_of(eavesdropper.strategy, eavesdropper.parameters),
         acknowledged=_split(scenario, receiver) if _alike(scenario, receiver) else None,
-        forged=table is not None and table.attack in FORGING,
+        forged=scenario.forges_acknowledgements,
         hijack=_hijack(scenario, receiver),
     )
 
@@ -349,10 +348,8 @@ def _may_lose_reference(scenario: Scenario) -> bool:
 
     A restart loses nothing if it had acknowledged nothing yet, and one at the end of the run needs nothing any more.
     """
-    table = scenario.acknowledgements
-    forged = table is not None and table.attack in FORGING
     restarts = [away for away in scenario.timeline.outages[LEGITIMATE] if not away.keeps_state]
-    return forged or any(away.start > 0 and away.stop < scenario.slots for away in restarts)
+    return scenario.forges_acknowledgements or any(away.start > 0 and away.stop < scenario.slots for away in restarts)
 
 
 def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:

@@ -12,7 +12,6 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.acknowledgements import FORGING
 from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.plant import Offset, Plant
 from evedrop.model.process import Floats, Process
@@ -83,10 +82,9 @@ class LoopTally:
         loop = controlled_plant(scenario)
         if loop is None:
             return None
-        acknowledgements = scenario.acknowledgements
+        stays = scenario.window(LEGITIMATE) == 0 and not scenario.timeline.outages[LEGITIMATE]
         # An estimator that never had the reference of a packet also corrects its estimate by it: `Offset` does not know how.
-        forged = acknowledgements is not None and acknowledgements.attack in FORGING
-        comparable = scenario.window(LEGITIMATE) == 0 and not scenario.timeline.outages[LEGITIMATE] and not forged
+        comparable = stays and not scenario.forges_acknowledgements
         tally = cls(loop.process, loop.plant, trials, scenario.legitimate.knows_input, comparable)
         tally.applications = {
             name: APPLICATIONS[name].tally(loop, table, trials) for name, table in scenario.applications.items()
@@ -98,15 +96,15 @@ class LoopTally:
 
         sensor: with the inputs; estimates: receiver → x̂, (c, n, R); action: the legitimate estimator's, (c, R).
         """
-        u, failed = sensor.u, sensor.failed
-        assert u is not None and failed is not None  # noqa: S101, PT018 - there is a controller
+        u, applied, failed = sensor.u, sensor.applied, sensor.failed
+        assert u is not None and applied is not None and failed is not None  # noqa: S101, PT018 - there is a controller
         for application in self.applications.values():
             if sensor.watermark is not None:
                 application.add_monitored(sensor.states, u, sensor)
-            application.add(sensor.states, u, estimates)
+            application.add(sensor.states, applied, estimates)
         self.trial_slots += failed.size
         self.failed += int(np.count_nonzero(failed))
-        clipped = self._plant.clips(u if sensor.watermark is None else u + sensor.watermark)
+        clipped = self._plant.clips(applied)
         self.clipped += int(np.count_nonzero(clipped))
         self.of_trials[0] += len(clipped)
         self.of_trials[1:3] += np.count_nonzero(failed, axis=0), np.count_nonzero(clipped, axis=0)

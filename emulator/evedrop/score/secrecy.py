@@ -6,7 +6,7 @@ Source: docs/mathematics/secrecy.md, secrecy and design; docs/metrics.md, verdic
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
@@ -368,8 +368,8 @@ def largest_means(theory: Expectation, means: Floats, slots: int, v: Floats | No
     lost = theory.first_loss
     if math.isnan(lost) or 0.0 < lost * trials < RARE:
         nobody = TheoreticalCovariance(theory.process, NOBODY)
-        unheard = _window_averages(nobody, slots) if v is None else _averages_of(variances_along(nobody, v, slots))
-        heaviest = np.maximum(heaviest, unheard)
+        parts = _traces(nobody, slots) if v is None else [variances_along(nobody, v, slots)]
+        heaviest = np.maximum(heaviest, _window_averages(parts, slots))
     return np.asarray(means.mean(axis=1, keepdims=True) - math.log(ERROR_RATE) / trials * heaviest)
 
 
@@ -378,16 +378,7 @@ def _expected(theory: Expectation, slots: int, v: Floats | None) -> Floats | Non
     if v is None:
         return _expected_averages(theory.alike, slots) if theory.known else None
     series = theory.along(v, slots)
-    return None if series is None else _averages_of(series)
-
-
-def _averages_of(series: Floats) -> Floats:
-    """The mean of a value of each slot, (slots,), over the slots of each window, (WINDOWS, 1); NaN for windows without slots."""
-    sums, slots = np.zeros(WINDOWS + 1), len(series)
-    np.add.at(sums, window_of(np.arange(slots), slots), series)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        averages: Floats = (sums[:WINDOWS] / np.diff(window_bounds(slots)))[:, None]
-    return averages
+    return None if series is None else _window_averages([series], slots)
 
 
 def _latest_bound(theory: Expectation, slots: int) -> float:
@@ -403,14 +394,20 @@ def _latest_bound(theory: Expectation, slots: int) -> float:
 @lru_cache(maxsize=64)
 def _expected_averages(alike: Alike, slots: int) -> Floats:
     """What theory expects in each window, of all receivers that are alike."""
-    return _window_averages(alike.expectation.stream(), slots)
+    return _window_averages(_traces(alike.expectation.stream(), slots), slots)
 
 
-def _window_averages(stream: TheoreticalTraceStream, slots: int) -> Floats:
-    """The mean of theoretical traces over the slots of each window, (WINDOWS, 1); NaN for windows without slots."""
-    sums = np.zeros(WINDOWS + 1)
-    for part in parts_of(range(slots)):
-        np.add.at(sums, window_of(np.arange(part.start, part.stop), slots), stream.next_traces(len(part)))
+def _traces(stream: TheoreticalTraceStream, slots: int) -> Iterator[Floats]:
+    """The theoretical traces of so many slots, some at a time."""
+    return (stream.next_traces(len(part)) for part in parts_of(range(slots)))
+
+
+def _window_averages(parts: Iterable[Floats], slots: int) -> Floats:
+    """The mean over the slots of each window, (WINDOWS, 1), of a value for each slot, given in parts; NaN without slots."""
+    sums, first = np.zeros(WINDOWS + 1), 0
+    for values in parts:
+        np.add.at(sums, window_of(np.arange(first, first + len(values)), slots), values)
+        first += len(values)
     with np.errstate(invalid="ignore", divide="ignore"):
         averages: Floats = (sums[:WINDOWS] / np.diff(window_bounds(slots)))[:, None]
     return averages

@@ -209,7 +209,7 @@ def _folder_for(scenario: str, made: Scenario, manner: Manner) -> Path:
         for folder in (wanted, *sorted(manner.out.glob(f"{glob.escape(wanted.name)}-*"))):
             with contextlib.suppress(OSError, ValueError):
                 same = all((folder / name).read_text(encoding="utf-8") == text for name, text in texts.items())
-                # Complete results do not say of which secret they are; those that are not complete do.
+                # The results of a complete run do not record its secret; those of an interrupted run do.
                 reusable = (folder / TASKS).exists() or (made.secret_file is None and _is_complete(folder))
                 if same and reusable:
                     return folder

@@ -164,10 +164,11 @@ def _powers(scenario: Scenario, trials: range) -> Iterator[tuple[Floats, Floats]
     for chunk in Simulation(scenario, trials).chunks():
         slots = chunk.slots
         assert slots is not None  # noqa: S101 - there are states in this mode
-        assert slots.sensor.u is not None  # noqa: S101 - there is a controller
+        applied = slots.sensor.applied
+        assert applied is not None  # noqa: S101 - there is a controller
         if slots.sensor.watermark is not None:
             feed.take_monitored(slots.sensor)
-        yield feed.take(slots.sensor.states, slots.sensor.u)
+        yield feed.take(slots.sensor.states, applied)
 
 
 def _lacking() -> str:

@@ -261,8 +261,8 @@ class SensorPart:
                 policy, attack, data = POLICIES[self.monitor.policy], self.monitor.attack, self.monitor.attack_data
                 _expect_no_more("part.monitor.parameters", self.monitor.parameters, policy.parameters)
                 _expect_right("part.monitor.parameters", policy.mistakes(self.monitor.parameters))
-                known = {} if attack is None else SENSOR_ATTACKS[attack].read(data).plain
-                _expect_no_more("part.monitor.attack_data", data, known)
+                entries = {} if attack is None else SENSOR_ATTACKS[attack].read(data).plain
+                _expect_no_more("part.monitor.attack_data", data, entries)
                 Monitor(self.monitor, bytes(KEY_BYTES), brief.batch)
                 self.monitor.spoofing(bytes(KEY_BYTES), brief.batch)
         with _using("part.states"):
@@ -327,12 +327,12 @@ class EavesdropperPart:
         kind, n, noise = STRATEGIES[self.strategy], brief.model.process.n, self.noise_distribution
         with _using("part.parameters"):
             self._expect_parameters(kind)
-            known = {*kind.parameters}
+            entries = {*kind.parameters}
             if "reads_as" in kind.parameters:
                 reader = READERS[self.parameters["reads_as"]]
                 self._expect_parameters(reader)
-                known |= {*reader.parameters}
-            _expect_no_more("part.parameters", self.parameters, known)
+                entries |= {*reader.parameters}
+            _expect_no_more("part.parameters", self.parameters, entries)
             streams = kind.streams(self.parameters)
         brief.expect_keys(streams)
         if kind.reads_leaks:

@@ -38,6 +38,11 @@ class SensorSlots(Record):
         """The true states, (c, n, R)."""
         return self.x if self.true is None else self.true
 
+    @property
+    def applied(self) -> Floats | None:
+        """The inputs with the watermark, u + e, as the plant gets them before it clips them, (c, m, R)."""
+        return self.u if self.u is None or self.watermark is None else self.u + self.watermark
+
 
 @dataclass(frozen=True, eq=False)
 class PacketSlots(Record):

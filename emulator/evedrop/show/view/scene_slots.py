@@ -76,19 +76,19 @@ class LoopValues:
 
     def take(self, sensor: SensorSlots, estimates: Mapping[str, Floats]) -> Moved:
         """The view's values of the next slots, from the sensor in this trial alone, and estimates as deviations, (c, n)."""
-        assert sensor.u is not None  # noqa: S101 - there is a controller
-        limited = self._entered(sensor.u)
+        applied = sensor.applied
+        assert sensor.u is not None and applied is not None  # noqa: S101, PT018 - there is a controller
+        limited = self._limited(sensor.u)
         first, self._next = self._next, self._next + len(limited)
         values = np.hstack([self._disturbances[first : self._next], limited])
-        entered = limited if sensor.watermark is None else self._entered(sensor.u + sensor.watermark)
         curves: dict[str, Floats] = {}
         for feed in self._feeds:
             if sensor.statistic is not None:
                 curves |= feed.take_monitored(first, sensor)
-            curves |= feed.take(first, entered, estimates)
+            curves |= feed.take(first, self._limited(applied), estimates)
         return Moved(values, curves)
 
-    def _entered(self, u: Floats) -> Floats:
+    def _limited(self, u: Floats) -> Floats:
         """The inputs u (c, m, 1) within their limits, (c, m)."""
         return self._plant.limited(u[:, :, 0].T).T
 

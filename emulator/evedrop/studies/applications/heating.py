@@ -13,7 +13,6 @@ import numpy as np
 from pydantic import Field
 
 from evedrop.model.process import Floats
-from evedrop.model.slot.records import SensorSlots
 from evedrop.scenario.application import (
     RECEIVERS,
     Application,
@@ -81,19 +80,12 @@ class ComfortTally(ApplicationTally):
         self._power: Floats = np.zeros(trials)
         self._known = {name: np.zeros(trials, np.int64) for name in loop.receivers}
         self._slots = np.zeros(trials, np.int64)
-        self._watermark: Floats | None = None
-
-    def add_monitored(self, x: Floats, u: Floats, sensor: SensorSlots) -> None:
-        """The heater gives the watermark, too."""
-        del x, u
-        self._watermark = sensor.watermark
 
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
         """Add the next slots."""
         state = self._range.state
         outside = self._range.outside(x[:, state])
         self._slots += len(x)
-        u, self._watermark = u if self._watermark is None else u + self._watermark, None
         for row, inputs in zip(outside, u, strict=True):  # slot by slot: the same bits however the slots are divided
             self._outside = self._outside + row
             self._power = self._power + self._plant.limited(inputs)[self._heater]

@@ -66,7 +66,7 @@ def test_the_other_loop_has_the_same_watermark() -> None:
         u[k] = controller.decide(k, state, d[k]) if k % PERIOD == 0 else u[k - 1]
         state = A @ state + PLANT.moved(u[k] + e[k]) + (B_D @ d[k])[:, None]
     other = PerfectLoop(GIVEN.process, PLANT, CONTROLLERS["lqr"](GIVEN, 2), PERIOD, d)
-    assert np.allclose(other.follow(x, u, e), PLANT.limited(u + e), atol=1e-10)
+    assert np.allclose(other.follow(x, u + e, e), PLANT.limited(u + e), atol=1e-10)
     assert PLANT.clips(u + e).any()
 
 

@@ -144,9 +144,7 @@ class HousePower(PowerFeed):
 
     def take(self, x: Floats, u: Floats) -> tuple[Floats, Floats]:
         """Add the next slots."""
-        e = self._watermark
-        entered = self._plant.limited(u if e is None else u + e)
-        return entered[:, self._grid], self._perfect.follow(x, u, e)[:, self._grid]
+        return self._plant.limited(u)[:, self._grid], self._perfect.follow(x, u, self._watermark)[:, self._grid]
 
 
 @final
@@ -172,7 +170,7 @@ class HouseholdTally(ApplicationTally):
         self._power.take_monitored(sensor)
 
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
-        """Add the next slots: states (c, n, R), inputs as decided (c, m, R), and every receiver's estimates, (c, n, R)."""
+        """Add the next slots: states (c, n, R), inputs with the watermark (c, m, R), and all estimates, (c, n, R)."""
         self.meter = self.meter.then(*self._power.take(x, u))
         for row in range(-self.done % self._period, len(x), self._period):
             for name, guess in self._guesses.items():
@@ -276,9 +274,9 @@ class PerfectLoop:
     def follow(self, x: Floats, u: Floats, e: Floats | None = None) -> Floats:
         """The other loop's inputs of the next slots, (c, m, R), within their limits.
 
-        x (c, n, R), u (c, m, R): of this loop, u as decided; e (c, m, R): the watermark, which is added to the inputs of both.
+        x (c, n, R), u (c, m, R): of this loop; e (c, m, R): the watermark, which is in u, and which the other loop gets, too.
         """
-        others, moved = np.empty(u.shape), self._plant.moved(u if e is None else u + e)
+        others, moved = np.empty(u.shape), self._plant.moved(u)
         for row, state in enumerate(x):
             if self._next % self._period == 0:
                 decided = self._controller.decide(self._next, state - self._e, self._disturbances[self._next])
