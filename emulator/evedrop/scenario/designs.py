@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evedrop.errors import UsageError
-from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.closed_forms import encrypted_fraction, threshold_for
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, stability_bound
 from evedrop.model.theory.json_values import JsonFields
@@ -90,7 +90,7 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
             "attack on acknowledgements that is always on; give the legitimate link only a quality, such as "
             "legitimate.link={quality = 0.9}, and remove events"
         )
-    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    scheme = scenario.make_scheme()
     model, arrives = scenario.energy_model, sum(acknowledged)
     unencrypted, encrypted = model.spent(scheme, 1.0, 0.0), model.spent(scheme, 1.0, 1.0)
     threshold = 1.0

@@ -8,7 +8,6 @@ import numpy as np
 
 from evedrop.model.acknowledgements import rates_of
 from evedrop.model.local_filter import settled
-from evedrop.model.schemes import scheme_of
 from evedrop.model.theory.covariances import stability_bound
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.plugins import sources_of
@@ -48,7 +47,7 @@ def warnings_of(scenario: Scenario, several: bool = False) -> list[str]:
             + ("; no state_probability can, the link must be better" if bound >= 1.0 else "")
         )
     warnings += _reference_warnings(scenario, mu)
-    warnings += [*_filter_warnings(scenario), *scheme_of(process, scenario.encoding.spec).warnings()]
+    warnings += [*_filter_warnings(scenario), *scenario.make_scheme().warnings()]
     warnings += _recording_warnings(scenario) if several or scenario.trials > 1 else []
     size = written_bytes(scenario)
     if size > _LARGE_BYTES:
@@ -72,7 +71,7 @@ def _reference_warnings(scenario: Scenario, mu: float) -> list[str]:
     if table is None or not scenario.forges_acknowledgements or mu == 0.0:
         return []
     rates = rates_of(table.attack, mu, 1.0, table.link.quality, table.flip or 0.0)
-    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    scheme = scenario.make_scheme()
     lost = scheme.lost_reference(mu, rates.legitimate)
     if lost is None or rates.legitimate[1] == 0.0 or lost.growth < 1.0:
         return []

@@ -20,7 +20,6 @@ from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.local_filter import MOST_STATES, FilterStep, Steps, settled
 from evedrop.model.plant import Plant
 from evedrop.model.process import MARGINAL, Floats, Process
-from evedrop.model.schemes import scheme_of
 from evedrop.model.staircase import NOT_REACHED, Staircase, checked_slots
 from evedrop.model.theory.horizon import horizon
 from evedrop.model.theory.leak import Leaks
@@ -225,7 +224,7 @@ def singular_mistakes(scenario: Scenario) -> Iterator[str]:
     if tested:
         with suppress(ValueError):  # A is singular, or there is a mistake in a scheme's noise: reported elsewhere
             process = table.process
-            distribution = scheme_of(process, scenario.encoding.spec).noise_distribution
+            distribution = scenario.make_scheme().noise_distribution
             yield from _blurred(Leaks(process, distribution), horizon(process, scenario.slots), scenario.slots)
 
 

@@ -25,7 +25,7 @@ from evedrop.model.energy import EnergyModel
 from evedrop.model.plant import Plant
 from evedrop.model.registry import asked
 from evedrop.model.schedule import StateProbability, mean_of
-from evedrop.model.schemes import SCHEMES
+from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.streams import LAST_TRIAL, MOST_SLOTS
@@ -387,6 +387,10 @@ class Scenario(Table):
     def scheme(self) -> type[Scheme]:
         """The scheme's class."""
         return SCHEMES[self.encoding.scheme]
+
+    def make_scheme(self) -> Scheme:
+        """The scheme of `[encoding]` for this process."""
+        return scheme_of(self.process.process, self.encoding.spec)
 
     @property
     def links(self) -> dict[str, LinkTable]:

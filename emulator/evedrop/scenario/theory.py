@@ -22,7 +22,7 @@ from evedrop.model.modulated import modulated_streaks
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes, uses_of
 from evedrop.model.process import Floats, Process, parts_of
 from evedrop.model.schedule import in_slot
-from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link_distribution import LinkDistribution, distribution_of
 from evedrop.model.theory import covariances as theory
@@ -47,14 +47,14 @@ def stated_form(scenario: Scenario, receiver: str) -> ClosedForm | None:
     make = SCHEMES[scenario.encoding.scheme].closed_forms.get(reader)
     if make is None:
         return None
-    return make(scheme_of(scenario.process.process, scenario.encoding.spec), conditions_of(scenario, receiver))
+    return make(scenario.make_scheme(), conditions_of(scenario, receiver))
 
 
 def _of_scheme(scenario: Scenario, receiver: str) -> ClosedForm | None:
     """What the scheme itself knows of an eavesdropper's strategy; None for one that learns more than packets tell."""
     if receiver == LEGITIMATE or receiver in scenario.leaks:
         return None
-    scheme, table = scheme_of(scenario.process.process, scenario.encoding.spec), scenario.eavesdroppers[receiver]
+    scheme, table = scenario.make_scheme(), scenario.eavesdroppers[receiver]
     received = scenario.quality[receiver] if _independent(scenario, receiver) else None
     return scheme.closed_form(table.reads_as or table.strategy, received, scenario.slots)
 
@@ -332,7 +332,7 @@ class Alike:
 
 def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
     """Maps the quality of a receiver's link to the frequencies of its actions; None if these are unknown."""
-    return _outcomes_of(scenario, receiver, scheme_of(scenario.process.process, scenario.encoding.spec))
+    return _outcomes_of(scenario, receiver, scenario.make_scheme())
 
 
 def _outcomes_of(scenario: Scenario, receiver: str, scheme: Scheme) -> OutcomesAt | None:
@@ -354,7 +354,7 @@ def _may_lose_reference(scenario: Scenario) -> bool:
 
 def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
     """The same for a receiver that knows the types of packets, behind the same link, where it bounds this one: without leaks."""
-    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    scheme = scenario.make_scheme()
     if receiver == LEGITIMATE or receiver in scenario.leaks or scheme.bound_outcomes(0.5) is None:
         return None
     return partial(_bound, scheme)
@@ -366,7 +366,7 @@ def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
     if table.given and not table.theory:
         return dict.fromkeys(scenario.receivers, Expectation(table.process, None, None, of_model=True, assumed=True))
     expectations = {}
-    scheme, mu_d = scheme_of(scenario.process.process, scenario.encoding.spec), scenario.encoding.state_probabilities
+    scheme, mu_d = scenario.make_scheme(), scenario.encoding.state_probabilities
     for name in scenario.receivers:
         closed = closed_of(scenario, name)
         bound = closed is not None and closed.bound
@@ -408,7 +408,7 @@ def error_floor_of(scenario: Scenario, receiver: str) -> tuple[Floats, bool] | N
     assumed = scenario.process.given and not scenario.process.theory
     if receiver == LEGITIMATE or receiver in scenario.leaks or assumed:
         return None
-    return scheme_of(scenario.process.process, scenario.encoding.spec).error_floor(scenario.slots)
+    return scenario.make_scheme().error_floor(scenario.slots)
 
 
 def _in_slots(mu_d: tuple[float, ...], outcomes_in: SlotOutcomes) -> SlotOutcomes:

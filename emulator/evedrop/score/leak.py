@@ -17,7 +17,6 @@ from evedrop.model.metrics.standard_error import standard_error, z_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.schedule import StateProbability, in_slots
-from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.theory.leaked_bits import RevealedBits
 from evedrop.names import LEGITIMATE
@@ -92,7 +91,7 @@ def leak_is_known(scenario: Scenario, receiver: str) -> bool:
     """
     if receiver == LEGITIMATE or scenario.of_model or scenario.window(receiver):
         return False
-    return scheme_of(scenario.process.process, scenario.encoding.spec).revealed_bits() is not None
+    return scenario.make_scheme().revealed_bits() is not None
 
 
 @final
@@ -117,7 +116,7 @@ class PacketBitsStream:
 
 def revealed_by_packets(scenario: Scenario) -> PacketBitsStream | None:
     """What the scenario's packets reveal; None if its scheme does not say."""
-    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    scheme = scenario.make_scheme()
     revealed = scheme.revealed_bits()
     return None if revealed is None else PacketBitsStream(scheme.mu_d, revealed)
 

@@ -18,7 +18,6 @@ from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.model.digest import RunDigest, block_starts
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.outcomes import eavesdropper_outcomes
-from evedrop.model.schemes import scheme_of
 from evedrop.model.theory.horizon import horizon
 from evedrop.results.folder import HeldFolder, disk_errors
 from evedrop.results.resolved_scenario import write_resolved
@@ -276,7 +275,7 @@ def _split_mode(scenario: Scenario) -> Mode:
 def _check_scheme(scenario: Scenario, mode: Mode) -> None:
     """Raise UsageError if events alone do not determine the errors of a scheme, or of a receiver that reads its packets."""
     name = scenario.encoding.scheme
-    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    scheme = scenario.make_scheme()
     reasons = {
         "reads its packets": scheme.reads_packets,
         "acts on acknowledgements": scheme.needs_acknowledgements,

@@ -24,7 +24,6 @@ from evedrop.model.outcomes import eavesdropper_outcomes
 from evedrop.model.plant import InputAwareEstimator
 from evedrop.model.process import Floats, ProcessNoise, Trajectory
 from evedrop.model.receiver import Codes, Flags, Receiver, trace_of
-from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link_core import LinkCore
 from evedrop.model.streams import OWN, Batch, Lineage
 from evedrop.model.theory.covariances import misled_covariances
@@ -73,7 +72,7 @@ class Simulation:
         self._keys = StreamKeys.from_scenario(scenario)
         if scenario.modules is not None:
             look_in(scenario.modules)
-        self._scheme = scheme_of(self._process, scenario.encoding.spec)
+        self._scheme = scenario.make_scheme()
         self._guard = guard = Guard(scenario, self._scheme, self._batch)
         secret = self._keys.secret(self._scheme.secret_streams)
         with guard.asking(LEGITIMATE, range(1)):

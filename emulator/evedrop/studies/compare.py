@@ -161,7 +161,7 @@ def _cells(group: Group, run_tally: RunTally) -> dict[str, Cell]:
 
 
 def _needs(scenario: Scenario, packets: PacketTally) -> Needs:
-    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    scheme = scenario.make_scheme()
     sent, encrypted = packets.sent / scenario.slots, packets.encrypted / scenario.slots
     of_trials = {
         "sent_fraction": sent,

@@ -35,7 +35,6 @@ from evedrop.live.protocol.brief import (
 )
 from evedrop.live.protocol.keys import MOST_PARTS, Sizes
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
-from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link import COUNTED_BURSTS
 from evedrop.names import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import new_folder
@@ -90,7 +89,7 @@ def _longest_window(scenario: Scenario) -> int:
 def sizes_of(scenario: Scenario, batch: int, message: int) -> Sizes:
     """The dimensions that determine the sizes of messages; batch: slots of a report; message: slots whose packets one carries."""
     plant, table = scenario.driven, scenario.controller
-    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    scheme = scenario.make_scheme()
     return Sizes(
         len(scenario.process.A),
         scenario.trials,
@@ -114,7 +113,7 @@ def history_of(scenario: Scenario) -> int:
     slots may be between them.
     """
     window = _longest_window(scenario)
-    scheme, channel = scheme_of(scenario.process.process, scenario.encoding.spec), ack_channel_of(scenario)
+    scheme, channel = scenario.make_scheme(), ack_channel_of(scenario)
     memory = 0 if channel is None else min(channel.memory, scenario.slots)
     if not scheme.may_be_silent:
         return max(window, memory)
@@ -156,7 +155,7 @@ def briefs_of(
     }
     routers = Routers.for_users(users, endpoints)
     spec = scenario.encoding.spec
-    scheme = scheme_of(scenario.process.process, spec)
+    scheme = scenario.make_scheme()
     public, mu_d = scenario.process, scenario.encoding.mu_d
     matrices, header = (public.A, public.Q, public.initial_covariance), len(scheme.header)
     model = Model(*matrices, mu_d, header, public.singular_noise, scenario.encoding.state_probabilities)
