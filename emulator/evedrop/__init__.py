@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from evedrop.live.launch.starter import preloaded
     from evedrop.scenario.loading import Scenario
     from evedrop.simulate.montecarlo import Plan
-    from evedrop.wire.journal import journal_tables
+    from evedrop.wire.journal_reading import journal_tables
     from evedrop.wire.running import wire  # the package `wire`, which can be called: see there
 
 __all__ = [

@@ -25,7 +25,7 @@ from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER, Link, LinkSchedule, streams_of
 from evedrop.model.streams import Batch, root_of_seed
 from evedrop.scenario.receivers import wire_stream_key
-from evedrop.wire.journal import journal_tables
+from evedrop.wire.journal_reading import journal_tables
 from tests.faults import ours
 from tests.faults.looks import failed_looks
 from tests.faults.programs import KEYS

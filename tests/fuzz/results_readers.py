@@ -28,7 +28,8 @@ from evedrop.score.sums import SlotSums
 from evedrop.show.report.wire import wire_failures
 from evedrop.show.view.scene_slots import replay
 from evedrop.simulate.montecarlo import simulate
-from evedrop.wire.journal import WireJournal, journal_tables
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.on_disk import scorekeeper_on_disk
 from tests.fuzz.reader import Reader, as_json, as_parquet, lines, raw, tried
 from tests.wire.wire_plans import wire_plan

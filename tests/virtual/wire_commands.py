@@ -19,7 +19,7 @@ from evedrop.system.output import say
 from evedrop.system.world import world
 from evedrop.virtual.endings import status_of
 from evedrop.wire.file import load_wire
-from evedrop.wire.journal import JOURNAL_FOLDER
+from evedrop.wire.journal_place import JOURNAL_FOLDER
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.run import run_wire
 from tests.virtual.small_limits import HUNG, LIMITS

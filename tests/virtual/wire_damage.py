@@ -24,7 +24,7 @@ from evedrop.scenario.words import toml_text
 from evedrop.system.world import world
 from evedrop.virtual.run import SimulatedWorld
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal import JOURNAL_FOLDER, UNFINISHED, locked
+from evedrop.wire.journal_place import JOURNAL_FOLDER, UNFINISHED, locked
 from evedrop.wire.records import RECORD, STORED
 from tests.virtual.wire_draws import BASE, ENDPOINTS, Tables
 

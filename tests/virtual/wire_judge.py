@@ -36,7 +36,8 @@ from evedrop.virtual.world import EPOCH
 from evedrop.virtual.zenoh.access import intersects
 from evedrop.wire.file import load_wire, resolved_wire
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal import JOURNAL_FOLDER, journal_tables
+from evedrop.wire.journal_place import JOURNAL_FOLDER
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.on_disk import summary_of_wire
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import REASONS, WireFate

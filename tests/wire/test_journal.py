@@ -20,8 +20,10 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER
-from evedrop.wire import journal as journal_of_wire
-from evedrop.wire.journal import WireJournal, journal_tables, part_names, unfinished_table
+from evedrop.wire import journal_reading
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_place import part_names
+from evedrop.wire.journal_reading import journal_tables, unfinished_table
 from evedrop.wire.records import (
     AGAIN,
     HELD,
@@ -361,7 +363,7 @@ import numpy as np
 import pyarrow as pa
 from evedrop.wire.records import HELD, Kind
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal import journal_tables
+from evedrop.wire.journal_reading import journal_tables
 from tests.wire.wire_plans import wire_plan
 
 folder, chance = Path(sys.argv[1]), random.Random(5)
@@ -424,7 +426,7 @@ from pathlib import Path
 import pyarrow as pa
 from evedrop.wire.records import Kind
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal import journal_tables
+from evedrop.wire.journal_reading import journal_tables
 from tests.wire.wire_plans import wire_plan
 
 def fill(name):
@@ -527,9 +529,9 @@ def test_a_journal_is_read_whole_whatever_its_wire_does_meanwhile(
 
     glob = Path.glob
     if place == "its records are read":
-        monkeypatch.setattr(journal_of_wire, "records_in", records)
+        monkeypatch.setattr(journal_reading, "records_in", records)
     elif place == "its parts are listed":
-        monkeypatch.setattr(journal_of_wire, "part_names", names)
+        monkeypatch.setattr(journal_reading, "part_names", names)
     else:
         monkeypatch.setattr(Path, "glob", look)
     keys = [row["key"] for row in rows_of(tmp_path)]

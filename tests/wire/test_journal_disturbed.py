@@ -22,7 +22,8 @@ from evedrop.errors import UsageError
 from evedrop.virtual.disk import DiskFault, DiskFaults
 from evedrop.virtual.scheduler import VirtualScheduler
 from evedrop.wire.history import Numbered
-from evedrop.wire.journal import WireJournal, journal_tables
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.records import Kind, WireFate
 from tests.disks import at, run_program, simulated
 from tests.examples import USUAL, examples, mostly_long

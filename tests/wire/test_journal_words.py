@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from evedrop.wire.journal import JournalWords, words_in
+from evedrop.wire.journal_words import JournalWords, words_in
 from evedrop.wire.records import Words
 from tests.disks import simulated
 
@@ -59,7 +59,7 @@ def test_a_key_that_two_threads_name_at_once_is_admitted_once(tmp_path: Path) ->
 
 def test_words_of_any_length_and_number_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The file grows with them, and ends with the last one when it is closed."""
-    monkeypatch.setattr("evedrop.wire.journal._ROOM", mmap.ALLOCATIONGRANULARITY)
+    monkeypatch.setattr("evedrop.wire.journal_words._ROOM", mmap.ALLOCATIONGRANULARITY)
     words = JournalWords(tmp_path, 1, lambda _: None)
     keys = {words.key_code(key): key for n in range(300) for key in (f"key/{n}", f"{n}/{'ö' * 40 * n}")}
     keys[words.key_code("last")] = "last"  # after which the file has room for more

@@ -11,7 +11,8 @@ import pyarrow as pa
 import pytest
 import zenoh
 
-from evedrop.wire.journal import KeyLimit, journal_tables
+from evedrop.wire.journal_reading import journal_tables
+from evedrop.wire.journal_words import KeyLimit
 from evedrop.wire.on_disk import scorekeeper_on_disk
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.publications import PublicationRelay, Publishers
@@ -51,7 +52,7 @@ def declared(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @pytest.fixture
 def few_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     """The programs of a side may use five keys."""
-    monkeypatch.setattr("evedrop.wire.journal.MOST_KEYS", 5)
+    monkeypatch.setattr("evedrop.wire.journal_words.MOST_KEYS", 5)
 
 
 @pytest.fixture
@@ -183,7 +184,7 @@ def test_the_keys_of_earlier_starts_keep_their_places(tmp_path: Path) -> None:
 
 def test_long_keys_need_more_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """The characters of the keys are limited, too; a shorter key may still fit."""
-    monkeypatch.setattr("evedrop.wire.journal.MOST_CHARACTERS", 100)
+    monkeypatch.setattr("evedrop.wire.journal_words.MOST_CHARACTERS", 100)
     told: list[str] = []
     plan = both_ways()
     limit = KeyLimit(plan.links, [("robot-base", "a" * 40, "put"), ("robot-base", "a" * 40, "query")], told.append)

@@ -16,7 +16,8 @@ import pytest
 from evedrop.errors import TraceError, UsageError
 from evedrop.scenario.recordings.link_fit import fit_messages
 from evedrop.wire.file import resolved_wire, wire_of
-from evedrop.wire.journal import JOURNAL_FOLDER, WireJournal
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_place import JOURNAL_FOLDER
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.recorded_link import journal_recording
 from evedrop.wire.records import AGAIN, Kind, WireFate

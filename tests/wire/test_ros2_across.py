@@ -13,7 +13,8 @@ import pytest
 import zenoh
 
 from evedrop.wire.file import load_wire
-from evedrop.wire.journal import WireJournal, journal_tables
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.relay import WireRelay
 from tests.conftest import LIMIT, wait_until

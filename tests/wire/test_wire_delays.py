@@ -14,7 +14,7 @@ from zenoh.ext import CacheConfig, HistoryConfig, MissDetectionConfig, RecoveryC
 from zenoh.ext import declare_advanced_publisher as advanced_publisher
 from zenoh.ext import declare_advanced_subscriber as advanced_subscriber
 
-from evedrop.wire.journal import journal_tables
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.plan import WireEvent
 from evedrop.wire.records import AGAIN, Kind, WireFate
 from evedrop.wire.steering import WireConductor

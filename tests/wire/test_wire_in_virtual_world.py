@@ -18,7 +18,7 @@ import zenoh
 from evedrop.system.world import world
 from evedrop.virtual.run import SimulatedWorld
 from evedrop.virtual.world import EPOCH
-from evedrop.wire.journal import journal_tables
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.plan import Side, WireEvent, WirePlan
 from evedrop.wire.run import run_wire
 from tests.virtual.wire_programs import connected

@@ -23,7 +23,8 @@ from evedrop.system.world import world
 from evedrop.wire import journal as journal_module
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal import WireJournal, journal_tables, recover
+from evedrop.wire.journal import WireJournal, recover
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.on_disk import summary_of_wire
 from evedrop.wire.records import HELD, Kind, WireFate
 from evedrop.wire.run import _begin_results, run_wire

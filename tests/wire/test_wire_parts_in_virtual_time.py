@@ -17,7 +17,8 @@ from evedrop.system.world import world
 from evedrop.virtual.run import SimulatedWorld
 from evedrop.virtual.scheduler import VirtualScheduler
 from evedrop.virtual.world import EPOCH
-from evedrop.wire.journal import WireJournal, journal_tables
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.plan import WireEvent, WirePlan
 from evedrop.wire.records import HELD, Kind, WireFate
 from evedrop.wire.relay import WireRelay

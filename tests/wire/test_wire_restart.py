@@ -17,7 +17,9 @@ from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.wire.file import load_wire
-from evedrop.wire.journal import JournalRecords, WireJournal, journal_tables
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reading import journal_tables
+from evedrop.wire.journal_records import JournalRecords
 from evedrop.wire.records import Kind, WireFate
 from evedrop.wire.run import continuation, run_wire
 from tests.conftest import Evedrop, Live, wait_until

@@ -18,7 +18,8 @@ from evedrop.results.wire_summary import WIRE_FILE, JournalSummary, WireLinkSumm
 from evedrop.show.report.wire import NOTHING_HEARD, WITHOUT_MODEL, wire_failures, wire_sentences, wire_table
 from evedrop.show.report.writing import write_report
 from evedrop.wire.file import resolved_wire, wire_of
-from evedrop.wire.journal import WireJournal, journal_tables
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.on_disk import closing_lines, scorekeeper_on_disk, summary_of_wire
 from evedrop.wire.plan import Side, WirePlan
 from evedrop.wire.records import AGAIN, UNLINKED, Kind, WireFate

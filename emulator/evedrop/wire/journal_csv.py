@@ -12,7 +12,7 @@ import pyarrow as pa
 from pyarrow import csv
 
 from evedrop.errors import UsageError
-from evedrop.wire.journal import journal_tables
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.records import PARQUET
 
 _PLAIN = pa.schema(

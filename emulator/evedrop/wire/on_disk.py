@@ -22,7 +22,8 @@ from evedrop.show.terminal_tables import fitted
 from evedrop.system.output import columns_of
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal import JOURNAL_FOLDER, JournalOnDisk
+from evedrop.wire.journal_place import JOURNAL_FOLDER
+from evedrop.wire.journal_reading import JournalOnDisk
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.scorekeeper import WireScorekeeper
 

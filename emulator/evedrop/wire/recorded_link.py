@@ -28,7 +28,8 @@ from evedrop.scenario.recordings.message_recording import (
 )
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal import JOURNAL_FOLDER, journal_tables
+from evedrop.wire.journal_place import JOURNAL_FOLDER
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.plan import WirePlan, numbered_as
 from evedrop.wire.records import REASONS, Kind, WireFate, codes_of, delivered_again, records_of
 

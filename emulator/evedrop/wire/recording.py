@@ -27,7 +27,9 @@ from evedrop.show.view.recording import Chunk, RecordingThread
 from evedrop.system.world import world
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal import JOURNAL_FOLDER, WireJournal, journal_tables
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_place import JOURNAL_FOLDER
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.panels import Pace, WirePanels
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.records import records_of

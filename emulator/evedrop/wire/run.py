@@ -25,7 +25,8 @@ from evedrop.system.output import warn
 from evedrop.system.world import world
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import Numbered
-from evedrop.wire.journal import JOURNAL_FOLDER, WireJournal
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_place import JOURNAL_FOLDER
 from evedrop.wire.on_disk import closing_lines
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay

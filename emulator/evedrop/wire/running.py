@@ -32,7 +32,7 @@ from evedrop.system.native_log import MARK
 from evedrop.system.processes import kill, wait_for
 from evedrop.system.world import world
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
-from evedrop.wire.journal import journal_tables
+from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.on_disk import ended_summary, scorekeeper_on_disk
 from evedrop.wire.plan import WirePlan
 

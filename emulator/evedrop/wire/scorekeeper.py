@@ -33,7 +33,8 @@ from evedrop.score.summary import Judged
 from evedrop.system.output import warn
 from evedrop.system.world import world
 from evedrop.wire.deliveries import KeyDeliveries, bounds
-from evedrop.wire.journal import JournalOnDisk, WireJournal
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reading import JournalOnDisk
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import REASONS, UNLINKED, Kind, Records, WireFate
 from evedrop.wire.tables import WireExpectTable

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Final, final
 
 from evedrop.system.world import world
-from evedrop.wire.journal import JournalRecords
+from evedrop.wire.journal_records import JournalRecords
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.records import WireFate
 from evedrop.wire.running_link import KeyOrder, Scheduler
