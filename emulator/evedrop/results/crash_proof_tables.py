@@ -57,7 +57,8 @@ class TableStream:
         self._held: list[list[NDArray[Any]]] = [[] for _ in schema]
         self._held_rows = 0
         self._sink = _Sink(path)
-        options = pa.ipc.IpcWriteOptions(compression="lz4")
+        # Arrow's threads would cost more than they save: the batches are small, and other processes need the cores.
+        options = pa.ipc.IpcWriteOptions(compression="lz4", use_threads=False)
         self._writer = pa.ipc.new_stream(pa.PythonFile(self._sink, mode="w"), schema, options=options)
         # Arrow writes the schema with the first batch, and a reader needs the schema before there are rows.
         empty = [
@@ -344,7 +345,11 @@ def stream_of(folder: Path, name: str) -> Iterator[tuple[pa.Schema, Iterator[pa.
 @contextlib.contextmanager
 def _stream_in(folder: Path, file: str) -> Iterator[pa.RecordBatchStreamReader]:
     """The stream in a file of the folder `unfinished`. Raises OSError or an error of Arrow."""
-    with pa.OSFile(str(folder / UNFINISHED / file)) as source, pa.ipc.open_stream(source) as reader:
+    options = pa.ipc.IpcReadOptions(use_threads=False)
+    with (
+        pa.OSFile(str(folder / UNFINISHED / file)) as source,
+        pa.ipc.open_stream(source, options=options) as reader,
+    ):
         yield reader
 
 
