@@ -22,7 +22,7 @@ from evedrop.live.network.access import Grant, access_control, grants
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import telemetry
 from evedrop.live.protocol.codec import enclosed
-from evedrop.live.protocol.commands import EndRun, Unknown
+from evedrop.live.protocol.commands import EndRun, Hold
 from evedrop.live.protocol.notices import Progress
 from evedrop.live.protocol.packets import read_delivery
 from tests.conftest import LIMIT, wait_until
@@ -86,8 +86,8 @@ def talk(stage: Bench) -> None:
         if name != "sensor":
             stage.put(name, stage.keys.progress(name), Progress(1).pack())
             assert stage.progress[name].hear()[1] == Progress(1).pack()
-        stage.put("recorder", stage.keys.control(name), Unknown().pack())
-        assert stage.controls[name].hear()[1] == Unknown().pack()
+        stage.put("recorder", stage.keys.control(name), Hold().pack())
+        assert stage.controls[name].hear()[1] == Hold().pack()
     stage.put("recorder", stage.keys.progress("recorder"), Progress(1).pack())
     assert stage.progress["recorder"].hear()[1] == Progress(1).pack()
 

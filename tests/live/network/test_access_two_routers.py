@@ -20,7 +20,7 @@ from evedrop.live.network.session import client_config
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol.brief import AnyBrief, RelayPart, RouterPart
 from evedrop.live.protocol.codec import enclosed
-from evedrop.live.protocol.commands import EndRun, Unknown
+from evedrop.live.protocol.commands import EndRun, Hold
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.notices import Progress
 from evedrop.names import RELAY
@@ -61,8 +61,8 @@ def test_everything_that_is_granted_crosses(stage: Bench) -> None:
         stage.settle(name)
     stage.settle("sensor")
     for name in ("sensor", *RECEIVERS):
-        stage.put("recorder", stage.keys.control(name), Unknown().pack())
-        assert stage.controls[name].hear() == (stage.keys.control(name), Unknown().pack())
+        stage.put("recorder", stage.keys.control(name), Hold().pack())
+        assert stage.controls[name].hear() == (stage.keys.control(name), Hold().pack())
 
 
 def test_an_eavesdropper_at_the_relay_hears_its_own_alone(stage: Bench) -> None:

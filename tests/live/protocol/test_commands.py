@@ -20,7 +20,6 @@ from evedrop.live.protocol.commands import (
     LinkChange,
     ReportStatus,
     Start,
-    Unknown,
     read_command,
 )
 from evedrop.model.slot.link import Change
@@ -55,16 +54,12 @@ def test_a_command_is_read_as_it_was_packed(process: str, command: ControlComman
     assert read(process, command.pack()) == command
 
 
-def test_an_unknown_command_is_no_error() -> None:
-    """A later version may have more; those are ignored."""
-    assert read("eve", pack({"do": "dance", "k": "x"})) == Unknown()
-
-
 @pytest.mark.parametrize(
     ("process", "fields", "message"),
     [
         ("eve", {}, "do = None; expected a string do"),
         ("eve", {"do": 3}, "do = 3; expected a string do"),
+        ("eve", {"do": "dance"}, "do = 'dance'; expected one of start, end, where, hold, abandon, go, change, again"),
         ("eve", {"do": "abandon"}, "Object missing required field `why`; expected the fields of Abandon"),
         ("router", {"do": "go"}, "Object missing required field `k`"),
         ("sensor", {"do": "go", "k": 1}, "absent = None; expected a list absent of strings"),

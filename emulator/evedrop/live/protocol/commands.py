@@ -57,10 +57,6 @@ class Hold(ControlCommand, frozen=True, tag="hold"):
     """To the sensor: stop before the next slot."""
 
 
-class Unknown(ControlCommand, frozen=True, tag="unknown"):
-    """A command that this version does not know, and ignores."""
-
-
 class Abandon(ControlCommand, frozen=True, tag="abandon"):
     """To all: the run was given up."""
 
@@ -153,10 +149,11 @@ _KINDS: Mapping[str, type[ControlCommand]] = {
 
 
 def read_command(message: Reader, bounds: Bounds) -> ControlCommand:
-    """Decode a command. Raises MalformedMessage."""
-    kind = _KINDS.get(message.text("do"))
+    """Decode a command. Raises MalformedMessage, also for an unknown command, since ignoring it may make results wrong."""
+    name = message.text("do")
+    kind = _KINDS.get(name)
     if kind is None:
-        return Unknown()
+        raise message.malformed(f"do = {shown(name)}", f"one of {', '.join(_KINDS)}")
     command = message.read(kind)
     command.expect(message, bounds)
     return command
