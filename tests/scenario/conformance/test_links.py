@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from evedrop.model.links.loss_model import Bernoulli, fates_of
 from evedrop.model.links.markov import GilbertElliott
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
+from evedrop.model.streams import Batch
 from evedrop.scenario.conformance.links import DelayChecks, LossChecks
+from evedrop.scenario.conformance.problems import large
 from tests.scenario.conformance.breaking import broken
 
 
@@ -98,6 +101,20 @@ def test_a_loss_model_that_breaks_a_rule_is_told_which(
 ) -> None:
     """As a scheme is."""
     assert message in broken(LossChecks(kind, parameters).verdicts())[rule]
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [
+        *[(Bernoulli, {"quality": 1.0 - lost}) for lost in (1e-5, 1e-4, 1e-3, 0.1)],
+        *[(GilbertElliott, {"p": p, "r": r}) for p, r in ((1e-4, 0.01), (1e-3, 0.5), (0.001, 0.001), (0.3, 0.3))],
+    ],
+)
+def test_a_right_loss_model_passes_with_any_random_numbers(kind: Any, parameters: dict[str, float]) -> None:
+    """Also if losses are rare: if 1 % of all right models failed, one of these would with a probability over 99.9 %."""
+    checks, problem = LossChecks(kind, parameters), large()[0]
+    for number in range(100):
+        checks.rate(replace(problem, batch=Batch(60, 600, 600 * number)))
 
 
 class Early(Normal):
