@@ -190,13 +190,17 @@ def test_no_burst_is_expected_of_a_sensor_that_stays_silent() -> None:
     assert link_summary_of(right, "bursts", tally).expected_mean_burst is None
 
 
-def test_no_delays_are_expected_of_packets_to_a_receiver_that_is_away_at_times() -> None:
-    """Those that meet an outage on their way are missing, and slow ones meet one more often."""
+def test_packets_that_a_receiver_misses_and_those_that_the_end_cuts_off_count_by_their_delays() -> None:
+    """Slow ones would be missing more often: the fractions are within 5 standard errors of the model all the same."""
     right = linked(5, [{"from": k, "to": k + 2, "pause": "slow"} for k in range(4, 396, 6)])
     slow = link_summary_of(right, "slow", tally_of(right, "slow"))
     assert slow.lost_by["paused"] > 0
+    assert slow.lost_by["underway"] > 0
     assert slow.delays is not None
-    assert slow.expected_delays is None
+    assert slow.expected_delays is not None
+    total = slow.delivered + sum(slow.lost_by[reason] for reason in ("late", "paused", "underway"))
+    for fraction, expected in zip(slow.delays, slow.expected_delays, strict=True):
+        assert abs(fraction - expected) < 5 * np.sqrt(expected * (1 - expected) / total) + 1e-12
 
 
 def test_nothing_is_said_of_what_was_not_measured() -> None:

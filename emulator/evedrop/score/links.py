@@ -151,7 +151,7 @@ def _expected_burst(pieces: list[tuple[LossModel, list[Thinned]]]) -> float | No
 
 
 def _with_delays(link: LinkSummary, schedule: LinkSchedule, tally: Tally) -> LinkSummary:
-    """The link with fractions of its delivered packets by delay, and their quantiles."""
+    """The link with fractions of the packets that it let through by delay, and their quantiles."""
     total = int(tally.delays.sum())
     if schedule.settings.get("delay") is None or not total:
         return link
@@ -159,8 +159,7 @@ def _with_delays(link: LinkSummary, schedule: LinkSchedule, tally: Tally) -> Lin
     return replace(
         link,
         delays=fractions.tolist(),
-        # Slow packets meet an outage of the receiver more often, and then have no delay: the rest is not a fair sample.
-        expected_delays=None if schedule.outages else _expected_delays(schedule),
+        expected_delays=_expected_delays(schedule),
         delay_quantiles={f"{level:g}": _quantile(np.cumsum(fractions), level) for level in QUANTILES},
     )
 

@@ -163,7 +163,7 @@ class LinkSummary(LinkAccount):
     mean_burst: float | None = None
     expected_mean_burst: float | None = None
     delays: Sequence[float] | None = None
-    """Fractions of the delivered packets by delay in slots, the last for delays beyond the window."""
+    """Fractions of the packets that the link let through by delay in slots, the last for delays beyond the window."""
     expected_delays: Sequence[float] | None = None
     delay_quantiles: Mapping[str, int | None] | None = None
 

@@ -31,11 +31,14 @@ K = 4
 
 
 def delays_of(slots: LinkSlots, window: int) -> np.ndarray:
-    """Delays that packets with these fates may have, as a journal has them: those that have no fate yet are one slot late."""
-    late = slots.lost[:, REASONS.index("late")].sum()
-    under_way = slots.delivered.size - slots.delivered.sum() - slots.lost.sum() - slots.unsent.sum()
+    """Delays that packets with these fates may have, as a journal has them.
+
+    Those that a receiver misses are in time, and those under way one slot late, whatever becomes of them.
+    """
+    lost = dict(zip(REASONS, slots.lost.sum(axis=0).tolist(), strict=True))
+    under_way = slots.delivered.size - slots.delivered.sum() - slots.lost.sum() - slots.unsent.sum() + lost["underway"]
     within = [under_way, *[0] * (window - 1)] if window else []
-    return np.array([slots.delivered.sum(), *within, late], np.uint32)
+    return np.array([slots.delivered.sum() + lost["down"] + lost["paused"], *within, lost["late"]], np.uint32)
 
 
 def _on(path: str, read: Callable[[Reader], Any]) -> tuple[str, Callable[[bytes], Any]]:

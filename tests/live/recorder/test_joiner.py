@@ -68,7 +68,7 @@ def link_of(window: int) -> LinkSlots:
     delivered = RNG.random((SLOTS, TRIALS)) < 0.5
     unsent = (RNG.random(SLOTS) < 0.5).astype(np.uint32) * (~delivered).any(axis=1)
     missing = np.count_nonzero(~delivered, axis=1) - unsent
-    kind = RNG.integers(0, len(REASONS), SLOTS)
+    kind = RNG.integers(0, len(REASONS) - (window == 0), SLOTS)  # without a window, none is under way
     lost = np.where(np.arange(len(REASONS)) == kind[:, None], missing[:, None], 0).astype(np.uint32)
     late = RNG.integers(0, window + 1, (SLOTS, TRIALS)).astype(np.uint16) if window else None
     return LinkSlots(0, delivered, lost, unsent.astype(np.uint32), late)

@@ -24,8 +24,6 @@ from evedrop.model.receiver import Action, Belief, Flags, asymmetry, packed_flag
 from evedrop.model.slot.link import COUNTED_BURSTS, Account
 from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
 
-_LATE = REASONS.index("late")
-
 
 @dataclass(frozen=True)
 class Extent:
@@ -260,11 +258,11 @@ def read_journal(message: Reader, first: int, windows: Mapping[str, int], extent
 def _check_account(message: Reader, name: str, link: Account, window: int) -> None:
     """Check that every packet has one fate: delivered in its slot, lost, not sent, or, if packets may be late, under way.
 
-    Its delay must be one that this fate can have.
+    Its delay must be one that this fate can have: a receiver that is away misses packets in their slots and later ones.
     """
     slots = link.slots
     trials = slots.delivered.shape[1]
-    delivered, late = slots.delivered.sum(axis=1), slots.lost[:, _LATE].tolist()
+    delivered = slots.delivered.sum(axis=1)
     fates = delivered + slots.lost.sum(axis=1, dtype=np.int64) + slots.unsent
     wrong = (fates > trials) if window else (fates != trials)
     if wrong.any():
@@ -274,7 +272,10 @@ def _check_account(message: Reader, name: str, link: Account, window: int) -> No
         )
     in_time, *within, after = link.delays.tolist()
     delays = [in_time, sum(within), after]
-    expected = [sum(delivered.tolist()), slots.delivered.size - sum(fates.tolist()), sum(late)]
+    lost = dict(zip(REASONS, slots.lost.sum(axis=0, dtype=np.int64).tolist(), strict=True))
+    away, later = lost["down"] + lost["paused"], slots.delivered.size - sum(fates.tolist()) + lost["underway"]
+    missed = min(max(in_time - sum(delivered.tolist()), 0), away)
+    expected = [sum(delivered.tolist()) + missed, later + away - missed, lost["late"]]
     if delays != expected:
         raise message.malformed(
             f"delays of {name}'s packets for {delays} in their slots, within the window and after it",

@@ -370,6 +370,7 @@ def link_of(loss: Mapping[str, Any], key: bytes, batch: Batch) -> Link:
     return Link(LinkSchedule({"loss": loss}), "it", {"link/it": key}, batch)
 
 
+_LET_THROUGH = (Fate.DELIVERED, Fate.LATE, Fate.DOWN, Fate.PAUSED, Fate.UNDERWAY)
 COUNTED_BURSTS = 64
 """Bursts of at least this many packets are counted together."""
 
@@ -383,7 +384,9 @@ class Account:
     """Runs of packets lost to the loss model that ended in these slots, by length: 1, 2, … and 64 or more. A slot without a
     packet ends a run."""
     delays: NDArray[np.uint32]
-    """Packets of these slots that were not lost, by their delay in slots: 0, 1, …, the window, and more."""
+    """Packets of these slots that the link let through, by their delay in slots: 0, 1, …, the window, and more.
+
+    With those that their receiver missed and those that the run's end cut off, which would be the slow ones more often."""
 
 
 @final
@@ -426,9 +429,9 @@ class Accountant:
         bins = self._window + 2
         if fates.delays is None:
             delays = np.zeros(bins, np.uint32)
-            delays[0] = counts[:, [Fate.DELIVERED, Fate.LATE]].sum()
+            delays[0] = counts[:, _LET_THROUGH].sum()
             return delays
-        through = (fates.codes == int(Fate.DELIVERED)) | (fates.codes == int(Fate.LATE))
+        through = np.isin(fates.codes, _LET_THROUGH)
         return np.bincount(np.minimum(fates.delays[through], bins - 1), minlength=bins).astype(np.uint32)
 
 
