@@ -22,6 +22,7 @@ from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
 from evedrop.scenarios import shipped
 from evedrop.score.run_tally import RunTally
+from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.simulate.montecarlo import check_mode
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import tasks_of
@@ -53,6 +54,22 @@ def test_totals_come_back(name: str, tmp_path: Path) -> None:
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert packed(load_score(tmp_path, scenario)) == packed(run_tally)
     assert packed(load_score(tmp_path / "none", scenario)) == packed(RunTally.nothing(scenario, 5))
+
+
+def test_a_digest_is_that_of_all_trials_or_none(tmp_path: Path) -> None:
+    """An application's too, of which another shard has stored nothing; its means are those of the trials that are there."""
+    scenario = load("replay-attack", {"slots": 12, "trials": 5, "expect": [], "event": [], "integrity.attack": None})
+    (task,) = tasks_of(scenario, Mode.EXACT, 1)
+    run_tally = task.carry_out(lambda _: None, lambda: False).blocks[0].run_tally
+    twice = scenario.model_copy(update={"trials": 10})
+    entries = []
+    for other in (run_tally, load_score(tmp_path, scenario)):
+        both = RunTally.merged([run_tally, other])
+        summary = summary_of(twice, both, dict.fromkeys(scenario.digested), RunOutcome(0.0))
+        entries.append(summary.applications["integrity"])
+    assert entries[0]["digest"]
+    assert entries[1]["digest"] is None
+    assert entries[1]["watermark_cost"] == pytest.approx(entries[0]["watermark_cost"])
 
 
 def test_a_file_of_somebody_else_runs_nothing(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -133,6 +133,17 @@ class LoopTally:
             for name, application in tallies[0].applications.items()
         }
         return whole
+
+    def entries(self, trials: int) -> dict[str, dict[str, Any]]:
+        """Application → its entry of the summary of a run of so many trials, which may be more than these.
+
+        Its means are of these, but a digest would be one of all: there is none where a shard has no metrics.
+        """
+        entries = {name: dict(tally.entry()) for name, tally in self.applications.items()}
+        for entry in entries.values():
+            if "digest" in entry and self.of_trials.shape[1] < trials:
+                entry["digest"] = None
+        return entries
 
     def summary(
         self, scenario: Scenario, legitimate: PeerSummary, times: SolveTimes, digest: str | None

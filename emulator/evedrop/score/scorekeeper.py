@@ -220,8 +220,8 @@ def summary_of(
     digests = {name: None if name in ending.accused else entry for name, entry in digests.items()}
     expected = expectations_of(scenario)
     peers = {name: _peer(name, tally, expected[name], digests[name], ending.mode) for name, tally in tallies.items()}
-    applications = {} if loop is None else {name: entry.entry() for name, entry in loop.applications.items()}
     legitimate = tallies[LEGITIMATE]
+    applications = {} if loop is None else loop.entries(legitimate.trials)
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
     true = true_ratios(run_tally, expected)
     secret, _, verdict = verdicts(scenario, tallies, expected, true)
