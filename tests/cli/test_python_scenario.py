@@ -179,6 +179,25 @@ def test_none_removes_entries_of_lists_too() -> None:
     assert fewer.event[0] == vehicle(event=[{**kill, "state": None}]).event[0]
 
 
+def test_all_changes_number_the_entries_of_lists_as_before(tmp_path: Path) -> None:
+    """Whether others are removed, changed, replaced or added by the same call; one that is removed and given is new."""
+    scenario = vehicle(event=[{"at": at, "note": "a word"} for at in range(10, 35, 5)])
+    file = tmp_path / "scenario.toml"
+    file.write_text(scenario.to_toml())
+    changes = {
+        "event.0": None,
+        "event.1.at": 16,
+        "event.2": {"at": 21, "note": "x"},
+        "event.5": {"at": 35, "note": "x"},
+    }
+    again = {"event.3": None, "event.3.at": 40, "event.3.note": "x"}
+    for changed in (scenario.replace(changes | again), Scenario.load(file, again | changes)):
+        assert [event.first for event in changed.event] == [16, 21, 40, 30, 35]
+    with pytest.raises(ScenarioError, match=r"event\.0\.at") as raised:
+        Scenario.load(file, {"event.0": None, "event.1.at": -1})
+    assert "line" not in str(raised.value)
+
+
 @pytest.mark.thorough
 def test_a_class_of_a_module_is_named_and_its_folder_known(own: Any, tmp_path: Path) -> None:
     """Worker processes import it from there: the same digests as in this process, and as by name."""

@@ -52,6 +52,8 @@ MOST_VALUES = 1_000_000
 _TWICE = ("Cannot overwrite", "Cannot declare", "Cannot mutate", "Cannot redefine")
 """How Python's TOML reader begins to say that an entry is given twice."""
 _MOST_DOTS = 32
+_REMOVED: Any = object()
+"""An entry of a list that is removed, until all other changes are made."""
 # Python's TOML reader takes time that grows with the square of the number of a key's parts.
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
 _DOTTED = re.compile(rf"""(?<![A-Za-z0-9_"'.-])(?:{_PART}){{{_MOST_DOTS}}}""")
@@ -112,10 +114,10 @@ def parse(
     tables = tables_in(text, source)
     if not tables and not changes:
         raise ScenarioError(source, ["has no entries; `evedrop new FILE` writes a scenario to start from"])
-    _remove(tables, without)
     locate_files(tables, folder)
-    with with_line_numbers(text, changes or ()):
-        return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
+    renumbered = [above for above, _, last in (key.rpartition(".") for key in without) if last.isdecimal()]
+    with with_line_numbers(text, [*(changes or ()), *renumbered]):
+        return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder, without=without)
 
 
 def locate_files(tables: dict[str, Any], folder: Path) -> None:
@@ -169,13 +171,17 @@ def checked(
     *,
     beyond_horizon: bool = False,
     folder: Path = Path(),
+    without: Collection[str] = (),
 ) -> Scenario:
     """The scenario that tables describe, with changes made and recordings read. Raises ScenarioError with every mistake.
 
-    folder: where custom modules are, if the tables name any and name no folder of modules.
+    folder: where custom modules are, if the tables name any and name no folder of modules; without: as for `load`.
     """
+    shortened = _remove(tables, without)
     for key, value in (changes or {}).items():
         set_entry(tables, key, value)
+    for entries in shortened:
+        entries[:] = [entry for entry in entries if entry is not _REMOVED]
     if changes and (wrong := list(unusable(tables))):
         raise ScenarioError(source, wrong)
     if any(named_in(tables)):
@@ -238,7 +244,7 @@ def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
                 inner[name] = new
             inner = inner[name]
         elif isinstance(inner, list) and name.isdecimal() and int(name) <= len(inner):
-            if last or int(name) == len(inner):
+            if last or int(name) == len(inner) or inner[int(name)] is _REMOVED:
                 inner[int(name) : int(name) + 1] = [new]
             inner = inner[int(name)]
         else:
@@ -441,10 +447,8 @@ def prepared(scenario: str | Path | Scenario, changes: Mapping[str, Any], *, bey
 
 def changed(scenario: Scenario, changes: Mapping[str, Any], *, beyond_horizon: bool = True) -> Scenario:
     """The scenario with changes by dotted key; None removes an entry. Raises ScenarioError with every mistake."""
-    tables = scenario.as_tables()
-    _remove(tables, _without_value(changes))
-    made = plain_tables(changes, scenario.title, scenario.modules)
-    return checked(tables, scenario.title, made, beyond_horizon=beyond_horizon)
+    made, without = plain_tables(changes, scenario.title, scenario.modules), _without_value(changes)
+    return checked(scenario.as_tables(), scenario.title, made, beyond_horizon=beyond_horizon, without=without)
 
 
 def _without_value(changes: Mapping[str, Any]) -> list[str]:
@@ -452,13 +456,13 @@ def _without_value(changes: Mapping[str, Any]) -> list[str]:
     return [key for key, value in changes.items() if value is None]
 
 
-def _remove(tables: dict[str, Any], keys: Collection[str]) -> None:
-    """Remove entries by dotted key, in place, those of lists by number; those that are not there, too."""
+def _remove(tables: dict[str, Any], keys: Collection[str]) -> list[list[Any]]:
+    """Remove entries by dotted key, in place, those of lists by number; those that are not there, too.
 
-    def numbered(key: str) -> list[tuple[int, str]]:
-        return [(int(name) if name.isdecimal() else -1, name) for name in key.split(".")]
-
-    for key in sorted(keys, key=numbered, reverse=True):  # the last one of a list first: that changes no other's number
+    The lists that it returns have `_REMOVED` in place of entries, so that the others keep their numbers until it is taken out.
+    """
+    shortened = []
+    for key in keys:
         *above, last = key.split(".")
         inner: Any = tables
         for name in above:
@@ -466,7 +470,9 @@ def _remove(tables: dict[str, Any], keys: Collection[str]) -> None:
         if isinstance(inner, dict):
             inner.pop(last, None)
         elif _entry(inner, last) is not None:
-            del inner[int(last)]
+            inner[int(last)] = _REMOVED
+            shortened.append(inner)
+    return shortened
 
 
 def _entry(table: Any, name: str) -> Any:
