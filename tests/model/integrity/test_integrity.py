@@ -145,6 +145,21 @@ def test_a_replay_is_seen_only_with_a_watermark() -> None:
     assert heard == [0, 1, 2, 3, 4, 2, 3, 4, 2, 3, 4, 2, 12, 13]
 
 
+@pytest.mark.parametrize("recorded", [1, 2, 3, 5])
+def test_a_slot_of_any_replay_repeats_what_the_filter_got_so_many_slots_before(recorded: int) -> None:
+    """Also if that is in an earlier attack, which has just ended, and if one follows another at once."""
+    spans = ((5, 8), (9, 10), (10, 14), (16, 17))
+    spoofing = MonitorPlan.of(LOOP, 0.3 * ONE, ALWAYS, ("replay", {"recorded": recorded}), spans).spoofing(
+        b"", Batch(20, 1)
+    )
+    assert spoofing is not None
+    heard: list[float] = []
+    for k in range(20):
+        expected = heard[k - recorded] if any(start <= k < stop for start, stop in spans) else float(k)
+        heard.append(float(spoofing(k, np.array([[float(k)]]))[0, 0]))
+        assert heard[k] == expected
+
+
 @pytest.mark.parametrize("k", [0, 1])
 def test_replaced_measurements_are_stationary_from_slot_0_on(k: int) -> None:
     """The values z of 4000 trials have the variance 0.1 / (1 − 0.8²) to 6 standard errors; the noise w_a alone has 0.1."""

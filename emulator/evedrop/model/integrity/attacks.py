@@ -1,7 +1,7 @@
 """Attacks on the sensor's measurements: other numbers take their place in some slots.
 
 `replace`: the sensor reports a stationary process of the attacker's own, z⁺ = A_a z + w_a, instead of y. `replay`: the sensor
-reports again what it measured in the slots before the attack, over and over.
+reports again what it reported some slots before, so that an attack repeats the slots before it, over and over.
 """
 
 from __future__ import annotations
@@ -219,7 +219,10 @@ class Replay(SensorAttack):
 
 @final
 class _Recording:
-    """The slot k of the attack repeats slot k − recorded, so both are at the same place, k modulo `recorded`."""
+    """The slot k of the attack repeats slot k − recorded, so both are at the same place, k modulo `recorded`.
+
+    Of an earlier attack, it repeats what the filter got: nothing is recorded while the attacker's numbers are reported.
+    """
 
     def __init__(self, recorded: int) -> None:
         self._recorded = recorded
