@@ -28,12 +28,13 @@ from evedrop.errors import UsageError
 from evedrop.results import crash_proof_tables
 from evedrop.results.crash_proof_tables import goes_on, last_round, parquet_batches
 from evedrop.results.ending import note_end
-from evedrop.results.folder import UNFINISHED
+from evedrop.results.folder import STATES, UNFINISHED
 from evedrop.results.reading import Results
-from evedrop.results.resolved_scenario import write_resolved
+from evedrop.results.resolved_scenario import TakenStates, write_resolved
 from evedrop.results.summary_file import unwritten
 from evedrop.results.writer import ResultsWriter
 from evedrop.scenario.loading import load
+from evedrop.scenario.recordings.disturbance_file import recorded_states
 from evedrop.scenario.tables import Scenario
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, summary_of
@@ -42,8 +43,9 @@ from evedrop.score.sums import SlotSums
 from evedrop.show.view.scene_slots import replay
 from evedrop.system.disk import write_all
 from evedrop.system.files import try_lock
+from evedrop.virtual.disk import DiskFault
 from tests.conftest import Evedrop, Live, wait_until
-from tests.disks import simulated
+from tests.disks import run_program, simulated
 from tests.examples import examples, mostly_long
 from tests.rogue import with_rogue
 from tests.steps import stepping
@@ -515,6 +517,26 @@ def test_rows_follow_no_batch_that_was_cut(tmp_path: Path, monkeypatch: pytest.M
             full[0] = False
             writer.write_rows(f"slot {first + count}")
     assert Results(tmp_path, {}).slots.num_rows == 100
+
+
+@pytest.mark.parametrize("fault", [DiskFault.BROKEN, DiskFault.FULL, DiskFault.FULL_ONCE])
+def test_states_of_which_a_part_was_written_can_be_read(fault: DiskFault, tmp_path: Path) -> None:
+    """An error in the middle of a write leaves the lines before it, and nothing is written again when the file is closed."""
+    process = SCENARIO.process.model_copy(update={"states": ["x", "y"]})
+    with simulated(tmp_path) as (scheduler, disk):
+
+        def take() -> None:
+            taken = TakenStates(disk.root, process)
+            taken.add(np.array([[0.25, 0.5], [0.75, 1.0]]))
+            taken.write()
+            disk.fail_next(fault)
+            taken.add(np.full((2, 2), 3.25))
+            with pytest.raises(OSError, match=r"Input/output|No space"):
+                taken.write()
+            taken.close()
+
+        run_program(scheduler, take)
+        assert recorded_states(disk.root / STATES).rows == [[0.25, 0.5], [0.75, 1.0]]
 
 
 def test_a_power_cut_may_take_hundreds_of_rounds(tmp_path: Path) -> None:

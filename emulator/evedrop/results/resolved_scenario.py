@@ -21,7 +21,7 @@ from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.recordings.disturbance_file import number_lines, table_head, table_text
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import toml_text
-from evedrop.system.world import world
+from evedrop.system.files import LineFile
 
 
 @final
@@ -31,8 +31,8 @@ class TakenStates:
     def __init__(self, folder: Path, process: ProcessTable) -> None:
         """Raises OSError if the file cannot be written."""
         self._around = np.array(process.around)
-        self._file = world().disk.text_writer(folder / STATES, "ab")
-        self._held: list[str] = [] if self._file.tell() else [table_head(process.states or (), process.units)]
+        self._file = LineFile(folder / STATES)
+        self._held: list[str] = [] if self._file.size else [table_head(process.states or (), process.units)]
 
     def add(self, x: Floats) -> None:
         """Add the states of the next slots, as deviations from the reference, (c, n)."""
@@ -40,10 +40,9 @@ class TakenStates:
         self._held.append(number_lines(rows))
 
     def write(self) -> None:
-        """Write all lines that are held back. Raises OSError if they cannot be written."""
+        """Write all lines that are held back. Raises OSError if they cannot be written, and leaves the file as it was."""
         held, self._held = "".join(self._held), []
-        self._file.write(held)
-        self._file.flush()
+        self._file.write(held.encode())
 
     def close(self) -> None:
         """Close the file."""

@@ -180,7 +180,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @final
 class LineFile:
-    """A file of JSON values, one a line, that grows. A line counts only if it is complete.
+    """A file of lines that grows, such as JSON values, one a line. A line counts only if it is complete.
 
     So `lines_in` reads everything that was appended, wherever the process was killed or the disk became full.
     """
@@ -203,14 +203,23 @@ class LineFile:
     def append(self, value: Any) -> bytes:
         """Add a line; returns it. Raises OSError if the disk has no room for it, and leaves the file as it was."""
         line = json.dumps(value).encode() + b"\n"
+        self.write(line)
+        return line
+
+    def write(self, lines: bytes) -> None:
+        """Add complete lines. Raises OSError as `append` does."""
         try:
-            write_all(self._file, line)
+            write_all(self._file, lines)
         except OSError:
             with suppress(OSError):
                 self._file.truncate(self._size)
             raise
-        self._size += len(line)
-        return line
+        self._size += len(lines)
+
+    @property
+    def size(self) -> int:
+        """The bytes of its lines."""
+        return self._size
 
     def close(self) -> None:
         """Close the file."""
