@@ -20,7 +20,7 @@ from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.operator import Answer, Order
 from evedrop.live.network.session import listening_config
 from evedrop.live.protocol.codec import Dropped
-from evedrop.live.protocol.keys import RunKeys, ZenohConfig
+from evedrop.live.protocol.keys import QUESTION_BYTES, RunKeys, ZenohConfig
 from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest, WireLinkStatus, WireStatus
 from evedrop.names import OPERATOR, RECORDER
 from evedrop.system.output import warn
@@ -98,7 +98,7 @@ class WireConductor:
                 self._clock.wait(self._changed, max(0.0, following[0] - self.seconds) if following else None)
 
 
-_TRANSPORT: ZenohConfig = {"link": {"rx": {"max_message_size": 2**20}}}
+_TRANSPORT: ZenohConfig = {"link": {"rx": {"max_message_size": 2 * QUESTION_BYTES}}}
 
 
 @final

@@ -13,14 +13,16 @@ from typing import Any
 import pytest
 import zenoh
 
+from evedrop.errors import UsageError
+from evedrop.live.network.connection import Question
 from evedrop.live.network.control_file import Control
-from evedrop.live.network.operator import Answer, ask
+from evedrop.live.network.operator import Answer, Order, ask
 from evedrop.live.protocol.brief import AnyBrief, RecorderPart
 from evedrop.live.protocol.codec import enclosed, payload_of
-from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.requests import PauseRequest, StatusRequest, StepRequest
+from evedrop.live.protocol.keys import COMMAND_BYTES, QUESTION_BYTES, RunKeys
+from evedrop.live.protocol.requests import LinkRequest, PauseRequest, StatusRequest, StepRequest
 from tests.builders import part_of
-from tests.conftest import wait_until
+from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
 
 OTHERS = ("sensor", "legitimate", "eve", "mallory", "nadia")
@@ -85,6 +87,41 @@ def test_the_operator_is_answered(stage: Bench) -> None:
     with answering(stage) as asked:
         assert ask(control(stage), StepRequest(3), PATIENCE) == Answer(7, "yes")
         assert asked == [StepRequest(3).pack()]
+
+
+def test_what_is_too_large_is_refused_and_not_lost(stage: Bench) -> None:
+    """The largest question and the largest answer arrive; of larger ones the operator learns how large they are."""
+    key, sizes = stage.keys.control("recorder"), []
+
+    def answer(query: zenoh.Query) -> None:
+        assert query.payload is not None
+        question = Question(key, query, payload_of(key, query.payload.to_bytes()) or b"")
+        order = Order.of(question)
+        assert order is not None
+        sizes.append(len(question.payload))
+        if isinstance(order.request, StepRequest):
+            order.done(7, "x" * (COMMAND_BYTES - len(Answer(7, "x" * 2**16).pack()) + 2**16 + order.request.slots - 1))
+        else:
+            order.done(7, "yes")
+
+    def link(size: int) -> LinkRequest:
+        least = len(LinkRequest({"note": "x" * 2**16}).pack()) - 2**16
+        return LinkRequest({"note": "x" * (size - least)})
+
+    queryable = stage.sessions["recorder"].declare_queryable(key, answer)
+    wait_until(lambda: ask(control(stage), StatusRequest(), PATIENCE), "a recorder that answers")
+    sizes.clear()
+    assert ask(control(stage), link(QUESTION_BYTES), PATIENCE) == Answer(7, "yes")
+    with pytest.raises(UsageError, match=f"has {QUESTION_BYTES + 1} bytes; expected at most {QUESTION_BYTES}"):
+        ask(control(stage), link(QUESTION_BYTES + 1), PATIENCE)
+    assert sizes == [QUESTION_BYTES]
+    largest = ask(control(stage), StepRequest(1), LIMIT)
+    assert largest is not None
+    assert len(largest.pack()) == COMMAND_BYTES
+    larger = ask(control(stage), StepRequest(2), LIMIT)
+    assert larger is not None
+    assert larger.refused[0].startswith(f"the answer has {COMMAND_BYTES + 1} bytes")
+    queryable.undeclare()
 
 
 @pytest.mark.parametrize("who", OTHERS)

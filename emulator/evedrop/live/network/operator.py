@@ -13,7 +13,7 @@ from typing import final
 import zenoh
 from msgspec import field
 
-from evedrop.errors import MalformedMessage
+from evedrop.errors import MalformedMessage, UsageError
 from evedrop.live.network.connecting import open_session
 from evedrop.live.network.connection import Question
 from evedrop.live.network.control_file import Control
@@ -21,7 +21,7 @@ from evedrop.live.network.endpoint import endpoint_in
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import AnyBrief, RelayPart, RoutingPart
 from evedrop.live.protocol.codec import Reader, StructMessage, enclosed, payload_of
-from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.keys import COMMAND_BYTES, QUESTION_BYTES, RunKeys
 from evedrop.live.protocol.requests import OperatorRequest, RunStatus, WireStatus, read_request
 from evedrop.names import OPERATOR, RECORDER
 from evedrop.system.fields import Slot
@@ -65,8 +65,12 @@ class Order:
             return None
 
     def answer(self, answer: Answer) -> None:
-        """Send the answer."""
-        self._question.answer(answer.pack())
+        """Send the answer; if it is too large to reach the operator, send only that it is."""
+        payload = answer.pack()
+        if len(payload) > COMMAND_BYTES:
+            large = f"the answer has {len(payload)} bytes, and at most {COMMAND_BYTES} reach you; the summary has them later"
+            payload = Answer(refused=(large,)).pack()
+        self._question.answer(payload)
 
     def done(self, slot: int, text: str) -> None:
         """Answer that the request takes effect from this slot on; text: what was done, in words."""
@@ -85,13 +89,18 @@ def read_answer(key: str, payload: bytes) -> Answer:
 def ask(control: Control, request: OperatorRequest, patience: float) -> Answer | None:
     """Ask the recorder of a run; None if it does not answer within `patience` seconds, because the run is over or ends.
 
-    Raises zenoh.ZError if the router is not there or refuses the operator.
+    Raises zenoh.ZError if the router is not there or refuses the operator, UsageError if the request is too large for it.
     """
+    payload = request.pack()
+    if len(payload) > QUESTION_BYTES:
+        raise UsageError(
+            f"the request has {len(payload)} bytes; expected at most {QUESTION_BYTES}: give shorter values"
+        )
     world().zenoh.init_log_from_env_or("off")
     key = RunKeys(control.run).control(RECORDER)
     # A run in progress has a router: one attempt is enough.
     with open_session(client_config(control)) as session:
-        for reply in session.get(key, payload=enclosed(key, request.pack()), timeout=patience):
+        for reply in session.get(key, payload=enclosed(key, payload), timeout=patience):
             answer = None if reply.ok is None else payload_of(key, reply.ok.payload.to_bytes())
             if answer is not None:
                 return read_answer(key, answer)

@@ -114,8 +114,9 @@ ZenohConfig = dict[str, Any]
 _FRAME_BYTES = 4096
 """Room for the other parts of a message: its key, field names, and additions of later versions."""
 COMMAND_BYTES = 32 * 2**20
-"""The largest command: changes of links contain their settings, such as recorded losses."""
-_QUESTION_BYTES = 2**20
+"""The largest command: changes of links contain their settings, such as recorded losses; and the largest answer."""
+QUESTION_BYTES = 2**20
+"""The largest request of the operator."""
 _NAME_BYTES = 128  # of a key in a list
 _LATE_BYTES = 32  # of the slots of a late packet, besides its columns
 
@@ -180,6 +181,6 @@ def low_pass(run: str, kinds: Mapping[str, int]) -> list[ZenohConfig]:
     asked = [f"evedrop/{run}/control/recorder"]
     return [
         *(rule(kind, under[kind], size, ["put", "delete"]) for kind, size in kinds.items()),
-        rule("question", asked, _QUESTION_BYTES, ["query"]),
-        rule("answer", asked, COMMAND_BYTES, ["reply"]),
+        rule("question", asked, QUESTION_BYTES + _FRAME_BYTES, ["query"]),
+        rule("answer", asked, COMMAND_BYTES + _FRAME_BYTES, ["reply"]),
     ]
