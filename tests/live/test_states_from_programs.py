@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -139,6 +141,36 @@ def test_states_are_taken_from_messages_as_they_come() -> None:
             if not newest:
                 with pytest.raises(RunError, match="more than 100000 states wait at slot 3"):
                     states.take(range(3, 4))
+
+
+@dataclass
+class Large:
+    """A sample of one MiB, of which a test counts how many are kept."""
+
+    payload: zenoh.ZBytes
+    key_expr: str = "robot/pose"
+    kind: ClassVar[zenoh.SampleKind] = zenoh.SampleKind.PUT
+
+
+def test_waiting_states_have_a_bounded_size() -> None:
+    """Large messages are refused in time, whatever their number; those that were taken, or left out, do not count."""
+    entry = ProgramPart("robot/pose", ["x", "v"], [0.0, 0.0], listen="tcp/127.0.0.1:0")
+    sample = Large(zenoh.ZBytes(b"[1, 0]".ljust(2**20)))
+    for newest in (True, False):
+        with ProgramStates(entry, newest, 5.0) as states:
+            for k in range(300):
+                states.hear(sample)  # type: ignore[arg-type]
+                assert states.take(range(k, k + 1))[0, 0] == 1.0
+            tracemalloc.start()
+            for _ in range(400):
+                states.hear(sample)  # type: ignore[arg-type]
+            most = tracemalloc.get_traced_memory()[1]
+            tracemalloc.stop()
+            assert most < (3 if newest else 260) * 2**20
+            with (
+                nullcontext() if newest else pytest.raises(RunError, match="more than 268435456 bytes wait at slot 300")
+            ):
+                states.take(range(300, 301))
 
 
 def test_a_silent_program_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

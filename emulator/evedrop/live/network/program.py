@@ -21,6 +21,7 @@ from evedrop.system.world import world
 LEAST_SECONDS = 5.0
 """The least time for which a program may be silent, as for a process of the run."""
 _MOST_WAITING = 100_000
+_MOST_WAITING_BYTES = 256 * 2**20
 _CONNECT_SECONDS = 30.0
 
 
@@ -51,7 +52,10 @@ class ProgramStates:
         """Raises BriefError if there is no router at the endpoint, or if the endpoint cannot be listened on."""
         self._entry = entry
         self._patience = max(patience, LEAST_SECONDS)
-        self._heard: deque[bytes] = deque(maxlen=1 if newest else _MOST_WAITING + 1)
+        self._newest = newest
+        self._heard: deque[bytes] = deque()
+        self._bytes = 0
+        """Of the messages that wait."""
         self._changed = world().condition()
         self._waited = 0.0
         where = entry.listen or entry.connect
@@ -79,8 +83,20 @@ class ProgramStates:
         large = len(sample.payload) > MOST_BYTES
         payload = bytes(MOST_BYTES + 1) if large else sample.payload.to_bytes()
         with self._changed:
-            self._heard.append(payload)
+            if self._newest:
+                self._heard.clear()
+                self._bytes = 0
+            if not self._too_many:
+                self._heard.append(payload)
+                self._bytes += len(payload)
             self._changed.notify()
+
+    @property
+    def _too_many(self) -> str:
+        """What waits too much, in words; empty while there is room for one message more."""
+        if len(self._heard) > _MOST_WAITING:
+            return f"more than {_MOST_WAITING} states wait"
+        return f"states in more than {_MOST_WAITING_BYTES} bytes wait" if self._bytes > _MOST_WAITING_BYTES else ""
 
     @property
     def waited(self) -> float:
@@ -96,12 +112,13 @@ class ProgramStates:
         with self._changed:
             there = self._changed.wait_for(lambda: self._heard, self._patience)
             self._waited = world().monotonic() - began
-            if len(self._heard) > _MOST_WAITING:
+            if too_many := self._too_many:
                 raise RunError(
-                    f"{self._about}: more than {_MOST_WAITING} states wait at slot {k}: the program sends faster than the run "
-                    "goes; give a pace, so that each slot takes the newest state"
+                    f"{self._about}: {too_many} at slot {k}: the program sends faster than the run goes; give a pace, so that "
+                    "each slot takes the newest state"
                 )
             payload = self._heard.popleft() if there else None
+            self._bytes -= len(payload or b"")
         if payload is None:
             problem = "no state came" if k == 0 else f"no state came after that of slot {k - 1}"
             raise RunError(
