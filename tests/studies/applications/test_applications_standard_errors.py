@@ -14,8 +14,11 @@ import pytest
 from evedrop.cli.api import montecarlo
 from evedrop.scenario.application import APPLICATIONS, STANDARD_ERRORS, ApplicationTally
 from evedrop.scenario.loading import load
+from evedrop.score.closed_loop_tally import LoopTally
 from evedrop.score.links import Detection
 from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
+from evedrop.simulate.trials import tasks_of
 from evedrop.studies.sweep import sweep_over
 from tests.examples import mostly_long
 
@@ -102,6 +105,27 @@ def test_a_sweep_has_the_standard_errors_of_an_application(tmp_path: Path) -> No
         assert row["heating_energy_standard_error"] == summary[STANDARD_ERRORS]["heating_energy"]
         error = summary[STANDARD_ERRORS]["receivers"][row["peer"]]["known_fraction"]
         assert row["known_fraction_standard_error"] == error
+
+
+@pytest.mark.parametrize(
+    ("name", "application", "total"),
+    [("heated-room", "comfort", "heating_energy"), ("microgrid", "household", "bought_energy")],
+)
+def test_trials_of_different_lengths_have_no_common_total(name: str, application: str, total: str) -> None:
+    """A shard, or a block of trials, that was cut short would make the mean of the energies smaller."""
+    tallies = []
+    for slots in (60, 60, 30):
+        (task,) = tasks_of(load(name, {"slots": slots, "trials": 2, "expect": []}), Mode.EXACT, 1)
+        tallies.append(task.carry_out(lambda _: None, lambda: False).blocks[0].run_tally.loop)
+    whole, cut_short = LoopTally.merged(tallies[:2]), LoopTally.merged(tallies)
+    assert whole is not None
+    assert cut_short is not None
+    entry = whole.entries(4)[application]
+    assert entry[total] is not None
+    assert len(APPLICATIONS[application].lines(entry)) >= 2
+    entry = cut_short.entries(6)[application]
+    assert entry[total] is None
+    assert "kWh" not in " ".join(APPLICATIONS[application].lines(entry))
 
 
 def test_an_application_without_trials_has_no_standard_errors() -> None:

@@ -115,11 +115,11 @@ class ComfortTally(ApplicationTally):
         }
 
     def summary(self) -> Summary:
-        """The summary's entry: means over trials; None before the first slot."""
-        slots = int(self._slots.sum())
+        """The summary's entry: means over trials; None before the first slot, and totals of trials that are not equally long."""
+        slots, alike = int(self._slots.sum()), bool(self.of_trials)
         return {
-            "discomfort": float(self._outside.mean()) * self._hours if slots else None,
-            "heating_energy": float(self._power.mean()) * self._hours if slots else None,
+            "discomfort": float(self._outside.mean()) * self._hours if alike else None,
+            "heating_energy": float(self._power.mean()) * self._hours if alike else None,
             "receivers": {
                 name: {"known_fraction": int(count.sum()) / slots if slots else None}
                 for name, count in self._known.items()
@@ -167,15 +167,18 @@ class Comfort(Application):
     @classmethod
     def lines(cls, summary: Summary) -> list[str]:
         """The discomfort, the energy, and how often receivers know whether the room is comfortable."""
-        if summary["discomfort"] is None:
+        if any(receiver["known_fraction"] is None for receiver in summary["receivers"].values()):
             return []
         fractions = ", ".join(
             f"{name} {cls.text(summary, (name, 'known_fraction'), '.3f')}" for name in summary["receivers"]
         )
+        lines = [f"fraction of slots in which each knows whether the room is comfortable: {fractions}"]
+        if summary["discomfort"] is None:
+            return lines
         return [
             f"the room is uncomfortable by {cls.text(summary, ('discomfort',), '.3g')} K h, and the heater gives "
             f"{cls.text(summary, ('heating_energy',), '.3g')} kWh",
-            f"fraction of slots in which each knows whether the room is comfortable: {fractions}",
+            *lines,
         ]
 
     @classmethod

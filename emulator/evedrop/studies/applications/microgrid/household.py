@@ -11,6 +11,7 @@ Source: docs/scenario.md, household; docs/microgrid.md, energy and privacy; docs
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -163,6 +164,8 @@ class HouseholdTally(ApplicationTally):
         self._guessed: dict[str, list[Floats]] = {name: [] for name in loop.receivers}
         self.meter = Meter.zero(trials)
         self.done = 0
+        self._alike = True
+        """Whether all trials have the same slots: otherwise their energies have no common mean."""
 
     def add_monitored(self, x: Floats, u: Floats, sensor: SensorSlots) -> None:
         """The grid gives the watermark, too."""
@@ -189,6 +192,7 @@ class HouseholdTally(ApplicationTally):
         whole = copy(parts[0])
         whole.meter = Meter.of_all([part.meter for part in parts])
         whole.done = min(part.done for part in parts)
+        whole._alike = all(part._alike and part.done == whole.done for part in parts)
         fewest = min(len(loads) for part in parts for loads in part._guessed.values())
         whole._guessed = {}
         for name in parts[0]._guessed:
@@ -199,7 +203,7 @@ class HouseholdTally(ApplicationTally):
     @property
     def of_trials(self) -> Mapping[tuple[str, ...], Floats]:
         """Every metric of every trial, (R,); NaN or infinite where it does not exist."""
-        meter, seconds = self.meter, self._slot_seconds
+        meter, seconds = self.meter, self._slot_seconds if self._alike else math.nan
         apart = meter.difference
         detected = self._detected(self._active)
         return {
@@ -376,10 +380,14 @@ class Household(Application):
             **summary["knowing_truth"],
             STANDARD_ERRORS: summary.get(STANDARD_ERRORS, {}).get("knowing_truth", {}),
         }
-        lines = [
-            f"the house buys {_kwh(summary, 'bought')} kWh and sells {_kwh(summary, 'sold')} kWh; a "
-            f"controller that sees the truth, {_kwh(seen, 'bought')} and {_kwh(seen, 'sold')} kWh"
-        ]
+        lines = (
+            []
+            if summary["bought_energy"] is None
+            else [
+                f"the house buys {_kwh(summary, 'bought')} kWh and sells {_kwh(summary, 'sold')} kWh; a "
+                f"controller that sees the truth, {_kwh(seen, 'bought')} and {_kwh(seen, 'sold')} kWh"
+            ]
+        )
         fractions = [summary[f"{name}_difference"] for name in ("net", "total", "summed")]
         if None not in fractions:
             errors = [cls.standard_error(summary, (f"{name}_difference",)) for name in ("net", "total", "summed")]
