@@ -13,14 +13,14 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
+from evedrop.cli.main import main
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.results.wire_summary import WIRE_FILE, JournalSummary, WireLinkSummary, WireSummary
 from evedrop.show.report.wire import NOTHING_HEARD, WITHOUT_MODEL, wire_failures, wire_sentences, wire_table
-from evedrop.show.report.writing import write_report
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_reading import journal_tables
-from evedrop.wire.on_disk import closing_lines, scorekeeper_on_disk, summary_of_wire
+from evedrop.wire.on_disk import closing_lines, scorekeeper_on_disk, summary_of_wire, write_wire_report
 from evedrop.wire.plan import Side, WirePlan
 from evedrop.wire.records import AGAIN, UNLINKED, Kind, WireFate
 from evedrop.wire.scorekeeper import WireScorekeeper
@@ -292,7 +292,7 @@ link = "scan"
     assert "expected 0.9 quantile of scan.latency below 0.025: held, found 0.02" in sentences
     assert any(line.startswith("expected scan.gap_messages below 3: FAILED") for line in wire_failures(summary))
     (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
-    write_report(tmp_path)
+    write_wire_report(tmp_path)
     page = checked(tmp_path)
     assert page.headings == [
         "Wire of robot and base",
@@ -309,21 +309,38 @@ link = "scan"
     assert "bernoulli: quality = 0.6" in page.texts
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(UsageError, match="not the summary of a wire of this version"):
-        write_report(tmp_path)
+        write_wire_report(tmp_path)
     (tmp_path / "summary.json").unlink()
-    with pytest.raises(UsageError, match="to make its report: evedrop report"):
-        write_report(tmp_path)
+    write_wire_report(tmp_path)
+    assert checked(tmp_path).headings == page.headings
     nothing, status = run(tmp_path / "silent", plan, messages=0)
     assert status == 1
     assert {(judged["held"], judged["why"]) for judged in nothing["expectations"]} == {(None, "the link heard nothing")}
     assert NOTHING_HEARD in closing_lines(read(tmp_path / "silent"))
     assert NOTHING_HEARD not in sentences
     (tmp_path / "silent" / WIRE_FILE).write_text(resolved_wire(plan))
-    write_report(tmp_path / "silent")
+    write_wire_report(tmp_path / "silent")
     page = checked(tmp_path / "silent")
     assert {"5 of 5 expectations FAILED", "expected scan.gap_messages below 3: FAILED, the link heard nothing"} <= set(
         page.texts
     )
+
+
+def test_the_page_of_a_start_is_not_made_from_the_summary_of_an_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which is still there, because it could neither be removed nor replaced."""
+    out, file = tmp_path / "out", tmp_path / "robot.toml"
+    file.write_text('[side.robot]\n[side.base]\n[[link]]\nfrom = "robot"\nto = "base"\nquality = 0.5\n')
+    words = ["wire", str(file), "--out", str(out), "--for", "0.1 s"]
+    assert main(words) == 0
+    earlier = (out / "summary.json").read_text()
+    monkeypatch.setattr(
+        "evedrop.wire.scorekeeper.replace_private", lambda *_: (out / "summary.json").write_text(earlier)
+    )
+    assert main(words) == 0
+    assert read(out).start == 1
+    assert "2 in this folder" in checked(out).texts
 
 
 def test_the_wire_file_travels_with_the_page_without_its_passwords(tmp_path: Path) -> None:
@@ -346,7 +363,7 @@ def test_the_wire_file_travels_with_the_page_without_its_passwords(tmp_path: Pat
     plan = wire_of(tomllib.loads(text))
     run(tmp_path, plan)
     (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
-    page = checked(write_report(tmp_path).parent)
+    page = checked(write_wire_report(tmp_path).parent)
     travelling = downloads(page)[WIRE_FILE]
     again = wire_of(tomllib.loads(travelling))
     assert (again.seed, again.links, again.events) == (plan.seed, plan.links, plan.events)
@@ -427,7 +444,7 @@ def test_a_wire_without_links_has_a_summary_and_a_page(tmp_path: Path) -> None:
     run(tmp_path, plan)
     (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
     assert read(tmp_path).links == {}
-    write_report(tmp_path)
+    write_wire_report(tmp_path)
     assert checked(tmp_path).headings[0] == "Wire without links"
 
 

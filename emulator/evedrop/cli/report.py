@@ -195,14 +195,14 @@ def print_results(folder: Path, as_json: bool = False, verbose: bool = False) ->
     print_summary(summary, str(folder), None if summary.mode == "live" else replay_command(folder), verbose)
 
 
-def report_page(folder: Path, silent: bool = False) -> None:
+def report_page(folder: Path, silent: bool = False, write: Callable[[Path], Path] | None = None) -> None:
     """Write report.html into a results folder, and say where it is; a page that cannot be written gives a warning.
 
-    silent: do not say where, for example because standard output is JSON.
+    silent: do not say where, for example because standard output is JSON; write: what writes it; `write_report` by default.
     """
-    from evedrop.show.report.writing import try_report
+    from evedrop.show.report.writing import try_report, write_report
 
-    path = try_report(folder)
+    path = try_report(folder, write or write_report)
     if path is not None and not silent:
         sys.stdout.write(f"report: {path}\n")
 

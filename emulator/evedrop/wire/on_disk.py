@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import sys
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -23,7 +24,7 @@ from evedrop.system.output import columns_of
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal_place import JOURNAL_FOLDER
-from evedrop.wire.journal_reading import JournalOnDisk
+from evedrop.wire.journal_reading import JournalOnDisk, journal_tables
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.scorekeeper import WireScorekeeper
 
@@ -79,4 +80,6 @@ def write_wire_report(folder: Path) -> Path:
     from evedrop.show.report.writing import wire_page, write_page  # noqa: PLC0415 - as above
 
     with results_of_this_version(folder):
-        return write_page(folder, wire_page(WireSource.of(folder, summary_of_wire(folder))))
+        summary = summary_of_wire(folder)
+        journal = partial(journal_tables, folder, summary.start, killed=summary.state == "killed")
+        return write_page(folder, wire_page(WireSource.of(folder, summary, journal)))

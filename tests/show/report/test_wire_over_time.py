@@ -12,9 +12,10 @@ import pytest
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WIRE_FILE, WireSummary
 from evedrop.show.report.wire_over_time import LANE, WireOverTime
-from evedrop.show.report.writing import write_report
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reading import journal_tables
+from evedrop.wire.on_disk import write_wire_report
 from evedrop.wire.records import Kind, WireFate
 from evedrop.wire.scorekeeper import WireScorekeeper
 from tests.pages import checked
@@ -47,7 +48,7 @@ def wire(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_message_counts_in_its_step(wire: Path) -> None:
     """All of the summary; the cut links have lost everything in its seconds; delays are those of the model; none is invented."""
     summary = WireSummary.read(wire / "summary.json")
-    history = WireOverTime.read(wire, summary)
+    history = WireOverTime.read(wire, summary, journal_tables(wire, summary.start))
     assert history.step == 0.2
     for name, account in summary.links.items():
         link = history.links[name]
@@ -70,22 +71,38 @@ def test_every_message_counts_in_its_step(wire: Path) -> None:
 
 def test_the_page_of_a_wire_has_lanes_and_charts(wire: Path) -> None:
     """A lane for each link, and charts of losses and delays with their axes."""
-    write_report(wire)
+    write_wire_report(wire)
     page = checked(wire)
     assert page.tags["img"] == 3
     assert page.tags["svg"] == 2
     assert {"fraction lost", "delay (s)", "seconds since the start", "cut"} <= set(page.texts)
 
 
+def test_rows_that_are_not_in_a_parquet_file_yet_count(tmp_path: Path) -> None:
+    """Of a wire that still runs: the page has its lanes."""
+    plan = robot_plan()
+    (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
+    with WireJournal(tmp_path, plan) as journal:
+        key = journal.words.key_code("k")
+        for n in range(300):
+            at = journal.history.began + 0.01 * n
+            journal.records.record(at, n, -1, 0.0, key, 0, 64, 0, Kind.PUT, WireFate.DELIVERED)
+        assert not [*(tmp_path / "journal").glob("*.parquet")]
+        write_wire_report(tmp_path)
+        page = checked(tmp_path)
+        assert "Over time" in page.headings
+        assert page.tags["img"] == 1
+
+
 def test_a_wire_of_another_start_or_without_a_journal(wire: Path, tmp_path: Path) -> None:
     """No row of another start counts; what cannot be read is said in its part of the page."""
     summary = WireSummary.read(wire / "summary.json")
     with pytest.raises(UsageError, match="cannot be read"):
-        WireOverTime.read(tmp_path, summary)
+        WireOverTime.read(tmp_path, summary, journal_tables(tmp_path, summary.start))
     text = (wire / "journal" / "history.jsonl").read_text()
     (tmp_path / "journal").mkdir()
     (tmp_path / "journal" / "history.jsonl").write_text(
         text + text.splitlines()[0].replace('"start": 1', '"start": 2') + "\n"
     )
-    history = WireOverTime.read(tmp_path, replace(summary, start=2, seconds=0.0))
+    history = WireOverTime.read(tmp_path, replace(summary, start=2, seconds=0.0), journal_tables(tmp_path, 2))
     assert not any(link.heard.any() for link in history.links.values())

@@ -74,6 +74,7 @@ def wire(options: argparse.Namespace) -> int:
     from evedrop.cli.report import report_page
     from evedrop.results.folder import results_folder
     from evedrop.system.world import world
+    from evedrop.wire.on_disk import write_wire_report
     from evedrop.wire.run import run_wire
 
     world().process.keep_modules()  # new keys cause collections
@@ -82,7 +83,7 @@ def wire(options: argparse.Namespace) -> int:
         speaking = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}
         with world().process.native_log_apart():
             status = run_wire(plan, folder, seconds=seconds, view=options.view, **speaking)
-        report_page(folder, options.quiet)
+        report_page(folder, options.quiet, write_wire_report)
         return status
 
 

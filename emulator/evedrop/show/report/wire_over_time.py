@@ -1,7 +1,6 @@
-"""What became of the messages of a wire's links over time, from the Parquet files of its journal: for lanes and charts.
+"""What became of the messages of a wire's links over time, from the rows of its journal: for lanes and charts.
 
-Time is divided into equal steps. A link needs a few hundred numbers for each, however many messages it took. Messages that are
-not yet in a Parquet file, because the wire runs or was killed, are left out.
+Time is divided into equal steps. A link needs a few hundred numbers for each, however many messages it took.
 
 Source: docs/wire/results.md, the journal.
 """
@@ -10,8 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import final
@@ -19,7 +17,6 @@ from typing import final
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Floats
@@ -133,15 +130,15 @@ class WireOverTime:
         return np.asarray((np.arange(count) + 0.5) * self.step, np.float64)
 
     @classmethod
-    def read(cls, folder: Path, summary: WireSummary) -> WireOverTime:
-        """Read the journal of the start that a summary is about. Raises UsageError if a file of it cannot be read."""
+    def read(cls, folder: Path, summary: WireSummary, journal: Iterable[pa.Table]) -> WireOverTime:
+        """Count the rows of the start that a summary is about; journal: these. Raises UsageError if they cannot be read."""
         most = min(_MOST_STEPS, math.ceil(summary.seconds / _SHORTEST_STEP))
         steps = max(1, math.ceil(most / _STEPS_OF_A_POINT)) * _STEPS_OF_A_POINT
         step = max(summary.seconds, _SHORTEST_STEP) / steps
         links = {name: LinkOverTime(steps) for name in summary.links}
         try:
             began = _began(folder / _JOURNAL / "history.jsonl", summary.start)
-            for table in _parts(folder / _JOURNAL, summary.start):
+            for table in journal:
                 places = np.clip((table["time"].to_numpy() - began) / step, 0, steps - 1).astype(np.int64)
                 of_link = table["link"].cast(pa.string())
                 for name, link in links.items():
@@ -160,12 +157,3 @@ def _began(history: Path, start: int) -> float:
     with history.open(encoding="utf-8") as lines:
         entries = (json.loads(line) for line in lines if line.startswith('{"start"'))
         return float(next(entry["time"] for entry in entries if entry["start"] == start))
-
-
-def _parts(journal: Path, start: int) -> Iterator[pa.Table]:
-    """The Parquet files of a start, in pieces."""
-    for path in sorted(journal.glob("*.parquet")):
-        if re.fullmatch(rf"0*{start}-\d+", path.stem):
-            with pq.ParquetFile(path) as file:
-                for batch in file.iter_batches(columns=["time", "link", "reason", "delay"]):
-                    yield pa.Table.from_batches([batch])

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 from markupsafe import Markup
 
-from evedrop.errors import UsageError
 from evedrop.model.metrics.text import percent_text
 from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, WireSummary
 from evedrop.scenario.words import toml_text
@@ -48,20 +48,12 @@ class WireSource:
     """The wire file without what is only this machine's: addresses, users with their passwords, certificates. Empty as above."""
     events: Sequence[tuple[str, str]]
     """When, and what."""
+    journal: Callable[[], Iterable[pa.Table]]
+    """Gives the rows of this start, a table for each part of the journal. Raises UsageError if they cannot be read."""
 
     @classmethod
-    def read(cls, folder: Path) -> WireSource:
-        """Read a folder. Raises UsageError if it is not that of a wire that ended."""
-        path = folder / WIRE_SUMMARY_FILE
-        if not path.exists():
-            raise UsageError(
-                f"{folder} has no {path.name}: the wire runs or was killed; to make its report: evedrop report {folder}"
-            )
-        return cls.of(folder, WireSummary.read(path))
-
-    @classmethod
-    def of(cls, folder: Path, summary: WireSummary) -> WireSource:
-        """A folder whose summary is known."""
+    def of(cls, folder: Path, summary: WireSummary, journal: Callable[[], Iterable[pa.Table]]) -> WireSource:
+        """A folder whose summary is known; journal: as above."""
         sides = [*dict.fromkeys(side for link in summary.links.values() for side in (link.source, link.target))]
         title = f"Wire of {', '.join(sides[:-1])} and {sides[-1]}" if sides else "Wire without links"
         events = [(f"{entry.seconds:,.1f} s", entry.event) for entry in summary.events]
@@ -75,7 +67,8 @@ class WireSource:
             travelling = toml_text({**tables, "side": anywhere})
         except (OSError, Unreadable, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             models, travelling = {}, ""
-        return cls(folder, summary, title, wire_title(summary), wire_outcome(summary), models, travelling, events)
+        about, outcome = wire_title(summary), wire_outcome(summary)
+        return cls(folder, summary, title, about, outcome, models, travelling, events, journal)
 
 
 def _model(loss: Mapping[str, Any]) -> str:
@@ -110,7 +103,7 @@ def _links(of: WireSource) -> Iterator[Markup]:
 
 def _over_time(of: WireSource) -> Iterator[Markup]:
     """A lane for each link, the fractions of messages lost, and the delays, over the time since the start."""
-    history = WireOverTime.read(of.folder, of.summary)
+    history = WireOverTime.read(of.folder, of.summary, of.journal())
     links = {name: link for name, link in history.links.items() if link.heard.any()}
     if not links:
         return

@@ -1,4 +1,4 @@
-"""Writes report.html into a results folder: of a run, a sweep, a comparison or a wire.
+"""Writes report.html into a results folder: of a run, a sweep or a comparison, or of a wire, whose journal a caller reads.
 
 To add a kind of results that has a report, write a function that makes its page and add it to `KINDS`.
 
@@ -15,7 +15,6 @@ from evedrop.errors import UsageError
 from evedrop.results.comparison import COMPARISON
 from evedrop.results.folder import replace_private
 from evedrop.results.reading import Results, results_of_this_version
-from evedrop.results.wire_summary import WIRE_FILE
 from evedrop.show.report.closing import SWEEP_FILE, amount, outcome
 from evedrop.show.report.comparison import comparison_heading
 from evedrop.show.report.page import Page, parts_of
@@ -57,16 +56,9 @@ def wire_page(source: WireSource) -> Page:
     return Page(source.title, source.about, *source.outcome, parts_of(WIRE_SECTIONS, source))
 
 
-def _wire_page_of(folder: Path) -> Page:
-    from evedrop.show.report.wire_sections import WireSource  # noqa: PLC0415 - the same
-
-    return wire_page(WireSource.read(folder))
-
-
 KINDS: Mapping[str, Callable[[Path], Page]] = {
     SWEEP_FILE: sweep_page,
     COMPARISON: comparison_page,
-    WIRE_FILE: _wire_page_of,
 }
 """A file that only such a folder has → the function that makes its page. Any other folder is that of a run."""
 
@@ -104,10 +96,13 @@ def has_results(folder: Path) -> bool:
     return True
 
 
-def try_report(folder: Path) -> Path | None:
-    """The same for a run that has just ended: a report that cannot be made gives a warning, and None."""
+def try_report(folder: Path, write: Callable[[Path], Path] = write_report) -> Path | None:
+    """The same for a run that has just ended: a report that cannot be made gives a warning, and None.
+
+    write: what makes and writes it.
+    """
     try:
-        return write_report(folder)
+        return write(folder)
     except Exception as error:  # the results are complete without a page
         why = f"{type(error).__name__}: {error}" if not isinstance(error, OSError) else str(error)
         warn(f"{REPORT} was not written ({' '.join(why.split())}); to write it later: evedrop report {folder}")
