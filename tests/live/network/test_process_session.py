@@ -180,6 +180,18 @@ def test_another_slot_that_is_missing_is_waited_for_as_long() -> None:
         gap.missed(2, 3)
 
 
+def test_a_short_patience_is_longer() -> None:
+    """The recorder, which lets the slot be sent again, needs some seconds to notice that it is missing."""
+    clock, gap = clock_at_start(), GapDetector(KEY, 0.0)
+    for _ in range(5):
+        gap.missed(7, 9)
+        clock.now += 1.0
+    gap.missed(7, 9)
+    clock.now += 0.5
+    with pytest.raises(Gap):
+        gap.missed(7, 9)
+
+
 def test_time_in_which_nothing_ran_hardly_counts() -> None:
     """A process that was suspended finds later messages at once, and the missing one may come yet."""
     clock, gap = clock_at_start(), GapDetector(KEY, 30.0)

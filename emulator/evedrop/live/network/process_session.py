@@ -21,6 +21,8 @@ from evedrop.live.protocol.keys import writer_of
 from evedrop.system.threads import Queue
 from evedrop.system.world import world
 
+LEAST_SECONDS = 5.0
+"""The least time for which a process waits for another one: a busy machine may not let a process work for some seconds."""
 _AHEAD = 64  # messages
 
 
@@ -164,12 +166,13 @@ class GapDetector:
     """Handles messages of slots that are not due: ignores earlier slots, and for later ones waits for the missing slot."""
 
     def __init__(self, key: str, patience: float) -> None:
-        """patience: for how many seconds later slots may arrive while the due one does not.
+        """patience: for how many seconds later slots may arrive while the due one does not; at least `LEAST_SECONDS`.
 
-        Time in which this process did not run hardly counts: the message may already be here, unread.
+        The recorder needs some of them to notice the loss. Time in which this process did not run hardly counts: the message may
+        already be here, unread.
         """
-        self._key, self._patience = key, patience
-        self._step = max(1.0, patience / 4.0)
+        self._key, self._patience = key, max(LEAST_SECONDS, patience)
+        self._step = max(1.0, self._patience / 4.0)
         self._slot, self._last, self._missing = -1, 0.0, 0.0
 
     def missed(self, due: int, slot: int) -> None:

@@ -12,14 +12,13 @@ import zenoh
 
 from evedrop.errors import BriefError, RunError
 from evedrop.live.network.connecting import open_session
+from evedrop.live.network.process_session import LEAST_SECONDS
 from evedrop.live.protocol.brief import ProgramPart
 from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.live.protocol.state_message import MOST_BYTES, read_state
 from evedrop.model.process import Floats
 from evedrop.system.world import world
 
-LEAST_SECONDS = 5.0
-"""The least time for which a program may be silent, as for a process of the run."""
 _MOST_WAITING = 100_000
 _MOST_WAITING_BYTES = 256 * 2**20
 _CONNECT_SECONDS = 30.0

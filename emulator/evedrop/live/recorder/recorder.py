@@ -19,13 +19,13 @@ from pathlib import Path
 
 from evedrop.errors import EvedropError, RunError
 from evedrop.live.network.launcher_pipe import emit, launcher_is_gone, when_launcher_is_gone
+from evedrop.live.network.process_session import LEAST_SECONDS
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import Brief, RecorderPart
 from evedrop.live.protocol.launcher_events import SaveStarted, SlotsDone
 from evedrop.live.recorder.conductor import Conductor, Stop
 from evedrop.live.recorder.direction import Direction
 from evedrop.live.recorder.recorded_run import RecordedRun
-from evedrop.live.recorder.recovery import LEAST_SECONDS
 from evedrop.live.recorder.run_end import RunEnd, reason_of
 from evedrop.model.eavesdroppers import REMOTE_CALLS
 from evedrop.results.folder import new_folder

@@ -19,6 +19,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import final
 
 from evedrop.errors import Silence
+from evedrop.live.network.process_session import LEAST_SECONDS
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again, ProcessStatus
@@ -29,8 +30,6 @@ from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.scenario.progress_events import ConnectionOutage, OnEvent
 from evedrop.system.world import world
 
-LEAST_SECONDS = 5.0
-"""The least of these: a busy machine may not let a process work for some seconds."""
 _POLL_SECONDS = 0.25
 
 
