@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from evedrop.errors import TraceError, UsageError
-from evedrop.scenario.recordings.link_fit import fit_messages
+from evedrop.scenario.recordings.message_fit import fit_messages
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_place import JOURNAL_FOLDER

@@ -20,19 +20,12 @@ from evedrop.errors import TraceError
 from evedrop.model.links import loss_of
 from evedrop.model.links.loss_model import Fate
 from evedrop.scenario.loading import load
-from evedrop.scenario.recordings import link_fit
-from evedrop.scenario.recordings.link_fit import (
-    ChunkedOutcomes,
-    RunLengthDistribution,
-    TwoStates,
-    delay_candidates,
-    fit,
-    lengths_of,
-    log_likelihood,
-    p_value,
-    wilson,
-)
+from evedrop.scenario.recordings import link_candidates, link_fit
+from evedrop.scenario.recordings.link_candidates import delay_candidates, wilson
+from evedrop.scenario.recordings.link_fit import fit
 from evedrop.scenario.recordings.link_recording import Outcomes
+from evedrop.scenario.recordings.run_lengths import RunLengthDistribution, lengths_of, p_value
+from evedrop.scenario.recordings.two_states import ChunkedOutcomes, TwoStates, log_likelihood
 from tests.builders import scalar_tables
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
@@ -140,7 +133,7 @@ def test_the_model_is_found_again(
 def test_no_parameters_are_more_likely(spec: dict[str, Any]) -> None:
     """Around the maximum that is found the likelihood is less, by more than where the search stopped short of it."""
     outcomes = recorded(spec, 20_000, 4)
-    gilbert_elliott = link_fit.gilbert_elliott(outcomes)
+    gilbert_elliott = link_candidates.gilbert_elliott(outcomes)
     assert gilbert_elliott.log_likelihood > log_likelihood(
         outcomes, TwoStates(spec["p"], spec["r"], spec.get("good", 1e-9), spec.get("bad", 1 - 1e-9))
     )
@@ -156,7 +149,7 @@ def test_no_parameters_are_more_likely(spec: dict[str, Any]) -> None:
 def test_gilbert_counts_transitions() -> None:
     """Estimates and likelihood of a recording that can be done by hand."""
     outcomes = np.array([1, 1, 1, 0, 0, 1, 1, 0, 1, 1], np.uint8)  # from good: 4 stay, 2 go; from bad: 1 stays, 2 go
-    gilbert = link_fit.gilbert(outcomes)
+    gilbert = link_candidates.gilbert(outcomes)
     p, r = 2 / 6, 2 / 3
     assert gilbert.spec["p"] == pytest.approx(p, abs=1e-4)
     assert gilbert.spec["r"] == pytest.approx(r, abs=1e-4)
@@ -168,7 +161,7 @@ def test_gilbert_counts_transitions() -> None:
 def test_extreme_recordings_have_estimates(word: str) -> None:
     """A change that was never seen, and no two alike: parameters are probabilities, likelihoods finite."""
     outcomes = np.array([int(c) for c in word], np.uint8)
-    for find in (link_fit.bernoulli, link_fit.gilbert, link_fit.gilbert_elliott):
+    for find in (link_candidates.bernoulli, link_candidates.gilbert, link_candidates.gilbert_elliott):
         result = find(outcomes)
         assert math.isfinite(result.log_likelihood)
         assert all(0.0 <= value <= 1.0 for name, value in result.spec.items() if name != "model")

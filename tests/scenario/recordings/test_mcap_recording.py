@@ -18,8 +18,8 @@ from mcap.writer import CompressionType
 from evedrop.errors import TraceError
 from evedrop.model.links import loss_of
 from evedrop.model.links.loss_model import Fate
-from evedrop.scenario.recordings.link_fit import fit_messages
 from evedrop.scenario.recordings.mcap_recording import mcap_recording
+from evedrop.scenario.recordings.message_fit import fit_messages
 from evedrop.wire.file import wire_of
 from tests.conftest import Evedrop
 from tests.examples import mostly_long

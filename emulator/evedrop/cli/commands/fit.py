@@ -119,7 +119,7 @@ def _journal(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]
 
 def _messages(recording: MessageRecording, options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
     """The fit of messages that were recorded."""
-    from evedrop.scenario.recordings.link_fit import fit_messages, message_lines
+    from evedrop.scenario.recordings.message_fit import fit_messages, message_lines
     from evedrop.scenario.recordings.message_recording import save_outcomes
 
     if options.save is not None:
