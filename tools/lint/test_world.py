@@ -18,6 +18,7 @@ NAMES = {
     *(f"queue.{name}" for name in ("LifoQueue", "PriorityQueue", "Queue", "SimpleQueue")),
     *(f"signal.{name}" for name in ("alarm", "set_wakeup_fd", "signal")),
     *(f"time.{name}{unit}" for name in ("monotonic", "perf_counter", "time") for unit in ("", "_ns")),
+    "msgspec.convert",  # as `converted` in system/structs.py
     "shutil.move",
     "shutil.rmtree",
     "time.sleep",

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from msgspec import Struct, convert, structs, to_builtins
+from msgspec import Struct, structs, to_builtins
 
 from evedrop.errors import UnknownName
 from evedrop.model.metrics import METRICS
@@ -22,6 +22,7 @@ from evedrop.model.metrics.text import estimate
 from evedrop.scenario import application
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.score.verdict import Verdict
+from evedrop.system.structs import converted
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -418,7 +419,7 @@ class Summary:
         own = {name: entries[name] for name in names}
         others = {name: value for name, value in entries.items() if name not in own}
         peers = {name: _peer_fields(peer) for name, peer in own["peers"].items()}
-        happened = structs.asdict(convert({name: own[name] for name in ("events", "outages")}, _Happened))
+        happened = structs.asdict(converted({name: own[name] for name in ("events", "outages")}, _Happened))
         summary = _adapter().validate_python({**own, **happened, "peers": peers, _OPEN: others})
         _expect_possible(summary)
         return summary

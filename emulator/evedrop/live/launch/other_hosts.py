@@ -24,7 +24,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, Annotated, Any, final
 
-from msgspec import Meta, Struct, convert, to_builtins
+from msgspec import Meta, Struct, to_builtins
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.hosts_file import HostsPlan, HostTable
@@ -45,6 +45,7 @@ from evedrop.system.environment import own_environment
 from evedrop.system.fields import NotNegative, Slot
 from evedrop.system.lacks import lack_of
 from evedrop.system.processes import kill, wait_for
+from evedrop.system.structs import converted
 from evedrop.system.threads import ThreadEvent
 from evedrop.system.waiting import Alarm
 from evedrop.system.world import world
@@ -140,7 +141,7 @@ def greeting_in(line: bytes) -> Greeting:
 
 def _message_in(line: bytes, kind: Any) -> Any:
     try:
-        return convert(json.loads(line), kind)
+        return converted(json.loads(line), kind)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{line[:80]!r} is not a message ({error})") from error
 

@@ -24,6 +24,7 @@ from evedrop.errors import Gap, MalformedMessage
 from evedrop.live.protocol.keys import MOST_PARTS, writer_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags, flags_of
+from evedrop.system.structs import converted
 from evedrop.system.world import world
 
 _LARGEST = 2**62  # the default bound of integers: slots can be added to it without leaving 64 bits
@@ -98,9 +99,10 @@ class Reader:
     def read(self, kind: type[S]) -> S:
         """All fields, as an object of this kind, whose declaration says what they may be."""
         try:
-            return msgspec.convert(self.fields, kind)
+            made: S = converted(self.fields, kind)
         except msgspec.ValidationError as error:
             raise self.malformed(str(error), f"the fields of {kind.__name__}") from error
+        return made
 
     def integer(self, name: str, least: int = 0, most: int | None = None) -> int:
         """An integer field, from `least` to `most`."""

@@ -17,6 +17,7 @@ import numpy as np
 
 from evedrop.model.process import Floats, Limits
 from evedrop.system.fields import Finite
+from evedrop.system.structs import converted
 
 T = TypeVar("T")
 
@@ -34,7 +35,7 @@ def plain(value: Any) -> Any:
 
 def read(kind: type[T], table: Any) -> T:
     """A dataclass from its table. Raises ValueError, with the place in the table and what was expected there."""
-    made = msgspec.convert(table, kind, dec_hook=_array)
+    made: T = converted(table, kind, dec_hook=_array)
     _expect_known(table, made, "$")
     return made
 
@@ -44,7 +45,7 @@ def _array(kind: Any, value: Any) -> Floats:
     is_matrix = isinstance(value, list) and len(value) > 0 and isinstance(value[0], list)
     rows: Any = _Limits if kind == Limits else list[list[Finite]] if is_matrix else list[Finite]
     try:
-        numbers = msgspec.convert(value, rows)
+        numbers = converted(value, rows)
     except msgspec.ValidationError as error:
         raise ValueError(str(error)) from error  # to which msgspec adds the place of the array
     return np.array([float(limit) for limit in numbers] if kind == Limits else numbers, np.float64)

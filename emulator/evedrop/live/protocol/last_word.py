@@ -17,6 +17,7 @@ from evedrop.errors import EvedropError, Gap, MalformedMessage, MissingProcesses
 from evedrop.live.protocol.keys import writer_of
 from evedrop.system.files import Unreadable, contents
 from evedrop.system.output import escaped
+from evedrop.system.structs import converted
 from evedrop.system.world import world
 
 _MOST_BYTES = 2**16
@@ -74,6 +75,6 @@ def last_word_file(folder: Path, process: str) -> Path:
 def read_last_word(file: Path) -> LastWord | None:
     """The last word in a file; None if there is none that can be read."""
     with suppress(Unreadable, ValueError, RecursionError):
-        word = json.decode(contents(file, _MOST_BYTES), type=LastWord)
+        word = converted(json.decode(contents(file, _MOST_BYTES)), LastWord)
         return LastWord(word.cause, escaped(word.sentence), word.blamed)
     return None

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import json
 
-import msgspec
-
 from evedrop.names import ProcessAction
 from evedrop.scenario.progress_events import (
     ConnectionOutage,
@@ -21,6 +19,7 @@ from evedrop.scenario.progress_events import (
     ViewOpened,
 )
 from evedrop.system.fields import Slot
+from evedrop.system.structs import converted
 
 
 class Alive(ProgressEvent, frozen=True, tag="alive"):
@@ -70,7 +69,7 @@ _ReadByLauncher = (
 def read_event(line: bytes) -> ProgressEvent:
     """Read a line of the recorder or a router. Raises ValueError if it is malformed."""
     try:
-        event: ProgressEvent = msgspec.convert(json.loads(line), _ReadByLauncher)
+        event: ProgressEvent = converted(json.loads(line), _ReadByLauncher)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
     return event
