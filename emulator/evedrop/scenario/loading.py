@@ -292,7 +292,9 @@ def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenari
         raise ScenarioError(
             "event", [f"set: names {name}, and the run was started without modules; expected a built-in class"]
         )
-    tables["event"].append({**event, "at": at})
+    if wrong := list(unusable({**event})):
+        raise ScenarioError("event", wrong)
+    tables["event"].append({**plain_tables(event, "event"), "at": at})
     try:
         # The horizon does not depend on events, and was checked when the run was started.
         return checked(tables, "event", beyond_horizon=True)

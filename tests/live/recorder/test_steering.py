@@ -181,6 +181,25 @@ def test_mistakes_change_nothing(event: dict[str, Any], places: list[str], golde
     assert (run.events, run.saved) == ([], [])
 
 
+@pytest.mark.parametrize(
+    ("changes", "refused"),
+    [
+        ({"rate": None}, "set: is empty; expected what changes"),
+        ({"loss": {"model": "trace", "outcomes": b"101"}}, "set.loss.outcomes: is a bytes; expected a number, a text"),
+        ({"loss": {"model": "no\x1b[31m", "quality": 0.5}}, "set.loss.model: is "),
+        ({"loss": {"model": {1: 2}}}, "set.loss.model.1: is a name with a control character"),
+    ],
+    ids=str,
+)
+def test_values_that_no_file_can_have_are_refused(changes: dict[str, Any], refused: str) -> None:
+    """A request may have what a file cannot: it is refused as well, and does not harm the run."""
+    run = Run()
+    asked = run.asks("link", event={"link": "legitimate", "set": changes})
+    assert run.holds(5) == go(5)
+    assert asked.answers[0].refused[0].startswith(refused)
+    assert (run.events, run.saved) == ([], [])
+
+
 def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
     """A kill waits for its receiver's last word; while it is not done nothing else is; then the change is made, at that slot."""
     run = Run({"at": 30, "kill": "smart"})
