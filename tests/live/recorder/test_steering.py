@@ -265,6 +265,16 @@ def test_a_run_may_begin_paused() -> None:
     assert run.conductor.told() == go(3)
 
 
+def test_a_run_that_begins_paused_may_be_resumed_before_it_is_held() -> None:
+    """The request waits for the hold before slot 0; the operator is not told that the run is not paused."""
+    run = Run(paused=True)
+    resumed = run.asks("resume")
+    assert resumed.answers == []
+    assert run.holds(0) == go(0)
+    assert resumed.answers == [Answer(0, "the run goes on with slot 0")]
+    assert [event[1] for event in run.events] == ["pause the run", "resume the run"]
+
+
 def test_resuming_a_run_that_goes_on_holds_nothing() -> None:
     """It is answered at once, and is not an event."""
     run = Run()

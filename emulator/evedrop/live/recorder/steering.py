@@ -125,7 +125,8 @@ class Steering:
 
         reported: all slots below it are joined.
         """
-        if isinstance(order.request, ResumeRequest) and self.at is None and not self._orders:
+        # A run that begins paused is paused although it is not held yet: then the resume waits for the hold before slot 0.
+        if isinstance(order.request, ResumeRequest) and self.at is None and not self._orders and not self.paused:
             self._forget_step(reported, "the run was resumed")
             order.done(reported, "the run is not paused")
             return
