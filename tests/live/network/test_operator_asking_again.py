@@ -11,8 +11,9 @@ import zenoh
 from evedrop.cli.main import main
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.operator import Answer
-from evedrop.live.protocol.codec import enclosed
+from evedrop.live.protocol.codec import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, read_request
 from evedrop.names import RECORDER
 from evedrop.system.ports import free_port
 
@@ -33,11 +34,14 @@ class Recorder:
         config.insert_json5("transport/auth/usrpwd", json.dumps({"dictionary_file": str(users)}))
         self.session = zenoh.open(config)
         self.asked, self.unanswered, self.folder = 0, unanswered, folder
+        self.requests: list[OperatorRequest] = []
         self._queryable = self.session.declare_queryable(KEY, self._take)
         Control("one", f"tcp/127.0.0.1:{port}", "operator", "secret").write(folder)
 
     def _take(self, query: zenoh.Query) -> None:
         self.asked += 1
+        assert query.payload is not None
+        self.requests.append(read_request(KEY, payload_of(KEY, query.payload.to_bytes()) or b""))
         with query:
             if self.asked > self.unanswered:
                 query.reply(KEY, enclosed(KEY, Answer(3, "held before slot 3").pack()))
@@ -70,3 +74,14 @@ def test_a_request_is_asked_once(
         assert main([words[0], str(tmp_path), *words[1:]]) == 2
     assert recorder.asked == 1
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "value", ["1" + "0" * 20, "1979-05-27", "[" * 600 + "1" + "]" * 600], ids=["number", "date", "deep"]
+)
+def test_a_value_that_cannot_be_in_a_message_is_sent_as_text(value: str, tmp_path: Path) -> None:
+    """The run then says what is wrong with it, as it does with any other."""
+    recorder = Recorder(tmp_path, unanswered=0)
+    with recorder.session:
+        assert main(["link", str(tmp_path), "smart", f"quality={value}"]) == 0
+    assert recorder.requests == [LinkRequest({"link": "smart", "set": {"quality": value}})]

@@ -6,7 +6,6 @@ Slow imports are made only by the command that needs them.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -186,6 +185,7 @@ def _event(name: str, words: list[str]) -> dict[str, Any]:
 
 def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
     """Put a value at a dotted key in `changes`; makes the tables in between."""
+    from evedrop.live.protocol.requests import LinkRequest
     from evedrop.scenario.loading import value_of
 
     *tables, last = dotted.split(".")
@@ -194,12 +194,13 @@ def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
         inner = inner.setdefault(table, {})
         if not isinstance(inner, dict):
             raise UsageError(f"link {name} {dotted}={text}: {table} already has a value; give it once")
-    value = value_of(text)
+    inner[last] = value_of(text)
     try:
-        json.dumps(value)
-    except TypeError:  # a date cannot be in a message, and no entry of a link is a date
-        value = text
-    inner[last] = value
+        LinkRequest({"link": name, "set": changes}).pack()
+    except (
+        OverflowError
+    ):  # a whole number of more than 64 bits cannot be in a message, and no entry of a link is so large
+        inner[last] = text
 
 
 COMMANDS = (link, partition, heal, pause, resume, step, status)
