@@ -179,6 +179,18 @@ def test_none_removes_entries_of_lists_too() -> None:
     assert fewer.event[0] == vehicle(event=[{**kill, "state": None}]).event[0]
 
 
+def test_an_event_is_added_on_a_host_without_the_secret(tmp_path: Path) -> None:
+    """The recorder of an operator's run needs no secret; the scenario still names its file."""
+    secret = tmp_path / "secret"
+    secret.write_bytes(bytes(32))
+    scenario = vehicle(secret_file=secret)
+    made = with_event(scenario, {"cut": "smart"}, 3)
+    assert made == scenario.replace(event=[{"at": 3, "cut": "smart"}])
+    secret.unlink()
+    assert with_event(scenario, {"cut": "smart"}, 3) == made
+    assert f'secret_file = "{secret}"' in made.to_toml()
+
+
 def test_all_changes_number_the_entries_of_lists_as_before(tmp_path: Path) -> None:
     """Whether others are removed, changed, replaced or added by the same call; one that is removed and given is new."""
     scenario = vehicle(event=[{"at": at, "note": "a word"} for at in range(10, 35, 5)])

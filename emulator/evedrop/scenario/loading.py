@@ -280,7 +280,8 @@ def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenari
 
     Raises ScenarioError with every mistake, worded as for the events of a file but without the new event's number.
     """
-    tables = scenario.model_dump(mode="json", exclude_none=True)
+    # The secret does not depend on events, and its file need not be on this host.
+    tables = scenario.model_dump(mode="json", exclude_none=True, exclude={"secret_file"})
     number = len(tables["event"])
     kinds = [kind for kind in EVENTS.values() if kind.by_operator]
     strange = [name for name in event if not any(name in kind.own_entries() for kind in kinds)]
@@ -297,10 +298,13 @@ def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenari
     tables["event"].append({**plain_tables(event, "event"), "at": at})
     try:
         # The horizon does not depend on events, and was checked when the run was started.
-        return checked(tables, "event", beyond_horizon=True)
+        changed = checked(tables, "event", beyond_horizon=True)
     except ScenarioError as error:
         mistakes = [line.removeprefix(f"event.{number}.") for line in error.mistakes]
         raise ScenarioError(error.source, mistakes) from None
+    if scenario.secret_file is None:
+        return changed
+    return changed.model_copy(update={"secret_file": scenario.secret_file})
 
 
 _PLAIN = (str, bool, int, float)
