@@ -19,6 +19,8 @@ from evedrop.system.environment import own_environment
 MISSING = "import sys; sys.modules['evedrop.model.kernels._compiled'] = None; "
 """As if the extension module had not been built."""
 SELFTEST = "import sys; from evedrop.cli.main import main; sys.exit(main(['selftest']))"
+MONTECARLO = SELFTEST.replace("selftest", "montecarlo")
+"""A command whose module imports the kernels before its options are read."""
 SHOWN = "from evedrop.model.kernels.choice import KERNELS; print(KERNELS)"
 
 
@@ -51,11 +53,13 @@ def test_kernels_that_cannot_be_had_are_refused() -> None:
     """An unknown name, and C where it was not built, with a way out."""
     for code, kernels, message in (
         (SELFTEST, "fortran", "EVEDROP_KERNELS is 'fortran'; expected one of numpy, baseline"),
+        (MONTECARLO, "fortran", "evedrop: EVEDROP_KERNELS is 'fortran'; expected one of numpy, baseline"),
         (MISSING + SELFTEST, "avx2", "EVEDROP_KERNELS is avx2, but the C kernels cannot be loaded"),
     ):
         done = python(code, kernels)
         assert done.returncode == 2
         assert message in done.stderr
+        assert "Traceback" not in done.stderr
 
 
 def test_an_instruction_set_may_be_asked_for() -> None:
