@@ -120,6 +120,16 @@ def test_values_of_different_kinds_are_text_in_the_table(evedrop: Evedrop) -> No
     assert "0.5,[0.25, 0.75]" in " ".join(checked(evedrop.folder / "out").texts)
 
 
+def test_seeds_that_no_column_of_numbers_holds_are_text_in_the_table(evedrop: Evedrop) -> None:
+    """Seeds have up to 256 bits: the points are not lost, and the page repeats them."""
+    seeds = [7, 2**64]
+    changes = {"slots": 2, "trials": 3, "expect": []}
+    table = sweep_over("eavesdroppers", changes, {"seed": seeds}, evedrop.folder / "out", lambda _: None, Plan(workers=1))
+    assert list(dict.fromkeys(table["seed"].to_pylist())) == [str(seed) for seed in seeds]
+    write_report(evedrop.folder / "out")
+    assert f"seed=7,{seeds[1]}" in " ".join(checked(evedrop.folder / "out").texts)
+
+
 GRID = {"encoding.state_probability": [0.3, 0.6, 0.9], "eavesdroppers.smart.link.quality": [0.5, 0.9]}
 CHANGES = {"slots": 12, "trials": 620}
 

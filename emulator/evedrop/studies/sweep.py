@@ -42,6 +42,7 @@ MOST_POINTS = 10_000
 _WRITE_SECONDS = 3.0  # from one table of the points so far to the next
 _RANGE = re.compile(r"[^\[\]{}\"',]*:[^\[\]{}\"',]*")  # a colon, and no character of a list or string
 _WHOLE = re.compile(r"[+-]?\d+")
+_LARGEST = 2**53  # of whole numbers in a column of numbers, which may have fractions, too; a seed may be larger
 
 
 def grid_of(texts: Sequence[str]) -> dict[str, list[Any]]:
@@ -216,6 +217,8 @@ def _checked(
 
 def _kind(value: Any) -> type | None:
     """The type of a value's column in the table, float for all numbers; None for what the table has only as text."""
+    if isinstance(value, int) and abs(value) > _LARGEST:
+        return None
     return next((kind for kind, of in ((bool, bool), (float, (int, float)), (str, str)) if isinstance(value, of)), None)
 
 
