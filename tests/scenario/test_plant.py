@@ -69,6 +69,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "no B": ({"plant__input_matrix": None}, "plant.input_matrix"),
     "units": ({"plant__input_units": ["kW"]}, "plant.input_units"),
     "a name twice": ({"plant__inputs": ["P", "P"]}, "plant.inputs"),
+    "a state twice": ({"process__states": ["SOC", "SOC"]}, "process.states"),
     "limits of inputs": (
         {"plant__input_lower": [2.0, -3.0]},
         "plant.input_lower",

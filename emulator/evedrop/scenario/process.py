@@ -85,8 +85,6 @@ def source_mistakes(table: ProcessTable, n: int) -> Iterator[Mistake]:
     for entry, words in (("states", table.states or []), ("units", table.units or [])) if table.given else ():
         if (sentence := word_mistake(words)) is not None:
             yield entry, sentence
-        elif entry == "states" and len({*words}) < len(words):
-            yield entry, "has a name twice; expected different names"
     if not table.given and table.theory is not None:
         yield "theory", "is given, but the states are simulated, and theory describes them; remove the line"
     offsets = None if table.zenoh is None else table.zenoh.offsets
@@ -177,6 +175,8 @@ class ProcessTable(Table):
             values = getattr(self, name)
             if values is not None and len(values) != n:
                 yield name, f"has {len(values)} entries; expected {n}, one for each state"
+        if self.states is not None and len({*self.states}) < len(self.states):
+            yield "states", "has a name twice; expected different names"
 
     def _shape_mistake(self, name: str) -> str | None:
         """What is wrong with the shape of a matrix; None if it is square."""
