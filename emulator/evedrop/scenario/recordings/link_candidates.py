@@ -19,6 +19,7 @@ from evedrop.scenario.recordings.two_states import TwoStates, most_likely
 _NEWTON = 20  # steps of Newton's method, which doubles the digits in each of the last ones
 Interval = tuple[float, float]
 _NORMAL = 1.959963984540054  # for 95 %
+_TAIL = 0.025
 
 
 @dataclass(frozen=True)
@@ -117,9 +118,14 @@ def delay_candidates(delays: Floats) -> list[Candidate]:
 
 def _normal(delays: Floats) -> Candidate:
     """The most likely normal model, whose delays are 0 where the normal number is not above 0."""
+    from scipy.special import chdtri, stdtrit  # noqa: PLC0415 - 0.2 s that only this needs
+
     count, mean, standard_deviation = len(delays), float(delays.mean()), float(delays.std())
     likelihood = -0.5 * count * (math.log(2.0 * math.pi * standard_deviation * standard_deviation) + 1.0)
-    errors = standard_deviation / math.sqrt(count), standard_deviation / math.sqrt(2.0 * count)
+    # Exact for a sample of any size: Student's for the mean, that of chi-square for the standard deviation.
+    reach = float(stdtrit(count - 1, 1.0 - _TAIL)) * standard_deviation / math.sqrt(count - 1)
+    least, most = (standard_deviation * math.sqrt(count / float(chdtri(count - 1, p))) for p in (_TAIL, 1.0 - _TAIL))
+    intervals = [(mean - reach, mean + reach), (least, most)]
     above = delays[delays > 0.0]
     if len(above) < count:
         scaled, zeros = above / standard_deviation, count - len(above)
@@ -127,8 +133,8 @@ def _normal(delays: Floats) -> Candidate:
         likelihood -= len(above) * math.log(standard_deviation)
         mean, standard_deviation = place / scale * standard_deviation, standard_deviation / scale
         to_both = standard_deviation * np.array([[1.0, -place / scale], [0.0, -1.0 / scale]])
-        errors = tuple(np.sqrt(np.diag(to_both @ covariance @ to_both.T)).tolist())
-    intervals = [normal_interval(*pair) for pair in zip((mean, standard_deviation), errors, strict=True)]
+        errors = np.sqrt(np.diag(to_both @ covariance @ to_both.T)).tolist()
+        intervals = [normal_interval(*pair) for pair in zip((mean, standard_deviation), errors, strict=True)]
     names = ("mean", "standard_deviation")
     return Candidate(
         "normal",
