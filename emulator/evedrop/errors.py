@@ -11,6 +11,7 @@ EvedropError                    exit status
 │   ├── Gap                     3   a slot is missing, doubled or out of order
 │   ├── Refusal                 3   another process could not read a message
 │   ├── Contradiction           3   a process contradicts itself, or another process
+│   ├── ClassFailed             3   a class that is not built in failed: names it, the slots and the trials
 │   ├── Silence                 3   a process is on the network and does nothing
 │   └── MissingProcesses        3   processes did not appear
 └── Interrupted               130   the user ended the run; results so far are written
@@ -180,6 +181,10 @@ class Silence(RunError):
     def __init__(self, processes: tuple[str, ...], failure: str) -> None:
         self.at_fault = processes
         super().__init__(f"{' and '.join(processes)}: {failure}")
+
+
+class ClassFailed(RunError):
+    """A class that is not built in raised an error, or gave a wrong result."""
 
 
 class UnwrittenResults(RunError):

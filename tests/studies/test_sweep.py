@@ -124,7 +124,9 @@ def test_seeds_that_no_column_of_numbers_holds_are_text_in_the_table(evedrop: Ev
     """Seeds have up to 256 bits: the points are not lost, and the page repeats them."""
     seeds = [7, 2**64]
     changes = {"slots": 2, "trials": 3, "expect": []}
-    table = sweep_over("eavesdroppers", changes, {"seed": seeds}, evedrop.folder / "out", lambda _: None, Plan(workers=1))
+    table = sweep_over(
+        "eavesdroppers", changes, {"seed": seeds}, evedrop.folder / "out", lambda _: None, Plan(workers=1)
+    )
     assert list(dict.fromkeys(table["seed"].to_pylist())) == [str(seed) for seed in seeds]
     write_report(evedrop.folder / "out")
     assert f"seed=7,{seeds[1]}" in " ".join(checked(evedrop.folder / "out").texts)

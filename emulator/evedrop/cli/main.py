@@ -69,7 +69,9 @@ def _status_of_command(given: list[str], parser: Parser | None) -> int:
         options = (parser or parser_of(given[0] if given else "")).parse_whole(given)
     except SystemExit as left:  # argparse has printed the help, or said what it expected
         return int(left.code or 0)
-    except EvedropError as error:  # importing a command's module refuses the value of a variable such as EVEDROP_KERNELS
+    except (
+        EvedropError
+    ) as error:  # importing a command's module refuses the value of a variable such as EVEDROP_KERNELS
         say(error.illustrated, "evedrop:")
         return error.exit_status
     command: Callable[[argparse.Namespace], int] = options.command

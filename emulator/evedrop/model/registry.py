@@ -41,6 +41,10 @@ def is_own(name: object) -> bool:
     return isinstance(name, str) and ":" in name
 
 
+CLASS_ERRORS = (Exception, SystemExit)
+"""What a class that is not built in may raise, instead of doing what it is asked for; also if it means to end the interpreter."""
+
+
 def place_of(error: BaseException, file: str | None = None) -> str:
     """A short description of an error in a custom module: the error, and the last line of that file, or of any, before it."""
     if isinstance(error, NoAnswer):
@@ -67,7 +71,7 @@ def answered(model: Any, entry: str, ask: Callable[[], Any]) -> list[tuple[str, 
     wanted = "expected it to return a list of (entry, what is wrong)"
     try:
         answer = ask()
-    except Exception as error:
+    except CLASS_ERRORS as error:
         file = getattr(sys.modules.get(model.__module__), "__file__", None)
         return [(entry, f"cannot be checked: {model.__name__}.mistakes raised {place_of(error, file)}; {wanted}")]
     if not isinstance(answer, list) or not all(isinstance(mistake, tuple) and len(mistake) == 2 for mistake in answer):
@@ -190,7 +194,7 @@ def _imported(name: str, target: str, origin: str) -> tuple[Any, str]:
     module_name, _, class_name = target.partition(":")
     try:
         module = importlib.import_module(module_name)
-    except (Exception, SystemExit) as error:
+    except CLASS_ERRORS as error:
         missing = isinstance(error, ModuleNotFoundError) and module_name.startswith(str(error.name))
         wanted = (
             "a module in the scenario's folder (or in its `modules`), or an installed one"

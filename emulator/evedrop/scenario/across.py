@@ -20,7 +20,7 @@ from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.links.loss_model import Fate
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Process
-from evedrop.model.registry import place_of
+from evedrop.model.registry import CLASS_ERRORS, place_of
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import LinkSchedule
@@ -95,7 +95,7 @@ def _own(path: str, kind: type[EventKind], ask: Callable[[], Iterator[str]]) -> 
     """The mistakes that a kind finds itself, or the error that it raised: its class may come from a package."""
     try:
         return list(ask())
-    except Exception as error:
+    except CLASS_ERRORS as error:
         return [f"{path}.{kind.kind}: cannot be checked: {kind.__name__} raised {place_of(error)}"]
 
 

@@ -24,7 +24,7 @@ from evedrop.errors import ScenarioError, UsageError
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.links import LOSS_MODELS
-from evedrop.model.registry import Registry, place_of
+from evedrop.model.registry import CLASS_ERRORS, Registry, place_of
 from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.across import mistakes_across
 from evedrop.scenario.arguments import path_argument
@@ -220,7 +220,7 @@ def _across(scenario: Scenario, beyond_horizon: bool, silent: bool = False) -> l
     """Mistakes across tables; an error that a custom class raises when asked is a mistake too, unless silent."""
     try:
         return mistakes_across(scenario, beyond_horizon)
-    except Exception as error:
+    except CLASS_ERRORS as error:
         if not has_foreign(scenario):
             raise
         if silent:

@@ -17,7 +17,7 @@ from evedrop.model.metrics import METRICS, metric, metrics_of
 from evedrop.model.metrics.metric import MetricTally, ScoredSlots, TallyMetric
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action
-from evedrop.model.registry import place_of
+from evedrop.model.registry import CLASS_ERRORS, place_of
 from evedrop.scenario.expect import ExpectTable
 from evedrop.scenario.tables import Scenario
 
@@ -80,7 +80,7 @@ class GuardedTally(MetricTally):
         if not self.failure:
             try:
                 return ask()
-            except Exception as error:
+            except CLASS_ERRORS as error:
                 self.fail(place_of(error))
         return None
 

@@ -17,7 +17,7 @@ import numpy as np
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS, single_specs
 from evedrop.model.links.loss_model import Fate
-from evedrop.model.receiver import Receiver
+from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Encoder, Scheme
 from evedrop.model.slot.link import Fates, LinkSchedule
@@ -32,7 +32,7 @@ from evedrop.scenario.conformance.checked import (
     is_foreign,
     scheme_in_words,
 )
-from evedrop.scenario.conformance.problems import Problem
+from evedrop.scenario.conformance.problems import Problem, expect_actions
 from evedrop.scenario.conformance.rules import Broken, expect_array, expect_finite
 from evedrop.scenario.dry_run import foreign
 from evedrop.scenario.tables import Scenario
@@ -91,11 +91,12 @@ class Guard:
                 expect_array(f"slot {k}: chi()", chi, np.float64, (n, trials), "n states, R trials")
                 expect_finite(f"slot {k}: chi()", chi, self._batch.first_trial)
 
-    def acted(self, receiver: str, k: int, action: Any) -> None:
+    def acted(self, receiver: str, k: int, action: Any, gamma: Flags) -> None:
         """Raise RunError unless this is a receiver's valid answer to a slot's γ."""
         if receiver in self._watched:
             with self.asking(receiver, range(k, k + 1)):
                 expect_array(f"slot {k}: act()", action, np.uint8, (self._batch.trials,), _EACH)
+                expect_actions(range(k, k + 1), action[None], gamma[None], self._problem)
 
     def fates(self, receiver: str, slots: range, fates: Fates) -> None:
         """Raise RunError unless these are valid fates of the packets of some slots on a receiver's link."""

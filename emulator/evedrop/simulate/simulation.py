@@ -255,7 +255,7 @@ class Simulation:
         """A receiver's action in slot k, (R,)."""
         with self._guard.asking(name, range(k, k + 1)):
             action = receiver.act(k, gamma)
-        self._guard.acted(name, k, action)
+        self._guard.acted(name, k, action, gamma)
         return action
 
     def _misled(self) -> set[str]:

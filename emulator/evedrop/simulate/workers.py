@@ -23,7 +23,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, final
 
 from evedrop.errors import EvedropError, RunError
-from evedrop.model.registry import place_of
+from evedrop.model.registry import CLASS_ERRORS, place_of
 from evedrop.scenario.dry_run import foreign
 from evedrop.simulate.tasks import OnProgress, R, Result, Stopped, Task
 from evedrop.system.environment import SINGLE_THREADED, own_environment
@@ -53,7 +53,7 @@ def in_this_process(tasks: Sequence[Task[R]], on_progress: OnProgress, stopped: 
             result = task.carry_out(on_progress, stopped)
         except EvedropError:
             raise
-        except Exception as error:
+        except CLASS_ERRORS as error:
             # A bug of this program keeps its traceback; an error in a class of the user's own names the class.
             if isinstance(error, OSError) or lack_of(error) is not None or not foreign(task.scenario):
                 raise
@@ -238,7 +238,7 @@ def _outcome(task: Task[Result], on_progress: OnProgress, stopped: Stopped) -> R
         raise
     except EvedropError as error:
         return str(error)
-    except Exception as error:
+    except CLASS_ERRORS as error:
         if (lack := lack_of(error)) is not None:
             return lack
         return f"trials {task.start} to {task.stop - 1}: {place_of(error)}"

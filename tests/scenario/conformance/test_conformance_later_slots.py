@@ -113,6 +113,30 @@ LATER = {
                "is nan; expected finite numbers"),
     "last": ("eavesdroppers.eve.strategy", _FOLLOWS.format("last = last._replace(P=last.P[:1])"),
              "eve's strategy later_last:Mine failed in slots {slots}, trials {trials}: "),
+    "leaves": ("eavesdroppers.eve.strategy", "Mine(Naive):\n    def uses(self, k):\n"
+               "        if k == 37:\n            raise SystemExit(0)",
+               "eve's strategy later_leaves:Mine failed in slot 37, trials {trials}: SystemExit: 0, later_leaves.py line "),
+    "file": ("encoding.scheme", "Mine(Sends):\n    def packet(self, k, x):\n"
+             "        return Packet(x if k != 30 else open('/nowhere'), np.zeros(x.shape[1], bool))",
+             "the scheme later_file:Mine failed in slot 30, trials {trials}: FileNotFoundError: [Errno 2] No such file"),
+    "refuses": ("encoding.scheme", "Mine(Sends):\n    def packet(self, k, x):\n        from evedrop.extend import UsageError\n"
+                "        if k == 30:\n            raise UsageError('no')\n        return Packet(x, np.zeros(x.shape[1], bool))",
+                "the scheme later_refuses:Mine failed in slot 30, trials {trials}: UsageError: no, later_refuses.py line "),
+    "mutates": ("encoding.scheme", "Mine(Sends):\n    def packet(self, k, x):\n        if k == 30:\n            x *= 2.0\n"
+                "        return Packet(x, np.zeros(x.shape[1], bool))",
+                "the scheme later_mutates:Mine failed in slot 30, trials {trials}: it changes in place what it is given "
+                "(ValueError: "),
+    "silences": ("eavesdroppers.eve.strategy", "Mine(Naive):\n    def step(self, k, belief, heard):\n        if k == 30:\n"
+                 "            heard.z[:] = 0.0\n        return super().step(k, belief, heard)",
+                 "eve's strategy later_silences:Mine failed in slot 30, trials {trials}: it changes in place what it is given "
+                 "(ValueError: "),
+    "acts": ("eavesdroppers.eve.strategy", "Mine(Naive):\n    def step(self, k, belief, heard):\n"
+             "        after = super().step(k, belief, heard)\n"
+             "        return after if k != 30 else after._replace(action=after.action + np.uint8(77))",
+             "eve's strategy later_acts:Mine failed in slot 30, trials {trials}: the action of trial {first} is 78 after a "
+             "packet was received; expected Action.STATE, INNOVATION or DISCARDED"),
+    "hears": ("eavesdroppers.eve.strategy", _FOLLOWS.format("found.action[:] = 1"),
+              "eve's strategy later_hears:Mine failed in slots {slots}, trials {trials}: slot "),
     "fates": ("legitimate.link.loss.model", "Mine(Bernoulli):\n    parameters = {}\n"
               "    def __init__(self): super().__init__(0.9)\n    def fates(self, first, uniforms):\n"
               "        return super().fates(first, uniforms) if first < 32 else 1 / 0",
@@ -135,7 +159,7 @@ OFTEN = ("packet", "uses", "block", "follow")
 """One case for each way into a class; the other cases use the same code."""
 
 
-@pytest.mark.parametrize("case", mostly_long(LATER, [*OFTEN, "fates"]))
+@pytest.mark.parametrize("case", mostly_long(LATER, [*OFTEN, "fates", "leaves", "file", "mutates", "acts", "hears"]))
 def test_what_breaks_in_a_later_slot_ends_a_study_in_memory(case: str, evedrop: Evedrop) -> None:
     """Status 3, as live, with class, slot and trials; and never an exit as if all were well."""
     changes = later(evedrop, case)

@@ -21,6 +21,11 @@ MISTAKES = {
     "dtype": ("scheme", "Mine(Sends):\n    def packet(self, k, x): return Packet(x.astype(np.float32), np.zeros(3, bool))"),
     "pair": ("scheme", "Mine(Sends):\n    def packet(self, k, x): return x, None"),
     "raises": ("scheme", "Mine(Sends):\n    def packet(self, k, x): return 1 / 0"),
+    "leaves": ("scheme", "Mine(Sends):\n    def packet(self, k, x): raise SystemExit(0)"),
+    "gone": ("scheme", "Mine(Plain):\n    @classmethod\n    def mistakes(cls, given): raise SystemExit(0)"),
+    "acts": ("eavesdropper",
+             "Mine(Naive):\n    def step(self, k, belief, heard):\n"
+             "        return super().step(k, belief, heard)._replace(action=np.full(self.trials, 1, np.uint8))"),
     "changes": ("scheme", "Mine(Sends):\n    def packet(self, k, x):\n        x += 1.0"),
     "header": ("scheme", "Mine(Plain):\n    header = ('one',)"),
     "key": ("scheme", "Mine(Plain):\n    def shared(self, keys, batch): return keys['noise']"),

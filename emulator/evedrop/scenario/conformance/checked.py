@@ -13,32 +13,33 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any, final
 
-from evedrop.errors import EvedropError, RunError
+from evedrop.errors import ClassFailed
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Receiver, Reception
-from evedrop.model.registry import place_of
+from evedrop.model.registry import CLASS_ERRORS, place_of
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme
 from evedrop.model.streams import Batch
 from evedrop.scenario.conformance.problems import (
     Problem,
+    expect_actions,
     expect_belief,
     expect_beliefs,
     expect_packet,
     expect_packets,
     slots_text,
 )
-from evedrop.scenario.conformance.rules import Broken
+from evedrop.scenario.conformance.rules import Broken, changes_in_place, is_about_read_only, read_only
 
 
-def failed(subject: str, slots: range, batch: Batch, how: str) -> RunError:
+def failed(subject: str, slots: range, batch: Batch, how: str) -> ClassFailed:
     """The error of a class that failed in consecutive slots; what: such as `the scheme mine:Mine`."""
     first = batch.first_trial
     trials = f"trial {first}" if batch.trials == 1 else f"trials {first} to {first + batch.trials - 1}"
     reason = how.removeprefix(f"{slots_text(slots)}: ")
-    return RunError(f"{subject} failed in {slots_text(slots)}, {trials}: {reason}; run `evedrop check` on the class")
+    return ClassFailed(f"{subject} failed in {slots_text(slots)}, {trials}: {reason}; run `evedrop check` on the class")
 
 
 @contextlib.contextmanager
@@ -49,12 +50,14 @@ def asking(subject: str, slots: range, batch: Batch, instance: object = None) ->
     """
     try:
         yield
-    except (EvedropError, OSError):
+    except ClassFailed:  # named already
         raise
     except Broken as error:
         raise failed(subject, slots, batch, str(error)) from error
-    except Exception as error:
-        raise failed(subject, slots, batch, place_of(error, _file_of(type(instance)))) from error
+    except CLASS_ERRORS as error:
+        reason = place_of(error, _file_of(type(instance)))
+        how = f"it {changes_in_place(reason)}" if is_about_read_only(error) else reason
+        raise failed(subject, slots, batch, how) from error
 
 
 def _file_of(kind: type) -> str | None:
@@ -77,7 +80,7 @@ class CheckedEncoder(Encoder):
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:
         """The encoder's packet."""
         with self._asking(range(k, k + 1)):
-            packet = self._encoder.encode(k, x, predicted)
+            packet = self._encoder.encode(k, read_only(x), read_only(predicted))
             expect_packet(k, packet, self._scheme, self._problem)
         return packet
 
@@ -86,14 +89,14 @@ class CheckedEncoder(Encoder):
         if type(self._encoder).encode_block is Encoder.encode_block:
             return super().encode_block(slots, x, predicted)
         with self._asking(slots):
-            packets = self._encoder.encode_block(slots, x, predicted)
+            packets = self._encoder.encode_block(slots, read_only(x), read_only(predicted))
             expect_packets(slots, packets, self._scheme, self._problem)
         return packets
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:
         """Pass the acknowledgements on to the encoder."""
         with self._asking(range(k, k + 1)):
-            self._encoder.acknowledged(k, acknowledged)
+            self._encoder.acknowledged(k, read_only(acknowledged))
 
 
 @final
@@ -121,8 +124,9 @@ class CheckedReceiver(Receiver):
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """The receiver's belief."""
         with self._asking(range(k, k + 1)):
-            after = self._receiver.step(k, belief, heard)
+            after = self._receiver.step(k, _read_only_belief(belief), _read_only_reception(heard))
             expect_belief(f"slot {k}: Belief", after, self._problem)
+            expect_actions(range(k, k + 1), after.action[None], heard.gamma[None], self._problem)
         return after
 
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
@@ -130,9 +134,21 @@ class CheckedReceiver(Receiver):
         if _takes_single_slots(type(self._receiver)):
             return super().follow(slots, belief, gamma, z)
         with self._asking(slots):
-            followed = self._receiver.follow(slots, belief, gamma, z)
-            expect_beliefs(slots, followed, self._problem)
+            followed = self._receiver.follow(slots, _read_only_belief(belief), read_only(gamma), read_only(z))
+            expect_beliefs(slots, followed, gamma, self._problem)
         return followed
+
+
+def _read_only_reception(heard: Reception) -> Reception:
+    """The same packets: what a receiver changed in place would be changed for others, too."""
+    header, truth = (None if array is None else read_only(array) for array in (heard.header, heard.truth))
+    return Reception(read_only(heard.gamma), read_only(heard.z), header, truth)
+
+
+def _read_only_belief(belief: Belief) -> Belief:
+    """The same belief, for the same reason."""
+    x_hat, P, action, memory = belief
+    return Belief(read_only(x_hat), read_only(P), read_only(action), tuple(map(read_only, memory)))
 
 
 def _takes_single_slots(kind: type[Receiver]) -> bool:

@@ -18,6 +18,7 @@ from evedrop.model.theory.covariances import OutcomesAt
 from evedrop.scenario.conformance.problems import (
     Problem,
     Slot,
+    expect_actions,
     expect_belief,
     frozen_belief,
     large,
@@ -117,6 +118,7 @@ class EavesdropperChecks(ReceiverChecks):
             with calling(f"slot {slot.k}: step()", self._kind):
                 after = receiver.step(slot.k, belief, heard)
             expect_belief(f"slot {slot.k}: Belief", after, problem)
+            expect_actions(range(slot.k, slot.k + 1), after.action[None], heard.gamma[None], problem)
             after = frozen_belief(after)
             yield replace(slot, heard=heard, before=belief, after=after)
             belief = after

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from evedrop.model.process import Floats, Process, Trajectory
-from evedrop.model.receiver import Belief, Beliefs, Flags, Receiver, Reception, asymmetry
+from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, asymmetry
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme
 from evedrop.model.streams import Batch, BlockReader
 from evedrop.scenario.conformance.rules import Broken, NamedKeys, calling, expect_array, expect_finite, frozen, key
@@ -165,6 +165,7 @@ def played(
         with calling(f"slot {k}: step()", kind):
             after = estimator.step(k, belief, heard)
         expect_belief(f"slot {k}: Belief", after, problem)
+        expect_actions(range(k, k + 1), after.action[None], heard.gamma[None], problem)
         after = frozen_belief(after)
         yield Slot(k, x, predicted, packet, heard, acknowledged, belief, after)
         belief = after
@@ -258,8 +259,20 @@ def expect_belief(where: str, belief: Any, problem: Problem) -> None:
             raise Broken(f"{where}.memory[{i}] is not an array whose last axis is the {trials} trials")
 
 
-def expect_beliefs(slots: range, given: Any, problem: Problem) -> None:
-    """Raise Broken unless this is what `Receiver.follow` must return for consecutive slots."""
+def expect_actions(slots: range, action: Codes, gamma: Flags, problem: Problem) -> None:
+    """Raise Broken unless these are actions of some slots with these γ, both (c, R), and only those with γ = 0 are LOST."""
+    wrong = (action > max(Action)) | ((action == int(Action.LOST)) == gamma)
+    if wrong.any():
+        row, r = np.argwhere(wrong)[0]
+        heard, wanted = ("a", "STATE, INNOVATION or DISCARDED") if gamma[row, r] else ("no", "LOST")
+        raise Broken(
+            f"slot {slots[row]}: the action of trial {problem.batch.first_trial + r} is {action[row, r]} after {heard} packet "
+            f"was received; expected Action.{wanted}"
+        )
+
+
+def expect_beliefs(slots: range, given: Any, gamma: Flags, problem: Problem) -> None:
+    """Raise Broken unless this is what `Receiver.follow` must return for consecutive slots with these γ, (c, R)."""
     if not (type(given) is tuple and len(given) == 2 and isinstance(given[0], Beliefs)):
         got = (
             f"a tuple of {', '.join(type(element).__name__ for element in given)}"
@@ -274,6 +287,7 @@ def expect_beliefs(slots: range, given: Any, problem: Problem) -> None:
     if not (np.isfinite(beliefs.x_hat).all() and np.isfinite(beliefs.P).all() and asymmetry(beliefs.P) is None):
         for row, k in enumerate(slots):
             expect_belief(f"slot {k}: Belief", Belief(*(column[row] for column in beliefs)), problem)
+    expect_actions(slots, beliefs.action, gamma, problem)
     expect_belief(f"slot {slots[-1]}: the last Belief", after, problem)
 
 

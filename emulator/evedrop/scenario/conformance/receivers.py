@@ -286,7 +286,7 @@ class BlockChecks:
         gamma, z = (frozen(np.array([getattr(self.slots[k].heard, name) for k in some])) for name in ("gamma", "z"))
         with calling(f"{slots_text(some)}: {_method_name(receiver, 'follow')}", self.kind):
             result: Any = receiver.follow(some, belief, gamma, z)
-        expect_beliefs(some, result, self.problem)
+        expect_beliefs(some, result, gamma, self.problem)
         return some, *result
 
     def _expect_same_packets(self, encoder: Encoder, coded: Sequence[tuple[range, PacketBlock]]) -> None:

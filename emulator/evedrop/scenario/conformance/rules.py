@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.registry import place_of
+from evedrop.model.registry import CLASS_ERRORS, place_of
 from evedrop.model.streams import root_of_seed, stream_key
 from evedrop.model.theory.covariances import Outcomes
 
@@ -66,12 +66,22 @@ def calling(call: str, kind: type) -> Iterator[None]:
     except _NotAskedFor as error:
         named = "in streams()" if hasattr(kind, "streams") else "in secret_streams, and in estimator_streams"
         raise Broken(f"{call} {error}; name every stream {named}, or leave it alone") from error
-    except Exception as error:
+    except CLASS_ERRORS as error:
         file = getattr(sys.modules.get(kind.__module__), "__file__", None)
         reason = place_of(error, file)
-        if "read-only" in str(error):
-            raise Broken(f"{call} changes in place what it is given ({reason}); make a new array instead") from error
+        if is_about_read_only(error):
+            raise Broken(f"{call} {changes_in_place(reason)}") from error
         raise Broken(f"{call} raised {reason}; expected no error") from error
+
+
+def is_about_read_only(error: BaseException) -> bool:
+    """Whether an error says that an array cannot be changed."""
+    return "read-only" in str(error)
+
+
+def changes_in_place(reason: str) -> str:
+    """What a class does that such an error ended; reason: the error, and where."""
+    return f"changes in place what it is given ({reason}); make a new array instead"
 
 
 def frozen(array: Array) -> Array:
@@ -79,6 +89,13 @@ def frozen(array: Array) -> Array:
     made = np.array(array)
     made.flags.writeable = False
     return made
+
+
+def read_only(array: Array) -> Array:
+    """The same numbers, which cannot be changed by this array."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def expect_array(where: str, array: Any, dtype: Any, shape: tuple[int, ...], means: str) -> None:
@@ -207,7 +224,7 @@ def how_broken(check: Callable[[Any], None], problem: Any) -> str | None:
         check(problem)
     except Broken as error:
         return str(error)
-    except Exception as error:
+    except CLASS_ERRORS as error:
         # A value that the class returned may break any code, including ours.
         return f"what it returned led to {place_of(error)}; expected what the base class describes"
     return None

@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from evedrop.errors import NoAnswer
 from evedrop.model.links.loss_model import Fate
-from evedrop.model.registry import answered, place_of
+from evedrop.model.registry import CLASS_ERRORS, answered, place_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.streams import MOST_SLOTS
 from evedrop.names import ProcessAction
@@ -230,7 +230,7 @@ class EventKind(When):
         """Refuse an event whose acts cannot be carried out: its class may come from a package."""
         try:
             _expect_acts(list(self.acts()))
-        except Exception as error:
+        except CLASS_ERRORS as error:
             reason = str(error) if isinstance(error, NoAnswer) else f"acts() raised {place_of(error)}"
             refuse([(self.kind, f"is an event that cannot be carried out: {reason}")])
         return self

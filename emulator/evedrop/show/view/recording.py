@@ -20,7 +20,7 @@ import rerun.blueprint as rrb
 from rerun.blueprint.api import create_in_memory_blueprint
 
 from evedrop.errors import NotRegistered
-from evedrop.model.registry import place_of
+from evedrop.model.registry import CLASS_ERRORS, place_of
 from evedrop.results.folder import private_file
 from evedrop.scenario.words import listed
 from evedrop.score.verdict import Verdict
@@ -81,7 +81,7 @@ class PanelSet:
         """A panel's answer; empty if it fails: a package's panel is then left out from now on, and a built-in one raises."""
         try:
             return ask()
-        except (Exception, SystemExit) as error:
+        except CLASS_ERRORS as error:
             if not PANELS.foreign(name):
                 raise
             self._panels.pop(name, None)
