@@ -118,6 +118,26 @@ def check_round(
     assert any(link.bursts[BATCH:].any() for journal in journaled.values() for link in journal.links.values())
 
 
+def test_a_router_says_how_far_it_has_decided_the_fates_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With many slots and trials that takes longer than a process may be silent."""
+    said, plan = [], RouterLoop._plan
+
+    def planned(loop: RouterLoop, first: int) -> range:
+        said.append((first, loop._session.status.slot))
+        return plan(loop, first)
+
+    monkeypatch.setattr(RouterLoop, "_plan", planned)
+    with MemoryBench(**LATE) as bench:
+        send(bench, range(SLOTS))
+        deliveries(bench, range(SLOTS))
+        bench.stage.commands.put(Again(1, 60, {}).pack())
+        announce(bench, 1, 60, 57)
+        send(bench, range(57, SLOTS))
+        deliveries(bench, range(60, SLOTS))
+    assert len(said) > SLOTS // BATCH + 57 // BATCH
+    assert all(first == slot for first, slot in said)
+
+
 def send_blocks(bench: MemoryBench, slots: range, count: int) -> None:
     """Have the sensor send the packets of these slots, `count` in a message; a batch begins a new message."""
     k = slots.start

@@ -264,6 +264,7 @@ class RouterLoop:
             for name, schedule in self._schedules.items()
         }
         for first in range(0, start + 1, self._brief.flow.batch):
+            self._session.status.slot = first  # with many slots and trials this may take longer than an outage
             slots = self._plan(first)
             before = range(first, min(slots.stop, start))
             if before and before.stop > start - COUNTED_BURSTS:  # for unfinished bursts and packets under way
