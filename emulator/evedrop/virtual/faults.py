@@ -185,8 +185,8 @@ class HangProcess(_OfProcess):
 
     @property
     def blamed(self) -> tuple[str, ...]:
-        """It; or who waits for what comes from it, directly or not, is as silent, and says on what it waits."""
-        return (*super().blamed, "waits on ", "has not sent", "did not report")
+        """It alone: a router that hangs still passes on the answers of all others."""
+        return (self.target,)
 
     def disturb(self, world: SimulatedWorld, process: VirtualProcess) -> bool:
         """Hold it up."""

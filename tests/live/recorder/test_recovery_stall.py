@@ -51,7 +51,7 @@ RUNS = {
         {"sensor": SENSOR_WAITS, "router": ROUTER_WAITS, "eve": at(150, KEYS.downlink("eve"))},
         ["eve"],
     ),
-    "a receiver that reports and makes no progress known": (
+    "a receiver that reports and makes no progress known, or a sensor that does not hear of it": (
         {"sensor": 100, "router": 100, "legitimate": 100, "eve": 100},
         {
             "sensor": at(100, KEYS.progress("eve")),
@@ -59,7 +59,7 @@ RUNS = {
             "legitimate": at(100, KEYS.downlink("legitimate")),
             "eve": at(100, KEYS.downlink("eve")),
         },
-        ["eve"],
+        ["sensor", "eve"],
     ),
     "a sensor that sleeps": (
         {"sensor": 100, "router": 100, "legitimate": 100, "eve": 100},
@@ -97,6 +97,49 @@ RUNS = {
         },
         ["controller"],
     ),
+    "a controller that does not take an estimate, or an estimator that did not send it": (
+        {"sensor": 64, "router": 64, "legitimate": 64, "eve": 64},
+        {
+            "sensor": at(70, KEYS.input),
+            "router": at(71, KEYS.uplink),
+            "legitimate": at(71, KEYS.downlink("legitimate")),
+            "eve": at(71, KEYS.downlink("eve")),
+            "controller": at(70, KEYS.estimate),
+        },
+        ["legitimate", "controller"],
+    ),
+    "a controller that does not take a state; the router keeps deliveries until the end of a batch": (
+        {"sensor": 64, "router": 64, "legitimate": 64, "eve": 64},
+        {
+            "sensor": at(70, KEYS.input),
+            "router": at(71, KEYS.uplink),
+            "legitimate": at(70, KEYS.downlink("legitimate")),
+            "eve": at(70, KEYS.downlink("eve")),
+            "controller": at(70, KEYS.state),
+        },
+        ["sensor", "controller"],
+    ),
+    "the same, and only the sensor is in the middle of a report": (
+        {"sensor": 68, "router": 71, "legitimate": 71, "eve": 71},
+        {
+            "sensor": at(70, KEYS.input),
+            "router": at(71, KEYS.uplink),
+            "legitimate": at(71, KEYS.downlink("legitimate")),
+            "eve": at(71, KEYS.downlink("eve")),
+            "controller": at(70, KEYS.state),
+        },
+        ["sensor", "controller"],
+    ),
+    "a controller that does not take the last estimate": (
+        {"sensor": 68, "router": 71, "legitimate": 71, "eve": 71},
+        {
+            "sensor": at(70, KEYS.input),
+            "router": at(71, KEYS.uplink),
+            "legitimate": at(70, KEYS.control("legitimate")),
+            "controller": at(70, KEYS.estimate),
+        },
+        ["legitimate", "controller"],
+    ),
     "a legitimate estimator that acknowledges nothing": (
         {"sensor": 64, "router": 64, "legitimate": 64, "eve": 64},
         {
@@ -122,7 +165,22 @@ def test_who_is_silent(case: str) -> None:
     places, answers, silent = RUNS[case]
     if "controller" in answers:
         places = {**places, "controller": 64}
-    assert silent_of(places, answers, ["controller"]) == silent
+    assert silent_of(places, answers, 10, ["controller"]) == silent
+
+
+@pytest.mark.parametrize(
+    ("answers", "silent"),
+    [
+        ({"router": at(70), "eve": at(70, KEYS.downlink("eve"))}, ["router"]),
+        ({"router": at(70, KEYS.uplink), "eve": at(70, KEYS.downlink("eve"))}, ["sensor", "router"]),
+        ({"router": at(70, KEYS.control("router")), "eve": at(70, KEYS.downlink("eve"))}, ["router", "eve"]),
+        ({"router": at(70, KEYS.control("router")), "eve": at(70)}, ["eve"]),
+    ],
+)
+def test_who_holds_up_a_held_run(answers: dict[str, ProcessStatus], silent: list[str]) -> None:
+    """The receiver that does not send its final belief, or the router that did not pass the barrier on."""
+    answers = {"sensor": at(70, KEYS.control("sensor")), "legitimate": at(70, KEYS.downlink("legitimate")), **answers}
+    assert silent_of(dict.fromkeys(["sensor", "router", "legitimate", "eve"], 70), answers, 10, (), ["eve"]) == silent
 
 
 class Run:
@@ -167,6 +225,17 @@ def test_a_silent_process_is_named_after_the_patience_and_not_before() -> None:
     with pytest.raises(Silence, match=message) as raised:
         run.wait(10.0)
     assert raised.value.at_fault == ("eve",)
+
+
+def test_all_are_asked_while_a_final_belief_is_awaited_and_nobody_is_silent() -> None:
+    """The time limit of the hold applies; whoever is late is named unless others were asked."""
+    run = Run(20.0)
+    assert run.stall.held_up_by(["eve"], run.places) == (("eve",), "")
+    run.answers = {"router": at(50), "eve": at(50, KEYS.downlink("eve"))}
+    for _ in range(400):
+        run.clock.now += 0.25
+        run.stall.poll(50, run.reported, held=True, missing=False, belief=True)
+    assert run.stall.held_up_by(["eve"], run.places) == (("router",), "router is at slot 50 and waits for no process")
 
 
 @pytest.mark.parametrize("how", ["held", "missing", "asleep", "joined"])

@@ -90,7 +90,9 @@ class Direction:
             self._steering.done(int(self._confirmations.get_nowait()))
         while not self._conductor.questions.empty():
             self._answer(self._conductor.questions.get_nowait())
-        self._steering.carry_on(self._joiner.done, self._places)
+        self._steering.carry_on(
+            self._joiner.done, self._places, lambda late: self._stall.held_up_by(late, self._places())
+        )
         self._run.view.note(self._steering.events)
 
     def look_after(self) -> None:
@@ -103,7 +105,8 @@ class Direction:
         owed = self._run.score.all_joined or done - self._joiner.settled >= flow.window - flow.batch
         unneeded = () if owed else (CONTROLLER,)
         missing = bool(self._conductor.missing)
-        self._stall.poll(done, self._places, unneeded, held=held, missing=missing)
+        belief = held and self._steering.awaits_belief
+        self._stall.poll(done, self._places, unneeded, held=held, missing=missing, belief=belief)
 
     def _places(self) -> dict[str, int]:
         """Process → the first slot that it has not reported, except for those away because the scenario says so."""

@@ -15,7 +15,7 @@ Source: docs/protocol.md, lost connections and silence.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import final
 
 from evedrop.errors import Silence
@@ -26,7 +26,7 @@ from evedrop.live.protocol.commands import Again, ProcessStatus
 from evedrop.live.protocol.keys import writer_of
 from evedrop.live.recorder.conductor import Conductor
 from evedrop.live.recorder.steering import STEP_SECONDS, Steering
-from evedrop.names import RECORDER, RELAY, ROUTER
+from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.scenario.progress_events import ConnectionOutage, OnEvent
 from evedrop.system.world import world
 
@@ -71,15 +71,17 @@ class Stall:
         *,
         held: bool,
         missing: bool,
+        belief: bool = False,
     ) -> None:
         """Check whether the run makes progress. Raises Silence if a process has held it up too long.
 
         All slots below `done` are joined. reported: process → the first slot that it has not reported; unneeded: processes
         whose reports are not needed to join slots. held: the run is held, and no process has anything to do; missing: some
-        process is not on the network, which is handled elsewhere.
+        process is not on the network, which is handled elsewhere; belief: the run is held until a receiver has sent its final
+        belief, for which the time limit of the hold applies, but all are asked.
         """
         now = world().monotonic()
-        if done > self._done or held:
+        if done > self._done or (held and not belief):
             self._done, self._polled, self._stalled, self._asked = done, now, 0.0, 0.0
             self._answers, self._moved = {}, {}
             return
@@ -104,15 +106,26 @@ class Stall:
         if self._stalled - self._asked > self._patience / 10.0:
             self._asked = self._stalled
             self._ask()
-        if self._stalled > self._patience + 2.0 * self._patience / 10.0:
+        if self._stalled > self._patience + 2.0 * self._patience / 10.0 and not belief:
             self._judge(places, unneeded)
 
-    def _judge(self, places: Mapping[str, int], unneeded: Collection[str]) -> None:
+    def held_up_by(self, late: Sequence[str], places: Mapping[str, int]) -> tuple[tuple[str, ...], str]:
+        """The processes for which a held run waits, and what they say; late: those that owe it a report or a final belief."""
+        return self._silent(places, (), late) if self._asked else (tuple(late), "")
+
+    def _silent(
+        self, places: Mapping[str, int], unneeded: Collection[str], late: Collection[str] = ()
+    ) -> tuple[tuple[str, ...], str]:
         # If nobody answers, no answer comes through.
-        silent = tuple(silent_of(places, self._answers, unneeded)) if self._answers else (self._router,)
+        silent = (
+            tuple(silent_of(places, self._answers, self._batch, unneeded, late)) if self._answers else (self._router,)
+        )
+        return silent, " and ".join(_described(name, self._answers.get(name)) for name in silent)
+
+    def _judge(self, places: Mapping[str, int], unneeded: Collection[str]) -> None:
+        silent, described = self._silent(places, unneeded)
         still = self._stalled - max(self._moved[name][1] if name in self._moved else 0.0 for name in silent)
         if still > self._patience:
-            described = " and ".join(_described(name, self._answers.get(name)) for name in silent)
             raise Silence(
                 silent,
                 f"alive, and silent for {still:.0f} s while the run waits for slot {self._done} ({described}); look at "
@@ -129,16 +142,20 @@ def _described(name: str, status: ProcessStatus | None) -> str:
 
 
 def silent_of(
-    places: Mapping[str, int], answers: Mapping[str, ProcessStatus], unneeded: Collection[str] = ()
+    places: Mapping[str, int],
+    answers: Mapping[str, ProcessStatus],
+    batch: int,
+    unneeded: Collection[str] = (),
+    late: Collection[str] = (),
 ) -> list[str]:
     """The processes that a run waits for when it stands still.
 
-    places: process → the first slot that it has not reported; answers: of the processes that have answered; unneeded:
-    processes whose reports are not needed to join slots.
+    places: process → the first slot that it has not reported; answers: of the processes that have answered; batch: slots of a
+    report; unneeded: processes whose reports are not needed to join slots; late: those that hold up a held run, if it is held.
     """
     joined = {name: k for name, k in places.items() if name not in unneeded}
-    behind = [name for name, k in joined.items() if k == min(joined.values())]
-    seen, chain = set(behind), list(behind)
+    behind = [name for name, k in joined.items() if (name in late if late else k == min(joined.values()))]
+    chain = list(behind)
     idle, mute = [], []
     for name in chain:  # grows
         status = answers.get(name)
@@ -146,25 +163,49 @@ def silent_of(
             mute.append(name)
         elif not status.waits:
             idle.append(name)
-        for key in () if status is None else status.waits:
-            writer = writer_of(key)
-            if writer in places and writer not in seen:
-                seen.add(writer)
-                chain.append(writer)
+        else:
+            chain += [writer for writer in map(writer_of, status.waits) if writer in places and writer not in chain]
     if idle or mute:
         return idle or mute
-    if len(behind) < len(joined):
-        return behind
-    # Every process claims to wait for another: some process has not sent a message that it claims to have sent.
+    # Every process claims to wait for another.
+    unreported = [name for name in behind if answers[name].slot >= places[name] + batch]
+    if unreported and len(behind) < len(joined):
+        return unreported
+    # Some wait for each other in a circle, and the rest for these; the recorder waits for those behind. In the circle, either a
+    # process has not sent a message that it claims to have sent, or another one does not take it.
+    direct = {name: {writer_of(key) for key in answers[name].waits} & {RECORDER, *chain} for name in chain}
+    direct[RECORDER] = set(behind)
+    awaited = {name: _reached(name, direct) for name in direct}
+    circle = [name for name in chain if all(name in awaited[other] for other in awaited[name])]
     owing = {
-        writer
-        for name in chain
+        process
+        for name in circle
         for key in answers[name].waits
-        if (writer := writer_of(key)) in answers
-        and writer != RECORDER
-        and ("/progress/" in key or answers[writer].slot > answers[name].slot)
+        if (writer := writer_of(key)) in circle
+        and ("/progress/" in key or _unsent(writer, answers[writer]) > answers[name].slot)
+        for process in (writer, name)
     }
-    return [name for name in places if name in owing] or behind
+    return [name for name in places if name in owing] or (behind if len(behind) < len(joined) else circle)
+
+
+def _unsent(process: str, status: ProcessStatus) -> int:
+    """The first slot of which a process has not sent its messages, by its answer.
+
+    Who waits for a command has sent all, also the barrier of a hold. Sensor and router wait for the acknowledgement or the input
+    of a slot after they have sent its packet or its deliveries.
+    """
+    answers = ("control", "ack", "input") if process in (SENSOR, ROUTER) else ("control",)
+    return status.slot + any(key.split("/")[2] in answers for key in status.waits)
+
+
+def _reached(name: str, direct: Mapping[str, Collection[str]]) -> set[str]:
+    """The processes that a process waits for, directly or not; direct: process → those that it waits for directly."""
+    reached: set[str] = set()
+    chain = [name]
+    for process in chain:  # grows
+        chain += sorted(set(direct[process]) - reached)
+        reached |= set(direct[process])
+    return reached
 
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated; the wait doubles each time

@@ -10,7 +10,7 @@ Source: docs/control.md.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -33,6 +33,10 @@ from evedrop.system.world import world
 
 STEP_SECONDS = 1.0
 """The most that counts between two polls: time in which the recorder itself did not run does not count."""
+
+
+HeldUpBy = Callable[[Sequence[str]], tuple[tuple[str, ...], str]]
+"""Processes that are late at a hold → those that hold them up, and what these say; empty if nobody was asked."""
 
 
 @dataclass(frozen=True)
@@ -135,10 +139,13 @@ class Steering:
             self._asked = True
             self._conductor.send_to(SENSOR, Hold())
 
-    def carry_on(self, reported: int, places: Callable[[], Mapping[str, int]]) -> None:
+    def carry_on(
+        self, reported: int, places: Callable[[], Mapping[str, int]], held_up_by: HeldUpBy = lambda late: (tuple(late), "")
+    ) -> None:
         """Carry out as many events as possible, given that all slots below `reported` are joined.
 
-        places: process → the first slot that it has not reported. Raises RunError if they do not become possible in time.
+        places: process → the first slot that it has not reported; held_up_by: see there. Raises RunError if they do not become
+        possible in time.
         """
         if self.at is None:
             return
@@ -146,11 +153,12 @@ class Steering:
             # A controller does not report at barriers, and receivers to which a router passes nothing on have nothing to report.
             behind = [name for name, k in places().items() if k < self.at and name != CONTROLLER]
             behind = [ROUTER] if ROUTER in behind else behind
-            self._fail(f"{' and '.join(behind)} did not report all slots before it")
+            self._fail(f"{' and '.join(behind)} did not report all slots before it", held_up_by, behind)
             return
         while self._settled():
             if self._pending and not self._may(self._pending[0]):
-                self._fail(f"{self._pending[0].names[0]} has not sent its final belief")
+                name = self._pending[0].names[0]
+                self._fail(f"{name} has not sent its final belief", held_up_by, [name])
                 return
             if self._pending:
                 self._do(self.at, self._pending.pop(0))
@@ -197,8 +205,8 @@ class Steering:
             )
         return False
 
-    def _fail(self, problem: str) -> None:
-        """Raise RunError if the run has been waiting for too long; problem: the missing condition.
+    def _fail(self, problem: str, held_up_by: HeldUpBy | None = None, late: Sequence[str] = ()) -> None:
+        """Raise RunError if the run has been waiting for too long; problem: the missing condition; late: who owes it.
 
         Time in which a process was missing, or the recorder itself did not run, does not count.
         """
@@ -206,9 +214,13 @@ class Steering:
         step, self._polled = min(now - self._polled, STEP_SECONDS), now
         self._waited += 0.0 if self._conductor.missing else step
         if self._waited > self._patience:
-            raise RunError(
+            silent, say = ((), "") if held_up_by is None else held_up_by(late)
+            problem = f"{problem} ({say})" if say else problem
+            failure = RunError(
                 f"{self._patience:.0f} s after the run was held before slot {self.at}, {problem}; look at the logs"
             )
+            failure.at_fault = silent
+            raise failure
 
     def _may(self, act: Act) -> bool:
         """Whether an act may begin: a receiver is ended or stopped only after it has left, in case it missed the hold."""
