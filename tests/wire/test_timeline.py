@@ -7,7 +7,7 @@ from typing import Any
 
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.timeline import moment_at, moments, with_change, with_cut_ended, with_partition_ended
+from evedrop.wire.timeline import moment_at, moments, with_change, with_cut_ended, with_partition_ended, with_request
 from tests.builders import mistakes_of, places_of
 from tests.golden.pages import Golden
 
@@ -149,3 +149,11 @@ def test_an_operator_changes_a_wire_that_has_run_for_weeks() -> None:
     assert quality(plan, weeks + 1.0) == 0.25
     plan, _ = with_cut_ended(plan, "scan", weeks + 2.0)
     assert moment_at(plan, weeks + 2.0).cut == frozenset()
+
+
+def test_an_operators_event_has_no_time_and_one_thing_to_do() -> None:
+    """It is done at once: what is to happen later, or two things in one request, are refused rather than done in part."""
+    plan = plan_of({"from": 1, "to": 9, "cut": "scan"})
+    for event in ({"cut": "back", "at": 50}, {"cut": "back", "from": 3, "to": 4}, {"heal": "scan", "cut": "back"}):
+        assert mistakes_of(with_request, plan, event, 2.0), event
+    assert with_request(plan, {"heal": "scan"}, 2.0)[1] == "heal scan"

@@ -68,10 +68,14 @@ def with_request(plan: WirePlan, event: Mapping[str, Any], time: float) -> tuple
 
     event: `heal` with the name of a link that is cut, `join` with two sides that are partitioned, or as for `with_change`.
     """
+    if timed := [name for name in ("at", "from", "to") if name in event]:
+        raise ScenarioError(
+            "event", [f"{name}: is given; expected no time, because it is done at once" for name in timed]
+        )
     healed, joined = event.get("heal"), event.get("join")
-    if isinstance(healed, str):
+    if isinstance(healed, str) and len(event) == 1:
         return with_cut_ended(plan, healed, time)
-    if isinstance(joined, list) and len(joined) == 2:
+    if isinstance(joined, list) and len(joined) == 2 and len(event) == 1:
         return with_partition_ended(plan, str(joined[0]), str(joined[1]), time)
     return with_change(plan, event, time)
 
