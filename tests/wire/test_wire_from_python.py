@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
 import pytest
 import zenoh
 
@@ -106,7 +107,7 @@ def used(running: RunningWire, got: list[int]) -> None:
         for n in range(400):
             numbers.put(str(n))
         wait_until(lambda: heard(running) == 400, "the wire hears all")
-        running.link("scan", quality=1.0)
+        running.link("scan", quality=np.float64(1.0))
         numbers.put("400")
         wait_until(lambda: got[-1:] == [400], "a link that loses nothing delivers")
         running.partition("robot", "base")

@@ -25,6 +25,7 @@ from evedrop.live.network.operator import Answer, ask
 from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest, WireStatus
 from evedrop.results.folder import claimed, default_folder, write_private
 from evedrop.results.wire_summary import WireSummary
+from evedrop.scenario.loading import plain_tables
 from evedrop.scenario.words import listed
 from evedrop.show.report.wire import expectation_failures, wire_faults
 from evedrop.system.killable import KillableProcess
@@ -212,7 +213,8 @@ class RunningWire:
 
     def link(self, name: str, **settings: Any) -> None:
         """Give a link other settings, such as `quality=0.2` or `delay={"model": "constant", "value": 0.1}`."""
-        self._steer({"link": name, "set": settings})
+        # Such as numbers of numpy, which a message cannot have; None is the value of an entry that is not given.
+        self._steer({"link": name, "set": {**dict.fromkeys(settings), **plain_tables(settings, name)}})
 
     def status(self) -> WireStatus:
         """The state of the wire now. Raises UsageError if it does not run."""

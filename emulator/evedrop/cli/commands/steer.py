@@ -185,7 +185,6 @@ def _event(name: str, words: list[str]) -> dict[str, Any]:
 
 def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
     """Put a value at a dotted key in `changes`; makes the tables in between."""
-    from evedrop.live.protocol.requests import LinkRequest
     from evedrop.scenario.loading import value_of
 
     *tables, last = dotted.split(".")
@@ -195,12 +194,6 @@ def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
         if not isinstance(inner, dict):
             raise UsageError(f"link {name} {dotted}={text}: {table} already has a value; give it once")
     inner[last] = value_of(text)
-    try:
-        LinkRequest({"link": name, "set": changes}).pack()
-    except (
-        OverflowError
-    ):  # a whole number of more than 64 bits cannot be in a message, and no entry of a link is so large
-        inner[last] = text
 
 
 COMMANDS = (link, partition, heal, pause, resume, step, status)

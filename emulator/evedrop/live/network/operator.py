@@ -89,9 +89,12 @@ def read_answer(key: str, payload: bytes) -> Answer:
 def ask(control: Control, request: OperatorRequest, patience: float) -> Answer | None:
     """Ask the recorder of a run; None if it does not answer within `patience` seconds, because the run is over or ends.
 
-    Raises zenoh.ZError if the router is not there or refuses the operator, UsageError if the request is too large for it.
+    Raises zenoh.ZError if the router is not there or refuses the operator, UsageError if the request cannot be sent.
     """
-    payload = request.pack()
+    try:
+        payload = request.pack()
+    except OverflowError as error:
+        raise UsageError("the request has a whole number of more than 64 bits; expected smaller ones") from error
     if len(payload) > QUESTION_BYTES:
         raise UsageError(
             f"the request has {len(payload)} bytes; expected at most {QUESTION_BYTES}: give shorter values"
