@@ -13,17 +13,19 @@ from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.operator import Answer
 from evedrop.live.protocol.codec import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, read_request
+from evedrop.live.protocol.requests import LinkRequest, LinkStatus, OperatorRequest, RunStatus, read_request
 from evedrop.names import RECORDER
 from evedrop.system.ports import free_port
 
 KEY = RunKeys("one").control(RECORDER)
+HELD = Answer(3, "held before slot 3")
 
 
 class Recorder:
     """A router, and a recorder there that lets the first requests go unanswered."""
 
-    def __init__(self, folder: Path, unanswered: int) -> None:
+    def __init__(self, folder: Path, unanswered: int, answer: Answer = HELD) -> None:
+        self._answer = answer
         port = free_port()
         config = zenoh.Config()
         config.insert_json5("mode", '"router"')
@@ -44,7 +46,7 @@ class Recorder:
         self.requests.append(read_request(KEY, payload_of(KEY, query.payload.to_bytes()) or b""))
         with query:
             if self.asked > self.unanswered:
-                query.reply(KEY, enclosed(KEY, Answer(3, "held before slot 3").pack()))
+                query.reply(KEY, enclosed(KEY, self._answer.pack()))
             elif self.unanswered == 1:
                 remove_control(self.folder)  # the run is over
 
@@ -84,3 +86,16 @@ def test_a_value_that_cannot_be_in_a_message_is_refused(tmp_path: Path, capsys: 
         assert "the request has a whole number of more than 64 bits" in capsys.readouterr().err
         assert main(["link", str(tmp_path), "smart", "loss.p=1979-05-27"]) == 0
     assert recorder.requests == [LinkRequest({"link": "smart", "set": {"loss": {"p": "1979-05-27"}}})]
+
+
+def test_a_status_says_which_shards_it_is_not_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Those that have not begun, or are over: the packets of their trials do not count."""
+    for shard in ("1", "2", "3"):
+        (tmp_path / "shards" / shard).mkdir(parents=True)
+    status = RunStatus(5, 9, 1.0, "running", {"router": True}, {"eve": LinkStatus.of(5, 4)}, [])
+    recorder = Recorder(tmp_path / "shards" / "2", 0, Answer(status=status))
+    with recorder.session:
+        assert main(["status", str(tmp_path)]) == 0
+    out, err = capsys.readouterr()
+    assert "link eve: 4 of 5 packets delivered" in out
+    assert "2 of 3 shards have not begun or are over; the status is that of the others" in " ".join(err.split())

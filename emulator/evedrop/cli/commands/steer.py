@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from evedrop.cli.command import command, option, together
 from evedrop.cli.options import as_json
 from evedrop.errors import BriefError, UsageError
-from evedrop.system.output import print_json
+from evedrop.system.output import print_json, warn
 from evedrop.system.world import world
 
 if TYPE_CHECKING:
@@ -105,12 +105,15 @@ def status(options: argparse.Namespace) -> int:
     """Show the status of a running simulation or wire."""
     from msgspec import to_builtins
 
-    from evedrop.live.network.control_file import read_controls
+    from evedrop.live.network.control_file import read_controls, shards_in
     from evedrop.live.protocol.requests import StatusRequest, status_of_shards
 
-    answers = [
-        _answer(options.run, control, StatusRequest(), "status", _PATIENCE) for control in read_controls(options.run)
-    ]
+    controls, shards = read_controls(options.run), shards_in(options.run)
+    answers = [_answer(options.run, control, StatusRequest(), "status", _PATIENCE) for control in controls]
+    if shards > len(controls):
+        warn(
+            f"{shards - len(controls)} of {shards} shards have not begun or are over; the status is that of the others"
+        )
     merged = answers[0].wire or status_of_shards([answer.status for answer in answers if answer.status is not None])
     if options.json:
         print_json(to_builtins(merged))

@@ -64,6 +64,11 @@ def read_controls(folder: Path) -> list[Control]:
     return [read_control(shard) for shard in shards] or [read_control(folder)]
 
 
+def shards_in(folder: Path) -> int:
+    """The number of shards of a run in progress, whether or not they have begun, or are over."""
+    return sum(path.is_dir() for path in folder.glob("shards/*"))
+
+
 def read_control(folder: Path) -> Control:
     """Read the control file of a run in progress. Raises UsageError if there is none, or it is malformed."""
     path = folder / _NAME
