@@ -124,12 +124,12 @@ class PeerSummary:
 
     @property
     def received_fraction(self) -> float | None:
-        """The fraction of packets received."""
+        """Packets received per slot."""
         return self.metric("received_fraction")
 
     @property
     def used_fraction(self) -> float | None:
-        """The fraction of packets received and used."""
+        """Packets received and used per slot."""
         return self.metric("used_fraction")
 
     @property

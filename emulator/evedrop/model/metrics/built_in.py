@@ -27,9 +27,9 @@ from evedrop.model.receiver import Action
 
 @final
 class ReceivedFraction(MeanMetric, TallyMetric):
-    """The fraction of packets that were received."""
+    """The number of packets that were received per slot: a sensor that stays silent lowers it, too."""
 
-    meaning = "packets received"
+    meaning = "packets received per slot"
     rests_on = "recorder"
     column = MetricColumn("received", 0, ".4f")
     sums = ("received", "late")
@@ -44,9 +44,9 @@ class ReceivedFraction(MeanMetric, TallyMetric):
 
 @final
 class UsedFraction(MeanMetric, TallyMetric):
-    """The fraction of packets that were received and used."""
+    """The number of packets that were received and used per slot."""
 
-    meaning = "packets received and used"
+    meaning = "those of them used"
     column = MetricColumn("used", 1, ".4f")
     sums = ("used", "late_used")
     trial_sums = "used"
