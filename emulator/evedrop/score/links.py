@@ -55,7 +55,7 @@ def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSumm
             lost_by={reason: count for reason, count in sorted(lost.items()) if count},
             bursts=np.trim_zeros(tally.bursts, "b").tolist(),
             mean_burst=_mean_burst(tally),
-            expected_mean_burst=None if tally.unsent or tally.lost.get("overflow") else _expected_burst(pieces),
+            expected_mean_burst=None if tally.unsent or tally.lost.get("overflow") else _expected_burst(pieces, tally),
         ),
         schedule,
         tally,
@@ -140,14 +140,13 @@ def _mean_burst(tally: Tally) -> float | None:
     return float(tally.bursts @ np.arange(1, len(tally.bursts) + 1)) / count
 
 
-def _expected_burst(pieces: list[tuple[LossModel, list[Thinned]]]) -> float | None:
-    """Mean number of consecutive losses by the model: P(lost) over P(lost after a packet that was not lost)."""
+def _expected_burst(pieces: list[tuple[LossModel, list[Thinned]]], tally: Tally) -> float | None:
+    """Mean length, by the model, of the bursts that end in the run; None if trials were cut short at different slots."""
     chain: Chain | None = pieces[0][0].chain if [len(parts) for _, parts in pieces] == [1] else None
-    if chain is None:
+    if chain is None or not tally.alike:
         return None
-    lost = 1.0 - chain.quality
-    begins = float((chain.stationary * chain.quality) @ chain.transitions @ lost)
-    return float(chain.stationary @ lost) / begins if begins > 0.0 else None
+    slots = pieces[0][1][0].slots
+    return chain.mean_burst(len(slots), slots.stop == tally.done)
 
 
 def _with_delays(link: LinkSummary, schedule: LinkSchedule, tally: Tally) -> LinkSummary:

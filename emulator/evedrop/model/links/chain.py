@@ -38,6 +38,20 @@ class Chain:
         """Whether the fates of all packets are independent and identically distributed: a single state, as in the paper."""
         return len(self.stationary) == 1
 
+    def mean_burst(self, slots: int, unfinished: bool) -> float | None:
+        """Mean length of the bursts of losses that end in so many slots: the packets lost in them over their number, as expected.
+
+        unfinished: whether a burst in the last slot does not end there, so that it is left out. None if no burst ends.
+        """
+        lost = 1.0 - self.quality
+        number = (slots - 1) * float((self.stationary * self.quality) @ self.transitions @ lost)
+        packets, last = slots * float(self.stationary @ lost), float(self.stationary @ lost)
+        if unfinished:
+            # In the last burst are those packets after which all are lost.
+            _, partial, _ = _power_and_sums(self.transitions * lost, slots, np.eye(len(lost)))
+            packets, last = packets - float((self.stationary * lost) @ partial.sum(axis=1)), 0.0
+        return packets / (number + last) if number + last > 0.0 else None
+
     def count_spectrum(self, parts: Sequence[Counted]) -> Spectrum | None:
         """The transform over this chain, stationary at the first of these ascending parts; None with too many states."""
         states = len(self.stationary)
