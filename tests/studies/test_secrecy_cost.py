@@ -151,3 +151,12 @@ def test_the_command_prints_the_table_and_json(evedrop: Evedrop) -> None:
         refused = evedrop(*words)
         assert refused.status == 2
         assert message in refused.err
+
+
+def test_a_fraction_of_no_energy_is_a_dash(evedrop: Evedrop) -> None:
+    """In its first slot the house neither buys nor sells with `plain`: nothing is a fraction of that."""
+    shown = evedrop("cost", "microgrid", "--trials", "2", "--slots", "1")
+    assert shown.status == 0
+    (line,) = (line for line in shown.out.splitlines() if "net: innovation from plain" in line)
+    assert line.split()[-3:] == ["–"] * 3
+    assert "nan" not in shown.out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +12,7 @@ from evedrop.cli.command import command, flag, option, together
 from evedrop.cli.in_memory import MEMORY, check_resuming, crew, default_trials, keeping, plan_of, resuming, studied
 from evedrop.cli.options import as_json, changes_of, entries, loaded, output, over_wire, print_so_far, scenario, tables
 from evedrop.errors import Interrupted, UsageError
-from evedrop.model.metrics.text import ShownNumber, number_text
+from evedrop.model.metrics.text import ShownNumber, finite_text, number_text
 from evedrop.system.output import print_json
 
 if TYPE_CHECKING:
@@ -191,6 +192,9 @@ def _print_cost(reproduction: SecrecyCost) -> None:
 
 
 def _cells(estimate: MeanEstimate, scale: float, unit: str) -> tuple[str, str, str]:
+    if not math.isfinite(estimate.mean):  # a fraction of an energy that is 0
+        dash = number_text(None)
+        return dash if math.isnan(estimate.mean) else finite_text(estimate.mean) + unit, dash, dash
     mean, low, high = (number_text(scale * value, ".3g") for value in (estimate.mean, estimate.low, estimate.high))
     error = ShownNumber(f"{float(f'{scale * estimate.standard_error:.3g}'):.2g}", scale * estimate.standard_error)
     return mean + unit, error, f"{low} to {high}{unit}"
