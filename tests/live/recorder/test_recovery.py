@@ -255,6 +255,25 @@ def test_a_round_that_is_lost_is_repeated_before_a_process_counts_as_silent(
     assert len(conducted.rounds) <= 6
 
 
+def test_a_round_that_has_helped_does_not_put_off_the_next_one() -> None:
+    """Each round in vain doubles the time until the next one; slots that are joined again let rounds begin as soon as before."""
+    conducted, clock = Conducted(), clock_at_start()
+    recovery = recovery_of(conducted, clock, 30.0)
+    conducted.lose("smart")
+    recovery.poll(10)
+    conducted.lost = {}
+    recovery.poll(10)
+    took = []
+    for done in (11, 12):
+        recovery.poll(done)
+        began, wanted = clock.now, len(conducted.rounds) + 2
+        while len(conducted.rounds) < wanted:
+            clock.now += 0.1
+            recovery.poll(done)
+        took.append(clock.now - began)
+    assert took[1] == pytest.approx(took[0], abs=0.15)
+
+
 def test_a_process_is_reached_when_its_commands_have_a_reader() -> None:
     """Its token alone is not enough; one that is away is not waited for."""
     network = Network()
