@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pytest
 
 from evedrop.scenario.progress_events import RunProgress
 from evedrop.scenario.tables import Scenario
+from evedrop.virtual import campaign
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, Disturbance
 from evedrop.virtual.faults import (
@@ -30,7 +32,9 @@ from evedrop.virtual.judge import misses
 from evedrop.virtual.notes import PutMessage
 from evedrop.virtual.programs import DrawnProgram
 from evedrop.virtual.reference import RunReference
+from evedrop.virtual.results import wrong_outages
 from evedrop.virtual.run import SimulatedRun
+from tests.virtual.simulated import play, read_case
 
 SCENARIO = Scenario(
     {
@@ -281,3 +285,113 @@ def test_a_program_that_is_wrong_ends_its_run(
     program = DrawnProgram(True, "list", mistake)
     broken = judged(tmp_path, {}, program=program, status=status, said=said)
     assert any("although a program is wrong" in miss for miss in broken) is missed
+
+
+@pytest.mark.parametrize(("moment", "missed"), [(0.71, False), (0.69, True)])
+def test_a_slot_that_is_sent_before_it_is_due_is_a_miss(moment: float, missed: bool, tmp_path: Path) -> None:
+    """Slot 5 is due half a second after the start, and a hold of a quarter of a second puts it off; it is noted at once."""
+    put = [
+        PutMessage(0.0, "control/sensor", "start"),
+        PutMessage(0.1, "uplink", "1"),
+        PutMessage(0.15, "uplink", "hold 2"),
+        PutMessage(0.4, "control/sensor", "go 2"),
+        PutMessage(0.41, "control/sensor", "go 2"),
+        PutMessage(0.41, "uplink", "2"),
+        PutMessage(moment, "uplink", "5"),
+    ]
+    broken = judged(tmp_path, {KILLED: 0.5}, status=3, put=put)
+    assert ("slot 5 is sent 0.010 s before it is due" in broken) is missed
+
+
+def test_an_outage_of_a_run_in_shards_names_its_shard() -> None:
+    """That of any other run names none."""
+    entry = {"process": "sensor", "slot": 1, "until": 2, "seconds": 0.1}
+    miss = "an outage of sensor in shard None of 2"
+    for shards, missed in ((1, False), (2, True)):
+        scenario = Scenario({**SCENARIO.as_tables(), "trials": 2, "shards": shards})
+        reference = RunReference(scenario, {"slots": 10}, {})
+        summary = {"ended": "complete", "outages": [entry]}
+        assert (miss in [*wrong_outages(summary, reference, frozenset())]) is missed
+
+
+_CASE = {
+    "seed": 1,
+    "ahead": 5,
+    "scenario": {
+        "title": "Drawn",
+        "slots": 20,
+        "pace": 0.3,
+        "longest_outage": 3.0,
+        "process": {"A": [[1.0]], "Q": [[0.01]], "initial_covariance": [[1.0]]},
+        "encoding": {"scheme": "plain"},
+        "legitimate": {"link": {"quality": 1.0}},
+        "plant": {"inputs": ["u"], "input_matrix": [[0.1]], "noise": [[0.0001]]},
+        "controller": {
+            "strategy": "lqr",
+            "state_weights": [1.0],
+            "input_weights": [0.1],
+            "period": 2,
+            "acts_on": "truth",
+        },
+    },
+}
+
+
+def _without_log(run: SimulatedRun) -> None:
+    (run.folder / "logs" / "sensor.log").unlink()
+
+
+def _summary_with(**entries: Any) -> Callable[[SimulatedRun], None]:
+    def change(run: SimulatedRun) -> None:
+        path = run.folder / "summary.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), **entries}))
+
+    return change
+
+
+def _with_decisions(run: SimulatedRun) -> None:
+    controller = json.loads((run.folder / "summary.json").read_text())["controller"]
+    _summary_with(controller={**controller, "decisions": 11})(run)
+
+
+def _outage(process: str, until: int | None) -> dict[str, object]:
+    return {"process": process, "slot": 1, "until": until, "seconds": 0.1, "shard": None}
+
+
+@pytest.mark.parametrize(
+    ("fault", "change", "miss"),
+    [
+        (None, _without_log, "there is no log sensor.log"),
+        (None, _with_decisions, "the controller has decided 11 times, once in 2 of 20 slots"),
+        (["confuse", "sensor", 100, None], _summary_with(misdelivered={}), "sensor has got 1 messages of other keys"),
+        (
+            ["cut", "recorder", 100, 0.1],
+            _summary_with(outages=[_outage("router", 4)]),
+            "the recorder was cut off, which sees nobody then, and the summary lists outages of router",
+        ),
+        (
+            ["cut", "legitimate", 100, None],
+            _summary_with(outages=[_outage("legitimate", 4)]),
+            "legitimate is cut off for good, and the summary has its outage end at slot 4",
+        ),
+        (
+            ["cut", "legitimate", 100, 1.0],
+            _summary_with(outages=[_outage("legitimate", 4)]),
+            "the outage of legitimate lasts 0.10 s after cut legitimate for 1.00 s after 100 events",
+        ),
+        (["kill", "legitimate", 380, None], _summary_with(slots=1), "slots were done 4.0 s before kill legitimate"),
+    ],
+)
+def test_what_results_must_say_and_do_not_is_a_miss(
+    fault: list[object] | None, change: Callable[[SimulatedRun], None], miss: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody changes the results of a run that keeps all promises."""
+    case = read_case(json.dumps({**_CASE, "faults": [fault] if fault else []}))
+    assert play(case).misses == ()
+
+    def changed(case: SimulatedCase, run: SimulatedRun, *rest: Any) -> list[str]:
+        change(run)
+        return misses(case, run, *rest)
+
+    monkeypatch.setattr(campaign, "misses", changed)
+    assert any(miss in broken for broken in play(case).misses)

@@ -8,6 +8,7 @@ Source: docs/maintainers/simulated-world.md.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.briefs import LAUNCHED_PATIENCE
 from evedrop.live.launch.other_hosts import TOLERATED
 from evedrop.live.network.session import READY_SECONDS
-from evedrop.names import RECORDER, ROUTER, SENSOR
+from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.crash_proof_tables import last_round
 from evedrop.results.reading import Results
 from evedrop.scenario.plugins import named_in
@@ -26,6 +27,7 @@ from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance, processes_of
 from evedrop.virtual.faults import (
     BreakWrite,
+    ConfuseKeys,
     CutConnection,
     DelayThread,
     DiskDisturbance,
@@ -38,6 +40,8 @@ from evedrop.virtual.faults import (
 )
 from evedrop.virtual.host_faults import FreezeSsh, LosePower
 from evedrop.virtual.host_parts import PROGRAM, SESSION, host_of, part_of
+from evedrop.virtual.metrics import slots_of_metrics
+from evedrop.virtual.outsiders import OperatorCommand
 from evedrop.virtual.processes import FORK_SERVERS
 from evedrop.virtual.reference import RunReference, tables_of
 from evedrop.virtual.results import lost_rows, wrong_outages, wrong_summary, wrong_tables
@@ -54,6 +58,10 @@ _SUSPENDED_SECONDS = 3.0
 """That the end of a run takes if a receiver is suspended."""
 _NOTICED_SECONDS = 0.1
 """Within which a connection that is cut is noticed."""
+_ANSWERED_SECONDS, _ANSWERED_SLOTS = 3.0, 5
+"""That the answer to an operator takes, and in how many slots a run is held, and does a few steps."""
+_UNSAVED_SECONDS = 4.0
+"""Within which rows are on the disk: of three seconds between two rounds, and of the time between two messages."""
 _LEASE_SECONDS, _GIVES_UP_SECONDS = 4.0, 1.5
 """Until a connection that is frozen counts as lost, and that the end of a process may take which gives up."""
 _PATIENCES = 2.0
@@ -111,6 +119,7 @@ def misses(
         broken += [f"{path.name} is left on {host}" for path in sorted(temporaries[host].iterdir())]
     broken += _of_logs(run)
     broken += _of_rounds(case, run, struck)
+    broken += _of_operators(case, run, struck)
     misled = any(isinstance(fault, BreakMessage) and fault.target == SENSOR for fault in struck)  # by a wrong number
     if not misled:
         broken += wrong_messages(case, run.put, disturbed=bool(struck) or case.program is not None)
@@ -341,6 +350,15 @@ def _of_rounds(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
         yield f"messages are asked for {rounds} times after {fault}"
 
 
+def _of_operators(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
+    """Whether operators get their answers soon, if nothing else happens to the run."""
+    if all(isinstance(fault, OperatorCommand) for fault in struck):
+        for words, seconds in run.typed:
+            most = _ANSWERED_SECONDS + _ANSWERED_SLOTS * case.scenario.pace
+            if seconds > most:
+                yield f"{words} is answered after {seconds:.1f} s, and not after {most:.1f} s at most"
+
+
 def _progress(run: SimulatedRun) -> Iterator[tuple[float, int]]:
     """When the run told of its progress, and how many slots were done."""
     for at, event in run.told:
@@ -388,6 +406,8 @@ def _of_results(
             if done or has_rows or (whole and not lacking and any(slots for _, slots in _progress(run))):
                 yield f"the results cannot be read: {error}"
             continue
+        if whole and done:
+            yield from _lost_logs(case, folder)
         if falsified:  # rows may have a number that was noticed later, when its block was complete
             continue
         summary = results.summary
@@ -404,10 +424,20 @@ def _of_results(
         is_over = reference.shards == 1 and any(message.said == "end" for message in run.put)
         if is_over and summary["slots"] < reference.scenario.slots:
             yield f"all slots were done, and the summary has {summary['slots']}"
+        if whole:
+            yield from _of_unsaved(run, struck, summary, expected)
         # A recorder that is killed has no time to save what it told.
         killed = run.ends.get(RECORDER, (0.0, 0))[1] == KILLED or any(fault.ends_at_once(RECORDER) for fault in struck)
         if not killed:
             yield from _of_course(case, run, struck, summary, expected, whole)
+
+
+def _lost_logs(case: SimulatedCase, folder: Path) -> Iterator[str]:
+    """The logs that a run which ended well has not left in its folder."""
+    shards = [f"shard-{number}" for number in range(1, 1 + case.scenario.shards)] if case.scenario.shards > 1 else [""]
+    for path in (Path(shard, f"{name}.log") for shard in shards for name in processes_of(case.scenario)):
+        if not (folder / "logs" / path).exists():
+            yield f"there is no log {path}"
 
 
 def _falsified(run: SimulatedRun, struck: Iterable[Disturbance]) -> bool:
@@ -429,6 +459,12 @@ def _of_course(
     if summary["slots"] < told and whole:
         yield f"{told} slots were done, and the summary has {summary['slots']}"
     yield from _of_cuts(run, struck, summary, reference)
+    yield from _of_lasting(struck, summary, reference)
+    yield from _of_misled(run, struck, summary, reference)
+    if _wrong_program(case) is not None and not struck:  # the sensor waits until what it has sent is done
+        sent = max((message.slots.stop for message in run.put if message.key == "uplink" and message.slots), default=0)
+        if summary["slots"] < sent:
+            yield f"the program has given states of {sent} slots, and the summary has {summary['slots']}"
     outages = [event for _, event in run.told if isinstance(event, ConnectionOutage)] if whole else []
     yield from wrong_outages(summary, reference, frozenset((event.process, event.slot) for event in outages))
     for entry in summary["outages"]:
@@ -466,6 +502,60 @@ def _of_cuts(
         and not {entry["process"] for entry in summary["outages"]} & {fault.target, *ROUTERS, RECORDER}
     ):
         yield f"the summary lists no outage of {fault.target}, which was cut off"
+    others = {entry["process"] for entry in summary["outages"]} - {fault.target}
+    if fault.target == RECORDER and others and len(struck) == 1:
+        yield f"the recorder was cut off, which sees nobody then, and the summary lists outages of {', '.join(sorted(others))}"
+
+
+def _of_lasting(
+    struck: Mapping[Disturbance, float], summary: Mapping[str, Any], reference: RunReference
+) -> Iterator[str]:
+    """Whether an outage lasts as long as what has cut the process off, and has no end if the run failed before.
+
+    Not if the run may have been held then, when nobody is missed.
+    """
+    fault = next(iter(struck), None)
+    if not isinstance(fault, CutConnection | FreezeConnection) or len(struck) > 1 or reference.scenario.timeline.holds:
+        return
+    outages = [entry for entry in summary["outages"] if entry["process"] == fault.target]
+    if summary["ended"] == "complete" and fault.seconds is not None:
+        over = [entry["seconds"] for entry in outages if entry["until"] < reference.scenario.slots]
+        longest = max(over, default=math.inf)  # at its end, a run does not wait for who is not needed any more
+        if longest < fault.seconds - _NOTICED_SECONDS:
+            yield f"the outage of {fault.target} lasts {longest:.2f} s after {fault}"
+    elif fault.seconds is None and outages and outages[-1]["until"] is not None:
+        yield f"{fault.target} is cut off for good, and the summary has its outage end at slot {outages[-1]['until']}"
+
+
+def _of_unsaved(
+    run: SimulatedRun, struck: Mapping[Disturbance, float], summary: Mapping[str, Any], reference: RunReference
+) -> Iterator[str]:
+    """Whether a recorder that was killed had saved all rows and metrics but those of the last seconds."""
+    fault = next(iter(struck), None)
+    if isinstance(fault, KillProcess) and len(struck) == 1 and reference.shards == 1:
+        saved = struck[fault] - _UNSAVED_SECONDS
+        early = max((done for at, done in _progress(run) if at < saved), default=0)
+        for what, slots in (("summary", summary["slots"]), ("last metrics", slots_of_metrics(summary) or 0)):
+            if slots < early:
+                yield f"{early} slots were done {_UNSAVED_SECONDS:.1f} s before {fault}, and there are {slots} in the {what}"
+
+
+def _of_misled(
+    run: SimulatedRun, struck: Mapping[Disturbance, float], summary: Mapping[str, Any], reference: RunReference
+) -> Iterator[str]:
+    """Whether the summary counts the messages that processes have dropped, since they came as those of another key.
+
+    Not if a process ends while the run goes on, with what it has counted.
+    """
+    scenario = reference.scenario
+    away = any(scenario.timeline.outages.values())
+    if run.status != reference.status or away or not all(isinstance(fault, ConfuseKeys) for fault in struck):
+        return
+    over = next((message.at for message in run.put if message.said == "end"), math.inf)
+    counts = Counter(name for at, name in run.misled if at < over and name != RELAY)  # which reports nothing
+    for name, count in sorted(counts.items()):
+        if (dropped := summary.get("misdelivered", {}).get(name, 0)) < count:
+            yield f"{name} has got {count} messages of other keys, and the summary has {dropped}"
 
 
 def _explains(fault: Disturbance, process: str) -> bool:

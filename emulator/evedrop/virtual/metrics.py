@@ -34,13 +34,18 @@ def unlike_memory(summary: Mapping[str, Any], wanted: Mapping[str, Any], shards:
     """
     controller = wanted.get("controller")
     if controller is not None:
-        wanted = {**wanted, "controller": {**controller, "decisions": shards * controller["decisions"]}}
+        wanted = {**wanted, "controller": {**controller, "decisions": _decisions(controller, wanted["slots"], shards)}}
     summary = {**summary, "events": _repeatable(summary["events"], wanted["events"])}
     for name, value in wanted.items():
         if name not in _OF_A_LIVE_RUN:
             yield from _differences(name, summary.get(name), value)
     for name in summary.keys() - wanted.keys() - _OF_A_LIVE_RUN:
         yield f"the summary has {name}, and in memory it has not"
+
+
+def _decisions(controller: Mapping[str, Any], slots: int, shards: int) -> int:
+    """How many decisions there are in some slots: one in each period, in every shard."""
+    return shards * -(-slots // int(controller["period"]))
 
 
 def _repeatable(
@@ -106,6 +111,9 @@ def unlike_rows(summary: Mapping[str, Any], tables: Mapping[str, pa.Table], shar
     if without:
         yield f"the metrics are of {slots} slots, and the tables have no rows of {', '.join(without)}"
         return
+    controller = summary.get("controller")
+    if controller is not None and shards == 1 and controller["decisions"] > _decisions(controller, slots, shards):
+        yield f"the controller has decided {controller['decisions']} times, once in {controller['period']} of {slots} slots"
     latecomers = {name: account["late"] for name, account in links.items()}
     for name, peer in summary["peers"].items():
         mean, late = means[name], latecomers[name]

@@ -81,6 +81,11 @@ def said_in(message: bytes) -> str:
     return " ".join(words)
 
 
+def came_as(key: str) -> str:
+    """Why a message was lost: it arrived as one of another key."""
+    return f"came as {key}"
+
+
 _SLOTS = re.compile(r"(\d+)(?:-(\d+))?")
 
 

@@ -59,7 +59,9 @@ class OperatorCommand(_Outsider):
     @staticmethod
     def _type(world: SimulatedWorld, *words: str) -> bool:
         """Carry out a command, such as `pause RUN`; returns whether the run did it, rather than to refuse."""
+        begun = here().monotonic()
         status = world.machine.program([words[0], str(world.results_now), *words[1:]])
+        world.typed.append((" ".join(words), here().monotonic() - begun))
         if status not in {0, UsageError.exit_status}:
             raise AssertionError(f"{' '.join(words)} ends with status {status}")
         return status == 0

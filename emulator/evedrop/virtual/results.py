@@ -77,6 +77,8 @@ def wrong_outages(
             yield f"an outage of {entry['process']} at slot {entry['slot']} until {entry['until']}, in a run that is complete"
         if entry["seconds"] < 0.0:
             yield f"an outage of {entry['seconds']} s"
+        if (entry.get("shard") is None) != (reference.shards == 1):
+            yield f"an outage of {entry['process']} in shard {entry.get('shard')} of {reference.shards}"
 
 
 def lost_rows(folder: Path) -> Iterator[str]:

@@ -76,6 +76,10 @@ class SimulatedRun:
     """The hash of all events."""
     put: list[PutMessage] = field(default_factory=list)
     """The messages that all processes have put."""
+    typed: list[tuple[str, float]] = field(default_factory=list)
+    """The commands of operators, each with the virtual seconds until its answer."""
+    misled: list[tuple[float, str]] = field(default_factory=list)
+    """When a message of another key arrived as a command, and at which process."""
     happened: list[Occurrence] = field(default_factory=list)
     """All events, if they were kept."""
 
@@ -96,6 +100,8 @@ class SimulatedWorld:
         """How many slots its sensor may be ahead."""
         self.told: list[tuple[float, ProgressEvent]] = []
         """The events that its launcher got."""
+        self.typed: list[tuple[str, float]] = []
+        """The commands of operators, each with the virtual seconds until its answer."""
         self.places: Mapping[str, str] = {}
         """Router → where it listens, if that is at a port."""
         self.hosts: OtherHosts | None = None
@@ -146,7 +152,7 @@ def run_in(
     hosts_file: that of `--hosts`, if the world has other hosts. begin: begins other programs, before the launcher.
     """
     run = SimulatedRun(world.results)
-    world.scenario, world.ahead, world.told = scenario, ahead, run.told
+    world.scenario, world.ahead, world.told, world.typed = scenario, ahead, run.told, run.typed
     given = {ROUTER: _ROUTER, RELAY: _RELAY} if scenario.relayed and scenario.shards == 1 else {}
     world.places = given if hosts_file is None else LISTENS
     scheduler = world.scheduler
@@ -157,6 +163,10 @@ def run_in(
         elif what == notes.ENDS:
             process, status = words
             run.ends[str(process)] = scheduler.now, int(str(status))
+        elif what == notes.LOST:
+            process, key, _, why = words
+            if key != f"control/{process}" and why == notes.came_as(f"control/{process}"):
+                run.misled.append((scheduler.now, str(process)))
 
     scheduler.watchers.append(watch)
 

@@ -9,10 +9,13 @@ from collections import Counter
 from collections.abc import Iterator
 
 from evedrop.live.launch.briefs import flow_of
-from evedrop.names import RECORDER
+from evedrop.names import RECORDER, SENSOR
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.notes import PutMessage
+
+_HOLDS_SECONDS, _ROUNDED_SECONDS = 0.05, 1e-6
+"""That a sensor may take to note that it holds, and by which times differ that are added up in another order."""
 
 
 def wrong_messages(case: SimulatedCase, put: list[PutMessage], *, disturbed: bool) -> Iterator[str]:
@@ -21,6 +24,8 @@ def wrong_messages(case: SimulatedCase, put: list[PutMessage], *, disturbed: boo
     if scenario.shards == 1:
         yield from _too_far_ahead(scenario, flow_of(scenario, case.ahead).window, put)
         yield from _forgotten(scenario, put)
+        if scenario.pace:
+            yield from _too_soon(scenario, put)
     yield from _to_the_absent(scenario, put)
     if not disturbed and not is_late(scenario):
         yield from _sent_again(put, scenario.shards)
@@ -63,6 +68,28 @@ def _forgotten(scenario: Scenario, put: list[PutMessage]) -> Iterator[str]:
                 yield f"slot {announced} is announced to be sent again, and slot {first} is sent"
                 return
             announced = None
+
+
+def _too_soon(scenario: Scenario, put: list[PutMessage]) -> Iterator[str]:
+    """The first slot that the sensor sends before it is due: a hold puts off all later slots for as long as it lasts."""
+    begun: float | None = None
+    held: dict[int, float] = {}
+    longer, goes_on = 0.0, set[int]()
+    for message in put:
+        command, _, slot = message.said.partition(" ")
+        if message.key == f"control/{SENSOR}" and command == "start" and begun is None:
+            begun = message.at
+        elif message.key == f"control/{SENSOR}" and command == "go" and int(slot) not in goes_on:
+            goes_on.add(int(slot))
+            longer += max(0.0, message.at - held.get(int(slot), message.at) - _HOLDS_SECONDS)
+        elif message.key == "uplink" and command == "hold":
+            held.setdefault(int(slot), message.at)
+        elif message.key == "uplink" and begun is not None:
+            for first in message.slots[:1]:
+                due = begun + first * scenario.pace + longer
+                if message.at < due - _ROUNDED_SECONDS:
+                    yield f"slot {first} is sent {due - message.at:.3f} s before it is due"
+                    return
 
 
 def _to_the_absent(scenario: Scenario, put: list[PutMessage]) -> Iterator[str]:

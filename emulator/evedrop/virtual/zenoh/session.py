@@ -435,7 +435,7 @@ class VirtualSession:
         for subscriber in others[:1] or right:
             key = subscriber.key if subscriber in others else frame.key
             self.scheduler.note(
-                notes.LOST, self.name, notes.key_within(frame.key), frame.number, f"came as {notes.key_within(key)}"
+                notes.LOST, self.name, notes.key_within(frame.key), frame.number, notes.came_as(notes.key_within(key))
             )
             subscriber.taker.put(frame.sample(key))
 
