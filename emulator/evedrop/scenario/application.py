@@ -385,6 +385,11 @@ APPLICATIONS: Registry[Application] = Registry(
 """By the name of the table. All are found by entry points; those of Evedrop are in its own pyproject.toml."""
 
 
+def is_own(application: type[Application]) -> bool:
+    """Whether an application comes with Evedrop, so that its failure is a bug."""
+    return application.__module__.startswith("evedrop.")
+
+
 def applications_in(tables: Iterable[str], besides: Container[str] = ()) -> dict[str, type[Application]]:
     """Name → application, for those of these names that are applications and can be loaded.
 

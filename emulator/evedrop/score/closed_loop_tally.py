@@ -18,9 +18,9 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Codes
 from evedrop.model.slot.records import SensorSlots
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.application import APPLICATIONS, ApplicationTally
 from evedrop.scenario.closed_loop import controlled_plant
 from evedrop.scenario.tables import Scenario
+from evedrop.score.guarded_application import GuardedApplication
 from evedrop.score.summary import ControllerSummary, PeerSummary, StandardErrors
 
 ESTIMATORS = ("ignoring_input", "knowing_input")
@@ -73,7 +73,7 @@ class LoopTally:
         """Sum of squared errors of the estimator that is not in the loop."""
         self.of_trials: Floats = np.zeros((4, trials))
         """The slots of each trial, and its fractions of the three totals above, in their order."""
-        self.applications: dict[str, ApplicationTally] = {}
+        self.applications: dict[str, GuardedApplication] = {}
         """Application → its totals, for those that the scenario uses."""
 
     @classmethod
@@ -87,7 +87,7 @@ class LoopTally:
         comparable = stays and not scenario.forges_acknowledgements
         tally = cls(loop.process, loop.plant, trials, scenario.legitimate.knows_input, comparable)
         tally.applications = {
-            name: APPLICATIONS[name].tally(loop, table, trials) for name, table in scenario.applications.items()
+            name: GuardedApplication.begun(name, loop, table, trials) for name, table in scenario.applications.items()
         }
         return tally
 
@@ -99,9 +99,7 @@ class LoopTally:
         u, applied, failed = sensor.u, sensor.applied, sensor.failed
         assert u is not None and applied is not None and failed is not None  # noqa: S101, PT018 - there is a controller
         for application in self.applications.values():
-            if sensor.watermark is not None:
-                application.add_monitored(sensor.states, u, sensor)
-            application.add(sensor.states, applied, estimates)
+            application.add(sensor, u, applied, estimates)
         self.trial_slots += failed.size
         self.failed += int(np.count_nonzero(failed))
         clipped = self._plant.clips(applied)
@@ -129,17 +127,18 @@ class LoopTally:
             whole.other_error += part.other_error
         whole.of_trials = np.concatenate([part.of_trials for part in tallies], axis=1)
         whole.applications = {
-            name: type(application).merged([part.applications[name] for part in tallies])
-            for name, application in tallies[0].applications.items()
+            name: GuardedApplication.merged([part.applications[name] for part in tallies])
+            for name in tallies[0].applications
         }
         return whole
 
     def entries(self, trials: int) -> dict[str, dict[str, Any]]:
-        """Application → its entry of the summary of a run of so many trials, which may be more than these.
+        """Application → its entry of the summary of a run of so many trials, which may be more than these; none if it failed.
 
         Its means are of these, but a digest would be one of all: there is none where a shard has no metrics.
         """
-        entries = {name: dict(tally.entry()) for name, tally in self.applications.items()}
+        answers = {name: application.entry() for name, application in self.applications.items()}
+        entries = {name: dict(answer) for name, answer in answers.items() if answer is not None}
         for entry in entries.values():
             if "digest" in entry and self.of_trials.shape[1] < trials:
                 entry["digest"] = None

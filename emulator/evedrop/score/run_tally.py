@@ -62,8 +62,10 @@ class RunTally:
 
     @property
     def failures(self) -> list[str]:
-        """Why metrics of packages failed, in words."""
-        return [failure for tally in self.tallies.values() for failure in tally.watched.failures]
+        """Why metrics and applications of packages failed, in words."""
+        applications = {} if self.loop is None else self.loop.applications
+        of_applications = [application.failure for application in applications.values() if application.failure]
+        return [failure for tally in self.tallies.values() for failure in tally.watched.failures] + of_applications
 
     @classmethod
     def merged(cls, parts: Sequence[RunTally]) -> RunTally:

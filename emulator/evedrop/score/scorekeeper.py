@@ -214,7 +214,7 @@ def summary_of(
     """The summary of a run; digests: process → its digest, None if it has none or the run was cut short.
 
     An accused process has no digest either, because its reports were contradicted. A run to the end in which a package's
-    metric failed is not `complete`: it ended with that failure.
+    metric or application failed is not `complete`: it ended with that failure.
     """
     tallies, detection, loop = run_tally.tallies, run_tally.detection, run_tally.loop
     digests = {name: None if name in ending.accused else entry for name, entry in digests.items()}

@@ -10,6 +10,7 @@ import pytest
 
 from evedrop.cli.api import montecarlo
 from evedrop.errors import ScenarioError
+from evedrop.results.reading import Results
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.closed_loop import controlled_plant
 from evedrop.scenario.loading import load
@@ -153,6 +154,66 @@ def test_an_application_of_another_package_needs_nothing_here(evedrop: Evedrop) 
     )
     assert done.status == 0, done.err
     assert "platoon" not in APPLICATIONS.names
+
+
+ADD, SUMMARY, TALLY = (
+    "self.smallest = np.minimum(",
+    'return {"smallest_gap": float(self.smallest.min())}',
+    "return GapTally(loop.state(table.gap), trials)",
+)
+FAILING = {
+    "an error in a slot": (ADD, f"raise ValueError('no'); {ADD}", "ValueError: no, platooning.py line "),
+    "a file that is missing": (ADD, f"open('/nowhere'); {ADD}", "FileNotFoundError: [Errno 2] No such file"),
+    "an exit": (ADD, f"raise SystemExit(0); {ADD}", "SystemExit: 0, platooning.py line "),
+    "an exit at the end": (SUMMARY, "raise SystemExit(0)", "SystemExit: 0, platooning.py line "),
+    "no number": (
+        SUMMARY,
+        "return {'smallest_gap': 'abc'}",
+        "summary() gave 'abc' as smallest_gap; expected a number, or None",
+    ),
+    "an object": (
+        SUMMARY,
+        "return {'smallest_gap': 1.0, 'more': object()}",
+        "TypeError: Object of type object is not JSON",
+    ),
+    "no tally": (TALLY, "return None", "it gave None as its tally; expected an ApplicationTally"),
+}
+"""What fails → the line of the module, its replacement, and the expected message."""
+
+
+@pytest.mark.parametrize("case", FAILING)
+@pytest.mark.parametrize("how", ["in memory", pytest.param("live", marks=pytest.mark.long)])
+def test_an_application_that_fails_costs_nothing_else(evedrop: Evedrop, case: str, how: str) -> None:
+    """All else is measured and saved; then the run fails with status 3, and names application, error and line."""
+    line, instead, message = FAILING[case]
+    page = (Path(__file__).parents[3] / "docs" / "your-own" / "application.md").read_text(encoding="utf-8")
+    module = page.partition("# platooning.py\n")[2].partition("```")[0]
+    install(evedrop.folder, {"platooning.py": module.replace(line, instead)}, PLATOON)
+    (evedrop.folder / "two.toml").write_text(SCENARIO)
+    command = ("run", "--view", "off") if how == "live" else ("montecarlo", "--workers", "1")
+    environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
+    done = evedrop.process(command[0], "two.toml", *command[1:], "--trials", "2", "--out", "run", env=environment)
+    assert done.status == 3, done.err
+    assert f"the application platoon of an installed package failed: {message}" in done.err
+    assert "Traceback" not in done.err
+    summary = Results.read(evedrop.folder / "run").summary
+    assert summary["ended"] in done.err
+    assert summary["slots"] == 200
+    assert summary["peers"]["legitimate"]["digest"] is not None
+    assert "platoon" not in summary
+    assert summary["expectations"][0]["held"] is None
+
+
+def test_closing_lines_that_fail_are_named(evedrop: Evedrop) -> None:
+    """The run has ended well, and the closing report says what its application could not say."""
+    page = (Path(__file__).parents[3] / "docs" / "your-own" / "application.md").read_text(encoding="utf-8")
+    module = page.partition("# platooning.py\n")[2].partition("```")[0].replace("['smallest_gap']", "['largest_gap']")
+    install(evedrop.folder, {"platooning.py": module}, PLATOON)
+    (evedrop.folder / "two.toml").write_text(SCENARIO)
+    environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
+    done = evedrop.process("montecarlo", "two.toml", "--trials", "2", "--out", "run", env=environment)
+    assert (done.status, done.err) == (0, "")
+    assert "platoon: its lines cannot be written (KeyError: 'largest_gap', platooning.py line " in done.out
 
 
 def test_an_application_that_cannot_be_loaded_is_a_mistake_of_who_uses_it(evedrop: Evedrop) -> None:

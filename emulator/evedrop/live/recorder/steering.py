@@ -140,7 +140,10 @@ class Steering:
             self._conductor.send_to(SENSOR, Hold())
 
     def carry_on(
-        self, reported: int, places: Callable[[], Mapping[str, int]], held_up_by: HeldUpBy = lambda late: (tuple(late), "")
+        self,
+        reported: int,
+        places: Callable[[], Mapping[str, int]],
+        held_up_by: HeldUpBy = lambda late: (tuple(late), ""),
     ) -> None:
         """Carry out as many events as possible, given that all slots below `reported` are joined.
 

@@ -12,9 +12,10 @@ from typing import Any
 
 from evedrop.model.metrics import all_metrics, columns, error_column, shown_metric, unloadable_metrics, z_column
 from evedrop.model.metrics.text import count_text, estimate, fraction_text, number_text
+from evedrop.model.registry import CLASS_ERRORS, place_of
 from evedrop.model.theory.rare_events import RARE
 from evedrop.names import SENSOR
-from evedrop.scenario.application import applications_in
+from evedrop.scenario.application import applications_in, is_own
 from evedrop.score.summary import (
     RARE_FRACTION,
     ControllerSummary,
@@ -303,7 +304,12 @@ def rare_events_words(trials: int) -> str:
 def application_lines(summary: Summary) -> Iterator[str]:
     """The lines of the applications that the scenario uses."""
     for name, application in applications_in(summary.applications).items():
-        yield from application.lines(summary.applications[name])
+        try:
+            yield from list(application.lines(summary.applications[name]))
+        except CLASS_ERRORS as error:
+            if is_own(application):
+                raise
+            yield f"{name}: its lines cannot be written ({place_of(error)})"
 
 
 def _loop_line(controller: ControllerSummary) -> str:
