@@ -12,7 +12,7 @@ from evedrop.model.streams import Batch
 from evedrop.scenario.loading import checked
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
-from evedrop.score.links import RATE_CONFIDENCE, interval, link_summary_of
+from evedrop.score.links import RATE_CONFIDENCE, Detection, interval, link_summary_of
 from evedrop.score.sums import Tally
 from tests.builders import scalar_tables
 
@@ -229,3 +229,15 @@ def test_nothing_is_said_of_what_was_not_measured() -> None:
     right = linked(1)
     summary = link_summary_of(right, "coins", Tally(right.slots, right.trials))
     assert (summary.rate, summary.interval, summary.within_interval, summary.mean_burst) == (None, None, None, None)
+
+
+def test_the_first_alarm_of_a_trial_counts() -> None:
+    """Whichever slots come together: of two alarms in one message, and of those in later ones."""
+    detection = Detection(3)
+    for first, alarms in (
+        (0, [[False, False, False]]),
+        (1, [[True, False, False], [True, False, True]]),
+        (3, [[True] * 3]),
+    ):
+        detection.add_alarms(first, np.array(alarms))
+    assert detection.first.tolist() == [1, 3, 2]

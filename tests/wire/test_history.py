@@ -83,3 +83,18 @@ def test_a_damaged_probability_is_refused(name: str, value: Any, tmp_path: Path)
 def test_no_delay_is_a_delay_that_is_right(tmp_path: Path) -> None:
     """As a link without one has it."""
     history_of(tmp_path, delay=None).expect_settings()
+
+
+def test_other_settings_of_a_later_start_are_those_of_later_messages(tmp_path: Path) -> None:
+    """Messages that an earlier start has numbered keep their fates; a key that is new has the later settings from its first."""
+    earlier, later = ({"loss": {**LOSS, "quality": quality}} for quality in (1.0, 0.5))
+    history = WireHistory(tmp_path)
+    history.begin(wire_plan(scan=earlier), 1.0)
+    before = history.changes_of("scan", "old", "put")[0].settings
+    history.end({("scan", "old", "put"): 5}, 2.0)
+    history.begin(wire_plan(scan=later), 3.0)
+    read = WireHistory.read(tmp_path)
+    first, second = read.changes_of("scan", "old", "put")
+    assert (first.at, first.settings, second.at) == (0, before, 5)
+    assert [(change.at, change.settings) for change in read.changes_of("scan", "new", "put")] == [(0, second.settings)]
+    assert second.settings != before
