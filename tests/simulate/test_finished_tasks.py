@@ -31,6 +31,7 @@ from evedrop.simulate.trials import tasks_of
 from evedrop.system.signals import stop_on_signals
 from tests.conftest import LIMIT, Evedrop
 from tests.examples import mostly_long
+from tests.pages import checked
 
 STUDY = (
     *("montecarlo", "eavesdroppers", "--trials", "4700", "--slots", "8"),
@@ -421,6 +422,28 @@ def test_other_studies_go_on_too(
         for every in (files(evedrop.folder / "cut/run"), whole(study))
     )
     assert cut == uninterrupted
+
+
+@pytest.mark.parametrize(("name", "of"), [("sweep", "points"), ("compare", "schemes")])
+def test_a_part_of_a_study_says_so(name: str, of: str, evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On its page, and when it is exported; the whole has no such words."""
+    with monkeypatch.context() as patched:
+        interrupted_after(patched, 2)
+        assert evedrop(*STUDIES[name], "--out", "cut/run").status == 130
+    part = f"2 of 3 {of} were done"
+    for file in ("some.csv", "some.tex", "some.png"):
+        assert evedrop("export", "cut/run", file).out.endswith(f"\ncut/run: {part}\n")
+    assert evedrop("report", "cut/run").status == 0
+    assert part in " ".join(checked(evedrop.folder / "cut/run").texts)
+    assert evedrop(*STUDIES[name], "--out", "cut/run", "--resume").status == 0
+    assert evedrop("export", "cut/run", "all.tex").out == "all.tex\n"
+    assert "were done" not in " ".join(checked(evedrop.folder / "cut/run").texts).replace(f"All 3 {of} were done", "")
+
+
+@pytest.mark.usefixtures("cut")
+def test_what_is_exported_of_some_trials_says_so(evedrop: Evedrop) -> None:
+    """As the other commands that read an interrupted study do."""
+    assert evedrop("export", "cut/run", "some.csv").out == "some.csv\ncut/run: interrupted\n"
 
 
 @pytest.mark.long

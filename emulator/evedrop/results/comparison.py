@@ -300,6 +300,8 @@ class Comparison:
     """Scheme that cannot be used with the process → why not, in lines."""
     of_estimate: bool = False
     """Whether errors are against the estimate of a sensor that measures, and not against the true state."""
+    not_done: tuple[str, ...] = ()
+    """Schemes that an interrupted comparison has not simulated."""
 
     @property
     def dominant(self) -> tuple[str, ...]:
@@ -337,6 +339,7 @@ class Comparison:
             "seed": self.seed,
             "first_trial": self.first_trial,
             **({"of_estimate": True} if self.of_estimate else {}),
+            **({"not_done": list(self.not_done)} if self.not_done else {}),
             "adversaries": list(self.adversaries),
             "dominant": list(self.dominant),
             "schemes": {
@@ -426,6 +429,7 @@ def _comparison(data: Mapping[str, Any]) -> Comparison:
         {name: _scheme(name, table, int(data["trials"])) for name, table in data["schemes"].items()},
         {name: tuple(why) for name, why in data["left_out"].items()},
         bool(data.get("of_estimate", False)),
+        tuple(map(str, data.get("not_done", ()))),
     )
 
 

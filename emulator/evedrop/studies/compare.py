@@ -144,6 +144,7 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
         schemes,
         matchups.left_out,
         some.measures,
+        tuple(scheme for scheme in matchups.schemes if scheme not in whole),
     )
 
 

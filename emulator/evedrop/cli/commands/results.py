@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from evedrop.cli.command import command, number_type, option, together
 from evedrop.errors import UsageError
+
+if TYPE_CHECKING:
+    from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults
 
 
 @command((option("run", "FOLDER", type=Path),), section="inspect", example="report runs/vehicle", page="export")
@@ -99,6 +103,7 @@ def _export_study(options: argparse.Namespace, kind: str) -> int:
     if kind in _TABLES:
         files = study.to_csv(options.file) if kind == ".csv" else [study.to_latex(options.file)]
         print("\n".join(map(str, files)))
+        _print_remark(study)
         return 0
     if isinstance(study, RunResults):
         panels = ("errors",) if study.typed_summary.mode in {"covariance-only", "error-coordinates"} else ()
@@ -114,7 +119,23 @@ def _export_study(options: argparse.Namespace, kind: str) -> int:
     except OSError as error:
         raise UsageError(f"{options.file} cannot be written ({error.strerror}); give another file") from error
     print(options.file)
+    _print_remark(study)
     return 0
+
+
+def _print_remark(study: RunResults | SweepResults | ComparisonResults) -> None:
+    """Say that a study has not ended, or was interrupted: what was exported is a part of it."""
+    from evedrop.cli.api.results import ComparisonResults, RunResults
+    from evedrop.show.report.comparison import schemes_done
+    from evedrop.show.report.sweep_sections import SweepSource
+
+    if isinstance(study, RunResults):
+        remark = study.remark
+    else:
+        done = schemes_done(study) if isinstance(study, ComparisonResults) else SweepSource.read(study.folder).lacking
+        remark = f"{study.folder}: {done}" if done else None
+    if remark is not None:
+        print(remark)
 
 
 def _export_wire(options: argparse.Namespace, kind: str) -> int:

@@ -27,13 +27,23 @@ def comparison_heading(comparison: Comparison) -> str:
     return f"{comparison.title} · {comparison.slots:,} slots · {trials}{against}"
 
 
+def schemes_done(comparison: Comparison) -> str:
+    """How many schemes were simulated before the comparison was interrupted; empty if it was not."""
+    done, left = len(comparison.schemes), len(comparison.not_done)
+    return f"{done:,} of {done + left:,} schemes were done" if left else ""
+
+
 def conclusion(comparison: Comparison) -> str:
-    """Which schemes dominate, and how many pairs are undecided, in a sentence."""
+    """Which schemes dominate, how many pairs are undecided, and how many schemes were done if not all, in a sentence."""
     verdicts = [
         cell.verdict for scheme in comparison.schemes.values() for cell in scheme.cells.values() if cell.verdict
     ]
     undecided = verdicts.count(SecrecyOutcome.OPEN)
-    more = f"; {undecided:,} of {len(verdicts):,} pairs need more trials" if undecided else ""
+    doubts = [
+        f"{undecided:,} of {len(verdicts):,} pairs need more trials" if undecided else "",
+        schemes_done(comparison),
+    ]
+    more = "".join(f"; {doubt}" for doubt in doubts if doubt)
     if comparison.dominant:
         alone = "each of them dominates" if len(comparison.dominant) > 1 else "dominates"
         return (

@@ -13,7 +13,14 @@ from markupsafe import Markup
 from evedrop.model.metrics.text import short_text
 from evedrop.results.comparison import COMPARISON, Cell, Comparison, read_comparison
 from evedrop.score.verdict import SecrecyOutcome
-from evedrop.show.report.comparison import comparison_lines, conclusion, pairs_table, schemes_table, verdict
+from evedrop.show.report.comparison import (
+    comparison_lines,
+    conclusion,
+    pairs_table,
+    schemes_done,
+    schemes_table,
+    verdict,
+)
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.travel import OF_PAGE, circumstances, download, input_files
 from evedrop.show.view.palette import VERDICTS, hexadecimal
@@ -38,11 +45,13 @@ class ComparisonSource:
 
     @property
     def outcome(self) -> str:
-        """How many pairs have each verdict, as a sentence."""
+        """How many pairs have each verdict, as a sentence, and how many schemes were done if not all."""
         verdicts = [cell.verdict for scheme in self.comparison.schemes.values() for cell in scheme.cells.values()]
         counts = [(word, verdicts.count(word)) for word in SecrecyOutcome]
         counted = ", ".join(f"{count:,} {word.value}" for word, count in counts if count)
-        return f"Secrecy of {sum(count for _, count in counts):,} pairs of scheme and adversary: {counted}"
+        done = schemes_done(self.comparison)
+        more = f"; {done}" if done else ""
+        return f"Secrecy of {sum(count for _, count in counts):,} pairs of scheme and adversary: {counted}{more}"
 
 
 def _matrix(of: ComparisonSource) -> Iterator[Markup]:

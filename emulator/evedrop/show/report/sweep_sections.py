@@ -58,6 +58,8 @@ class SweepSource:
     """How much was run."""
     outcome: str
     """At how many points the state is secret, as a sentence, or how many points were done."""
+    lacking: str
+    """How many points were done before the sweep was interrupted; empty if all were."""
     inks: Mapping[str, str]
     """Receiver → its colour."""
 
@@ -78,7 +80,8 @@ class SweepSource:
             amount = " · ".join((f"{done:,} points of {', '.join(grid)}", *sizes))
             outcome = "; ".join(sweep_outcome(table.to_pylist(), list(grid), done, planned))
             changes, mode = entries["changes"], entries["mode"]
-            return cls(folder, table, rows, entries["scenario"], changes, grid, mode, amount, outcome, inks)
+            lacking = _points_done(done, planned) if done < planned else ""
+            return cls(folder, table, rows, entries["scenario"], changes, grid, mode, amount, outcome, lacking, inks)
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{folder} cannot be read as a sweep ({error}); run the sweep again") from error
 
@@ -98,9 +101,13 @@ def sweep_outcome(rows: Sequence[Mapping[str, Any]], keys: Sequence[str], done: 
             f"{outcome.headline} at {counts[outcome]:,}" for outcome in reversed(SecrecyOutcome) if counts[outcome]
         )
     if done < planned:
-        yield f"{done:,} of {planned:,} points were done"
+        yield _points_done(done, planned)
     elif not counts:
         yield f"All {planned:,} points were done"
+
+
+def _points_done(done: int, planned: int) -> str:
+    return f"{done:,} of {planned:,} points were done"
 
 
 def _size(counts: Sequence[int], of: str) -> str:
