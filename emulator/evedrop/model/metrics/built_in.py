@@ -46,7 +46,7 @@ class ReceivedFraction(MeanMetric, TallyMetric):
 class UsedFraction(MeanMetric, TallyMetric):
     """The number of packets that were received and used per slot."""
 
-    meaning = "those of them used"
+    meaning = "packets received and used per slot"
     column = MetricColumn("used", 1, ".4f")
     sums = ("used", "late_used")
     trial_sums = "used"
