@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 from evedrop.system.world import world
 from evedrop.virtual.zenoh import transport
-from evedrop.wire import departures, journal, publications, queries, ros2, tallies
+from evedrop.wire import departures, journal_words, publications, queries, ros2, tallies
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.send_queue import SendQueue
 from evedrop.wire.side import SideSession
@@ -33,7 +33,7 @@ def _perhaps_hang(side: SideSession) -> None:
 
 _CONSTANTS: dict[str, tuple[tuple[Any, str, Any], ...]] = {
     FEW_KEYS: (
-        (journal, "MOST_KEYS", 6),
+        (journal_words, "MOST_KEYS", 6),
         (publications, "MOST_PUBLISHERS", 1),
         (publications, "OFTEN", 5),
         (ros2, "MOST_SENDERS", 1),
