@@ -165,7 +165,7 @@ BAD: dict[str, tuple[list[bytes], type[EvedropError], str]] = {
 @pytest.mark.parametrize("name", ["legitimate", "suspicious"])
 def test_receiver_refuses(case: str, name: str, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     """A gap that is not closed, or a malformed delivery, ends a receiver with an error that names the key and what was due."""
-    monkeypatch.setattr("evedrop.live.network.process_session.LEAST_SECONDS", 0.0)
+    monkeypatch.setattr("evedrop.live.network.process_session._LEAST_GAP", 0.0)
     messages, error, text = BAD[case]
     brief = replace(briefs()[name], flow=Flow(WINDOW, BATCH, longest_outage=0.0))
     stage.fill(RunKeys(brief.run).downlink(name), messages)

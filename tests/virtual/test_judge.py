@@ -361,7 +361,7 @@ def _outage(process: str, until: int | None) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("fault", "change", "miss"),
     [
-        (None, _without_log, "there is no log sensor.log"),
+        (None, _without_log, "there is no logs/sensor.log"),
         (None, _with_decisions, "the controller has decided 11 times, once in 2 of 20 slots"),
         (["confuse", "sensor", 100, None], _summary_with(misdelivered={}), "sensor has got 1 messages of other keys"),
         (

@@ -433,11 +433,17 @@ def _of_results(
 
 
 def _lost_logs(case: SimulatedCase, folder: Path) -> Iterator[str]:
-    """The logs that a run which ended well has not left in its folder."""
-    shards = [f"shard-{number}" for number in range(1, 1 + case.scenario.shards)] if case.scenario.shards > 1 else [""]
-    for path in (Path(shard, f"{name}.log") for shard in shards for name in processes_of(case.scenario)):
-        if not (folder / "logs" / path).exists():
-            yield f"there is no log {path}"
+    """The logs that a run which ended well has not left in its folder. A full disk may leave them in that of their shard."""
+    names = [f"{name}.log" for name in processes_of(case.scenario)]
+    whole = [(path, path) for path in (Path("logs", name) for name in names)]
+    shards = [
+        (Path("logs", f"shard-{number}", name), Path("shards", str(number), "logs", name))
+        for number in range(1, 1 + case.scenario.shards)
+        for name in names
+    ]
+    for path, unmoved in shards if case.scenario.shards > 1 else whole:
+        if not ((folder / path).exists() or (folder / unmoved).exists()):
+            yield f"there is no {path}"
 
 
 def _falsified(run: SimulatedRun, struck: Iterable[Disturbance]) -> bool:

@@ -173,7 +173,7 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_bad_packet_is_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A gap that is not closed, or a malformed packet, ends the router's work with an error that says which."""
-    monkeypatch.setattr("evedrop.live.network.process_session.LEAST_SECONDS", 0.0)
+    monkeypatch.setattr("evedrop.live.network.process_session._LEAST_GAP", 0.0)
     messages, line = BAD[name]
     bench = MemoryBench(longest_outage=0.0)
     loop = RouterLoop(bench.brief, bench.stage.session(bench.brief))

@@ -28,7 +28,7 @@ KEY = "evedrop/r/telemetry/sensor"
 
 def test_a_repeated_message_is_ignored_and_a_missing_one_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without patience, the second message after a gap ends the run."""
-    monkeypatch.setattr("evedrop.live.network.process_session.LEAST_SECONDS", 0.0)
+    monkeypatch.setattr("evedrop.live.network.process_session._LEAST_GAP", 0.0)
     scenario = briefed()
     brief = cast("Brief[RecorderPart]", made(scenario)["recorder"])
     brief = replace(brief, flow=replace(brief.flow, longest_outage=0.0))

@@ -23,6 +23,8 @@ from evedrop.system.world import world
 
 LEAST_SECONDS = 5.0
 """The least time for which a process waits for another one: a busy machine may not let a process work for some seconds."""
+_LEAST_GAP = 4.0  # seconds: after the recorder has had messages sent again, and before it calls a process silent
+_LEAST_STEP = 2.0  # seconds that count between two later slots, if as many have passed
 _AHEAD = 64  # messages
 
 
@@ -166,13 +168,13 @@ class GapDetector:
     """Handles messages of slots that are not due: ignores earlier slots, and for later ones waits for the missing slot."""
 
     def __init__(self, key: str, patience: float) -> None:
-        """patience: for how many seconds later slots may arrive while the due one does not; at least `LEAST_SECONDS`.
+        """patience: for how many seconds later slots may arrive while the due one does not; at least `_LEAST_GAP`.
 
         The recorder needs some of them to notice the loss. Time in which this process did not run hardly counts: the message may
         already be here, unread.
         """
-        self._key, self._patience = key, max(LEAST_SECONDS, patience)
-        self._step = max(1.0, self._patience / 4.0)
+        self._key, self._patience = key, max(_LEAST_GAP, patience)
+        self._step = max(_LEAST_STEP, self._patience / 4.0)
         self._slot, self._last, self._missing = -1, 0.0, 0.0
 
     def missed(self, due: int, slot: int) -> None:

@@ -31,6 +31,7 @@ from evedrop.scenario.progress_events import ConnectionOutage, OnEvent
 from evedrop.system.world import world
 
 _POLL_SECONDS = 0.25
+_LEAST_ASKING = 3.0  # seconds for which all are asked: a process that misses a message says so before, if it was sent again twice
 
 
 def patience_of(longest_outage: float, pace: float, batch: int, program: bool = False) -> float:
@@ -106,7 +107,7 @@ class Stall:
         if self._stalled - self._asked > self._patience / 10.0:
             self._asked = self._stalled
             self._ask()
-        if self._stalled > self._patience + 2.0 * self._patience / 10.0 and not belief:
+        if self._stalled > self._patience + max(_LEAST_ASKING, self._patience / 5.0) and not belief:
             self._judge(places, unneeded)
 
     def held_up_by(self, late: Sequence[str], places: Mapping[str, int]) -> tuple[tuple[str, ...], str]:
@@ -177,14 +178,13 @@ def silent_of(
     direct[RECORDER] = set(behind)
     awaited = {name: _reached(name, direct) for name in direct}
     circle = [name for name in chain if all(name in awaited[other] for other in awaited[name])]
-    owing = {
-        process
-        for name in circle
-        for key in answers[name].waits
-        if (writer := writer_of(key)) in circle
-        and ("/progress/" in key or _unsent(writer, answers[writer]) > answers[name].slot)
-        for process in (writer, name)
-    }
+    waits = [
+        (writer, name, key) for name in circle for key in answers[name].waits if (writer := writer_of(key)) in circle
+    ]
+    unsent = [(writer, name) for writer, name, _ in waits if _unsent(writer, answers[writer]) > answers[name].slot]
+    # How far the progress must be for which a sensor waits, its answer does not say.
+    unsent = unsent or [(writer, name) for writer, name, key in waits if "/progress/" in key]
+    owing = {name for pair in unsent for name in pair}
     return [name for name in places if name in owing] or (behind if len(behind) < len(joined) else circle)
 
 
