@@ -145,7 +145,7 @@ def test_states_are_taken_from_messages_as_they_come() -> None:
 
 @dataclass
 class Large:
-    """A sample of one MiB, of which a test counts how many are kept."""
+    """A sample of one MiB. A test measures how many of them are kept."""
 
     payload: zenoh.ZBytes
     key_expr: str = "robot/pose"

@@ -57,7 +57,7 @@ def test_totals_come_back(name: str, tmp_path: Path) -> None:
 
 
 def test_a_digest_is_that_of_all_trials_or_none(tmp_path: Path) -> None:
-    """An application's too, of which another shard has stored nothing; its means are those of the trials that are there."""
+    """An application has no digest if another shard has stored nothing. Its means are those of the trials that are there."""
     scenario = load("replay-attack", {"slots": 12, "trials": 5, "expect": [], "event": [], "integrity.attack": None})
     (task,) = tasks_of(scenario, Mode.EXACT, 1)
     run_tally = task.carry_out(lambda _: None, lambda: False).blocks[0].run_tally

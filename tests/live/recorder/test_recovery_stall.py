@@ -159,6 +159,14 @@ RUNS = {
 """What happens → the slots by report, the answers, and which processes are silent."""
 
 
+def test_a_process_is_named_once() -> None:
+    """Although another one waits for messages of two of its keys."""
+    places = {"sensor": 100, "router": 100, "controller": 99}
+    waits = at(100, KEYS.state, KEYS.uplink)
+    answers = {"sensor": at(100), "router": ROUTER_WAITS, "controller": waits}
+    assert silent_of(places, answers, 10) == ["sensor"]
+
+
 @pytest.mark.parametrize("case", RUNS)
 def test_who_is_silent(case: str) -> None:
     """The process at the end of the chain of waiting processes, whichever others are idle."""
@@ -228,7 +236,7 @@ def test_a_silent_process_is_named_after_the_patience_and_not_before() -> None:
 
 
 def test_all_are_asked_while_a_final_belief_is_awaited_and_nobody_is_silent() -> None:
-    """The time limit of the hold applies; whoever is late is named unless others were asked."""
+    """The hold has its own time limit. Before anybody was asked, the late processes are named."""
     run = Run(20.0)
     assert run.stall.held_up_by(["eve"], run.places) == (("eve",), "")
     run.answers = {"router": at(50), "eve": at(50, KEYS.downlink("eve"))}

@@ -31,7 +31,9 @@ from evedrop.scenario.progress_events import ConnectionOutage, OnEvent
 from evedrop.system.world import world
 
 _POLL_SECONDS = 0.25
-_LEAST_ASKING = 3.0  # seconds for which all are asked: a process that misses a message says so before, if it was sent again twice
+_LEAST_ASKING = (
+    3.0  # seconds for which all are asked: a process that misses a message says so before, if it was sent again twice
+)
 
 
 def patience_of(longest_outage: float, pace: float, batch: int, program: bool = False) -> float:
@@ -165,7 +167,8 @@ def silent_of(
         elif not status.waits:
             idle.append(name)
         else:
-            chain += [writer for writer in map(writer_of, status.waits) if writer in places and writer not in chain]
+            writers = dict.fromkeys(map(writer_of, status.waits))  # several keys may have one writer
+            chain += [writer for writer in writers if writer in places and writer not in chain]
     if idle or mute:
         return idle or mute
     # Every process claims to wait for another.
