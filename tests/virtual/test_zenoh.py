@@ -814,16 +814,69 @@ def test_a_token_is_not_seen_by_who_watches_later_without_history(net: Network) 
     assert seen == [("alive/b", True), ("alive/a", False)]
 
 
+def settled(net: Network, other: Any, *seen: list[tuple[str, bool]]) -> None:
+    """Wait until the router has told everything to those who watch "alive/*": another session shows a token after it."""
+    token = other.liveliness().declare_token("alive/settled")
+    net.until(lambda: all(("alive/settled", True) in events for events in seen))
+    token.undeclare()
+    net.until(lambda: all(("alive/settled", False) in events for events in seen))
+    for events in seen:
+        events[:] = [event for event in events if event[0] != "alive/settled"]
+
+
 @behaviour
 def test_a_token_is_seen_by_its_own_session(net: Network) -> None:
     """As by others."""
-    net.router()
-    client = net.client("client")
-    seen = watched(client, "alive/a")
+    client, other = pair(net)
+    seen = watched(client, "alive/*"), watched(other, "alive/*")
+    settled(net, other, *seen)
     token = client.liveliness().declare_token("alive/a")
-    net.until(lambda: seen == [("alive/a", True)])
+    net.until(lambda: all(seen))
+    settled(net, other, *seen)
     token.undeclare()
-    net.until(lambda: seen == [("alive/a", True), ("alive/a", False)])
+    net.until(lambda: seen == ([("alive/a", True), ("alive/a", False)],) * 2)
+
+
+@behaviour
+def test_a_token_that_is_withdrawn_at_once_may_be_seen_twice_by_its_own_session(net: Network) -> None:
+    """What the router tells of it may come when it is gone."""
+    client, other = pair(net)
+    seen = watched(client, "alive/*"), watched(other, "alive/*")
+    settled(net, other, *seen)
+    client.liveliness().declare_token("alive/a").undeclare()
+    net.until(lambda: seen[1] == [("alive/a", True), ("alive/a", False)])
+    settled(net, other, *seen)
+    assert seen[0].count(("alive/a", True)) == seen[0].count(("alive/a", False)) in {1, 2}
+    assert seen[0][-1] == ("alive/a", False)
+
+
+@behaviour
+def test_a_token_of_two_sessions_ends_with_the_second_for_both(net: Network) -> None:
+    """Neither is told when the other one withdraws it first."""
+    sessions = pair(net)
+    seen = watched(sessions[0], "alive/*"), watched(sessions[1], "alive/*")
+    settled(net, sessions[1], *seen)
+    tokens = []
+    for session in sessions:
+        tokens.append(session.liveliness().declare_token("alive/a"))
+        net.until(lambda: all(seen))
+        settled(net, session, *seen)
+    for session, token in zip(sessions, tokens, strict=True):
+        token.undeclare()
+        settled(net, session, *seen)
+    assert seen == ([("alive/a", True), ("alive/a", False)],) * 2
+
+
+@behaviour
+def test_a_session_that_watches_later_without_history_sees_the_end_of_its_own_token_twice(net: Network) -> None:
+    """Once from itself and once from the router."""
+    client, other = pair(net)
+    token = client.liveliness().declare_token("alive/a")
+    net.until(lambda: present(other, "alive/a"))
+    seen = watched(client, "alive/*", history=False)
+    present(client, "alive/nobody")  # the answer comes after the router knows that it is watched
+    token.undeclare()
+    net.until(lambda: seen == [("alive/a", False), ("alive/a", False)])
 
 
 @behaviour

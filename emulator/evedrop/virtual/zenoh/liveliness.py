@@ -104,9 +104,9 @@ class Liveliness:
         """Who is there now; the handler gets that, if there is one. Raises ZError if the session is closed."""
         return self._questions.ask(TransportFrame("liveliness_query", key), timeout, handler)
 
-    def known(self, key: str, but: End | None = None) -> list[str]:
-        """The tokens that this session knows: its own, and those from all ends but one."""
-        others = (token for end in self._session.ends if end is not but for token in end.tokens)
+    def known(self, key: str) -> list[str]:
+        """The tokens that this session knows: its own, and those from all ends."""
+        others = (token for end in self._session.ends for token in end.tokens)
         return [token for token in dict.fromkeys(chain(self.shown, others)) if intersects(key, token)]
 
     def to_tell(self, key: str) -> list[str]:
@@ -130,7 +130,7 @@ class Liveliness:
             return
         if watches:
             end.watched[key] = None
-            for token in self.known(key, but=end) if frame.number else ():
+            for token in self.known(key) if frame.number else ():
                 if self._session.lets_out(end, "liveliness_token", token):
                     end.send(TransportFrame("token", token))
         elif frame.kind == "no token":
@@ -150,17 +150,21 @@ class Liveliness:
         return own or any(key in end.tokens for end in self._session.ends if end not in but)
 
     def _tell(self, source: End | None, key: str, *, there: bool) -> None:
-        """Tell the watchers here, and other ends, that a token has come or gone; not those that know of one of the same key."""
+        """Tell the watchers here, and the ends, that a token has come or gone; not those that know of one of the same key.
+
+        A router tells it to the client that shows it as well, if that one watches.
+        """
         if not self._is_shown(key, source):
             for watch in [*self.watching]:
                 if intersects(watch.key, key):
                     watch.taker.put(_token_sample(key, there=there))
         kind = "token" if there else "no token"
         for end in self._session.ends:
-            if end is source or (source is not None and not self._session.router) or self._is_shown(key, source, end):
-                continue
-            # Routers are told everything; clients, what they want to know.
-            wanted = end.to_router or any(intersects(pattern, key) for pattern in end.watched)
+            if end.to_router:  # routers are told everything
+                wanted = end is not source and (source is None or self._session.router)
+                wanted = wanted and not self._is_shown(key, source, end)
+            else:  # clients, what they watch
+                wanted = any(intersects(pattern, key) for pattern in end.watched) and not self._is_shown(key, source)
             if wanted and self._session.lets_out(end, "liveliness_token", key):
                 end.send(TransportFrame(kind, key))
 
