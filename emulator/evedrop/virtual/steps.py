@@ -109,7 +109,7 @@ class _NoteReader:
             self._put(number, note)
         elif note.what in (notes.GETS, notes.LOST):
             self._ends(note)
-        elif note.what != notes.WRITES and not (note.what in _LIVES and note.words[0] in FORK_SERVERS):
+        elif note.what != notes.WRITES and not (note.what in _LIVES and str(note.words[0]).startswith(FORK_SERVERS)):
             self._add(_other(note))
 
     def _add(self, step: Step) -> None:

@@ -20,7 +20,9 @@ from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import Condition, Lock, Queue, Thread, ThreadEvent
 from evedrop.system.world import Address, World
 from evedrop.virtual.disk import VirtualDisk
+from evedrop.virtual.disturbance import LAUNCHER
 from evedrop.virtual.host_parts import HOST_FORK_SERVER, part_on
+from evedrop.virtual.notes import BY_HAND
 from evedrop.virtual.pipes import Pipe, PipeFile
 from evedrop.virtual.processes import FORK_SERVERS, VirtualForkServer, VirtualMachine
 from evedrop.virtual.scheduler import (
@@ -123,9 +125,10 @@ class VirtualWorld(World):
 
     def fork_channels(self, modules: Sequence[Sequence[str]]) -> AbstractContextManager[Sequence[ForkChannel]]:
         """Channels with simulated fork servers on the machine of the current process."""
-        host = self.machine.current.task.host
-        names = [part_on(HOST_FORK_SERVER, host)] if host else FORK_SERVERS
-        return nullcontext([VirtualForkServer(self.machine, name) for name in names[: len(modules)]])
+        task = self.machine.current.task
+        names = [part_on(HOST_FORK_SERVER, task.host)] if task.host else FORK_SERVERS
+        others = "" if task.host or task.name == LAUNCHER else f" {BY_HAND}"  # no fault of the run hits them
+        return nullcontext([VirtualForkServer(self.machine, f"{name}{others}") for name in names[: len(modules)]])
 
     def ssh(self, command: Sequence[str]) -> SshClient:
         """A simulated ssh, which the other hosts have."""
