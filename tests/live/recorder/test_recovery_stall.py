@@ -9,7 +9,8 @@ import pytest
 from evedrop.errors import Silence
 from evedrop.live.protocol.commands import ProcessStatus
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.recorder.recovery import Stall, patience_of, silent_of
+from evedrop.live.recorder.recovery import Stall, patience_of
+from evedrop.live.recorder.wait_graph import WaitGraph
 from tests.clock import clock_at_start, time_of_a_test
 
 KEYS = RunKeys("r")
@@ -164,7 +165,7 @@ def test_a_process_is_named_once() -> None:
     places = {"sensor": 100, "router": 100, "controller": 99}
     waits = at(100, KEYS.state, KEYS.uplink)
     answers = {"sensor": at(100), "router": ROUTER_WAITS, "controller": waits}
-    assert silent_of(places, answers, 10) == ["sensor"]
+    assert WaitGraph(places, answers, 10).silent() == ["sensor"]
 
 
 @pytest.mark.parametrize("case", RUNS)
@@ -173,7 +174,7 @@ def test_who_is_silent(case: str) -> None:
     places, answers, silent = RUNS[case]
     if "controller" in answers:
         places = {**places, "controller": 64}
-    assert silent_of(places, answers, 10, ["controller"]) == silent
+    assert WaitGraph(places, answers, 10, ["controller"]).silent() == silent
 
 
 @pytest.mark.parametrize(
@@ -188,7 +189,10 @@ def test_who_is_silent(case: str) -> None:
 def test_who_holds_up_a_held_run(answers: dict[str, ProcessStatus], silent: list[str]) -> None:
     """The receiver that does not send its final belief, or the router that did not pass the barrier on."""
     answers = {"sensor": at(70, KEYS.control("sensor")), "legitimate": at(70, KEYS.downlink("legitimate")), **answers}
-    assert silent_of(dict.fromkeys(["sensor", "router", "legitimate", "eve"], 70), answers, 10, (), ["eve"]) == silent
+    assert (
+        WaitGraph(dict.fromkeys(["sensor", "router", "legitimate", "eve"], 70), answers, 10, (), ["eve"]).silent()
+        == silent
+    )
 
 
 class Run:

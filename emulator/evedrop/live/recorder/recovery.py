@@ -5,10 +5,8 @@ back, the conductor begins a round: the sensor sends its packets again from the 
 them again, and every process sends its reports again; a process ignores messages that it already has. Rounds are repeated until
 slots are joined again.
 
-    recorder ── waits for reports of the process furthest behind ── waits for a message of … ── waits for no process
-
-When a run stands still, every process is asked what it waits for. The run waits for the process at the end of such a chain. Work
-that no other process waits for does not count as progress.
+When a run stands still, every process is asked what it waits for, and `wait_graph` tells for which one the run waits. Work that
+no other process waits for does not count as progress.
 
 Source: docs/protocol.md, lost connections and silence.
 """
@@ -23,10 +21,10 @@ from evedrop.live.network.process_session import LEAST_SECONDS
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again, ProcessStatus
-from evedrop.live.protocol.keys import writer_of
 from evedrop.live.recorder.conductor import Conductor
 from evedrop.live.recorder.steering import STEP_SECONDS, Steering
-from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
+from evedrop.live.recorder.wait_graph import WaitGraph
+from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.scenario.progress_events import ConnectionOutage, OnEvent
 from evedrop.system.world import world
 
@@ -120,9 +118,8 @@ class Stall:
         self, places: Mapping[str, int], unneeded: Collection[str], late: Collection[str] = ()
     ) -> tuple[tuple[str, ...], str]:
         # If nobody answers, no answer comes through.
-        silent = (
-            tuple(silent_of(places, self._answers, self._batch, unneeded, late)) if self._answers else (self._router,)
-        )
+        graph = WaitGraph(places, self._answers, self._batch, unneeded, late)
+        silent = tuple(graph.silent()) if self._answers else (self._router,)
         return silent, " and ".join(_described(name, self._answers.get(name)) for name in silent)
 
     def _judge(self, places: Mapping[str, int], unneeded: Collection[str]) -> None:
@@ -142,73 +139,6 @@ def _described(name: str, status: ProcessStatus | None) -> str:
     if not status.waits:
         return f"{name} is at slot {status.slot} and waits for no process"
     return f"{name} says that it is at slot {status.slot} and waits on {', '.join(status.waits[:3])}"
-
-
-def silent_of(
-    places: Mapping[str, int],
-    answers: Mapping[str, ProcessStatus],
-    batch: int,
-    unneeded: Collection[str] = (),
-    late: Collection[str] = (),
-) -> list[str]:
-    """The processes that a run waits for when it stands still.
-
-    places: process → the first slot that it has not reported; answers: of the processes that have answered; batch: slots of a
-    report; unneeded: processes whose reports are not needed to join slots; late: those that hold up a held run, if it is held.
-    """
-    joined = {name: k for name, k in places.items() if name not in unneeded}
-    behind = [name for name, k in joined.items() if (name in late if late else k == min(joined.values()))]
-    chain = list(behind)
-    idle, mute = [], []
-    for name in chain:  # grows
-        status = answers.get(name)
-        if status is None:
-            mute.append(name)
-        elif not status.waits:
-            idle.append(name)
-        else:
-            writers = dict.fromkeys(map(writer_of, status.waits))  # several keys may have one writer
-            chain += [writer for writer in writers if writer in places and writer not in chain]
-    if idle or mute:
-        return idle or mute
-    # Every process claims to wait for another.
-    unreported = [name for name in behind if answers[name].slot >= places[name] + batch]
-    if unreported and len(behind) < len(joined):
-        return unreported
-    # Some wait for each other in a circle, and the rest for these; the recorder waits for those behind. In the circle, either a
-    # process has not sent a message that it claims to have sent, or another one does not take it.
-    direct = {name: {writer_of(key) for key in answers[name].waits} & {RECORDER, *chain} for name in chain}
-    direct[RECORDER] = set(behind)
-    awaited = {name: _reached(name, direct) for name in direct}
-    circle = [name for name in chain if all(name in awaited[other] for other in awaited[name])]
-    waits = [
-        (writer, name, key) for name in circle for key in answers[name].waits if (writer := writer_of(key)) in circle
-    ]
-    unsent = [(writer, name) for writer, name, _ in waits if _unsent(writer, answers[writer]) > answers[name].slot]
-    # How far the progress must be for which a sensor waits, its answer does not say.
-    unsent = unsent or [(writer, name) for writer, name, key in waits if "/progress/" in key]
-    owing = {name for pair in unsent for name in pair}
-    return [name for name in places if name in owing] or (behind if len(behind) < len(joined) else circle)
-
-
-def _unsent(process: str, status: ProcessStatus) -> int:
-    """The first slot of which a process has not sent its messages, by its answer.
-
-    Who waits for a command has sent all, also the barrier of a hold. Sensor and router wait for the acknowledgement or the input
-    of a slot after they have sent its packet or its deliveries.
-    """
-    answers = ("control", "ack", "input") if process in (SENSOR, ROUTER) else ("control",)
-    return status.slot + any(key.split("/")[2] in answers for key in status.waits)
-
-
-def _reached(name: str, direct: Mapping[str, Collection[str]]) -> set[str]:
-    """The processes that a process waits for, directly or not; direct: process → those that it waits for directly."""
-    reached: set[str] = set()
-    chain = [name]
-    for process in chain:  # grows
-        chain += sorted(set(direct[process]) - reached)
-        reached |= set(direct[process])
-    return reached
 
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated; the wait doubles each time
