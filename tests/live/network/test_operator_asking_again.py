@@ -9,6 +9,7 @@ import pytest
 import zenoh
 
 from evedrop.cli.main import main
+from evedrop.live.network import control_file
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.operator import Answer
 from evedrop.live.protocol.codec import enclosed, payload_of
@@ -99,3 +100,54 @@ def test_a_status_says_which_shards_it_is_not_of(tmp_path: Path, capsys: pytest.
     out, err = capsys.readouterr()
     assert "link eve: 4 of 5 packets delivered" in out
     assert "2 of 3 shards have not begun or are over; the status is that of the others" in " ".join(err.split())
+
+
+def test_a_status_goes_without_a_shard_that_ends_meanwhile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its recorder does not answer any more, and its control file is gone."""
+    for shard in ("1", "2"):
+        (tmp_path / "shards" / shard).mkdir(parents=True)
+    status = RunStatus(5, 9, 1.0, "running", {"router": True}, {"eve": LinkStatus.of(5, 4)}, [])
+    over, other = Recorder(tmp_path / "shards" / "1", 1), Recorder(tmp_path / "shards" / "2", 0, Answer(status=status))
+    with over.session, other.session:
+        assert main(["status", str(tmp_path)]) == 0
+    assert over.asked == 1
+    out, err = capsys.readouterr()
+    assert "link eve: 4 of 5 packets delivered" in out
+    assert "1 of 2 shards have not begun or are over; the status is that of the others" in " ".join(err.split())
+
+
+def test_a_control_file_that_vanishes_is_that_of_a_shard_that_is_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the look at the folder and the reading."""
+    for shard in ("1", "2"):
+        (tmp_path / "shards" / shard).mkdir(parents=True)
+        Control("one", "tcp/127.0.0.1:7447", "operator", shard).write(tmp_path / "shards" / shard)
+    read = control_file.read_control
+
+    def vanishing(folder: Path) -> Control:
+        if folder.name == "1":
+            remove_control(folder)
+        return read(folder)
+
+    monkeypatch.setattr(control_file, "read_control", vanishing)
+    assert [control.password for control in control_file.read_controls(tmp_path)] == ["2"]
+
+
+def test_a_status_of_shards_that_all_end_meanwhile_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another shard has just begun, but it was not asked."""
+    for shard in ("1", "2"):
+        (tmp_path / "shards" / shard).mkdir(parents=True)
+
+    class Begins(Recorder):
+        """The first shard, whose end is the beginning of the second."""
+
+        def _take(self, query: zenoh.Query) -> None:
+            Control("one", "tcp/127.0.0.1:7447", "operator", "secret").write(tmp_path / "shards" / "2")
+            super()._take(query)
+
+    with Begins(tmp_path / "shards" / "1", 1).session:
+        assert main(["status", str(tmp_path)]) == 2
+    assert "it ended before it answered" in capsys.readouterr().err

@@ -108,12 +108,18 @@ def status(options: argparse.Namespace) -> int:
     from evedrop.live.network.control_file import read_controls, shards_in
     from evedrop.live.protocol.requests import StatusRequest, status_of_shards
 
-    controls, shards = read_controls(options.run), shards_in(options.run)
-    answers = [_answer(options.run, control, StatusRequest(), "status", _PATIENCE) for control in controls]
-    if shards > len(controls):
-        warn(
-            f"{shards - len(controls)} of {shards} shards have not begun or are over; the status is that of the others"
-        )
+    answers, ended, shards = [], [], shards_in(options.run)
+    for control in read_controls(options.run):
+        try:
+            answers.append(_answer(options.run, control, StatusRequest(), "status", _PATIENCE))
+        except UsageError as error:
+            if control in read_controls(options.run):  # it is not a shard that has ended meanwhile
+                raise
+            ended.append(error)
+    if not answers:
+        raise ended[0]
+    if shards > len(answers):
+        warn(f"{shards - len(answers)} of {shards} shards have not begun or are over; the status is that of the others")
     merged = answers[0].wire or status_of_shards([answer.status for answer in answers if answer.status is not None])
     if options.json:
         print_json(to_builtins(merged))
@@ -149,7 +155,8 @@ def _answer(run: Path, control: Control, request: OperatorRequest, subject: str,
         answer = ask(control, request, patience)
         # A recorder that has lost its connection is back in a moment; these requests may be carried out twice.
         while answer is None and request.repeatable and world().monotonic() - began < _AWAY_SECONDS:
-            read_controls(run)  # raises UsageError when the run is over
+            if control not in read_controls(run):  # which raises UsageError when the run is over
+                break
             world().sleep(_AGAIN_SECONDS)
             answer = ask(control, request, patience)
     except zenoh.ZError as error:

@@ -60,8 +60,14 @@ def no_run(folder: Path, why: str) -> UsageError:
 
 def read_controls(folder: Path) -> list[Control]:
     """Read the control file of a run in progress, or those of its shards. Raises UsageError as `read_control` does."""
-    shards = sorted(path.parent for path in folder.glob(f"shards/*/{_NAME}"))
-    return [read_control(shard) for shard in shards] or [read_control(folder)]
+    controls = []
+    for path in sorted(folder.glob(f"shards/*/{_NAME}")):
+        try:
+            controls.append(read_control(path.parent))
+        except UsageError:
+            if is_there(path):  # the shard is not over
+                raise
+    return controls or [read_control(folder)]
 
 
 def shards_in(folder: Path) -> int:
