@@ -155,21 +155,11 @@ def secrecy(
     true, replayed: as in `Compared`.
     """
     (legitimate, legitimate_theory), (name, other, other_theory) = of_legitimate, of_eavesdropper
-    # A lower bound can support a promise, but cannot deny one.
-    bounded = other_theory.bound is not None
-    theirs = other_theory.bound or other_theory
-    both_known = legitimate_theory.known and theirs.known
-    legitimate_bound = legitimate_theory.limit if legitimate_theory.known else math.inf
-    perfect_by_theory = (math.isfinite(legitimate_bound) and math.isinf(theirs.limit)) or (None if bounded else False)
-    # A limit too large to be computed neither promises nor denies anything.
-    perfect_by_theory = perfect_by_theory if both_known and not math.isnan(legitimate_bound + theirs.limit) else None
     complete = legitimate.done == legitimate.slots
-    bound = _latest_bound(legitimate_theory, legitimate.slots) if complete else math.inf
     # What theory promises does not depend on how soon a run was interrupted, but must not take long then.
     slots = legitimate.slots if complete else min(legitimate.slots, max(legitimate.done, _PROMISED_SLOTS))
-    legitimate_is_bounded = math.isfinite(legitimate_bound) or not legitimate_theory.has_limit
-    holds_from = _holds_from(legitimate_theory.alike, theirs.alike, slots)
-    always = legitimate_is_bounded and slots > 1 and holds_from == 1
+    promise = promise_of(legitimate_theory, other_theory, slots)
+    bound = _latest_bound(legitimate_theory, legitimate.slots) if complete else math.inf
     heavy = legitimate_theory.infinite_variance or other_theory.infinite_variance
     test = sign_of_median if heavy else sign_of_mean
     means = MeanErrors(window_means(legitimate), window_means(other))
@@ -181,12 +171,11 @@ def secrecy(
         relative, windows, in_doubt = _relative(means, test, slots)
         if in_doubt is not None:
             missing = _missing(*((LEGITIMATE, *of_legitimate) if in_doubt is Claim.HELD else of_eavesdropper))
-    if not legitimate_theory.has_limit:
-        perfect = Claim.UNDECIDED
-    elif perfect_by_theory is False:
+    perfect = Claim.UNDECIDED
+    if legitimate_theory.has_limit and promise.perfect is False:
         perfect = Claim.FAILED
-    else:
-        perfect = perfect_verdict(means.theirs, means.ours, bound, test) if complete else Claim.UNDECIDED
+    elif legitimate_theory.has_limit and complete:
+        perfect = perfect_verdict(means.theirs, means.ours, bound, test)
     ratio, scatter, ratio_from = ratio_of((legitimate, legitimate_theory), other)
     scatter = None if heavy else scatter
     is_rounding = legitimate.done > 0 and other_theory.is_rounding(other.error / max(other.offered, 1), other.done)
@@ -196,21 +185,17 @@ def secrecy(
     compared = Compared(
         name,
         after_start,
-        grows=perfect is Claim.HELD and (perfect_by_theory is True or (perfect_by_theory is None and floor_grows())),
-        denied=both_known
-        and not bounded
-        and not perfect_by_theory
-        and holds_from is None
-        and legitimate.slots > WINDOWS,
+        grows=perfect is Claim.HELD and (promise.perfect is True or (promise.perfect is None and floor_grows())),
+        denied=promise.denied and legitimate.slots > WINDOWS,
         true=true,
         replayed=replayed,
     )
     entry = SecrecySummary(
         relative=relative.value,
         perfect=perfect.value,
-        relative_by_theory=(always or (None if bounded else False)) if both_known else None,
-        relative_from=holds_from if both_known and legitimate_is_bounded else None,
-        perfect_by_theory=perfect_by_theory,
+        relative_by_theory=promise.relative,
+        relative_from=promise.relative_from,
+        perfect_by_theory=promise.perfect,
         judged_by="median" if heavy else "mean",
         sentence="",
         ratio=ratio if math.isfinite(ratio) else None,
@@ -219,22 +204,64 @@ def secrecy(
         leak=None if other.leak is None else other.leak.summary,
         verdict=verdict_on(compared, unit),
     )
+    shown = ""  # one trial decides no window
+    if math.isnan(ratio):
+        shown = "nothing was measured"
+    elif legitimate.trials > 1 or relative is not Claim.UNDECIDED:
+        shown = _shown(relative, perfect, windows, missing, legitimate.trials, math.isfinite(bound), heavy)
+    parts = [part for part in (shown, _promised(entry, other_theory)) if part]
+    return replace(entry, sentence=f"{name}: {'; '.join(parts)}"), compared
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What theory promises about secrecy against an eavesdropper; None where it makes no claim."""
+
+    perfect: bool | None = None
+    relative: bool | None = None
+    relative_from: int | None = None
+    """The first slot from which it promises relative secrecy."""
+    denied: bool = False
+    """Whether it expects at the end of the run that the eavesdropper's error is not larger."""
+
+
+def promise_of(legitimate: Expectation, other: Expectation, slots: int) -> Promise:
+    """What theory promises about an eavesdropper in so many slots, from what it expects of both receivers."""
+    theirs = other.bound or other
+    if not (legitimate.known and theirs.known):
+        return Promise()
+    unless_promised = False if other.bound is None else None  # a lower bound can support a promise, but cannot deny one
+    is_bounded = math.isfinite(legitimate.limit)
+    perfect = (is_bounded and math.isinf(theirs.limit)) or unless_promised
+    if math.isnan(legitimate.limit + theirs.limit):  # too large to be computed
+        perfect = None
+    holds_from = _holds_from(legitimate.alike, theirs.alike, slots)
+    stays = is_bounded or not legitimate.has_limit
+    return Promise(
+        perfect,
+        (stays and slots > 1 and holds_from == 1) or unless_promised,
+        holds_from if stays else None,
+        denied=other.bound is None and not perfect and holds_from is None,
+    )
+
+
+def _shown(
+    relative: Claim, perfect: Claim, windows: str, missing: str, trials: int, is_bounded: bool, heavy: bool
+) -> str:
+    """What a run has shown about secrecy against an eavesdropper, as part of a sentence.
+
+    windows: the slots in which relative secrecy failed or is undecided; missing: what the trials lack; is_bounded: whether the
+    legitimate error is; heavy: whether the variance of an error is infinite.
+    """
     where = f" in slots {windows}" if windows else ""
     shown = {
         Claim.HELD: "its error was larger in every window of the run",
         Claim.FAILED: f"its error was not larger{where}",
-        Claim.UNDECIDED: f"{legitimate.trials:,} trials are too few to decide{where}{missing}",
+        Claim.UNDECIDED: f"{trials:,} trials are too few to decide{where}{missing}",
     }[relative]
     if perfect is Claim.HELD:
-        shown = f"its error grew while the legitimate one {'stayed bounded' if math.isfinite(bound) else 'did not'}"
-    if heavy and legitimate.trials > 1:
-        shown += " (judged by medians, because the variance is infinite)"
-    if math.isnan(ratio):
-        shown = "nothing was measured"
-    elif legitimate.trials == 1 and relative is Claim.UNDECIDED:  # one trial decides no window
-        shown = ""
-    parts = [part for part in (shown, _promise(entry, other_theory)) if part]
-    return replace(entry, sentence=f"{name}: {'; '.join(parts)}"), compared
+        shown = f"its error grew while the legitimate one {'stayed bounded' if is_bounded else 'did not'}"
+    return f"{shown} (judged by medians, because the variance is infinite)" if heavy and trials > 1 else shown
 
 
 @dataclass(frozen=True)
@@ -428,7 +455,7 @@ def _missing(name: str, tally: Tally, theory: Expectation) -> str:
     return f": theory expects a larger error of {name}, which rare events carry; {ways}"
 
 
-def _promise(entry: SecrecySummary, theory: Expectation) -> str:
+def _promised(entry: SecrecySummary, theory: Expectation) -> str:
     """What theory promises, or why it makes no claim about an eavesdropper, as the end of a sentence."""
     promised = "perfect" if entry.perfect_by_theory else "relative" if entry.relative_by_theory else "no"
     if promised == "no" and entry.relative_from is not None:
