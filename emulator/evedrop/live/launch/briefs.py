@@ -154,23 +154,20 @@ def briefs_of(
         name: world().token(16).hex() for name in (ROUTER, SENSOR, *scenario.receivers, *steered, RECORDER, OPERATOR)
     }
     routers = Routers.for_users(users, endpoints)
-    spec = scenario.encoding.spec
-    scheme = scenario.make_scheme()
-    public, mu_d = scenario.process, scenario.encoding.mu_d
-    matrices, header = (public.A, public.Q, public.initial_covariance), len(scheme.header)
-    model = Model(*matrices, mu_d, header, public.singular_noise, scenario.encoding.state_probabilities)
-    leaks, channel, chart = scenario.leaks, ack_channel_of(scenario), chart_of(scenario)
     identities = identities_of(run, endpoints, tuple(users))
-    table, monitor, flow = scenario.controller, monitor_of(scenario), flow_of(scenario, ahead)
-    wiring = None if table is None else Wiring(table.acts_on, scenario.legitimate.knows_input)
-    disturbances = None if scenario.driven is None else encoded(disturbances_of(scenario))
-    controller = _controller_part(scenario, disturbances)
-    states = None if public.source == "zenoh" else states_of(scenario)
+    flow = flow_of(scenario, ahead)
     limits = sizes_of(scenario, flow.batch, flow.message).of_kinds
-
-    def modules(**named: Any) -> str | None:
-        """The folder of own classes for a process whose part names one."""
-        return scenario.modules if any(named_in(named)) else None
+    scheme, public = scenario.make_scheme(), scenario.process
+    model = Model(
+        public.A,
+        public.Q,
+        public.initial_covariance,
+        scenario.encoding.mu_d,
+        len(scheme.header),
+        public.singular_noise,
+        scenario.encoding.state_probabilities,
+    )
+    disturbances = None if scenario.driven is None else encoded(disturbances_of(scenario))
 
     def brief(process: str, owned: Mapping[str, bytes], part: Part) -> AnyBrief:
         return Brief(
@@ -193,54 +190,14 @@ def briefs_of(
             identity=identities.get(process),
         )
 
-    schedules = {name: scenario.schedule(name) for name in scenario.receivers}
-    link_keys = keys.links(schedules)
-    if channel is not None:
-        link_keys[f"link/{ACKNOWLEDGEMENTS}"] = keys.acknowledgements
-    router = RouterPart(
-        links=schedules,
-        pace=scenario.pace,
-        users=routers.at_router,
-        leaks=leaks,
-        acknowledgements=channel,
-        controller=wiring,
-        zid=routers.zid,
-        limits=limits,
-        modules=scenario.modules,  # even if no link names a class: an operator can set another link model
-    )
-    made = [brief(ROUTER, link_keys, router)]
+    router = _router_part(scenario, routers, limits)
+    made = [brief(ROUTER, _router_keys(keys, router), router)]
     if endpoints.relay is not None and routers.zid is not None:
         listen = str(endpoints.relay.listen)
-        relay = RelayPart(routers.at_relay, scenario.receivers, listen, routers.zid, wiring, limits)
+        relay = RelayPart(routers.at_relay, scenario.receivers, listen, routers.zid, _wiring(scenario), limits)
         made.append(brief(RELAY, {}, relay))
-    sensor = SensorPart(
-        scheme=spec,
-        pace=scenario.pace,
-        receivers=scenario.receivers,
-        holds=sorted(
-            {slot for slot in scenario.timeline.holds if slot < scenario.slots} | ({0} if task.paused else set())
-        ),
-        history=history_of(scenario),
-        leaks=leaks,
-        chart=chart,
-        plant=scenario.driven,
-        disturbances=disturbances,
-        controller=None if table is None else SensorLoopPart(table.period, table.acts_on),
-        modules=modules(scheme=spec),
-        monitor=monitor,
-        states=None if states is None else encoded(states),
-        program=_program_of(public),
-    )
-    own = _sensor_keys(scenario, keys, monitor is not None)
-    made.append(brief(SENSOR, {**own, **keys.secret(scheme.secret_streams)}, sensor))
-    legitimate = LegitimatePart(
-        scheme=spec,
-        window=scenario.window(LEGITIMATE),
-        outages=_outages(scenario, LEGITIMATE),
-        controller=_estimator_loop(scenario),
-        modules=modules(scheme=spec),
-    )
-    made.append(brief(LEGITIMATE, keys.secret(scheme.estimator_streams), legitimate))
+    made.append(brief(SENSOR, _sensor_keys(scenario, keys), _sensor_part(scenario, task, disturbances)))
+    made.append(brief(LEGITIMATE, keys.secret(scheme.estimator_streams), _legitimate_part(scenario)))
     recorder = RecorderPart(
         scenario=scenario.model_dump(mode="json"),
         results=str(task.results),
@@ -252,19 +209,108 @@ def briefs_of(
         classes=_answers(scenario),
     )
     made.append(brief(RECORDER, {}, recorder))
-    if controller is not None:
+    if (controller := _controller_part(scenario, disturbances)) is not None:
         made.append(brief(CONTROLLER, {}, controller))
     for name, listener in scenario.eavesdroppers.items():
-        eavesdropper = EavesdropperPart(
-            strategy=listener.strategy,
-            parameters=listener.parameters,
-            window=scenario.window(name),
-            outages=_outages(scenario, name),
-            noise_covariance=None if scheme.noise_distribution is None else scheme.noise_distribution.given,
-            modules=modules(strategy=listener.strategy, parameters=listener.parameters),
-        )
-        made.append(brief(name, keys.eavesdropper(name, listener.strategy, listener.parameters), eavesdropper))
+        owned = keys.eavesdropper(name, listener.strategy, listener.parameters)
+        made.append(brief(name, owned, _eavesdropper_part(scenario, name)))
     return {made_brief.process: made_brief for made_brief in made}
+
+
+def _router_keys(keys: StreamKeys, part: RouterPart) -> dict[str, bytes]:
+    """Stream → key, for the streams of all links."""
+    acknowledgements = {} if part.acknowledgements is None else {f"link/{ACKNOWLEDGEMENTS}": keys.acknowledgements}
+    return {**keys.links(part.links), **acknowledgements}
+
+
+def _router_part(scenario: Scenario, routers: Routers, limits: Mapping[str, int]) -> RouterPart:
+    """The router's part; limits: the largest message of each kind, in bytes."""
+    return RouterPart(
+        links={name: scenario.schedule(name) for name in scenario.receivers},
+        pace=scenario.pace,
+        users=routers.at_router,
+        leaks=scenario.leaks,
+        acknowledgements=ack_channel_of(scenario),
+        controller=_wiring(scenario),
+        zid=routers.zid,
+        limits=limits,
+        modules=scenario.modules,  # even if no link names a class: an operator can set another link model
+    )
+
+
+def _sensor_keys(scenario: Scenario, keys: StreamKeys) -> dict[str, bytes]:
+    """Stream → key, for the sensor's own streams and those of the secret."""
+    measurement = {"measurement": keys.measurement} if scenario.measures else {}
+    monitored = monitor_of(scenario) is not None
+    monitors = {"watermark": keys.watermark, "spoofing": keys.spoofing} if monitored else {}
+    secret = keys.secret(scenario.make_scheme().secret_streams)
+    return {"process": keys.process, **measurement, **monitors, **secret}
+
+
+def _sensor_part(scenario: Scenario, task: RecorderTask, disturbances: str | None) -> SensorPart:
+    """The sensor's part; disturbances: encoded, None without a plant."""
+    table, process = scenario.controller, scenario.process
+    states = None if process.source == "zenoh" else states_of(scenario)
+    holds = {slot for slot in scenario.timeline.holds if slot < scenario.slots}
+    return SensorPart(
+        scheme=scenario.encoding.spec,
+        pace=scenario.pace,
+        receivers=scenario.receivers,
+        holds=sorted(holds | ({0} if task.paused else set())),
+        history=history_of(scenario),
+        leaks=scenario.leaks,
+        chart=chart_of(scenario),
+        plant=scenario.driven,
+        disturbances=disturbances,
+        controller=None if table is None else SensorLoopPart(table.period, table.acts_on),
+        modules=_modules(scenario, scheme=scenario.encoding.spec),
+        monitor=monitor_of(scenario),
+        states=None if states is None else encoded(states),
+        program=_program_of(process),
+    )
+
+
+def _legitimate_part(scenario: Scenario) -> LegitimatePart:
+    """The legitimate estimator's part."""
+    return LegitimatePart(
+        scheme=scenario.encoding.spec,
+        window=scenario.window(LEGITIMATE),
+        outages=_outages(scenario, LEGITIMATE),
+        controller=_estimator_loop(scenario),
+        modules=_modules(scenario, scheme=scenario.encoding.spec),
+    )
+
+
+def _eavesdropper_part(scenario: Scenario, name: str) -> EavesdropperPart:
+    """The part of the eavesdropper with this name."""
+    listener, noise = scenario.eavesdroppers[name], scenario.make_scheme().noise_distribution
+    return EavesdropperPart(
+        strategy=listener.strategy,
+        parameters=listener.parameters,
+        window=scenario.window(name),
+        outages=_outages(scenario, name),
+        noise_covariance=None if noise is None else noise.given,
+        modules=_modules(scenario, strategy=listener.strategy, parameters=listener.parameters),
+    )
+
+
+def _controller_part(scenario: Scenario, disturbances: str | None) -> ControllerPart | None:
+    """The controller's part: its strategy, assignment and disturbances; None without a controller."""
+    assignment, table = scenario.assignment, scenario.controller
+    if assignment is None or table is None or disturbances is None:
+        return None
+    return ControllerPart(table.strategy, assignment, table.acts_on, disturbances)
+
+
+def _modules(scenario: Scenario, **named: Any) -> str | None:
+    """The folder of own classes for a process whose part names one."""
+    return scenario.modules if any(named_in(named)) else None
+
+
+def _wiring(scenario: Scenario) -> Wiring | None:
+    """The controller's connections; None without a controller."""
+    table = scenario.controller
+    return None if table is None else Wiring(table.acts_on, scenario.legitimate.knows_input)
 
 
 def _program_of(process: ProcessTable) -> ProgramPart | None:
@@ -335,24 +381,9 @@ def expect_no_launcher_needed(scenario: Scenario) -> None:
             )
 
 
-def _sensor_keys(scenario: Scenario, keys: StreamKeys, monitored: bool) -> dict[str, bytes]:
-    """Stream → key, for the sensor's own streams, without those of the secret; monitored: whether there is a detector."""
-    measurement = {"measurement": keys.measurement} if scenario.measures else {}
-    monitors = {"watermark": keys.watermark, "spoofing": keys.spoofing} if monitored else {}
-    return {"process": keys.process, **measurement, **monitors}
-
-
 def _estimator_loop(scenario: Scenario) -> EstimatorLoopPart | None:
     """When the legitimate estimator sends its estimate, and the plant if it knows the inputs; None if neither."""
     table, told = scenario.controller, scenario.legitimate.knows_input
     if table is None or (table.acts_on == "truth" and not told):
         return None
     return EstimatorLoopPart(table.period, table.acts_on, scenario.driven if told else None)
-
-
-def _controller_part(scenario: Scenario, disturbances: str | None) -> ControllerPart | None:
-    """The controller's part: its strategy, assignment and disturbances; None without a controller."""
-    assignment, table = scenario.assignment, scenario.controller
-    if assignment is None or table is None or disturbances is None:
-        return None
-    return ControllerPart(table.strategy, assignment, table.acts_on, disturbances)
