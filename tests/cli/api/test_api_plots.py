@@ -102,6 +102,20 @@ def test_errors_of_rounding_lie_on_the_lower_edge(results: RunResults) -> None:
     assert axes.get_ylim()[0] < floor
 
 
+def test_errors_far_below_the_highest_lie_on_the_lower_edge() -> None:
+    """An axis spans 30 powers of ten; the picture says which errors are not where it shows them, in a title that has room."""
+    study = montecarlo("numerical", slots=300, trials=3, plan=Plan(mode=Mode.ERROR_COORDINATES, workers=1))
+    (axes,) = study.plot("errors").axes
+    low, high = axes.get_ylim()
+    assert high / low < 1e32
+    assert (study.peers["legitimate"].mean_squared_error or 0.0) < low
+    curves = {line.get_label(): np.asarray(line.get_ydata(), float) for line in axes.get_lines()}
+    assert curves["legitimate"].min() == pytest.approx(low)
+    above, words = axes.get_title("left").split(";\n")
+    assert above.endswith("no band: rare events")
+    assert words == f"values below {low:.3g} lie on the lower edge"
+
+
 def test_a_run_without_any_error_has_a_figure() -> None:
     """Without a warning, which would be an error here: no value is positive."""
     results = montecarlo("replay-attack-before", trials=1)

@@ -494,6 +494,15 @@ def test_values_below_the_floor_lie_on_the_lower_edge_and_the_chart_says_so() ->
     assert LogChart("", "", "", [Curve("", "#123456", errors[:2], np.zeros(2))], floor=0.01).figure is not None
 
 
+def test_a_chart_says_which_values_are_too_far_below_the_highest() -> None:
+    """One of 1e-3 is not one of 1e220, where the axis ends."""
+    x, y = np.arange(3.0), np.array([1e250, 1e220, 1e-3])
+    figure = drawn(LogChart("label", "slot", "error", [Curve("one", "#123456", x, y)], floor=1e-6))
+    assert figure[0].text == "error; values below 1e+220 lie on the lower edge"
+    figure = drawn(LogChart("label", "slot", "error", [Curve("one", "#123456", x[:2], y[:2])], floor=1e-6))
+    assert figure[0].text == "error"
+
+
 def test_a_chart_of_any_size_has_an_axis() -> None:
     """One slot is a dot; errors of 1e300 and intervals that reach below 0 or to infinity are drawn as far as the axis goes."""
     dot = drawn(LogChart("label", "slot", "error", [Curve("one", "#123456", np.array([3.0]), np.array([0.5]))]))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 from evedrop.show.report.page import made, printable
-from evedrop.show.view.error_floor import ErrorAxis, floor_words
+from evedrop.show.view.error_floor import ErrorAxis
 from evedrop.show.view.figure_style import drawing
 from evedrop.show.view.label_places import end_of, label_places
 
@@ -154,9 +154,8 @@ class LogChart:
         axis = _linear_axis(heights) if self.linear else ErrorAxis.of(heights, self.floor)
         if axis is None:
             return None
-        above = f"{self.y_name}; {floor_words(self.floor)}" if axis.below else self.y_name
         names = [(curve.name, curve.colour) for curve in curves] if len(curves) > _MOST_LABELS else []
-        return made("chart", self.label, above, self._drawing(curves, axis), self.x_name, names)
+        return made("chart", self.label, self.y_name + axis.words, self._drawing(curves, axis), self.x_name, names)
 
     def _drawing(self, curves: Sequence[Curve], axis: ErrorAxis) -> Markup:
         style = {

@@ -36,11 +36,6 @@ def mean_band(means: Floats, standard_errors: Floats) -> tuple[Floats, Floats]:
         return means / factor, means * factor
 
 
-def floor_words(floor: float) -> str:
-    """What a caption says if a value is below the floor."""
-    return f"values below {floor:g} lie on the lower edge"
-
-
 @dataclass(frozen=True)
 class ErrorAxis:
     """The ends of a logarithmic axis."""
@@ -48,7 +43,12 @@ class ErrorAxis:
     low: float
     high: float
     below: bool
-    """Whether values lie below the floor."""
+    """Whether values lie below it."""
+
+    @property
+    def words(self) -> str:
+        """What a caption says of values below the axis, after a semicolon; empty without any."""
+        return f"; values below {self.low:.3g} lie on the lower edge" if self.below else ""
 
     @classmethod
     def of(cls, heights: Sequence[Floats], floor: float) -> ErrorAxis | None:
@@ -58,8 +58,9 @@ class ErrorAxis:
         shown = shown[shown > 0.0]
         if not shown.size:
             return None
-        below, high = bool((finite < floor).any()), float(shown.max())
+        high = float(shown.max())
         low = max(float(shown.min()), high / _MOST)
+        below = bool((finite < low).any())
         most = min(max(high * _ROOM, 10.0 * floor), sys.float_info.max)
         return cls(low if below else low / _ROOM, most, below)
 

@@ -33,7 +33,7 @@ from evedrop.score.rare_events import recorded_rare_errors, sound_errors
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.view import journal_column
 from evedrop.show.view.axis_name import as_mathematics, axis_name, squared_unit, without_mathematics
-from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
+from evedrop.show.view.error_floor import ErrorAxis, error_floor
 from evedrop.show.view.figure_style import drawing, save
 from evedrop.show.view.lanes import EAVESDROPPER
 from evedrop.show.view.palette import TRUTH_CURVE, VERDICTS, hexadecimal, paper_inks
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 
 _WIDTH = 8.4
+_LETTERS = 100  # of a title that has room in a line
 _LAST = 300  # slots of lanes and plane unless told otherwise
 _MARGIN = 0.25  # around the truth in the plane, as a fraction of its extent
 _LINES, _DOTS = ("-", "-.", ":"), (".", "x", "+")
@@ -122,8 +123,8 @@ def _errors(
     inks: of each receiver; floor: values below it are drawn at it; rare: receiver → what rare events carry of its expected error
     in each slot of the run. There is no band where they carry more than it covers.
     """
-    many, gaps, heights = False, False, list[Floats]()
-    for i, (name, ink) in enumerate(inks.items()):
+    many, gaps, curves = False, False, dict[str, tuple[dict[str, Any], Floats, Floats]]()
+    for name in inks:
         mine = rows.filter(pc.equal(rows["peer"], name))
         if slots is not None:
             mine = mine.filter(pc.is_in(mine["slot"], pa.array(slots, pa.int64())))
@@ -131,7 +132,11 @@ def _errors(
         error, theory = columns["mean_squared_error"], columns["theoretical_trace_covariance"]
         if np.isnan(error).all():
             error = columns["mean_actual_trace_covariance"]
-        heights += [error, theory]
+        curves[name] = columns, error, theory
+    axis = ErrorAxis.of([height for _, *heights in curves.values() for height in heights], floor)
+    floor = axis.low if axis is not None and axis.below else floor
+    for i, (name, (columns, error, theory)) in enumerate(curves.items()):
+        ink = inks[name]
         dot = "o" if len(error) == 1 else ""  # a line through one slot cannot be seen
         line = _LINES[i % len(_LINES)] if len(inks) > _ALIKE else _LINES[0]
         axes.plot(columns["slot"], np.maximum(error, floor), line, color=ink, label=name, linewidth=1.3, marker=dot)
@@ -142,9 +147,8 @@ def _errors(
                 scatter = sound_errors(columns["standard_error"], rare[name][columns["slot"]] if name in rare else None)
                 fraction = np.exp(2.0 * scatter / error)  # symmetric on the logarithmic axis, and never below 0
                 gaps |= bool(np.isnan(scatter[columns["trials"] > 1]).any())
-            edges = (np.maximum(edge, floor) for edge in (error / fraction, error * fraction))
-            axes.fill_between(columns["slot"], *edges, color=ink, alpha=0.25, linewidth=0)
-    axis = ErrorAxis.of(heights, floor)
+            below, above = (np.maximum(edge, floor) for edge in (error / fraction, error * fraction))
+            axes.fill_between(columns["slot"], below, above, color=ink, alpha=0.25, linewidth=0)
     if axis is not None:  # otherwise the axis has nothing to show, and no logarithms
         axes.set_yscale("log")
         axes.set_ylim(axis.low, axis.high)
@@ -152,7 +156,8 @@ def _errors(
     axes.set_ylabel(y_label)
     title = "squared error" + (", mean ± 2 standard errors" if many else "") + "; dashed: theory"
     title += "; no band: rare events" if gaps else ""
-    axes.set_title(f"{title}; {floor_words(floor)}" if axis is not None and axis.below else title)
+    words = "" if axis is None else axis.words
+    axes.set_title(title + (words if len(title + words) < _LETTERS else words.replace("; ", ";\n")))
 
 
 class _RecordedTrial:
