@@ -189,6 +189,7 @@ def secrecy(
         denied=promise.denied and legitimate.slots > WINDOWS,
         true=true,
         replayed=replayed,
+        by_median=heavy and legitimate.trials > 1,
     )
     entry = SecrecySummary(
         relative=relative.value,

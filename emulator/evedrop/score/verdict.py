@@ -91,6 +91,8 @@ class Compared:
     """The same for errors against the true state, if the sensor sends an estimate; its ratio is NaN if that is unknown."""
     replayed: bool = False
     """Whether all trials replay the same recording of losses, so that intervals hold for this recording only."""
+    by_median: bool = False
+    """Whether medians decide, because a variance is infinite: distances and the ratio are of means, which then say nothing."""
 
     @property
     def outcome(self) -> SecrecyOutcome:
@@ -122,6 +124,8 @@ def verdict_on(compared: Compared, unit: str = "", *, best: bool = False) -> Ver
         numbers += ", in this trial"
     elif compared.replayed:
         numbers += ", given this recording of losses"
+    if compared.by_median:
+        numbers += " (means of infinite variance; judged by medians)"
     knows = "more than" if values.ratio < _SMALLER else "as much as"
     reason = {
         SecrecyOutcome.BROKEN: f"{name} knows {knows} the estimator; {numbers}",

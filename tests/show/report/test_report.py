@@ -668,6 +668,20 @@ def test_a_verdict_of_secret_says_what_theory_promises_beyond_it() -> None:
     assert lines["equal"].endswith("its squared error (by means of infinite variance)")
 
 
+def test_no_verdict_rests_on_means_of_infinite_variance_without_saying_so() -> None:
+    """A few trials make the legitimate mean larger than an eavesdropper's, although it is smaller in the median."""
+    study = montecarlo("numerical", slots=200, trials=60, plan=Plan(mode=Mode.ERROR_COORDINATES, workers=1))
+    medians = [peer.error_quantiles["0.5"] for peer in study.peers.values() if peer.error_quantiles is not None]
+    assert min(medians) == medians[0]
+    words = "squared error (means of infinite variance; judged by medians)"
+    assert study.verdict is not None
+    assert study.verdict.sentence.endswith(words)
+    for name, secrecy in study.secrecy.items():
+        assert secrecy.verdict is not None
+        assert words in secrecy.verdict.sentence, name
+    assert all("(by means of infinite variance)" in line for _, line in closing.verdict_lines(study.typed_summary))
+
+
 def test_a_sweep_without_a_point_is_told_to_go_on(evedrop: Evedrop) -> None:
     """The report of a sweep that was interrupted so early is not what the error advises."""
     made = ("sweep", "eavesdroppers", "--over", "seed=1,2", "--slots", "12", "--trials", "2", "--out", "study")

@@ -209,10 +209,11 @@ def verdict_lines(summary: Summary) -> Iterator[tuple[SecrecyOutcome, str]]:
         times = f"{verdict.times} its squared error" if verdict.times else ""
         if summary.filter is not None and (true := summary.filter.true_ratios.get(name)) is not None:
             times += f", {times_text(true.ratio, true.interval)} against the true state"
-        if times and verdict.outcome == SecrecyOutcome.RELATIVE and summary.trials > 1:
+        if times and summary.trials > 1:
             claims = summary.secrecy[name]
             times += " (by means of infinite variance)" if claims.judged_by == "median" else ""
-            times += "; perfect by theory, which trials may never show" if claims.perfect_by_theory else ""
+            if verdict.outcome == SecrecyOutcome.RELATIVE and claims.perfect_by_theory:
+                times += "; perfect by theory, which trials may never show"
         yield verdict.outcome, f"{verdict.headline:{words}}  {name:{names}}  {times}".rstrip()
 
 
