@@ -244,6 +244,12 @@ def test_a_run_cut_short_decides_nothing() -> None:
     """Windows of a run that was interrupted are not whole."""
     verdict = judged(tally(around(0.001), done=40), tally(around(0.002), done=40))
     assert (verdict.relative, verdict.relative_by_theory) == (Claim.UNDECIDED, True)
+    assert verdict.sentence == "eve: the run was cut short; theory promises relative secrecy"
+
+
+def test_a_run_of_one_slot_needs_slots_and_not_trials() -> None:
+    """The first slot is in no window, so that no number of trials could decide."""
+    assert "eve: the run has too few slots;" in judged(tally(around(1.0), 1, 1), tally(around(2.0), 1, 1)).sentence
 
 
 def test_a_run_that_measured_nothing_says_so() -> None:

@@ -98,6 +98,7 @@ def test_a_run_of_one_slot_does_not_decide() -> None:
         *_, verdict = verdicts(scenario, tally_of(scenario).tallies, expectations_of(scenario))
         assert verdict is not None
         assert verdict.outcome == SecrecyOutcome.OPEN
+        assert verdict.reason.startswith("the run has too few slots")
 
 
 def test_a_trial_without_states_has_a_verdict_without_distances() -> None:

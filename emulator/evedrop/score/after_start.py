@@ -23,6 +23,8 @@ ERROR_RATE = 0.01
 """Of a verdict: how often it may be given in error."""
 AS_MUCH = 1.25
 """An eavesdropper knows as much as the legitimate estimator if its squared error is at most this many times as large."""
+TOO_SHORT = "the run has too few slots"
+"""Why a comparison is open, however many trials there are."""
 _MOST, _FEWEST, _SHORTEST = 32, 8, 8
 """Batches before neighbours are joined; batches in the second half, and slots of a batch, that a comparison needs."""
 _ROUNDING = 1e-6
@@ -58,15 +60,15 @@ class AfterStart:
         Tests the mean of the logarithm of the ratio by Student's t, with the variance for correlated batches.
         """
         over, under = theirs.later, ours.later
-        if not len(under):
-            return cls(math.nan, in_one_trial=True)
+        if not len(under):  # not even a slot, or only one, which is in the first half
+            return cls(math.nan, why_open=TOO_SHORT if ours._batches else "", in_one_trial=True)
         squares = float(under[:, 1].mean()), float(over[:, 1].mean())
         distances = None if any(map(math.isnan, squares)) else (math.sqrt(squares[0]), math.sqrt(squares[1]))
         floor = max(_ROUNDING * noise, np.finfo(float).tiny)
         mean, other = float(under[:, 0].mean()), float(over[:, 0].mean())
         ratio = 1.0 if max(mean, other) <= floor else math.inf if mean <= floor else other / mean
         if len(under) < _FEWEST or ours.length < _SHORTEST:
-            return cls(ratio, None, None, distances, "the run has too few slots", in_one_trial=True)
+            return cls(ratio, None, None, distances, TOO_SHORT, in_one_trial=True)
         logarithms = np.log(np.clip(over[:, 0], floor, _LARGEST)) - np.log(np.clip(under[:, 0], floor, _LARGEST))
         low, high = _limits(logarithms)
         larger = True if low > 0.0 else False if high < math.log(AS_MUCH) else None

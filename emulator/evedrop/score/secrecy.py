@@ -20,7 +20,7 @@ from evedrop.model.theory.covariances import NOBODY, TheoreticalCovariance
 from evedrop.model.theory.rare_events import RARE
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.theory import Alike, Expectation, TheoreticalTraceStream, variances_along
-from evedrop.score.after_start import AS_MUCH, ERROR_RATE, AfterStart, ratio_interval
+from evedrop.score.after_start import AS_MUCH, ERROR_RATE, TOO_SHORT, AfterStart, ratio_interval
 from evedrop.score.rare_events import rare_events_of
 from evedrop.score.summary import RARE_FRACTION, SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_bounds, window_means, window_of
@@ -51,6 +51,7 @@ class SignTest:
 SignTestOf = Callable[[Floats], SignTest]
 """Tests a quantity, from its samples (R,)."""
 _NOTHING = SignTest(1.0, 1.0)
+_CUT_SHORT = "the run was cut short"
 _PROMISED_SLOTS = 10_000  # for which theory is computed at least
 
 
@@ -205,11 +206,17 @@ def secrecy(
         leak=None if other.leak is None else other.leak.summary,
         verdict=verdict_on(compared, unit),
     )
+    where = f" in slots {windows}" if windows else ""
+    undecided = f"{legitimate.trials:,} trials are too few to decide{where}{missing}"
+    if slots == 1 or not complete:
+        undecided = TOO_SHORT if complete else _CUT_SHORT
     shown = ""  # one trial decides no window
     if math.isnan(ratio):
         shown = "nothing was measured"
     elif legitimate.trials > 1 or relative is not Claim.UNDECIDED:
-        shown = _shown(relative, perfect, windows, missing, legitimate.trials, math.isfinite(bound), heavy)
+        shown = _shown(
+            relative, perfect, where, undecided, is_bounded=math.isfinite(bound), by_median=compared.by_median
+        )
     parts = [part for part in (shown, _promised(entry, other_theory)) if part]
     return replace(entry, sentence=f"{name}: {'; '.join(parts)}"), compared
 
@@ -246,23 +253,19 @@ def promise_of(legitimate: Expectation, other: Expectation, slots: int) -> Promi
     )
 
 
-def _shown(
-    relative: Claim, perfect: Claim, windows: str, missing: str, trials: int, is_bounded: bool, heavy: bool
-) -> str:
+def _shown(relative: Claim, perfect: Claim, where: str, undecided: str, *, is_bounded: bool, by_median: bool) -> str:
     """What a run has shown about secrecy against an eavesdropper, as part of a sentence.
 
-    windows: the slots in which relative secrecy failed or is undecided; missing: what the trials lack; is_bounded: whether the
-    legitimate error is; heavy: whether the variance of an error is infinite.
+    where: the slots in which relative secrecy failed; undecided: why it is; is_bounded: whether the legitimate error is.
     """
-    where = f" in slots {windows}" if windows else ""
     shown = {
         Claim.HELD: "its error was larger in every window of the run",
         Claim.FAILED: f"its error was not larger{where}",
-        Claim.UNDECIDED: f"{trials:,} trials are too few to decide{where}{missing}",
+        Claim.UNDECIDED: undecided,
     }[relative]
     if perfect is Claim.HELD:
         shown = f"its error grew while the legitimate one {'stayed bounded' if is_bounded else 'did not'}"
-    return f"{shown} (judged by medians, because the variance is infinite)" if heavy and trials > 1 else shown
+    return f"{shown} (judged by medians, because the variance is infinite)" if by_median else shown
 
 
 @dataclass(frozen=True)
@@ -308,11 +311,11 @@ def _after_start(
         distances = ours.distance, theirs.distance
     value, scatter = ratio
     if legitimate.slots <= WINDOWS:
-        return AfterStart(value, None, None, distances, "the run has too few slots")
+        return AfterStart(value, None, None, distances, TOO_SHORT)
     if is_rounding:
         return AfterStart(1.0, None, False, distances)
     if legitimate.done != legitimate.slots:
-        return AfterStart(value, None, None, distances, "the run was cut short")
+        return AfterStart(value, None, None, distances, _CUT_SHORT)
     interval = ratio_interval(value, scatter, legitimate.trials)
     larger = _larger(means, test)
     return AfterStart(value, interval, larger, distances, f"{legitimate.trials:,} trials are too few")
