@@ -290,6 +290,16 @@ def test_trials_bound_an_error_unless_rare_events_matter() -> None:
     assert error.lasting == (0.0, math.inf)
 
 
+def test_pairs_that_a_short_run_leaves_open_are_not_said_to_need_trials(tmp_path: Path) -> None:
+    """No number of trials of five slots decides them."""
+    result = compare("vehicle", schemes=["plain"], adversaries=["naive"], out=tmp_path, slots=5, trials=4, expect=[])
+    verdict = result.cell("plain", "naive").secrecy
+    assert verdict is not None
+    assert verdict.verdict is not None
+    assert verdict.verdict.reason.startswith("the run has too few slots")
+    assert conclusion(result).endswith("; undecided: 1 of 1 pairs")
+
+
 def test_a_scheme_alone_does_not_dominate(literature: Comparison) -> None:
     """Nor does one if no adversary counts against it."""
     alone = replace(literature, schemes={"cipher": literature.schemes["cipher"]})

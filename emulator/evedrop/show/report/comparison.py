@@ -40,7 +40,7 @@ def conclusion(comparison: Comparison) -> str:
     ]
     undecided = verdicts.count(SecrecyOutcome.OPEN)
     doubts = [
-        f"{undecided:,} of {len(verdicts):,} pairs need more trials" if undecided else "",
+        f"undecided: {undecided:,} of {len(verdicts):,} pairs" if undecided else "",
         schemes_done(comparison),
     ]
     more = "".join(f"; {doubt}" for doubt in doubts if doubt)
