@@ -14,7 +14,7 @@ from evedrop.show.view.recording import ViewRecording
 from evedrop.show.view.scene_slots import replay
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
-from tests.show.view.read_back import lane, rows
+from tests.show.view.read_back import events, lane, rows
 
 SLOTS = 120
 EVE = {"eve": {"strategy": "naive", "link": {"quality": 0.7}}}
@@ -37,6 +37,19 @@ def test_recording_of_a_study_holds_its_curves(study: Path) -> None:
     above = [k for k in range(SLOTS) if expected[k] > 1e-2]
     assert len(above) > SLOTS / 2
     np.testing.assert_allclose([shown[k][0] for k in above], [0.5 * np.log10(expected[k]) for k in above], rtol=1e-12)
+
+
+def test_the_view_of_an_interrupted_study_names_the_trials_that_it_has(tmp_path: Path) -> None:
+    """And not those that its scenario plans."""
+    folder = montecarlo("eavesdroppers", trials=3, slots=512, out=tmp_path / "study").folder
+    texts = {name: (folder / name).read_text(encoding="utf-8") for name in ("scenario.toml", "summary.json")}
+    assert "trials = 3\n" in texts["scenario.toml"]
+    (folder / "scenario.toml").write_text(texts["scenario.toml"].replace("trials = 3\n", "trials = 4000\n"))
+    (folder / "summary.json").write_text(texts["summary.json"].replace('"complete"', '"interrupted"'))
+    path = replay(folder)
+    title = rows(path, "title", "TextDocument:text")
+    assert all(text.endswith("means of 3 trials, everything else: the first of them") for (text,) in title.values())
+    assert events(path)[0][-1].endswith("; curves: mean of 3 trials")
 
 
 @pytest.mark.parametrize(
