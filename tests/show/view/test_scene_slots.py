@@ -1,3 +1,4 @@
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from evedrop import load_results, montecarlo, run
 from evedrop.errors import UsageError
+from evedrop.score.verdict import distance_text, times_text
 from evedrop.show.view.recording import ViewRecording
 from evedrop.show.view.scene_slots import replay
 from evedrop.simulate.montecarlo import Plan
@@ -50,6 +52,30 @@ def test_the_view_of_an_interrupted_study_names_the_trials_that_it_has(tmp_path:
     title = rows(path, "title", "TextDocument:text")
     assert all(text.endswith("means of 3 trials, everything else: the first of them") for (text,) in title.values())
     assert events(path)[0][-1].endswith("; curves: mean of 3 trials")
+
+
+def test_distances_and_ratio_of_the_verdict_so_far_are_of_all_trials(tmp_path: Path) -> None:
+    """As the table has them; of several trials, distances of some states are not known."""
+    folder = montecarlo("eavesdroppers", trials=3, slots=512, out=tmp_path / "study").folder
+    text = (folder / "summary.json").read_text(encoding="utf-8")
+    (folder / "summary.json").write_text(text.replace('"complete"', '"interrupted"'))  # without a verdict at its end
+    title = rows(replay(folder), "title", "TextDocument:text")
+    table = [row for row in load_results(folder).slots.to_pylist() if row["slot"] >= 256]
+    ours, smart = (
+        float(np.mean([row["mean_squared_error"] for row in table if row["peer"] == name]))
+        for name in ("legitimate", "smart")
+    )
+    said = title[511][0].replace("\\", "")
+    off = (
+        f"the estimator is {distance_text(ours**0.5)} off, the best eavesdropper (smart) {distance_text(smart**0.5)}: "
+    )
+    assert f"{off}{times_text(smart / ours)}" in said
+    folder = montecarlo("vehicle", trials=3, slots=512, out=tmp_path / "of two units").folder
+    title = rows(replay(folder), "title", "TextDocument:text")
+    said = title[max(k for k in title if k < 511)][0].replace("\\", "")
+    assert re.search(
+        r"the best eavesdropper \(smart\) has [0-9,.]+ × (\[.*\] )?the estimator's squared error, so far", said
+    )
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from evedrop.show.view.lanes import received, squares
 from evedrop.show.view.palette import GROUND, LABEL, TRUTH, Colour
 from evedrop.show.view.panels.curves import times_of
 from evedrop.show.view.panels.panel import LEGEND_HEIGHT, VERDICT_HEIGHT, PlacedView, ViewPanel, lanes_height
-from evedrop.show.view.scene import Scene, SceneSlots
+from evedrop.show.view.scene import PeerSlots, Scene, SceneSlots
 
 _TITLE_PATH = "title"
 _VERDICTS = 60  # of a run that is as fast as possible
@@ -61,11 +61,16 @@ class VerdictLine(ViewPanel):
         yield from self._texts(so_far)
 
     def _errors(self, slots: SceneSlots) -> dict[str, tuple[Floats, Floats]]:
-        """Receiver → its squared errors, and its squared distances, (c,) each."""
-        return {
-            name: (peer.squared_error, squares((slots.x - peer.x_hat)[:, : self._states]))
-            for name, peer in slots.peers.items()
-        }
+        """Receiver → its squared errors, and its squared distances, (c,) each: means over all trials.
+
+        NaN for distances of some states in several trials, of which the view has the states of one.
+        """
+        return {name: (peer.squared_error, self._squares(slots.x, peer)) for name, peer in slots.peers.items()}
+
+    def _squares(self, x: Floats, peer: PeerSlots) -> Floats:
+        if self.scene.trials == 1:
+            return squares((x - peer.x_hat)[:, : self._states])
+        return peer.squared_error if self._states == self.scene.n else np.full(len(x), np.nan)
 
     def _so_far(self) -> str:
         (_, ours), *theirs = self._batches.items()
