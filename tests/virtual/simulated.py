@@ -8,11 +8,13 @@ from __future__ import annotations
 import argparse
 import gc
 import hashlib
+import signal
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import pyarrow as pa
@@ -116,38 +118,49 @@ def unlike(failed: Sequence[tuple[int, tuple[str, ...]]]) -> list[tuple[int, tup
 
 
 def save_time() -> None:
-    """Let a worker search its new objects for cycles less often, and its modules never; and use no threads for small tables."""
+    """Let a worker search its new objects for cycles less often, and its modules never; and use no threads for small tables.
+
+    Ctrl-C is for the campaign, which waits for the cases that are being played.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()
     gc.set_threshold(50_000)
     pa.set_cpu_count(1)
 
 
 def campaign(seeds: range, workers: int, explained: int, view: Path | None) -> bool:
-    """Play the cases of seeds, and explain the first ones that fail in different ways; returns whether none failed."""
-    begun, events, total = time.perf_counter(), 0, hashlib.blake2b(digest_size=8)
+    """Play the cases of seeds, and explain the first ones that fail in different ways; returns whether all kept their promises.
+
+    Ctrl-C ends it early: it then tells of those that were played.
+    """
+    begun, count, events, total = time.perf_counter(), 0, 0, hashlib.blake2b(digest_size=8)
     failed: list[tuple[int, tuple[str, ...]]] = []
-    with ProcessPoolExecutor(workers, initializer=save_time) as pool:
-        for seed, case, digest, happened, seconds, misses, status in pool.map(
-            played, seeds, chunksize=SEEDS_OF_A_SCENARIO
-        ):
-            events += happened
-            total.update(digest.encode())
-            if misses or len(seeds) <= 20:
-                print(f"{seed}  {status}  {case}  {happened} events, {seconds:.2f} s, {digest}")
-            for miss in misses:
-                print(f"    MISS {miss}")
-            if misses:
-                failed.append((seed, misses))
+    with ProcessPoolExecutor(workers, initializer=save_time) as pool, suppress(KeyboardInterrupt):
+        try:
+            for seed, case, digest, happened, seconds, misses, status in pool.map(
+                played, seeds, chunksize=SEEDS_OF_A_SCENARIO
+            ):
+                count += 1
+                events += happened
+                total.update(digest.encode())
+                if misses or len(seeds) <= 20:
+                    print(f"{seed}  {status}  {case}  {happened} events, {seconds:.2f} s, {digest}")
+                for miss in misses:
+                    print(f"    MISS {miss}")
+                if misses:
+                    failed.append((seed, misses))
+        finally:
+            pool.shutdown(cancel_futures=True)
     took = time.perf_counter() - begun
     for seed, misses in unlike(failed)[:explained]:
         print(f"\nseed {seed}: {any_case(seed)}")
         show(shrunk(any_case(seed), misses), view)
         view = None
     print(
-        f"{len(seeds)} runs, {len(failed)} with a miss; {events:,} events in {took:.1f} s, {len(seeds) / took:.1f} runs/s; "
+        f"{count} runs, {len(failed)} with a miss; {events:,} events in {took:.1f} s, {count / took:.1f} runs/s; "
         f"hash of all events {total.hexdigest()}"
     )
-    return not failed
+    return not failed and count == len(seeds)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
