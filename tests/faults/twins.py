@@ -11,8 +11,9 @@ from evedrop.scenario.tables import Scenario
 from evedrop.virtual import faults, host_faults, host_parts
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY as ALL
-from evedrop.virtual.disturbance import LAUNCHER, Disturbance
+from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.processes import FORK_SERVERS as SERVERS
+from evedrop.virtual.processes import LAUNCHER
 from tests.faults.disturbed import CLEANER, FORK_SERVERS
 from tests.faults.hosts import CONNECTION, HOST_CLEANER, HOST_FORK_SERVER, PROGRAM, SESSION, SSH
 from tests.faults.kinds import CONFUSED, EVERYBODY, RESULTS

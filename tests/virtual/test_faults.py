@@ -12,8 +12,9 @@ from evedrop.scenario.tables import Scenario
 from evedrop.virtual import campaign, faults, judge, notes, outsiders
 from evedrop.virtual.campaign import play_case
 from evedrop.virtual.cases import SimulatedCase
-from evedrop.virtual.disturbance import EVERYBODY, LAUNCHER, Disturbance
+from evedrop.virtual.disturbance import EVERYBODY, Disturbance
 from evedrop.virtual.moments import CHANGES, COMMANDS
+from evedrop.virtual.processes import LAUNCHER
 from evedrop.virtual.reference import RunReference
 from evedrop.virtual.run import SimulatedRun
 from evedrop.virtual.zenoh.access import Access

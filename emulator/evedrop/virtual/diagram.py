@@ -14,7 +14,7 @@ from typing import final
 
 from evedrop.names import CONTROLLER, LEGITIMATE, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.virtual import notes
-from evedrop.virtual.disturbance import LAUNCHER
+from evedrop.virtual.processes import LAUNCHER
 from evedrop.virtual.steps import Life, Mark, Step
 
 _MOST_LINES = 120

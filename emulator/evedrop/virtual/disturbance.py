@@ -20,7 +20,6 @@ from evedrop.virtual.processes import FORK_SERVERS
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld
 
-LAUNCHER = "launcher"
 EVERYBODY = "everybody"
 """All processes that are connected with a router."""
 ROUTERS = (ROUTER, RELAY)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, final
 from evedrop.live.launch.hosts_file import processes_of
 from evedrop.names import RELAY, ROUTER
 from evedrop.scenario.tables import Scenario
-from evedrop.virtual.disturbance import LAUNCHER, Disturbance
+from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.faults import (
     HangUpProcess,
     InterruptProcess,
@@ -26,6 +26,7 @@ from evedrop.virtual.faults import (
 from evedrop.virtual.host_faults import HOST_KINDS
 from evedrop.virtual.host_parts import HOST_FORK_SERVER, LISTENS, PROGRAM, SESSION, SSH, host_of, part_of, part_on
 from evedrop.virtual.other_hosts import ODDITIES
+from evedrop.virtual.processes import LAUNCHER
 
 _ONE_IN = 8
 """How many runs there are for each with other hosts."""

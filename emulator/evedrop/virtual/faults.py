@@ -16,9 +16,9 @@ from evedrop.errors import Interrupted, UsageError
 from evedrop.names import RECORDER, ROUTER, SENSOR
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual.disk import DiskFault
-from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance, processes_of
+from evedrop.virtual.disturbance import EVERYBODY, KILLED, ROUTERS, Disturbance, processes_of
 from evedrop.virtual.host_parts import host_of, part_of
-from evedrop.virtual.processes import FORK_SERVERS, VirtualProcess
+from evedrop.virtual.processes import FORK_SERVERS, LAUNCHER, VirtualProcess
 
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld

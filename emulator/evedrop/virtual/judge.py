@@ -24,7 +24,7 @@ from evedrop.scenario.plugins import named_in
 from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
 from evedrop.virtual.broken_messages import CONTRADICTIONS, BreakMessage
 from evedrop.virtual.cases import SimulatedCase
-from evedrop.virtual.disturbance import EVERYBODY, KILLED, LAUNCHER, ROUTERS, Disturbance, processes_of
+from evedrop.virtual.disturbance import EVERYBODY, KILLED, ROUTERS, Disturbance, processes_of
 from evedrop.virtual.faults import (
     BreakWrite,
     ConfuseKeys,
@@ -42,7 +42,7 @@ from evedrop.virtual.host_faults import FreezeSsh, LosePower
 from evedrop.virtual.host_parts import PROGRAM, SESSION, host_of, part_of
 from evedrop.virtual.metrics import slots_of_metrics
 from evedrop.virtual.outsiders import OperatorCommand
-from evedrop.virtual.processes import FORK_SERVERS
+from evedrop.virtual.processes import FORK_SERVERS, LAUNCHER
 from evedrop.virtual.reference import RunReference, tables_of
 from evedrop.virtual.results import lost_rows, wrong_outages, wrong_summary, wrong_tables
 from evedrop.virtual.run import SimulatedRun

@@ -24,7 +24,8 @@ from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import RECORDER
 from evedrop.scenario.tables import Scenario
 from evedrop.system.world import world as here
-from evedrop.virtual.disturbance import LAUNCHER, Disturbance
+from evedrop.virtual.disturbance import Disturbance
+from evedrop.virtual.processes import LAUNCHER
 
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld

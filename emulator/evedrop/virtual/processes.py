@@ -35,6 +35,7 @@ _START_SECONDS = 0.05
 """The mean time until a process that is started begins its work."""
 _REMOVED_SECONDS = 0.01
 _POLL_SECONDS = 0.25
+LAUNCHER = "launcher"
 FORK_SERVERS = ("fork server", "fork server of the recorder")
 """The processes that start others."""
 

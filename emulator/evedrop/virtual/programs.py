@@ -20,8 +20,8 @@ from evedrop.results.folder import STATES
 from evedrop.scenario.loading import Scenario
 from evedrop.system.files import lines_in
 from evedrop.system.world import world as here
-from evedrop.virtual.disturbance import LAUNCHER
 from evedrop.virtual.notes import BY_HAND
+from evedrop.virtual.processes import LAUNCHER
 
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld

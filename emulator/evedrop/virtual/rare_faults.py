@@ -16,11 +16,12 @@ from evedrop.scenario.tables import Scenario
 from evedrop.system.world import world as here
 from evedrop.virtual.broken_messages import BreakMessage
 from evedrop.virtual.by_hand import RunByHand, RunWrongly, WriteBriefs
-from evedrop.virtual.disturbance import LAUNCHER, Disturbance
+from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.drawn_faults import events_of
 from evedrop.virtual.faults import CutConnection, RenameResults
 from evedrop.virtual.moments import COMMANDS, DECISIONS, FINAL_BELIEFS, PROGRESS_OF_RECEIVERS
 from evedrop.virtual.outsiders import ChangeLink, OperatorCommand, PauseRun
+from evedrop.virtual.processes import LAUNCHER
 from evedrop.virtual.rereading import RereadMessages
 
 if TYPE_CHECKING:

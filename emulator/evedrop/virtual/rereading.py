@@ -29,8 +29,9 @@ from evedrop.scenario.tables import Scenario
 from evedrop.score.run_tally import RunTally
 from evedrop.system.world import world as here
 from evedrop.virtual.broken_messages import broken
-from evedrop.virtual.disturbance import LAUNCHER, Disturbance
+from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.notes import key_within
+from evedrop.virtual.processes import LAUNCHER
 
 if TYPE_CHECKING:
     from evedrop.live.recorder.steering import Steering

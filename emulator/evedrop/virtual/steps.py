@@ -13,8 +13,7 @@ from typing import final
 
 from evedrop.live.protocol.keys import reader_of, writer_of
 from evedrop.virtual import notes
-from evedrop.virtual.disturbance import LAUNCHER
-from evedrop.virtual.processes import FORK_SERVERS
+from evedrop.virtual.processes import FORK_SERVERS, LAUNCHER
 from evedrop.virtual.scheduler import Occurrence
 
 _LATE = 0.05

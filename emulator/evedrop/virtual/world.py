@@ -20,11 +20,10 @@ from evedrop.system.this_process import ThisProcess
 from evedrop.system.threads import Condition, Lock, Queue, Thread, ThreadEvent
 from evedrop.system.world import Address, World
 from evedrop.virtual.disk import VirtualDisk
-from evedrop.virtual.disturbance import LAUNCHER
 from evedrop.virtual.host_parts import HOST_FORK_SERVER, part_on
 from evedrop.virtual.notes import BY_HAND
 from evedrop.virtual.pipes import Pipe, PipeFile
-from evedrop.virtual.processes import FORK_SERVERS, VirtualForkServer, VirtualMachine
+from evedrop.virtual.processes import FORK_SERVERS, LAUNCHER, VirtualForkServer, VirtualMachine
 from evedrop.virtual.scheduler import (
     VirtualCondition,
     VirtualEvent,
