@@ -13,11 +13,13 @@ import numpy as np
 
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats, Process
-from evedrop.model.reference_code import ReferenceCode
+from evedrop.model.reference_code import ReferenceCode, triangular_solutions
+from evedrop.model.staircase import is_singular
 from evedrop.model.theory.closed_forms import ClosedForm, ReceiverConditions, reference_covariances, reference_limit
 from evedrop.model.theory.covariances import NOBODY, Outcomes, has_infinite_variance, limit_trace, traces_of_slots
 
-_FOLLOWED = 32  # critical slots whose consequences are computed each by itself
+_APART = 64  # critical slots whose consequences are computed each by itself: the first
+_MERGED = 8  # later ones, or equal groups of them, that are merged at a time, in pairs; as many newer ones stay apart
 
 
 def reference_floor(process: Process, received: float, acknowledged: tuple[float, float], slots: int) -> Floats:
@@ -28,16 +30,17 @@ def reference_floor(process: Process, received: float, acknowledged: tuple[float
         E P_k ≥ E[P_k; no critical slot yet] + c Σ_j (1−c)^j F_{j,k},
 
     where F_{j,k} is the error if slot j is the first critical slot, x_{j−1} is known exactly and every later packet is heard:
-    Σ_k for j = 0, then by the recursion of the exact reader. It is exact where c = 0. Of many slots j, some stand for
-    themselves and those before them, because F_{j,k} falls in j.
+    Σ_k for j = 0, then by the recursion of the exact reader. It is exact where c = 0. After the
+    first slots j, neighbours are followed as one, with an error that is at most that of each of them; if Q is singular, that may
+    be 0, and they are left out.
     """
     c = acknowledged[1]
     unheard, spared = 1.0 - received - c, 1.0
     A, Q, G = process.A, process.Q, process.noise_factor
-    code, n = ReferenceCode(process), process.n
+    code, n, singular = ReferenceCode(process), process.n, is_singular(process)
+    white = triangular_solutions(np.broadcast_to(G, (n, n, n)), np.eye(n))
     sigma, before = process.initial_covariance, np.zeros_like(Q)
-    D, weights, first, spacing = np.empty((0, n, n)), np.empty(0), np.empty(0, np.int64), 1
-    waiting = 0.0
+    D, weights, counts = np.empty((0, n, n)), np.empty(0), np.empty(0, np.int64)
     bounds = np.empty(slots)
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(slots):
@@ -45,34 +48,47 @@ def reference_floor(process: Process, received: float, acknowledged: tuple[float
                 sigma = A @ sigma @ A.T + Q
                 before = unheard * (A @ before @ A.T + spared * Q)
                 L = code.at(k)
-                D = _heard((A - L) @ D, L @ D, G)
-                waiting += c * spared
-                if (k - 1) % spacing == 0:
-                    D, first = np.concatenate([D, G[None]]), np.append(first, k)
-                    weights, waiting = np.append(weights, waiting), 0.0
+                D = _heard(white @ (L - A) @ D, L @ D)
+                if not singular or k <= _APART:
+                    D = np.concatenate([D, G[None]])
+                    weights, counts = np.append(weights, c * spared), np.append(counts, 1)
             else:
                 before = unheard * sigma
-            if len(first) > _FOLLOWED:
-                # The mass of a slot that is no longer followed goes to the next one that is.
-                spacing *= 2
-                kept = np.flatnonzero((first - 1) % spacing == 0)
-                sums = np.add.reduceat(weights, np.append(0, kept[:-1] + 1))
-                waiting += weights[kept[-1] + 1 :].sum()
-                D, weights, first = D[kept], sums, first[kept]
             spared *= 1.0 - c
             bound = np.trace(before) + c * np.trace(sigma) + weights @ (D * D).sum(axis=(1, 2))
             if not np.isfinite(bound):
                 bounds[k:] = np.inf
                 break
             bounds[k] = bound
+            for count in sorted(set(counts[_APART:].tolist()), reverse=True) if k % _MERGED == 0 else ():
+                places = _APART + np.flatnonzero(counts[_APART:] == count)
+                if len(places) >= 2 * _MERGED:
+                    older, newer = places[:_MERGED:2], places[1:_MERGED:2]
+                    D[newer], weights[newer] = _least(D[older], D[newer]), weights[older] + weights[newer]
+                    counts[newer] *= 2
+                    kept = np.delete(np.arange(len(D)), older)
+                    D, weights, counts = D[kept], weights[kept], counts[kept]
     return bounds
 
 
-def _heard(apart: Floats, carried: Floats, G: Floats) -> Floats:
-    """The errors' factors after a packet x − r, (c, n, n): apart, those of x − r before its noise; carried, those of r."""
-    count, n, _ = apart.shape
+def _least(older: Floats, newer: Floats) -> Floats:
+    """Factors of covariances that are at most those of both factors, (c, n, n) each.
+
+    older: lower triangular, nonsingular. In the coordinates in which its covariance is 1 and the other's diagonal, the smaller
+    entries count.
+    """
+    count, n, _ = older.shape
+    columns = triangular_solutions(np.repeat(older, n, axis=0), newer.transpose(1, 0, 2).reshape(n, count * n))
+    u, s, _ = np.linalg.svd(columns.reshape(n, count, n).transpose(1, 0, 2))
+    least: Floats = older @ (u * np.minimum(s, 1.0)[:, None])
+    return least
+
+
+def _heard(seen: Floats, carried: Floats) -> Floats:
+    """The errors' factors after a packet x − r, (c, n, n): seen, of x − r before its noise, which is whitened; carried, of r."""
+    count, n, _ = seen.shape
     joint = np.zeros((count, 2 * n, 2 * n))
-    joint[:, :n, :n], joint[:, :n, n:], joint[:, n:, n:] = G, apart, carried
+    joint[:, :n, :n], joint[:, :n, n:], joint[:, n:, n:] = np.eye(n), seen, carried
     return kernels.triangular_factors(joint)[:, n:, n:]
 
 

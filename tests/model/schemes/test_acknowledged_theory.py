@@ -73,6 +73,32 @@ def test_the_floor_follows_many_slots() -> None:
     assert np.isinf(reference_floor(MIXED, 0.9, (0.81, 0.09), 3000)[-1])
 
 
+@pytest.mark.parametrize("singular", [False, True], ids=["Q nonsingular", "Q singular"])
+@pytest.mark.parametrize("start", [1.0, 1e3, 1e8])
+def test_the_floor_holds_for_a_state_that_shrinks(start: float, singular: bool) -> None:
+    """The error of one critical slot by plain covariances: however large the state is at first, and close where they are rare."""
+    A = np.array([[0.97, 0.3], [0.0, 0.9]])
+    Q = np.array([[1.0, 0.5], [0.5, 0.25 if singular else 1.0]])
+    slots, c = 300, 1e-6
+    floor = reference_floor(Process(A, Q, start * np.eye(2), singular), 1.0 - c, (1.0 - c, c), slots)
+    sigma = list(itertools.islice(exact_sigmas(Process(A, Q, start * np.eye(2), singular)), slots))
+    exact_traces = c * np.array([np.trace(matrix) for matrix in sigma])
+    back = np.linalg.inv(A).T
+    G = np.array([[1.0], [0.5]]) if singular else np.linalg.cholesky(Q)
+    F = np.empty((0, 2, 2))
+    for k in range(1, slots):
+        H = G.T @ back @ np.linalg.inv(sigma[k - 1])
+        L = A + G @ H
+        shown = H @ F @ H.T + np.eye(G.shape[1])
+        gain = L @ F @ H.T @ np.linalg.inv(shown)
+        left = L - gain @ H
+        F = np.concatenate([left @ F @ left.swapaxes(1, 2) + gain @ gain.swapaxes(1, 2), Q[None]])
+        exact_traces[k] += c * np.trace(F, axis1=1, axis2=2).sum()
+    assert (floor <= exact_traces * (1.0 + 1e-6)).all()
+    assert (floor[:60] >= exact_traces[:60] * (1.0 - 1e-3)).all()
+    assert singular or (floor >= 0.9 * exact_traces).all()
+
+
 @pytest.mark.parametrize(
     ("initial", "honest"), [(1e-3 * np.eye(2), 4.91e7), (np.eye(2), 2.36e10)], ids=["from Q", "from I"]
 )
