@@ -18,7 +18,7 @@ from evedrop.model.theory.design import (
     perfect_secrecy,
     relative_secrecy,
 )
-from evedrop.model.theory.ratio import Adversary, adversary_bound
+from evedrop.model.theory.ratio import Adversary, adversary_bound, traces_of
 from tests.builders import MICROGRID, UNSTABLE
 from tests.examples import examples, mostly_long
 
@@ -294,3 +294,16 @@ def test_a_link_just_above_the_bound_leaves_just_one_interval() -> None:
     assert high == 1.0
     assert low == pytest.approx(stability_bound(UNSTABLE, mu), abs=1e-6)
     assert 0.99 < low < 1.0
+
+
+def test_the_best_may_be_to_send_all_states() -> None:
+    """Of a stable process, against an eavesdropper that hears little: J_e hardly depends on μ_d, and J falls as μ_d rises."""
+    process = Process(np.array([[0.7]]), np.eye(1), np.eye(1))
+    deaf, nearly = smart(0.0), smart(0.05)
+    assert (
+        best_difference(process, 0.9, deaf) == best_ratio(process, 0.9, deaf) == best_ratio(process, 0.9, nearly) == 1.0
+    )
+    for mu_d in np.linspace(0.01, 0.99, 50):
+        ours, theirs = traces_of(process, 0.9, nearly, float(mu_d))
+        best_ours, best_theirs = traces_of(process, 0.9, nearly, 1.0)
+        assert theirs / ours < best_theirs / best_ours

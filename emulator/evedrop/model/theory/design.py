@@ -313,11 +313,12 @@ def _argmax(process: Process, mu: float, adversary: Adversary, gain: Callable[[f
     points = points[points - low > 0.1 * ATTAINED * (1.0 - low)]
     losses = np.array([loss(point) for point in points])
     lowest = int(np.argmin(losses))
-    if not np.all(np.isfinite(losses)) or losses[lowest] >= 0.0 or lowest in (0, len(points) - 1):
+    if not np.all(np.isfinite(losses)) or losses[lowest] >= 0.0 or lowest == 0:
         return None
-    optimum = minimize_scalar(
-        loss, bounds=(points[lowest - 1], points[lowest + 1]), method="bounded", options={"xatol": 1e-10}
-    )
+    neighbours = points[lowest - 1 : lowest + 2]
+    optimum = minimize_scalar(loss, bounds=(neighbours[0], neighbours[-1]), method="bounded", options={"xatol": 1e-10})
+    if lowest == len(points) - 1 and losses[lowest] <= optimum.fun:
+        return 1.0
     mu_d = float(optimum.x)
     return mu_d if mu_d - low > ATTAINED * (1.0 - low) else None
 
