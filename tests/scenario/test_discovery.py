@@ -45,12 +45,25 @@ def test_what_cannot_be_read_is_no_scenario(tmp_path: Path) -> None:
     assert not any(is_scenario(tmp_path / f"{name}.toml") for name in "abc")
 
 
-@pytest.mark.parametrize("neighbour", ["summary.json", "slots.parquet", "unfinished"])
-def test_the_copy_in_a_results_folder_is_none(tmp_path: Path, neighbour: str) -> None:
-    """Of a run that ended, and of one that goes on."""
-    (tmp_path / "scenario.toml").write_text(SCENARIO, encoding="utf-8")
+@pytest.mark.parametrize(
+    ("neighbour", "copy"),
+    [
+        *(
+            (name, "scenario.toml")
+            for name in ("summary.json", "slots.parquet", "unfinished", "shards", "finished_tasks")
+        ),
+        ("sweep.json", "scenario.toml"),
+        ("compare.json", "scenarios/innovation.toml"),
+    ],
+)
+def test_the_copy_in_a_results_folder_is_none(tmp_path: Path, neighbour: str, copy: str) -> None:
+    """Of a run that ended, of one that goes on, of a sweep, and of each scheme of a comparison."""
+    path = tmp_path / copy
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(SCENARIO, encoding="utf-8")
+    assert is_scenario(path)
     (tmp_path / neighbour).touch()
-    assert not is_scenario(tmp_path / "scenario.toml")
+    assert not is_scenario(path)
 
 
 def test_folders_are_searched_in_order_and_each_scenario_is_taken_once(tmp_path: Path) -> None:

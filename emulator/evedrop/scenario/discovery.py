@@ -15,18 +15,17 @@ from evedrop.system.files import Unreadable, text_of
 
 _HEADINGS = tuple(re.compile(rf"^\s*\[{name}\]", re.MULTILINE) for name in ("process", "encoding"))
 _MOST_BYTES = 2**28  # as for every scenario
-_OF_RESULTS = ("summary.json", "slots.parquet", "unfinished")  # the last one exists while a run is in progress
+OF_RESULTS = ("summary.json", "slots.parquet", "unfinished", "shards", "sweep.json", "compare.json", "finished_tasks")
+"""Files and folders that show that a folder is a results folder, of a study in progress, too."""
 
 
 def is_scenario(path: Path) -> bool:
     """Whether a file looks like a user's scenario: TOML with the tables `process` and `encoding`.
 
-    False for a name that begins with an underscore, and for the copy in a results folder. True for a file that is not
+    False for a name that begins with an underscore, and for the copies in a results folder. True for a file that is not
     valid TOML but has both headings: a scenario with a mistake to report.
     """
-    if path.suffix != ".toml" or path.name.startswith("_"):
-        return False
-    if path.name == "scenario.toml" and any(path.with_name(name).exists() for name in _OF_RESULTS):
+    if path.suffix != ".toml" or path.name.startswith("_") or _is_copy(path):
         return False
     try:
         text = text_of(path, _MOST_BYTES)
@@ -39,6 +38,12 @@ def is_scenario(path: Path) -> bool:
     except (ValueError, RecursionError):
         return all(heading.search(text) for heading in _HEADINGS)
     return all(isinstance(tables.get(name), dict) for name in ("process", "encoding"))
+
+
+def _is_copy(path: Path) -> bool:
+    if path.name == "scenario.toml" and any(path.with_name(name).exists() for name in OF_RESULTS):
+        return True
+    return path.parent.name == "scenarios" and (path.parent.parent / "compare.json").exists()
 
 
 def scenarios_in(folder: Path) -> Iterator[Path]:

@@ -19,6 +19,7 @@ from evedrop.cli.words import speaks_python
 from evedrop.errors import EvedropError, UsageError
 from evedrop.results.crash_proof_tables import goes_on
 from evedrop.scenario.arguments import CHANGES, path_argument, refuse_unless, table_argument
+from evedrop.scenario.discovery import OF_RESULTS
 from evedrop.scenario.loading import plain_tables, prepared
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
@@ -35,8 +36,6 @@ if TYPE_CHECKING:
 
 _Results = TypeVar("_Results", RunResults, SweepResults, ComparisonResults)
 
-_OF_RESULTS = ("summary.json", "unfinished", "shards", "sweep.json", "compare.json", "finished_tasks")
-"""Files and folders that show that a folder is a results folder."""
 _NO_FOLDER = "resume=True goes on with the study in a folder: give the folder as out, and leave overwrite out"
 
 
@@ -127,7 +126,7 @@ def _clear(folder: Path, overwrite: bool) -> None:
         return
     if not overwrite:
         raise UsageError(f"{folder} is not empty; give another out, or overwrite=True to replace the results in it")
-    if not any((folder / name).exists() for name in _OF_RESULTS):
+    if not any((folder / name).exists() for name in OF_RESULTS):
         raise UsageError(f"{folder} is not a results folder, and overwrite=True replaces only those; give another out")
     if goes_on(folder):
         raise UsageError(f"{folder} belongs to a run in progress; wait for its end, or give another out")
