@@ -7,6 +7,9 @@ from typing import Any
 
 import pytest
 
+from evedrop.cli.main import parser_of
+from evedrop.cli.options import changes_of
+from evedrop.scenario.loading import load
 from tests.conftest import Evedrop
 
 SMALL = ("--set", "slots=12", "--set", "expect=[]")
@@ -32,6 +35,16 @@ def test_a_changed_entry_sets_the_trials(command: str, evedrop: Evedrop) -> None
             assert each.pop("trials") == 3
             each.pop("wall_seconds"), each.pop("slots_per_second"), each.pop("surprising")
     assert found == expected
+
+
+def test_changes_are_made_in_the_order_of_the_command_line() -> None:
+    """The last change of an entry is made after one of the table around it, or of its other form, that came before."""
+    for between in ("legitimate.link={quality = 0.7}", "legitimate.link.loss={model = 'bernoulli', quality = 0.7}"):
+        words = [
+            f"--set={change}" for change in ("legitimate.link.quality=0.5", between, "legitimate.link.quality=0.1")
+        ]
+        changed = load("vehicle", changes_of(parser_of("run").parse_whole(["run", "vehicle", *words])))
+        assert changed.legitimate.link.quality == 0.1
 
 
 def test_what_a_comparison_changes_is_the_scenario(evedrop: Evedrop) -> None:

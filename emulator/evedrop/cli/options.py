@@ -59,6 +59,7 @@ def changes_of(options: argparse.Namespace) -> dict[str, Any]:
         key, equals, value = change.partition("=")
         if not equals or not key:
             raise UsageError(f"--set {change}: expected KEY=VALUE, such as --set seed=3")
+        changes.pop(key, None)  # changes are made in order: the last one of an entry after those of tables around it
         changes[key] = value_of(value)
     for name in ("seed", "slots", "trials", "first_trial", "record_trials", "pace"):
         value = getattr(options, name, None)
