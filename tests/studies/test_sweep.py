@@ -110,6 +110,57 @@ def test_a_repeated_value_is_refused(texts: str, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+_BERNOULLI = {"model": "bernoulli", "quality": 0.2}
+
+
+@pytest.mark.parametrize(
+    ("earlier", "later", "values"),
+    [
+        ("legitimate.link.quality", "legitimate.link", [{"quality": 0.2}]),
+        ("legitimate.link.quality", "legitimate.link.loss", [_BERNOULLI]),
+        ("legitimate.link.quality", "legitimate", [{"link": {"quality": 0.2}}]),
+    ],
+)
+def test_a_key_that_a_later_one_sets_again_is_refused(
+    earlier: str, later: str, values: list[Any], tmp_path: Path
+) -> None:
+    """The table would show values that had no effect. The other way round, both have one, or nothing is left of the first."""
+    grid: dict[str, list[Any]] = {earlier: [0.5, 0.9], later: values}
+    with pytest.raises(UsageError, match=f"{later} sets {earlier}, too, whose values would have no effect"):
+        sweep_over("eavesdroppers", {}, grid, tmp_path / "out", lambda _: None, Plan())
+    assert not (tmp_path / "out").exists()
+
+
+def test_keys_of_a_table_and_of_an_entry_in_it_can_be_varied_together(tmp_path: Path) -> None:
+    """If the table comes first, its other entries are those of each of its values. A loss and a quality exclude each other."""
+    changes = {"slots": 2, "trials": 2, "expect": []}
+    grid: dict[str, list[Any]] = {
+        "legitimate.link": [{"quality": 0.2}, {"quality": 0.9}],
+        "legitimate.link.corrupt": [0.0, 1.0],
+    }
+    table = sweep_over("eavesdroppers", changes, grid, tmp_path / "out", lambda _: None, Plan(workers=1))
+    assert table["peer"].to_pylist().count("legitimate") == 4
+    other = {"legitimate.link.loss.quality": [0.1], "legitimate.link.quality": [0.2]}
+    for keys in (other, dict(reversed(other.items()))):
+        with pytest.raises(UsageError, match="would have no effect"):
+            sweep_over("eavesdroppers", changes, keys, tmp_path / "no", lambda _: None, Plan())
+
+
+def test_the_values_of_a_sweep_are_set_after_all_changes(tmp_path: Path) -> None:
+    """Also if a change of the same entry came before one of the table around it."""
+    changes = {
+        "slots": 2,
+        "trials": 2,
+        "expect": [],
+        "legitimate.link.quality": 0.5,
+        "legitimate.link": {"quality": 0.7},
+    }
+    grid = {"legitimate.link.quality": [0.0, 1.0]}
+    table = sweep_over("eavesdroppers", changes, grid, tmp_path / "out", lambda _: None, Plan(workers=1))
+    rows = [row for row in table.to_pylist() if row["peer"] == "legitimate"]
+    assert [row["received_fraction"] for row in rows] == [0.0, 1.0]
+
+
 def test_values_of_different_kinds_are_text_in_the_table(evedrop: Evedrop) -> None:
     """A number and a list: the table, plot and page are made, and the values read as TOML."""
     changes = {"slots": 2, "trials": 3, "expect": []}

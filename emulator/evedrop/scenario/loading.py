@@ -258,6 +258,13 @@ def _drop_other_form(table: dict[str, Any], names: list[str]) -> None:
         table.pop(other, None)
 
 
+def undoes(later: str, earlier: str) -> bool:
+    """Whether `set_entry` with one dotted key removes what it has put at another one before."""
+    names, parts = earlier.split("."), later.split(".")
+    other_forms = [[*names[:i], SHORT_FORMS[name]] for i, name in enumerate(names) if name in SHORT_FORMS]
+    return names[: len(parts)] == parts or any(parts[: len(gone)] == gone for gone in other_forms)
+
+
 def _no_such_key(dotted: str, name: str, inner: Any) -> UsageError:
     if isinstance(inner, list):
         return UsageError(f"{dotted}: {name} is not an entry of a list of {len(inner)}; give 0 to {len(inner)}")

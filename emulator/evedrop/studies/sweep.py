@@ -22,7 +22,7 @@ from evedrop.model.metrics import all_metrics, error_column, estimated_metrics, 
 from evedrop.results.folder import disk_errors, private_pictures, private_replacement, write_private
 from evedrop.results.tables import with_strategies
 from evedrop.scenario.application import APPLICATIONS
-from evedrop.scenario.loading import prepared, read, value_of
+from evedrop.scenario.loading import prepared, read, undoes, value_of
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.scenarios import shipped
@@ -193,7 +193,14 @@ def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> 
 def _checked(
     source: str | Path | Scenario, changes: Mapping[str, Any], grid: Grid, plan: Plan
 ) -> list[tuple[Point, Scenario]]:
-    """Every point with its scenario. Raises UsageError for a repeated value, ScenarioError with the mistakes of all points."""
+    """Every point with its scenario.
+
+    Raises UsageError for a repeated value, or a key whose values have no effect, ScenarioError with the mistakes of all points.
+    """
+    for earlier, later in itertools.combinations(grid, 2):
+        if undoes(later, earlier):
+            raise UsageError(f"{later} sets {earlier}, too, whose values would have no effect; vary one of them")
+    others = {key: value for key, value in changes.items() if key not in grid}  # made before those of a point
     for key, values in grid.items():
         stored = Counter((_kind(value), _in_table(value)) for value in values)
         for (_, value), count in stored.items():
@@ -204,7 +211,7 @@ def _checked(
     mistakes: dict[str, None] = {}
     for point in points:
         try:
-            scenario = prepared(source, {**changes, **point}, beyond_horizon=plan.mode.value != "exact")
+            scenario = prepared(source, {**others, **point}, beyond_horizon=plan.mode.value != "exact")
         except ScenarioError as error:
             mistakes.update(dict.fromkeys(error.mistakes))
             continue
