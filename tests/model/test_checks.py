@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.model.checks import as_toml, flag_mistakes, whole_number_mistakes
+from evedrop.model.checks import as_toml, flag_mistakes, is_number, whole_number_mistakes
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.delays import DELAY_MODELS, LONGEST, DelayModel, delay_of
 from evedrop.model.links import LOSS_MODELS, loss_of
@@ -37,6 +37,12 @@ def test_the_example_of_every_class_has_no_mistakes(kind: str, name: str) -> Non
     kind_ = KINDS[kind][name]
     assert kind_.mistakes({}) == []
     assert [kind_.mistakes({entry: value}) for entry, value in kind_.parameters.items()] == [[]] * len(kind_.parameters)
+
+
+def test_a_whole_number_beyond_float64_is_none() -> None:
+    """A file can have one of 4096 bits, and the mathematics cannot use it."""
+    largest = int(sys.float_info.max)
+    assert [is_number(sign * number) for sign in (1, -1) for number in (largest, 10**400)] == [True, False] * 2
 
 
 NUMBER = "expected a number from 0 to 1"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -45,9 +46,9 @@ def as_toml(value: Any) -> str:
 
 
 def is_number(value: Any, least: float = -math.inf, most: float = math.inf) -> bool:
-    """Whether a value is a finite number from `least` to `most`."""
+    """Whether a value is a finite number from `least` to `most`, no whole number beyond those of float64."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return number and least <= value <= most and abs(value) < math.inf
+    return number and least <= value <= most and abs(value) <= sys.float_info.max
 
 
 def expect_slots(*slots: int) -> None:

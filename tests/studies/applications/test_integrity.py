@@ -272,6 +272,15 @@ def test_mistakes_are_named(changes: dict[str, Any], place: str, golden: Golden)
     golden("check", caught.value.mistakes)
 
 
+@pytest.mark.parametrize("place", ["integrity.threshold", "integrity.attack.matrix"])
+def test_a_number_beyond_float64_is_a_mistake(place: str) -> None:
+    """A whole number of a file may have more digits than the detector's arithmetic takes."""
+    value: Any = 10**400 if place.endswith("threshold") else [[10**400]]
+    with pytest.raises(ScenarioError) as caught:
+        load("replay-attack", {"expect": [], "integrity.attack": ATTACK, place: value})
+    assert places_of(caught.value.mistakes) == [place]
+
+
 UNSEEN: dict[str, Any] = {
     "expect": [],
     "process": {
