@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from evedrop import compare, montecarlo
@@ -466,6 +467,22 @@ def test_the_numerical_example_at_slot_sixty(
     )
     assert last(result, "innovation", "smart") == pytest.approx((smart, legitimate), rel=5e-4)
     assert last(result, "innovation", "genie") == pytest.approx((genie, legitimate), rel=5e-4)
+
+
+def test_parameters_may_be_of_numpy() -> None:
+    """As entries of a scenario may be: matrices, numbers and tuples mean what lists and numbers mean."""
+    parameters = {
+        "noise.noise_covariance": np.eye(2),
+        "quantised-schedule.bits": np.int64(4),
+        "innovation.state_probability": np.float32(0.5),
+    }
+    schemes = [key.partition(".")[0] for key in parameters]
+    result = compare(
+        "eavesdroppers", schemes=schemes, adversaries=["naive"], parameters=parameters, trials=2, slots=3, expect=None
+    )
+    given = {scheme: found.parameters for scheme, found in result.schemes.items()}
+    assert given["noise"]["noise_covariance"] == [[1.0, 0.0], [0.0, 1.0]]
+    assert (given["quantised-schedule"]["bits"], given["innovation"]["state_probability"]) == (4, 0.5)
 
 
 def test_the_table_is_a_row_for_each_pair(everything: Everything) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from evedrop import Scenario, compare, design, load_results, montecarlo, run, sweep
+from evedrop import Scenario, compare, cost, design, load_results, montecarlo, run, sweep
 from evedrop.cli.api import RunResults, design_budget, design_policy, design_schedule
 from evedrop.errors import UnknownName, UsageError
 from evedrop.simulate.montecarlo import Plan
@@ -41,6 +41,8 @@ def results() -> RunResults:
         (sweep, [SMALL, "slots"], {}, f"over='slots': {A_GRID}"),
         (sweep, [SMALL, {3: [1, 2]}], {}, A_GRID),
         (montecarlo, [SMALL], {"out": 3}, "out=3: expected the name of a folder"),
+        (montecarlo, [SMALL], {"out": 3, "resume": True}, "out=3: expected the name of a folder"),
+        (cost, ["microgrid"], {"out": 3}, "out=3: expected the name of a folder"),
         (montecarlo, [SMALL], {"out": b"x"}, "out=b'x': expected the name of a folder"),
         (montecarlo, [SMALL], {"out": "x", "overwrite": "no"}, "overwrite='no': expected True or False"),
         (montecarlo, [SMALL], {"workers": "2"}, "workers='2': expected a whole number"),

@@ -75,13 +75,12 @@ def results_of(
         raise UsageError(_NO_FOLDER)
     if out is None:
         folder = Path(tempfile.mkdtemp(prefix="evedrop-"))
-    elif resume:
-        folder = Path(out)
     else:
         path_argument("out", out, "the name of a folder, or None for a temporary one")
         refuse_unless(isinstance(overwrite, bool), "overwrite", overwrite, "True or False")
         folder = Path(out)
-        _clear(folder, overwrite)
+        if not resume:
+            _clear(folder, overwrite)
     kept = out is not None
     try:
         with progress(on_event, total) as emit:
@@ -108,6 +107,8 @@ def place_in(out: str | Path | None, resume: bool) -> Iterator[StudyPlace | None
     """The place of a study that writes a folder only if `out` says so. Raises UsageError for `resume` without a folder."""
     if resume and out is None:
         raise UsageError(_NO_FOLDER)
+    if out is not None:
+        path_argument("out", out, "the name of a folder, or None for none")
     try:
         yield None if out is None else StudyPlace(Path(out), resume)
     except EvedropError as error:
@@ -292,9 +293,10 @@ def compare(
         fits = names is None or (isinstance(names, Iterable) and not isinstance(names, str))
         refuse_unless(fits, name, names, "a list of names or classes")
     table_argument("parameters", parameters, 'a dict such as {"innovation.state_probability": 0.7}')
-    chosen = _named({"schemes": schemes, "adversaries": adversaries}, "compare", scenario, given)
+    asked = {"schemes": schemes, "adversaries": adversaries, "parameters": parameters}
+    chosen = _named(asked, "compare", scenario, given)
     made = scenario_of(scenario, given)
-    matchups = matchups_of(made, chosen.get("schemes"), chosen.get("adversaries"), parameters)
+    matchups = matchups_of(made, chosen.get("schemes"), chosen.get("adversaries"), chosen.get("parameters"))
 
     def compared(folder: Path, emit: OnEvent) -> ComparisonResults:
         comparison = compare_all(matchups, folder, emit, plan_of(plan, workers, scheduler), resume=resume)
