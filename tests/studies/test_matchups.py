@@ -106,6 +106,7 @@ def test_all_wrong_names_are_told_at_once(evedrop: Evedrop) -> None:
         ("--schemes", ""),
         ("--with", "innovation.state_probability"),
         ("--with", "innovation.state_probability=2.0"),
+        ("--schemes", "plain", "--with", "innovation.state_probability=0.7"),
         ("--trials", "0"),
         ("--workers", "0"),
         ("--slots", "5000"),

@@ -174,6 +174,8 @@ def _chosen(
         if name not in entries.get(scheme, ()):
             parts = [f"{scheme}.{entry}" for scheme, available in entries.items() for entry in available]
             mistakes.append(f"{key} is not a parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
+        elif scheme not in chosen[0]:
+            mistakes.append(f"{key}: {scheme} is not among the schemes that are compared; add it, or leave this out")
     if mistakes:
         raise UsageError("\n  ".join(["nothing was compared:", *mistakes]))
     return chosen[0], chosen[1]
