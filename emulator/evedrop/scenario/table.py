@@ -225,7 +225,7 @@ def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
         few = kind == "too_short"
         limit = f"fewer than {context['min_length']}" if few else f"more than {context['max_length']}"
         return f"has {limit} {things}; expected {'at least' if few else 'at most'} that many"
-    expected = _EXPECTED.get(kind, detail["msg"])
+    expected = context["expected"].replace("'", "") if kind == "literal_error" else _EXPECTED.get(kind, detail["msg"])
     return f"is {as_toml(value)}; expected {expected}{example}"
 
 

@@ -110,6 +110,27 @@ def test_a_wrong_event_is_named(name: str, golden: Golden) -> None:
     golden("check", mistakes)
 
 
+@pytest.mark.parametrize(
+    ("event", "mistake"),
+    [
+        (
+            {"at": 5, "kill": "eve", "state": "last"},
+            "event.0.state: is given, but this event does not restart the receiver; give it with restart, or from and to",
+        ),
+        ({"at": 5, "cut": 3}, 'event.0.cut: is 3; expected a receiver, or a list of receivers, such as "legitimate"'),
+        ({"at": 5, "heal": ["eve", 3]}, 'event.0.heal: is ["eve", 3]; expected a receiver, or a list of receivers'),
+        (
+            {"from": 5, "to": 9, "kill": "eve", "state": "first"},
+            'event.0.state: is "first"; expected prior or last, such as "last"',
+        ),
+    ],
+)
+def test_a_wrong_value_is_told_in_plain_words(event: dict[str, Any], mistake: str) -> None:
+    """One mistake for each, of an entry that the file has."""
+    (told,) = mistakes_of(right, event)
+    assert told.startswith(mistake)
+
+
 def test_all_wrong_entries_are_named_at_once() -> None:
     """A line for each, of events among other tables; what only other tables show waits until every table is valid."""
     mistakes = mistakes_of(

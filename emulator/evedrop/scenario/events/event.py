@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from evedrop.errors import NoAnswer
 from evedrop.model.links.loss_model import Fate
@@ -21,7 +21,7 @@ from evedrop.model.registry import CLASS_ERRORS, answered, place_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.streams import MOST_SLOTS
 from evedrop.names import ProcessAction
-from evedrop.scenario.table import Mistake, Table, refuse
+from evedrop.scenario.table import Mistake, Table, expected, refuse
 
 
 class Effect:
@@ -137,7 +137,13 @@ class Return(Effect):
     present = True
 
 
-Names = str | list[str]
+def _names(value: Any) -> Any:
+    if isinstance(value, str) or (isinstance(value, list) and all(isinstance(name, str) for name in value)):
+        return value
+    raise expected("a receiver, or a list of receivers")
+
+
+Names = Annotated[str | list[str], BeforeValidator(_names)]
 Slot = Annotated[int, Field(strict=True, ge=0, le=MOST_SLOTS, examples=[400])]
 
 

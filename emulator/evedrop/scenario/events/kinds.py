@@ -158,6 +158,14 @@ class Kill(EventKind):
     fault = Fault(0, may_have=("state",))
     alone = _ALONE
 
+    def mistakes(self) -> Iterator[Mistake]:
+        """A state without an end, at which the receiver would be restarted."""
+        if self.state is not None and self.to is None:
+            yield (
+                "state",
+                "is given, but this event does not restart the receiver; give it with restart, or from and to",
+            )
+
     def acts(self) -> Iterator[Act]:
         """The kill, and the restart."""
         yield _act(Kill, self, self.first, Leave(Fate.DOWN, ProcessAction.END))
