@@ -345,6 +345,29 @@ def test_a_side_with_overlapping_keys_asks_each_query_once(tmp_path: Path) -> No
         assert kinds(wire)[before:] == [(Kind.QUERY, 0), (Kind.REPLY, 0)] * 3
 
 
+def test_a_wildcard_over_hidden_keys_of_several_links_crosses_once(tmp_path: Path) -> None:
+    """The wire listens to each of them apart, and these expressions have no key in common: a wildcard has, with each."""
+    plan = plan_of(
+        link("robot", "base", keys="a/@config/**", name="a"),
+        link("robot", "base", keys="b/@config/**", name="b"),
+        link("base", "robot", keys="*/@config/**"),
+    )
+    wildcard, written = "*/@config/x", []
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as robot, wire.program("base") as base:
+        offer(base, "a/@config/x", b"x")
+        base.declare_subscriber(wildcard, lambda sample: written.append(sample.payload.to_bytes()))
+        wait_until(lambda: answers(robot, "a/@config/x"), "the queryable is there")
+        wait_until(lambda: robot.put("a/@config/x", b"first") or written, "the subscriber is there")
+        before = len(kinds(wire))
+        assert answers(robot, wildcard, consolidation=zenoh.ConsolidationMode.NONE) == [b"x"]
+        assert kinds(wire)[before:] == [(Kind.QUERY, 0), (Kind.REPLY, 0)]
+        robot.put(wildcard, b"all")
+        robot.put("a/@config/x", b"last")
+        wait_until(lambda: b"last" in written, "the last message crosses")
+        assert written.count(b"all") == 1
+        assert wire.rows_of(wildcard)["kind"].tolist() == [Kind.QUERY, Kind.PUT]
+
+
 def test_the_end_of_the_time_for_replies_is_no_message(tmp_path: Path) -> None:
     """The asker gets Zenoh's error, whatever the link back does; in the journal, the next reply is the first."""
     held: list[zenoh.Query] = []

@@ -119,10 +119,10 @@ def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...
 def expressions_in_turn(
     side: Side, links: Iterable[WireLink]
 ) -> Iterator[tuple[zenoh.KeyExpr, tuple[zenoh.KeyExpr, ...]]]:
-    """`expressions_of` a side, each with those before it that have common keys: a message belongs to the first of them."""
+    """`expressions_of` a side, each with those before it: a message belongs to the first that has keys in common with its own."""
     expressions = [zenoh.KeyExpr(text) for text in expressions_of(side, links)]
     for at, expression in enumerate(expressions):
-        yield expression, tuple(earlier for earlier in expressions[:at] if earlier.intersects(expression))
+        yield expression, tuple(expressions[:at])
 
 
 def side_config(side: Side, largest: int, users: str | None) -> ZenohConfig:
