@@ -114,7 +114,7 @@ class WireJudge:
         try:
             starts = range(1, len(course.begun) + 1)
             rows = {
-                number: [row for table in journal_tables(run.folder, number, True) for row in table.to_pylist()]
+                number: [row for table in journal_tables(run.folder, number) for row in table.to_pylist()]
                 for number in starts
             }
         except UsageError as error:

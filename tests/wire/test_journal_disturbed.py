@@ -111,7 +111,7 @@ def disturbed(folder: Path, faults: DiskFaults, seed: int = 1) -> Iterator[Distu
 
 def messages(folder: Path) -> list[int]:
     """The messages in a journal, after a check that their rows are right."""
-    rows: list[dict[str, Any]] = pa.concat_tables(journal_tables(folder, killed=True)).to_pylist()
+    rows: list[dict[str, Any]] = pa.concat_tables(journal_tables(folder)).to_pylist()
     for row in rows:
         n = row["sequence"]
         assert row["key"] in {f"scan/{n % 7}", f"unknown key {n % ROWS % 7 + 1}"}

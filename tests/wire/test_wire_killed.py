@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -84,6 +85,8 @@ def test_a_wire_without_a_summary_is_summed_up_from_its_journal(
         rows = [*csv.DictReader(text)]
     assert capfd.readouterr().out == f"{len(rows)} messages are in {exported}\n"
     every = pa.concat_tables(journal_tables(folder)).to_pylist()
+    latest = Counter(row["reason"] for table in journal_tables(folder, start=2) for row in table.to_pylist())
+    assert (latest.pop(None), latest) == (delivered, {"loss": LOST, **dropped})
     assert [(row["key"], int(row["n"]), row["fate"], row["reason"] or None) for row in rows] == [
         (row["key"], row["n"], row["fate"], row["reason"]) for row in every
     ]

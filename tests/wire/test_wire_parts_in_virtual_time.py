@@ -141,7 +141,7 @@ def run(
             scheduler.at(killed_at, lambda: process.signal(signal.SIGKILL))
         scheduler.run(200 * HOUR, lambda: not process.task.alive)
         outcome = wire.outcome
-        outcome.journal = pa.concat_tables(journal_tables(wire.folder, killed=killed_at is not None))
+        outcome.journal = pa.concat_tables(journal_tables(wire.folder))
     assert scheduler.errors == []
     outcome.status, outcome.digest, outcome.seconds = process.task.status, scheduler.digest, scheduler.now
     return outcome

@@ -29,12 +29,12 @@ from evedrop.wire.records import PARQUET, UNLINKED, Kind, Records, WireFate, rec
 _LATEST = 1e15  # seconds
 
 
-def journal_tables(folder: Path | str, start: int | None = None, killed: bool = False) -> Iterator[pa.Table]:
+def journal_tables(folder: Path | str, start: int | None = None) -> Iterator[pa.Table]:
     """The journal of a wire's folder in the order of its rows, a table for each part.
 
     The wire may still run, or may have been killed. A journal without messages is one empty table.
 
-    start: only the rows of this start of the wire, from 1; None: the rows of all starts. killed: as for `records_in`.
+    start: only the rows of this start of the wire, from 1; None: the rows of all starts.
 
     Raises UsageError if there is no journal, or a part cannot be read.
     """
@@ -44,14 +44,22 @@ def journal_tables(folder: Path | str, start: int | None = None, killed: bool = 
             f"{folder} is not the folder of a wire: it has no folder {JOURNAL_FOLDER}; give the results folder of a wire"
         )
     names = [name for name in part_names(journal) if start in {None, start_of(name)}]
-    links = WireHistory.read(journal).links  # after the names: a start is in it before its parts are there
+    history = WireHistory.read(journal)  # after the names: a start is in it before its parts are there
+    killed = _state(journal, history) == "killed"
     if not names:
         yield PARQUET.empty_table()
     for name in names:
         try:
-            yield _table(journal, name, links, killed)
+            yield _table(journal, name, history.links, killed)
         except (OSError, pa.ArrowException) as error:
             raise damaged(journal, name, error) from error
+
+
+def _state(journal: Path, history: WireHistory) -> JournalState:
+    """What became of the latest start."""
+    if history.ended:
+        return "ended"
+    return "running" if is_locked(journal) else "killed"
 
 
 def _table(journal: Path, name: str, links: dict[int, list[str]], killed: bool) -> pa.Table:
@@ -102,9 +110,7 @@ class JournalOnDisk:
         self.history = WireHistory.read(folder / JOURNAL_FOLDER)
         self.seconds = 0.0
         """Until the wire ended, was last alive, or heard its last message, as far as these were read."""
-        self.state: JournalState = "ended"
-        if not self.history.ended:
-            self.state = "running" if is_locked(folder / JOURNAL_FOLDER) else "killed"
+        self.state = _state(folder / JOURNAL_FOLDER, self.history)
         self._keys = [""]  # code 0 stands for all keys beyond the limit
         self._codes = {"": 0}
 
@@ -115,7 +121,7 @@ class JournalOnDisk:
     def read(self) -> None:
         """Hand all records to the listeners. Raises UsageError if there is no journal, or it is damaged."""
         self._is_alive_at(last_beat(self._folder / JOURNAL_FOLDER / UNFINISHED))
-        for table in journal_tables(self._folder, self.history.start, killed=self.state == "killed"):
+        for table in journal_tables(self._folder, self.history.start):
             for key in {*_words_of(table["key"])} - {*self._codes}:
                 try:
                     zenoh.KeyExpr(key)

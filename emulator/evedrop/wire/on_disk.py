@@ -81,5 +81,5 @@ def write_wire_report(folder: Path) -> Path:
 
     with results_of_this_version(folder):
         summary = summary_of_wire(folder)
-        journal = partial(journal_tables, folder, summary.start, killed=summary.state == "killed")
+        journal = partial(journal_tables, folder, summary.start)
         return write_page(folder, wire_page(WireSource.of(folder, summary, journal)))
