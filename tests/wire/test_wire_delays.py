@@ -9,18 +9,19 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
+import pytest
 import zenoh
 from zenoh.ext import CacheConfig, HistoryConfig, MissDetectionConfig, RecoveryConfig
 from zenoh.ext import declare_advanced_publisher as advanced_publisher
 from zenoh.ext import declare_advanced_subscriber as advanced_subscriber
 
 from evedrop.wire.journal_reading import journal_tables
-from evedrop.wire.plan import WireEvent
+from evedrop.wire.plan import Side, WireEvent
 from evedrop.wire.records import AGAIN, Kind, WireFate
 from evedrop.wire.steering import WireConductor
 from tests.conftest import wait_until
 from tests.wire.test_publications import reader, ready
-from tests.wire.wire_at_work import LOSSY, PERFECT, at_work, both_ways, is_declared, link, plan_of
+from tests.wire.wire_at_work import ANYWHERE, LOSSY, PERFECT, at_work, both_ways, is_declared, link, plan_of
 
 READY = link("robot", "base", keys="ready", name="ready")
 BLOCK = zenoh.CongestionControl.BLOCK
@@ -146,10 +147,27 @@ def test_events_cut_and_part_links_and_change_them_while_the_wire_runs(tmp_path:
     assert [line.partition(": ")[2] for line in messages][:3] == ["go", "partition robot, base", "heal robot, base"]
 
 
-def test_a_late_reader_gets_the_history_of_an_advanced_publisher(tmp_path: Path) -> None:
-    """The cache of the publisher is asked across the wire."""
-    with at_work(both_ways(), tmp_path) as wire, wire.program("robot", timestamping={"enabled": True}) as robot:
-        publisher = advanced_publisher(robot, "map", cache=CacheConfig(max_samples=3), publisher_detection=True)
+@pytest.mark.parametrize(
+    ("key", "of_links", "of_side"),
+    [
+        ("map", "**", "**"),
+        ("map", "**", "map"),
+        ("map/1", "**", "map/*"),
+        ("map/1", "**", "map/**"),
+        ("map/@config/1", "map/@config/**", "**"),
+    ],
+)
+def test_a_late_reader_gets_the_history_of_an_advanced_publisher(
+    key: str, of_links: str, of_side: str, tmp_path: Path
+) -> None:
+    """The cache of the publisher is asked across the wire, whatever hides the key from `**`, or allows it at its side."""
+    plan = plan_of(
+        link("robot", "base", keys=of_links),
+        link("base", "robot", keys=of_links),
+        sides={"robot": Side("robot", (ANYWHERE,), keys=(of_side,))},
+    )
+    with at_work(plan, tmp_path) as wire, wire.program("robot", timestamping={"enabled": True}) as robot:
+        publisher = advanced_publisher(robot, key, cache=CacheConfig(max_samples=3), publisher_detection=True)
         for n in range(5):
             publisher.put(str(n))
         wait_until(lambda: len(wire.rows) >= 5, "the wire hears")
@@ -157,7 +175,7 @@ def test_a_late_reader_gets_the_history_of_an_advanced_publisher(tmp_path: Path)
             got: list[str] = []
             subscriber: Any = advanced_subscriber(
                 late,
-                "map",
+                key,
                 lambda sample: got.append(sample.payload.to_string()),
                 history=HistoryConfig(detect_late_publishers=True),
             )

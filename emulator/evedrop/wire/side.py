@@ -25,8 +25,8 @@ _REMOTE = zenoh.Locality.REMOTE
 ZenohConfig = dict[str, Any]
 PROBES = "@evedrop/*/*"
 """The keys of messages with which the wire finds out whether sides are joined outside it; `**` does not include them."""
-HIDDEN = ("@ros2_lv/**", "@/*/@ros2_lv/**", "**/@adv/**")
-"""Keys that `**` does not match although programs use them: the graph of ROS 2, and the histories of advanced publishers."""
+_ROS2 = ("@ros2_lv/**", "@/*/@ros2_lv/**")
+"""Keys that `**` does not match although programs use them: the graph of ROS 2."""
 _CONNECT_SECONDS = 10.0
 _ATTEMPTS = 5  # another program may take a port between its choice and its use
 _PORT_0 = re.compile(r":0(?=[?#]|$)")
@@ -104,15 +104,14 @@ def opened(
 
 
 def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...]:
-    """The key expressions under which a wire listens at a side: those that the side allows, and those that `**` hides.
+    """The key expressions under which a wire listens at a side: those that the side allows, and those that wildcards hide.
 
-    links: whose key expressions may name further keys that `**` hides.
+    Among the latter are the histories of all keys. links: whose key expressions may name further keys that `**` hides.
     """
     expressions = list(side.keys)
     if side.keys == ("**",):
-        expressions += [*HIDDEN, *(link.keys for link in links if "@" in link.keys)]
-    else:
-        expressions += [f"{key}/@adv/**" for key in side.keys if key.endswith("**")]
+        expressions += [*_ROS2, *(link.keys for link in links if "@" in link.keys)]
+    expressions += [f"{key}/@adv/**" for key in expressions if key not in _ROS2]
     return tuple(dict.fromkeys(expressions))
 
 
