@@ -100,6 +100,11 @@ def test_warnings(golden: Golden) -> None:
     assert [warning for warning in warnings_of_wire(mixed) if "tls/" in warning] == []
     assert warnings[1] in warnings_of_wire(mixed), "nobody shows a certificate at tcp/"
     assert "certificates required" not in "".join(wire_lines(mixed))
+    copies = {**TO_BASE, "tap": True}
+    for first, second, none in ((copies, TO_BASE, "publication"), (TO_BASE, copies, "key"), (copies, copies, "key")):
+        assert f"link robot-base-2 takes no {none}: robot-base, which" in "".join(
+            warnings_of_wire(plan_of(first, second))
+        )
     back = {"from": "base", "to": "robot"}
     tap = {"from": "robot", "to": "third", "tap": True}
     assert not list(

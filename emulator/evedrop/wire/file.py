@@ -468,7 +468,9 @@ def warnings_of_wire(plan: WirePlan) -> Iterator[str]:
         for before in plan.links[:i]:
             same = (before.source, before.target) == (link.source, link.target)
             if same and before.expression.includes(link.expression):
-                yield f"link {link.name} takes no key: {before.name}, which comes first, takes all of them; move {link.name} up"
+                none = "publication" if before.tap and not link.tap else "key"
+                why = f"{before.name}, which comes first, takes all of them"
+                yield f"link {link.name} takes no {none}: {why}; move {link.name} up"
                 break
     for side in plan.sides.values():
         if not any(side.name in (link.source, link.target) for link in plan.links):
