@@ -334,13 +334,17 @@ def test_the_page_of_a_start_is_not_made_from_the_summary_of_an_earlier_one(
     file.write_text('[side.robot]\n[side.base]\n[[link]]\nfrom = "robot"\nto = "base"\nquality = 0.5\n')
     words = ["wire", str(file), "--out", str(out), "--for", "0.1 s"]
     assert main(words) == 0
+    same = "start it in its folder: the same messages have the same fates, apart from changes by hand."
+    assert same in "".join(checked(out).texts)
     earlier = (out / "summary.json").read_text()
     monkeypatch.setattr(
         "evedrop.wire.scorekeeper.replace_private", lambda *_: (out / "summary.json").write_text(earlier)
     )
     assert main(words) == 0
     assert read(out).start == 1
-    assert "2 in this folder" in checked(out).texts
+    texts = checked(out).texts
+    assert "2 in this folder" in texts
+    assert "start it in its folder: its fates are those of start 1, not of start 2, apart from" in "".join(texts)
 
 
 def test_the_wire_file_travels_with_the_page_without_its_passwords(tmp_path: Path) -> None:

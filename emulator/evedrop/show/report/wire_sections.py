@@ -158,17 +158,23 @@ def _events(of: WireSource) -> Iterator[Markup]:
 
 def _repeat(of: WireSource) -> Iterator[Markup]:
     """The wire file to save, the command that starts it again, and when, where and with which versions it was made."""
+    start = of.summary.start
     if of.travelling:
+        same = (
+            "the same messages have the same fates"
+            if start == 1
+            else f"its fates are those of start 1, not of start {start}"
+        )
         yield made(
             "paragraph",
-            "Save the wire file, and start it in its folder: the same messages have the same fates. Its sides listen on free "
+            f"Save the wire file, and start it in its folder: {same}, apart from changes by hand. Its sides listen on free "
             "ports of this machine: the addresses, users and certificates of this wire do not travel with the page.",
         )
         yield download(WIRE_FILE, of.travelling)
         yield made("code", f"evedrop wire {WIRE_FILE} --out again\nevedrop view again")
     facts = {
         "seed": of.summary.seed,
-        "start": f"{of.summary.start:,} in this folder",
+        "start": f"{start:,} in this folder",
         **circumstances(of.folder / WIRE_SUMMARY_FILE),
         "time": f"{of.summary.seconds:,.1f} s",
         **of.summary.made_with,
