@@ -87,6 +87,16 @@ def test_an_operator_adds_events() -> None:
     assert wire_of(tomllib.loads(resolved_wire(plan))) == plan
 
 
+def test_an_operator_takes_a_delay_away() -> None:
+    """As `radio.link("radio", delay=None)` does, since None is the value of an entry that is not given."""
+    delay = {"model": "constant", "value": 0.2}
+    plan = wire_of({"side": SIDES, "link": [{"name": "radio", "from": "robot", "to": "base", "delay": delay}]})
+    plan, message = with_change(plan, {"link": "radio", "set": {"delay": None}}, 2.0)
+    assert message == 'link radio: delay = { model = "constant", value = 0.0 }'
+    assert moment_at(plan, 2.0).settings["radio"]["delay"] == {**delay, "value": 0.0}
+    assert wire_of(tomllib.loads(resolved_wire(plan))) == plan
+
+
 def test_an_operator_ends_cuts() -> None:
     """Those that last; later ones of the file stay. A cut ended at its very beginning leaves nothing."""
     plan = plan_of({"at": 1, "cut": "scan"}, {"from": 2, "to": 9, "cut": "scan"}, {"from": 20, "to": 21, "cut": "scan"})

@@ -505,6 +505,7 @@ class WireFile(Table):
 
 
 _NEEDS = {"rate": "queue", "queue": "rate", "reorder": "delay"}
+_NO_DELAY: Mapping[str, Any] = {"model": "constant", "value": 0.0}
 
 
 def changed_settings(
@@ -520,4 +521,4 @@ def changed_settings(
     names = ["loss" if name == "quality" else name for name in changes]
     needed = [_NEEDS[name] for name in names if name in _NEEDS]
     names += [name for name in needed if name in made and name not in names and name not in first]
-    return {name: made.get(name, 0.0) for name in names}
+    return {name: made.get(name, _NO_DELAY if name == "delay" else 0.0) for name in names}
