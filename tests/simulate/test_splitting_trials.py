@@ -140,6 +140,16 @@ def test_the_exact_mode_estimates_the_same() -> None:
         assert abs(estimate.z) < SURE, name
 
 
+def test_covariances_are_split_as_covariances_although_a_plant_moves_the_states(tmp_path: Path) -> None:
+    """They are those of the model, as the means beside them are: the inputs are in neither, so both have the theory's mean."""
+    plan = Plan(Mode.COVARIANCE_ONLY, workers=1, rare=True)
+    peers = montecarlo("heated-room", slots=20, trials=40, plan=plan, out=tmp_path / "it").summary["peers"]
+    for name, peer in peers.items():
+        estimate, plain = peer["rare_estimate"], peer["mean_actual_trace_covariance"]
+        assert abs(estimate["mean_error"] - plain) < 0.5 * plain, name
+        assert abs(estimate["z"]) < SURE, name
+
+
 @pytest.mark.long
 def test_flipped_acknowledgements_agree_with_many_trials() -> None:
     """Where packets depend on acknowledgements, in a run that is short enough for plain trials to contain what matters."""

@@ -199,7 +199,7 @@ def simulate(scenario: Scenario, folder: Path, on_event: OnEvent, plan: Plan = P
                     summary = merger.summary(ending(how))
                     if plan.rare and how == "complete":
                         on_progress = progress_counter(on_event, work_of(scenario))
-                        estimates = rare_estimates(scenario, _split_mode(scenario), stop.is_set, on_progress)
+                        estimates = rare_estimates(scenario, _split_mode(scenario, plan.mode), stop.is_set, on_progress)
                         summary = summary.with_rare_estimates(estimates)
                     writer.settle(merger.at, summary)
             if not merger.trials:
@@ -261,9 +261,12 @@ def _shorter(scenario: Scenario) -> str:
     return "" if last is None or last < 0 else f" and give at most {last + 1:,} slots"
 
 
-def _split_mode(scenario: Scenario) -> Mode:
-    """The mode in which trials are split: covariances alone scatter less than errors, where events determine them."""
-    if scenario.of_model:
+def _split_mode(scenario: Scenario, mode: Mode) -> Mode:
+    """The mode in which the trials of a study of this mode are split: covariances scatter less than errors of the same mean.
+
+    With a plant or given states, the means of errors differ from those of the model's covariances.
+    """
+    if mode is Mode.EXACT and scenario.of_model:
         return Mode.EXACT
     try:
         check_mode(scenario, Mode.COVARIANCE_ONLY)

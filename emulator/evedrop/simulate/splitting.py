@@ -10,7 +10,7 @@ Source: docs/mathematics/verdicts.md, splitting; docs/montecarlo.md, rare events
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -231,6 +231,8 @@ def rare_estimates(
     """Receiver → its estimate, by populations that together have at least the scenario's trials; empty once `stopped`."""
     estimates: dict[str, RareEstimate] = {}
     trials, expected = trials_of(scenario), expectations_of(scenario)
+    if mode is Mode.COVARIANCE_ONLY:  # theory's own model is simulated, whatever moves the states
+        expected = {name: replace(expectation, of_model=False) for name, expectation in expected.items()}
     for name in scenario.receivers:
         means = Splitter(scenario, mode, name, trials, stopped, on_progress).estimated()
         if stopped():
