@@ -224,6 +224,14 @@ def test_packets_that_a_receiver_misses_and_those_that_the_end_cuts_off_count_by
         assert abs(fraction - expected) < 5 * np.sqrt(expected * (1 - expected) / total) + 1e-12
 
 
+def test_a_quantile_that_is_met_exactly_is_met() -> None:
+    """Of ten packets three are in time and six a slot late: nine of ten, although 0.3 + 0.6 is less than 0.9 in doubles."""
+    right = linked(1)
+    tally = Tally(right.slots, right.trials)
+    tally.delays = np.array([3, 6, 1, 0, 0, 0])
+    assert link_summary_of(right, "slow", tally).delay_quantiles == {"0.5": 1, "0.9": 1, "0.99": 2}
+
+
 def test_nothing_is_said_of_what_was_not_measured() -> None:
     """Of a run that did not begin."""
     right = linked(1)

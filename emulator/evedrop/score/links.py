@@ -159,7 +159,8 @@ def _with_delays(link: LinkSummary, schedule: LinkSchedule, tally: Tally) -> Lin
         link,
         delays=fractions.tolist(),
         expected_delays=_expected_delays(schedule),
-        delay_quantiles={f"{level:g}": _quantile(np.cumsum(fractions), level) for level in QUANTILES},
+        # Of counts, so that nine packets of ten are not a little less than 0.9.
+        delay_quantiles={f"{level:g}": _quantile(np.cumsum(tally.delays) / total, level) for level in QUANTILES},
     )
 
 
