@@ -175,7 +175,8 @@ class LoopTally:
         slots, *totals = self.of_trials
         alike = bool(slots.all()) and bool((slots == slots[0]).all())
         failed, clipped, other = (standard_error(total / slots) if alike else None for total in totals)
-        errors = [legitimate.standard_errors.get("mean_squared_error"), other if self._offset else None]
+        meaningful = self._offset is not None and not legitimate.infinite_variance
+        errors = [legitimate.standard_errors.get("mean_squared_error"), other if meaningful else None]
         return {
             "failed_fraction": failed,
             "clipped_fraction": clipped,

@@ -6,7 +6,7 @@ Source: docs/metrics.md, filter.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from typing import final
 
@@ -115,8 +115,11 @@ class FilterTally:
         """Whether all trials have the same slots."""
         return all(self.slots * len(values) == self.count for values in self.of_trials.values())
 
-    def summary(self, scenario: Scenario, compared: Mapping[str, AfterStart]) -> FilterSummary:
-        """The summary's entry on the filter; compared: eavesdropper → what `compared` gives."""
+    def summary(self, scenario: Scenario, compared: Mapping[str, AfterStart], heavy: Collection[str]) -> FilterSummary:
+        """The summary's entry on the filter.
+
+        compared: eavesdropper → what `compared` gives; heavy: receivers whose errors have infinite variance.
+        """
         driven = scenario.driven
         assert driven is not None  # noqa: S101 - else there is no tally
         steps = Steps(scenario.process.process, driven)
@@ -131,7 +134,8 @@ class FilterTally:
         mean_trace = mean if self.slots else None
         alike = self._alike
         spread = {
-            name: standard_error(values / self.slots) if alike else None for name, values in self.of_trials.items()
+            name: standard_error(values / self.slots) if alike and name not in heavy else None
+            for name, values in self.of_trials.items()
         }
         error, own_of_trials = spread.pop(SENSOR, None), self.of_trials.get(SENSOR)
         plan = monitor_of(scenario)

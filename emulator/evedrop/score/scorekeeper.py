@@ -220,6 +220,7 @@ def summary_of(
     digests = {name: None if name in ending.accused else entry for name, entry in digests.items()}
     expected = expectations_of(scenario)
     peers = {name: _peer(name, tally, expected[name], digests[name], ending.mode) for name, tally in tallies.items()}
+    heavy = {name for name, peer in peers.items() if peer.infinite_variance}
     legitimate = tallies[LEGITIMATE]
     applications = {} if loop is None else loop.entries(legitimate.trials)
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
@@ -250,7 +251,7 @@ def summary_of(
         controller=None
         if loop is None
         else loop.summary(scenario, peers[LEGITIMATE], run_tally.solve_times, digests[CONTROLLER]),
-        filter=None if run_tally.filter is None else run_tally.filter.summary(scenario, true),
+        filter=None if run_tally.filter is None else run_tally.filter.summary(scenario, true, heavy),
         applications=applications,
         surprising=_surprising(scenario, tallies),
         expectations=expectations,

@@ -146,3 +146,28 @@ def test_an_application_without_trials_has_no_standard_errors() -> None:
     assert entry == {"heating_energy": 2.0}
     assert APPLICATIONS["comfort"].standard_error(entry, ("heating_energy",)) is None
     assert APPLICATIONS["comfort"].text(entry, ("heating_energy",)) == "2"
+
+
+HEAVY: dict[str, Any] = {
+    "process.A": [[1.3, 0.1], [0.0, 0.9]],
+    "encoding.state_probability": 0.2,
+    "legitimate.link.quality": 0.7,
+}
+
+
+@pytest.mark.parametrize("scenario", ["measured", "heated-room"])
+def test_errors_of_infinite_variance_have_no_standard_errors_in_filter_and_controller_either(
+    scenario: str, tmp_path: Path
+) -> None:
+    """Against the true state, and of the estimator that is not in the loop; the filter's own error has one."""
+    summary = montecarlo(scenario, slots=20, trials=10, expect=[], plan=ALONE, out=tmp_path / "it", **HEAVY).summary
+    assert summary["peers"]["legitimate"]["infinite_variance"]
+    if scenario == "measured":
+        errors = summary["filter"][STANDARD_ERRORS]
+        assert errors["mean_squared_error"] > 0.0
+        heavy = {name for name, peer in summary["peers"].items() if peer["infinite_variance"]}
+        assert {name for name, error in errors["mean_true_squared_errors"].items() if error is None} == heavy
+    else:
+        errors = summary["controller"][STANDARD_ERRORS]
+        assert set(errors["mean_squared_errors"].values()) == {None}
+        assert all(error is not None for error in summary["controller"]["mean_squared_errors"].values())
