@@ -12,10 +12,13 @@ from evedrop.model.process import Floats
 from evedrop.scenario.loading import load
 from evedrop.scenario.theory import expectations_of
 from evedrop.score.after_start import AfterStart, BatchMeans, DistanceTally, _limits, leading_states
+from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import verdicts
 from evedrop.score.secrecy import MeanErrors, _larger, sign_of_mean
 from evedrop.score.sums import WINDOWS
 from evedrop.score.verdict import Compared, SecrecyOutcome, times_text, verdict_of, verdict_on, verdict_so_far
+from evedrop.simulate.simulation import Mode
+from evedrop.simulate.trials import TrialBlock, TrialsTask, carry_out
 from tests.score.test_verdict_calibration import tally_of
 
 
@@ -229,10 +232,31 @@ def test_a_distance_counts_the_first_states_of_one_unit() -> None:
     x_hat[:2], x_hat[2:, :, 0] = 100.0, [3.0, 4.0, 50.0, 60.0]
     errors = np.sum((x - x_hat) ** 2, axis=1)
     tally.add_slots(0, errors, errors[:, 0], x, x_hat)
-    assert tally.distance == 5.0
+    assert tally.distance(later=True) == 5.0
+    assert tally.distance(later=False) == pytest.approx(np.sqrt((2 * 20_000 + 2 * 25) / 4))
     unknown = DistanceTally(2, 4, 1)
     unknown.add_slots(0, np.ones((4, 1)), np.ones(4))
-    assert unknown.distance is None
+    assert unknown.distance(later=True) is unknown.distance(later=False) is None
+
+
+@pytest.mark.parametrize(("slots", "chunks"), [(1, ()), (2, ()), (3, ()), (10, ()), (11, ()), (90, (2, 3, 1))])
+def test_distances_and_ratio_are_of_the_same_slots(slots: int, chunks: tuple[int, ...]) -> None:
+    """Where all states have one unit, one follows from the other; also if trials were cut short, after so many chunks."""
+    scenario = load("heated-room", {"slots": slots, "trials": 6, "expect": []})
+    whole = tally_of(scenario)
+    if chunks:
+        tables, parts = scenario.model_dump(mode="json"), list[TrialBlock]()
+        for number, chunk in enumerate(chunks):
+            asked = [False] * (chunk - 1) + [True]
+            task = TrialsTask(tables, 2 * number, 2 * number + 2, Mode.EXACT)
+            parts += carry_out(task, lambda _: None, iter(asked).__next__).blocks
+        whole = RunTally.merged([part.run_tally for part in parts])
+    _, each, _ = verdicts(scenario, whole.tallies, expectations_of(scenario))
+    for compared_ in each:
+        distances = compared_.after_start.distances
+        assert distances is not None
+        if distances[0] > 0.0:
+            assert (distances[1] / distances[0]) ** 2 == pytest.approx(compared_.after_start.ratio)
 
 
 def test_a_single_trial_has_a_verdict_and_its_batches_are_those_of_the_view() -> None:

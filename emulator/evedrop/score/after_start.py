@@ -145,12 +145,13 @@ class BatchMeans:
 
 @final
 class DistanceTally:
-    """How far one receiver's estimates are off in the second half of a run; for a single trial, its errors by batches as well."""
+    """How far one receiver's estimates are off in either half of a run; for a single trial, its errors by batches as well."""
 
     def __init__(self, states: int | None, slots: int, trials: int) -> None:
         """states: how many of the first states a distance counts, None for all; slots: of the whole run."""
-        self._states, self._first = states, slots // 2
-        self._total, self._counted = 0.0, 0
+        self._states, self._slots = states, slots
+        self._first = slots // 2 + 1  # of the second half, as that of a ratio
+        self._sums, self._counts = np.zeros(2), np.zeros(2, np.int64)
         self._batches = BatchMeans() if trials == 1 else None
         self._held: list[tuple[Floats, Floats]] = []
         self._held_slots = self._done = 0
@@ -167,7 +168,8 @@ class DistanceTally:
                 sums = np.full(len(errors), np.nan)
             else:
                 sums = kernels.sums(kernels.squared_errors(x[:, : self._states], x_hat[:, : self._states]))[:, 0]
-        self._counted += errors[max(0, self._first - first) :].size
+        later = errors[max(0, self._first - first) :].size
+        self._counts += errors.size - later, later
         self._held.append((errors[:, 0].copy(), sums))
         self._held_slots += len(errors)
         if self._held_slots >= _HELD:
@@ -178,8 +180,9 @@ class DistanceTally:
         if not self._held:
             return
         errors, sums = (np.concatenate(columns) for columns in zip(*self._held, strict=True))
-        later = sums[max(0, self._first - self._done) :, None]
-        self._total = float(added_in_order(np.array([self._total]), later)[0])
+        earlier = max(0, self._first - self._done)
+        for half, part in enumerate((sums[:earlier], sums[earlier:])):
+            self._sums[half] = added_in_order(self._sums[half : half + 1], part[:, None])[0]
         if self._batches is not None:
             self._batches.add(errors, sums)
         self._done, self._held, self._held_slots = self._done + len(sums), [], 0
@@ -190,19 +193,21 @@ class DistanceTally:
         self._add_held()
         return self._batches
 
-    @property
-    def distance(self) -> float | None:
-        """Root mean square over slots and trials; None before the second half, and where it is not known."""
+    def distance(self, *, later: bool) -> float | None:
+        """Root mean square over trials and slots, if `later` those of the second half; None without slots, or if not known."""
         self._add_held()
-        return math.sqrt(self._total / self._counted) if self._counted and not math.isnan(self._total) else None
+        halves = slice(1 if later else 0, None)
+        total, count = float(self._sums[halves].sum()), int(self._counts[halves].sum())
+        return math.sqrt(total / count) if count and not math.isnan(total) else None
 
     @classmethod
     def merged(cls, parts: Sequence[Self]) -> Self:
         """The tally of disjoint sets of trials, in their order."""
-        whole = cls(parts[0]._states, 2 * parts[0]._first, 0)
+        whole = cls(parts[0]._states, parts[0]._slots, 0)
         for part in parts:
             part._add_held()
-        whole._total, whole._counted = sum(part._total for part in parts), sum(part._counted for part in parts)
+            whole._sums += part._sums
+            whole._counts += part._counts
         whole._batches = parts[0].batches if len(parts) == 1 else None
         return whole
 

@@ -180,7 +180,9 @@ def secrecy(
     ratio, scatter, ratio_from = ratio_of((legitimate, legitimate_theory), other)
     scatter = None if heavy else scatter
     is_rounding = legitimate.done > 0 and other_theory.is_rounding(other.error / max(other.offered, 1), other.done)
-    after_start = _after_start((legitimate, other), means, test, (ratio, scatter), legitimate_theory, is_rounding)
+    after_start = _after_start(
+        (legitimate, other), means, test, (ratio, scatter, ratio_from), legitimate_theory, is_rounding
+    )
     if missing:
         after_start = replace(after_start, why_open=missing.removeprefix(": "))
     compared = Compared(
@@ -297,19 +299,20 @@ def _after_start(
     tallies: tuple[Tally, Tally],
     means: MeanErrors,
     test: SignTestOf,
-    ratio: tuple[float, float | None],
+    ratio: tuple[float, float | None, int | None],
     theory: Expectation,
     is_rounding: bool,
 ) -> AfterStart:
-    """The comparison in the second half of the run; ratio: with its standard error; is_rounding: of the eavesdropper's error."""
+    """The comparison in the second half of the run; ratio: as from `ratio_of`; is_rounding: of the eavesdropper's error."""
     legitimate, other = tallies
     ours, theirs = legitimate.distance, other.distance
     if ours is not None and theirs is not None and ours.batches is not None and theirs.batches is not None:
         return AfterStart.of_batches(ours.batches, theirs.batches, float(np.trace(theory.process.Q)))
+    value, scatter, first = ratio
     distances = None
-    if ours is not None and theirs is not None and ours.distance is not None and theirs.distance is not None:
-        distances = ours.distance, theirs.distance
-    value, scatter = ratio
+    if ours is not None and theirs is not None:  # of the same slots as the ratio
+        far, farther = (tally.distance(later=first != 0) for tally in (ours, theirs))
+        distances = None if far is None or farther is None else (far, farther)
     if legitimate.slots <= WINDOWS:
         return AfterStart(value, None, None, distances, TOO_SHORT)
     if is_rounding:
