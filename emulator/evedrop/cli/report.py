@@ -100,7 +100,10 @@ def _print_details(console: ReportConsole, summary: Summary, replay: str | None)
 def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
     """Print the table of a sweep: one row for each point and peer."""
     console = terminal()
-    console.show(sweep_table(table.to_pylist(), keys))
+    rows = table.to_pylist()
+    console.show(sweep_table(rows, keys))
+    for line in closing.sweep_doubts(rows):
+        console.say(line, _WARNING)
     console.say(f"results: {folder}/sweep.parquet, sweep.png")
 
 

@@ -30,7 +30,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from evedrop import montecarlo
+from evedrop import montecarlo, sweep
 from evedrop.errors import UsageError
 from evedrop.model.metrics.text import ShownNumber, estimate, number_text, percent_text, short_text
 from evedrop.results.reading import Results
@@ -658,6 +658,29 @@ def test_a_sweep_begins_with_the_verdict_at_its_points() -> None:
     ]
     assert begins([[None, secret]], 3) == ["✓ secret at 1", "1 of 3 points were done"]
     assert begins([[None], [None]], 2) == ["All 2 points were done"]
+
+
+def test_a_sweep_has_no_interval_where_rare_events_carry_the_mean(tmp_path: Path) -> None:
+    """Of ten trials none loses the first packet, which carries the legitimate error; the naive one does not depend on it."""
+    grid = {"encoding.state_probability": [0.4, 0.5]}
+    results = sweep("vehicle", grid, trials=10, slots=60, out=tmp_path / "study")
+    rows = {name: [row for row in results.table.to_pylist() if row["peer"] == name] for name in ("legitimate", "naive")}
+    for row in rows["legitimate"]:
+        error = row["mean_squared_error_standard_error"]
+        assert row["theoretical_trace_covariance"] > row["mean_squared_error"] + 20.0 * error
+    lacking = sum(row["rare_fraction"] > 0.1 for row in results.table.to_pylist())
+    page = checked(results.report().parent)
+    said = f"{lacking} of the 8 means are probably too small, and have no z: rare events carry more than 10 % of"
+    assert f"{said} the expected error" in page.texts
+    assert "Mean error with its 95 % interval (none where rare events carry the mean); dotted: theory" in page.texts
+    (axes,) = results.plot().axes
+    containers: list[Any] = axes.containers
+    drawn_bars = {
+        each.get_label(): sum(len(bar) == 2 and np.isfinite(bar).all() for bar in each.lines[2][0].get_segments())
+        for each in containers
+    }
+    assert (drawn_bars["legitimate"], drawn_bars["naive"]) == (0, 2)
+    assert axes.get_ylabel().endswith("no ±: rare events)")
 
 
 def test_a_verdict_of_secret_says_what_theory_promises_beyond_it() -> None:

@@ -257,7 +257,7 @@ def _embedded(svg: str) -> Markup:
     size = re.search(r'viewBox="[^"]*"', svg)
     assert size is not None  # noqa: S101 - matplotlib writes it
     groups = svg[svg.index('<g id="figure_1">') : svg.rindex("</svg>")]
-    groups = re.sub(r'<g id="[\w.]+_\d+">', "<g>", groups).replace("xlink:href=", "href=")
+    groups = re.sub(r'<g id="[\w.]+_\d+"(/?)>', r"<g\1>", groups).replace("xlink:href=", "href=")
     groups = re.sub(r'(<text style="[^"]*)font-family: [^;"]*; ', r"\1", groups)
     # matplotlib 3.10 writes it so
     groups = re.sub(r'(<text style=")font: ([\d.]+px)[^;"]*', r"\1font-size: \2", groups)

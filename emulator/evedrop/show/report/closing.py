@@ -329,6 +329,17 @@ def _loop_line(controller: ControllerSummary) -> str:
     return line
 
 
+def sweep_doubts(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """A line about the means of a sweep that rare events carry, if there are some; rows: as for `sweep_table`."""
+    count = sum((row["rare_fraction"] or 0.0) > RARE_FRACTION for row in rows)
+    if count:
+        are, have = ("are", "have") if count > 1 else ("is", "has")
+        yield (
+            f"{count:,} of the {len(rows):,} means {are} probably too small, and {have} no z: rare events carry more than "
+            f"{fraction_text(RARE_FRACTION)} of the expected error"
+        )
+
+
 def sweep_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> TextTable:
     """A row for each point and receiver; rows: those of sweep.parquet, keys: the entries that the sweep changed."""
     metrics = columns("sweep_column")

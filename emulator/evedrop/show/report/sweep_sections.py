@@ -26,9 +26,10 @@ from evedrop.model.metrics import all_metrics, error_column, shown_metric
 from evedrop.model.process import Floats
 from evedrop.results.tables import swept_strategies
 from evedrop.scenario.loading import value_of
+from evedrop.score.rare_events import sound_errors
 from evedrop.score.verdict import SecrecyOutcome, weakest
 from evedrop.show.report.chart import Curve, LogChart
-from evedrop.show.report.closing import SWEEP_FILE, SWEEP_TABLE, sweep_table
+from evedrop.show.report.closing import SWEEP_FILE, SWEEP_TABLE, sweep_doubts, sweep_table
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.travel import OF_PAGE, SCENARIO, circumstances, download
 from evedrop.show.view.axis_name import axis_name
@@ -138,14 +139,16 @@ def _errors(of: SweepSource) -> Iterator[Markup]:
         words = None
         if not all(isinstance(row[first], (int, float)) for row in rows):
             words = list(dict.fromkeys(str(row[first]) for row in rows))
-        curves = [
+        drawn = [
             _curve(name, of.inks[name], [row for row in rows if row["peer"] == name], first, words)
             for name in dict.fromkeys(row["peer"] for row in rows)
         ]
         label = (
             f"Mean error of every receiver against {first}, with what theory expects. The table has the values. {where}"
         )
-        shown = f"Mean error with its 95 % interval; dotted: theory{'; ' if where else ''}{where}"
+        few = " (none where rare events carry the mean)" if any(gaps for _, gaps in drawn) else ""
+        shown = f"Mean error with its 95 % interval{few}; dotted: theory{'; ' if where else ''}{where}"
+        curves = [curve for curve, _ in drawn]
         yield LogChart(label, _axis(first), shown, curves, words, y_axis="mean error").figure or Markup()
     if len(combinations) > _MOST_CHARTS:
         yield made(
@@ -158,16 +161,24 @@ def _axis(key: str) -> Markup:
     return Markup(escape(axis_name(key)).replace("μ_d", Markup("μ<sub>d</sub>")))  # noqa: S704 - escaped
 
 
-def _curve(name: str, ink: str, rows: Sequence[Mapping[str, Any]], key: str, words: Sequence[str] | None) -> Curve:
-    """The curve of a receiver; words: the names of the places of the axis, if it has names."""
+def _curve(
+    name: str, ink: str, rows: Sequence[Mapping[str, Any]], key: str, words: Sequence[str] | None
+) -> tuple[Curve, bool]:
+    """The curve of a receiver, and whether marks have no bars because rare events carry the mean.
+
+    words: the names of the places of the axis, if it has names.
+    """
     marks, lines = (
         [metric for metric, kind in all_metrics().items() if kind.sweep_picture == way] for way in ("marks", "lines")
     )
     x = [float(row[key]) if words is None else float(words.index(str(row[key]))) for row in rows]
     y, theory = (_values(rows, names) for names in (marks, lines))
+    errors = _values(rows, [error_column(metric) for metric in marks])
+    sound = sound_errors(errors, _values(rows, ["rare_fraction"]) * theory)
     with np.errstate(all="ignore"):
-        factor = np.exp(1.96 * np.nan_to_num(_values(rows, [error_column(metric) for metric in marks])) / y)
-    return Curve(name, ink, np.array(x), y, y / factor, y * factor, theory, bars=True)
+        factor = np.exp(1.96 * np.nan_to_num(sound) / y)
+    curve = Curve(name, ink, np.array(x), y, y / factor, y * factor, theory, bars=True)
+    return curve, bool((np.isnan(sound) & ~np.isnan(errors)).any())
 
 
 def _values(rows: Sequence[Mapping[str, Any]], names: list[str]) -> Floats:
@@ -183,6 +194,7 @@ def _metrics(of: SweepSource) -> Iterator[Markup]:
         "if the sensor measures, against the estimate that it sends, and times the true error: against the true state"
     )
     yield made("table", sweep_table(of.rows, tuple(of.grid)), caption)
+    yield made("sentences", list(sweep_doubts(of.rows)))
 
 
 def _repeat(of: SweepSource) -> Iterator[Markup]:

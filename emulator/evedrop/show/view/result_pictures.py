@@ -244,7 +244,7 @@ _MOST_PANELS = 6
 def draw_sweep(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
     """Draw the table of a sweep over these keys as `path`.png and `path`.pdf: simulated errors as marks, theory as lines.
 
-    Bars at the marks are standard errors.
+    Bars at the marks are standard errors, except where rare events carry more of the mean than these cover.
     """
     save(path, sweep_figure(table, keys))
 
@@ -268,7 +268,7 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
         [name for name, scheme in all_metrics().items() if scheme.sweep_picture == way] for way in ("marks", "lines")
     )
     inks = paper_inks(dict.fromkeys(row["peer"] for row in rows), strategies)
-    combinations = _others(rows, keys)
+    combinations, gaps = _others(rows, keys), False
     if len(combinations) > len(axes):
         words = f"the first {len(axes)} of {len(combinations):,} combinations"
         axes[0].figure.suptitle(words, x=0.02, ha="left", fontsize=9)
@@ -276,13 +276,16 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
         for (peer, ink), mark in zip(inks.items(), itertools.cycle(_MARKS), strict=False):
             mine = [row for row in rows if row["peer"] == peer and tuple(row[key] for key in keys[1:]) == values]
             x = _positions([row[keys[0]] for row in mine])
-            theory = [_height(row, lines) for row in mine]
+            theory = np.array([_height(row, lines) for row in mine])
+            errors = np.array([_height(row, [error_column(name) for name in marks]) for row in mine])
+            sound = sound_errors(errors, np.array([_height(row, ["rare_fraction"]) for row in mine]) * theory)
+            gaps |= bool((np.isnan(sound) & ~np.isnan(errors)).any())
             numbers = all(isinstance(row[keys[0]], (int, float)) for row in mine)
             scheme.plot(x, theory, "-" if numbers else "_", color=ink, linewidth=1.2, markersize=26)
             scheme.errorbar(
                 x,
                 [_height(row, marks) for row in mine],
-                [_height(row, [error_column(name) for name in marks]) for row in mine],
+                sound,
                 fmt=mark,
                 color=ink,
                 markerfacecolor="white",
@@ -300,7 +303,7 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
     limits = [limit for scheme in axes for limit in scheme.get_ylim()]
     for scheme in axes:
         scheme.set_ylim(min(limits), max(limits))
-    axes[0].set_ylabel("mean error ± standard error (lines: theory)")
+    axes[0].set_ylabel("mean error ± standard error (lines: theory" + (";\nno ±: rare events)" if gaps else ")"))
     axes[0].legend()
 
 
