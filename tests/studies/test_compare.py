@@ -21,7 +21,7 @@ from evedrop.results.summary_file import plain
 from evedrop.scenario.loading import load
 from evedrop.score.summary import RareEvents
 from evedrop.score.verdict import SecrecyOutcome
-from evedrop.show.report.comparison import conclusion, verdict
+from evedrop.show.report.comparison import comparison_lines, conclusion, verdict
 from evedrop.show.report.comparison_sections import COMPARISON_SECTIONS, ComparisonSource
 from evedrop.show.report.writing import write_report
 from evedrop.simulate.montecarlo import Plan
@@ -299,6 +299,20 @@ def test_pairs_that_a_short_run_leaves_open_are_not_said_to_need_trials(tmp_path
     assert verdict.verdict is not None
     assert verdict.verdict.reason.startswith("the run has too few slots")
     assert conclusion(result).endswith("; undecided: 1 of 1 pairs")
+
+
+def test_rare_events_that_carry_the_legitimate_error_are_said(tmp_path: Path) -> None:
+    """A lost first packet, which ten trials lack; the adversary is as far off with it as without."""
+    result = compare(
+        "vehicle", schemes=["innovation"], adversaries=["naive"], out=tmp_path, slots=60, trials=10, expect=[]
+    )
+    legitimate, naive = result.schemes["innovation"].legitimate, result.cell("innovation", "naive").eavesdropper
+    assert legitimate.theory is not None
+    assert legitimate.theory.mean > 50.0 * legitimate.mean
+    assert naive is not None
+    assert naive.rare_events is not None
+    assert naive.rare_events.fraction < 0.1
+    assert any(line.endswith(": innovation up to more than 99 %") for line in comparison_lines(result))
 
 
 def test_a_scheme_alone_does_not_dominate(literature: Comparison) -> None:

@@ -180,7 +180,9 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
             "below the expectation of theory"
         )
     fractions = {
-        name: max((_rare_fraction(cell.eavesdropper) for cell in scheme.cells.values()), default=0.0)
+        name: max(
+            map(_rare_fraction, (*scheme.legitimate_errors, *(cell.eavesdropper for cell in scheme.cells.values())))
+        )
         for name, scheme in comparison.schemes.items()
     }
     rare = [
