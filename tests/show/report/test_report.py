@@ -660,6 +660,16 @@ def test_a_sweep_begins_with_the_verdict_at_its_points() -> None:
     assert begins([[None], [None]], 2) == ["All 2 points were done"]
 
 
+def test_true_and_false_are_named_on_the_axis_of_a_sweep(tmp_path: Path) -> None:
+    """And not drawn at 1 and 0, with a line and numbers between them."""
+    results = sweep("vehicle", {"process.singular_noise": [True, False]}, trials=2, slots=12, out=tmp_path / "study")
+    texts = checked(results.report().parent).texts
+    assert {"True", "False"} <= {text.strip() for text in texts[: texts.index("Metrics", texts.index("Errors") + 4)]}
+    (axes,) = results.plot().axes
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["True", "False"]
+    assert all(line.get_linestyle() == "None" for line in axes.get_lines())
+
+
 def test_a_sweep_has_no_interval_where_rare_events_carry_the_mean(tmp_path: Path) -> None:
     """Of ten trials none loses the first packet, which carries the legitimate error; the naive one does not depend on it."""
     grid = {"encoding.state_probability": [0.4, 0.5]}

@@ -32,7 +32,7 @@ from evedrop.show.report.chart import Curve, LogChart
 from evedrop.show.report.closing import SWEEP_FILE, SWEEP_TABLE, sweep_doubts, sweep_table
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.travel import OF_PAGE, SCENARIO, circumstances, download
-from evedrop.show.view.axis_name import axis_name
+from evedrop.show.view.axis_name import are_numbers, axis_name
 from evedrop.show.view.palette import paper_inks
 from evedrop.system.files import Unreadable, text_of
 
@@ -137,7 +137,7 @@ def _errors(of: SweepSource) -> Iterator[Markup]:
         rows = [row for row in of.rows if tuple(row[key] for key in others) == values]
         where = ", ".join(f"{key} = {value}" for key, value in zip(others, values, strict=True))
         words = None
-        if not all(isinstance(row[first], (int, float)) for row in rows):
+        if not are_numbers(row[first] for row in rows):
             words = list(dict.fromkeys(str(row[first]) for row in rows))
         drawn = [
             _curve(name, of.inks[name], [row for row in rows if row["peer"] == name], first, words)

@@ -1,4 +1,4 @@
-"""What the axis of a scenario's entry is called in pictures, and the unit of a squared error."""
+"""What the axis of a scenario's entry is called in pictures, whether it has numbers, and the unit of a squared error."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ def axis_name(key: str) -> str:
     if table == "eavesdroppers" and entry == "link.quality":
         return f"μ of {receiver}: probability that a packet arrives"
     return _NAMES.get(key.removeprefix("legitimate."), key)
+
+
+def are_numbers(values: Iterable[object]) -> bool:
+    """Whether an axis shows values at their places; it names others side by side, such as words, true and false."""
+    return all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
 
 
 def squared_unit(units: Iterable[str]) -> str:

@@ -32,7 +32,7 @@ from evedrop.scenario.recorded import recorded, recorded_noise, recorded_strateg
 from evedrop.score.rare_events import recorded_rare_errors, sound_errors
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.view import journal_column
-from evedrop.show.view.axis_name import as_mathematics, axis_name, squared_unit, without_mathematics
+from evedrop.show.view.axis_name import are_numbers, as_mathematics, axis_name, squared_unit, without_mathematics
 from evedrop.show.view.error_floor import ErrorAxis, error_floor
 from evedrop.show.view.figure_style import drawing, save
 from evedrop.show.view.lanes import EAVESDROPPER
@@ -280,7 +280,7 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
             errors = np.array([_height(row, [error_column(name) for name in marks]) for row in mine])
             sound = sound_errors(errors, np.array([_height(row, ["rare_fraction"]) for row in mine]) * theory)
             gaps |= bool((np.isnan(sound) & ~np.isnan(errors)).any())
-            numbers = all(isinstance(row[keys[0]], (int, float)) for row in mine)
+            numbers = are_numbers(row[keys[0]] for row in mine)
             scheme.plot(x, theory, "-" if numbers else "_", color=ink, linewidth=1.2, markersize=26)
             scheme.errorbar(
                 x,
@@ -314,7 +314,7 @@ def _height(row: dict[str, Any], metrics: list[str]) -> float:
 
 def _positions(values: list[Any]) -> list[float]:
     """Places on the axis: numbers as they are; other values side by side."""
-    if all(isinstance(value, (int, float)) for value in values):
+    if are_numbers(values):
         return [float(value) for value in values]
     return [float(i) for i in range(len(values))]
 
