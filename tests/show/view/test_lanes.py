@@ -184,5 +184,5 @@ def title_of(scene: Scene) -> str:
 def test_the_title_says_which_trials_are_shown() -> None:
     """If there are several."""
     assert title_of(replace(SCENE, title="a", trials=1)) == "**a**"
-    many = "**a** · curves: means of 2,000 trials, everything else: the first of them"
+    many = "**a** · curves of errors and tr P: means of 2,000 trials, everything else: the first of them"
     assert title_of(replace(SCENE, title="a", trials=2000)) == many

@@ -51,7 +51,7 @@ def test_the_view_of_an_interrupted_study_names_the_trials_that_it_has(tmp_path:
     path = replay(folder)
     title = rows(path, "title", "TextDocument:text")
     assert all(text.endswith("means of 3 trials, everything else: the first of them") for (text,) in title.values())
-    assert events(path)[0][-1].endswith("; curves: mean of 3 trials")
+    assert events(path)[0][-1].endswith("; curves of errors and tr P: means of 3 trials")
 
 
 def test_distances_and_ratio_of_the_verdict_so_far_are_of_all_trials(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ class Event(NamedTuple):
 
 def introduction(scene: Scene) -> list[Event]:
     """The first lines: the title of the run, and its receivers."""
-    trials = "" if scene.trials == 1 else f"; curves: mean of {scene.trials} trials"
+    trials = "" if scene.trials == 1 else f"; curves of errors and tr P: means of {scene.trials:,} trials"
     about = [Event(0, "INFO", f"{scene.title}{trials}")]
     for shown in scene.receivers:
         kind = "scheme" if shown.role == "legitimate" else "strategy"

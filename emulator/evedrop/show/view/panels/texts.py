@@ -85,7 +85,8 @@ class VerdictLine(ViewPanel):
     def _texts(self, sentences: Mapping[int, str]) -> Iterator[Column]:
         """The line from some slots on, where it changes; sentences: slot → what is said of secrecy, in order."""
         trials = self.scene.trials
-        of = "" if trials == 1 else f" · curves: means of {trials:,} trials, everything else: the first of them"
+        curves = f"curves of errors and tr P: means of {trials:,} trials"
+        of = "" if trials == 1 else f" · {curves}, everything else: the first of them"
         title = f"**{_plain(self.scene.title)}**{of}"
         new = dict[int, str]()
         for k, sentence in sentences.items():
