@@ -159,10 +159,16 @@ def test_no_pattern_repeats_a_group_possessively() -> None:
         ("[process]", "initial_covariance", "[process]"),
         ('"a b".c = 1 # note', "d", '"a b".c'),
         ("tabs\t= 1", "tabs", "1"),
+        ('link = { loss = { model = "trace" }, delay = { model = 3 } }', "legitimate.link.delay.model", "3"),
+        ("link = { loss = { quality = 3 }, quality = 1 }", "legitimate.link.loss.quality", "3"),
+        ("links = [{ loss = { p = 2 } }, { quality = 3 }]", "eavesdroppers.b.links.1.quality", "3"),
+        ("links = [{ quality = 2 }, { quality = 3 }]", "eavesdroppers.b.links.1.quality", "3"),
+        ("links = [{ quality = 2 }, { quality = 3 }]", "eavesdroppers.b.links.0.quality", "2"),
+        ("quality = 3", "eavesdroppers.links.0.quality", "3"),
     ],
 )
 def test_an_excerpt_marks_the_value_of_an_entry(row: str, name: str, marked: str) -> None:
-    """Or the first key, where the entry has no value of its own in that line."""
+    """In its table, or the first key, where the entry has no value of its own in that line."""
     shown, carets = excerpt(row, 12, name).split("\n")
     assert shown.startswith("   12 | ")
     assert shown[carets.index("^") : carets.rindex("^") + 1] == marked

@@ -63,15 +63,17 @@ def with_line_numbers(text: str, changed: Iterable[str] = ()) -> Iterator[None]:
 
 def _excerpt_of(mistake: str, row: str, line: int) -> str:
     path, _, rest = mistake.partition(":")
-    return excerpt(row, line, path.rpartition(".")[2], key="is not an entry" in rest)
+    return excerpt(row, line, path, key="is not an entry" in rest)
 
 
 _LONGEST = 68  # characters of a line that is shown, so that it fits 80 columns
 _VALUE = r"""("[^"]*"|'[^']*'|\[.*\]|\{.*\}|[^\s,}\]\#]+)"""
+_TABLE = re.compile(r"\{(?:[^{}]++|\{[^{}]*+\})*\}")
+"""A table within a line, which may hold tables."""
 
 
-def excerpt(row: str, line: int, name: str = "", *, key: bool = False, column: int | None = None) -> str:
-    """A line of a file, and below it carets: below the value of the entry `name`, or below its key.
+def excerpt(row: str, line: int, path: str = "", *, key: bool = False, column: int | None = None) -> str:
+    """A line of a file, and below it carets: below the value of the entry with this dotted path, or below its key.
 
     If the line does not have this entry, the carets are below the header or the first key. column: where a single caret is, from
     0, in place of them. Empty if that is too far right to be shown.
@@ -79,7 +81,7 @@ def excerpt(row: str, line: int, name: str = "", *, key: bool = False, column: i
     row = row.removesuffix("\r")
     statement = row.strip() if row.lstrip().startswith("[") else row.partition("=")[0].strip()
     begin, end = row.find(statement), row.find(statement) + len(statement)
-    entry = re.search(rf"(?<![\w-])({re.escape(name)})\s*=\s*{_VALUE}", row) if name else None
+    entry = _entry_in(row, path) if path else None
     if column is not None:
         begin, end = column, column + 1
     elif entry is not None:
@@ -90,6 +92,19 @@ def excerpt(row: str, line: int, name: str = "", *, key: bool = False, column: i
     marks = " " * begin + "^" * max(1, min(end, len(shown)) - begin)
     margin = " " * len(str(line))
     return f"   {line} | {shown}{'…' if len(row) > _LONGEST else ''}\n   {margin} | {marks}"
+
+
+def _entry_in(row: str, path: str) -> re.Match[str] | None:
+    """The key and the value of an entry, of those of its name the one in its table; None if the line does not have it."""
+    *tables, name = path.split(".")
+    begin = 0
+    for table in tables:
+        if (found := re.compile(rf"(?<![\w-]){re.escape(table)}\s*=").search(row, begin)) is not None:
+            begin = found.end()
+        elif table.isdecimal() and len(items := [*_TABLE.finditer(row, begin)]) > int(table):
+            begin = items[int(table)].start()
+    entry = re.compile(rf"(?<![\w-])({re.escape(name)})\s*=\s*{_VALUE}")
+    return entry.search(row, begin) or entry.search(row)
 
 
 def line_of(path: str, lines: Mapping[str, int]) -> int | None:
