@@ -233,6 +233,14 @@ def test_misuse_is_refused(evedrop: Evedrop) -> None:
     assert (done.status, "no/a.tex cannot be written" in done.err) == (2, True), done.err
 
 
+def test_both_tables_in_one_file_are_refused(evedrop: Evedrop) -> None:
+    """One would replace the other, also by another name of the same file."""
+    (evedrop.folder / "there").mkdir()
+    done = evedrop("design", "numerical", "--csv", "same", "--latex", "there/../same")
+    assert (done.status, done.err) == (2, "evedrop: --csv and --latex are both same; give two files\n")
+    assert not (evedrop.folder / "same").exists()
+
+
 def test_python_writes_them_too(tmp_path: Path) -> None:
     """`to_csv` and `to_latex` of results."""
     run = montecarlo("eavesdroppers", trials=4, slots=20, expect=[])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
@@ -39,6 +40,8 @@ def written_tables(options: argparse.Namespace) -> Iterator[None]:
         return
     if getattr(options, "json", False):
         raise UsageError("--csv and --latex write the table that --json replaces; leave --json or these out")
+    if len({file and os.path.realpath(file) for file in files}) == 1:
+        raise UsageError(f"--csv and --latex are both {files[0]}; give two files")
     made = Path("runs") if getattr(options, "out", None) is None else options.out
     for file in files:
         if file is not None and (file.parent.exists() or not file.absolute().is_relative_to(made.absolute())):
