@@ -186,7 +186,7 @@ def _print_cost(reproduction: SecrecyCost) -> None:
             table.add(f"{measure}: {names[ours]} from {names[theirs]}", *_cells(measured, 100.0, " %"))
     console = terminal()
     console.say(
-        f"{reproduction.trials} days, each with {reproduction.scheme} and with plain, over the same link and with the same noise"
+        f"{reproduction.trials} trials, each with {reproduction.scheme} and with plain, over the same link, with the same noise"
     )
     console.show(table)
 
