@@ -137,6 +137,7 @@ def riccati(assignment: Assignment) -> tuple[Floats, Floats]:
     return K, P
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of an input matrix that leaves double precision, which is refused
 def held(assignment: Assignment, entry: Floats | None = None) -> tuple[Floats, Floats]:
     """A and B from one decision to the next, (n, n) and (n, m), with the inputs held in between.
 
