@@ -299,6 +299,24 @@ def peak_of_report(folder: Path) -> int:
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the largest memory of a program alone")
+def test_the_report_of_a_run_in_progress_leaves_out_rows_that_come_meanwhile(
+    study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A table is read twice, to count its rows and for what is in them; the second time it has twice as many slots."""
+    read_pieces, reads = Results.pieces, Counter[str]()
+
+    def growing(self: Results, name: str, *arguments: Any) -> Iterator[pa.Table]:
+        reads[name] += 1
+        for piece in read_pieces(self, name, *arguments):
+            yield piece.filter(pc.field("slot") < 30 * reads[name])
+
+    monkeypatch.setattr(Results, "pieces", growing)
+    source = RunSource.read(study)
+    assert {(*mean.slot.tolist(),) for mean in source.means.values()} == {(*map(float, range(30)),)}
+    assert {(recorded.last, recorded.outcome.taken) for recorded in source.trial.values()} == {(29, 30)}
+    assert reads == {"slots": 2, "trials": 2}
+
+
 def test_the_memory_of_a_report_does_not_grow_with_the_slots(study: Path, tmp_path: Path) -> None:
     """It used to read whole tables, 0.7 kB a slot, and later to keep what it had read of them, some 45 bytes a slot."""
     peaks = []

@@ -70,12 +70,19 @@ class SlotRows:
     def pieces(self, columns: Sequence[str]) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Some columns, as pieces: the receiver, and its next rows. All rows at once if the slots of the table are not in order.
 
+        Without the rows that a run in progress has added since the constructor read the table.
+
         Raises UsageError as the constructor does.
         """
         if self._in_order:
-            yield from self._by_receiver(self._results.pieces(self._table, self._with_keys(columns)))
+            tables = self._results.pieces(self._table, self._with_keys(columns))
         else:  # somebody has written the table again
-            yield from self._by_receiver([self._results.part(self._table, self._with_keys(columns)).sort_by("slot")])
+            tables = iter([self._results.part(self._table, self._with_keys(columns)).sort_by("slot")])
+        left = {name: extent.rows for name, extent in self.extents.items()}
+        for name, rows in self._by_receiver(tables):
+            if left.get(name):
+                yield name, {key: _rows(column, slice(left[name])) for key, column in rows.items()}
+                left[name] = max(0, left[name] - len(rows["slot"]))
 
     def _with_keys(self, columns: Sequence[str]) -> list[str]:
         keys = ["slot", "peer", *([] if self._trial is None else ["trial"])]
@@ -104,7 +111,7 @@ def _column(name: str, column: pa.ChunkedArray) -> Any:
     return np.array([words.setdefault(str(word), len(words)) for word in column.to_pylist()], np.intp), list(words)
 
 
-def _rows(column: Any, some: Flags) -> Any:
+def _rows(column: Any, some: Flags | slice) -> Any:
     """Some rows of a column as `_column` returns it."""
     return (column[0][some], column[1]) if isinstance(column, tuple) else column[some]
 
