@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
 from evedrop import load_results, montecarlo, run
 from evedrop.errors import UsageError
+from evedrop.results.reading import Results
 from evedrop.score.verdict import distance_text, times_text
 from evedrop.show.view.recording import ViewRecording
 from evedrop.show.view.scene_slots import replay
@@ -39,6 +41,23 @@ def test_recording_of_a_study_holds_its_curves(study: Path) -> None:
     above = [k for k in range(SLOTS) if expected[k] > 1e-2]
     assert len(above) > SLOTS / 2
     np.testing.assert_allclose([shown[k][0] for k in above], [0.5 * np.log10(expected[k]) for k in above], rtol=1e-12)
+
+
+def test_the_view_of_a_run_in_progress_shows_the_slots_that_all_its_tables_have(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Although its tables grow while they are read, one after the other."""
+    read_table, reads = Results._table, 0
+
+    def growing(self: Results, name: str, schema_like: Callable[[pa.Schema], pa.Schema]) -> pa.Table:
+        nonlocal reads
+        reads += 1
+        return read_table(self, name, schema_like).filter(pc.field("slot") < 60 + 10 * reads)
+
+    monkeypatch.setattr(Results, "_table", growing)
+    path = replay(study, tmp_path / "r.rrd")
+    assert reads == 2
+    assert max(rows(path, "error/naive", "Scalars:scalars")) == 69
 
 
 def test_the_view_of_an_interrupted_study_names_the_trials_that_it_has(tmp_path: Path) -> None:

@@ -284,13 +284,15 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     looked_at = recorded(folder)
     scenario = looked_at.scenario
     path = folder / "recording.rrd" if path is None else path
-    peers = {name: _peer(results, name) for name in scenario.receivers}
-    sensor = _sensor(results, scenario.receivers[0])
+    # Each table once, and the trials first: those of a run in progress grow, and later ones have at least the same slots.
+    trials, slots, inputs = results.trials, results.slots, results.inputs
+    peers = {name: _peer(folder, trials, slots, name) for name in scenario.receivers}
+    sensor = _sensor(trials, inputs, scenario.receivers[0])
     x = sensor.x[:, :, 0]
     if not len(x):
         raise UsageError(f"{folder} has no recorded trial to show; run it again, for example in the exact mode")
     _check_shapes(folder, len(scenario.process.A), x, peers)
-    trial = ShownTrial(scenario, _first_trial_of(results), looked_at.unknown_links)
+    trial = ShownTrial(scenario, int(pc.min(trials["trial"]).as_py()), looked_at.unknown_links)
     if trial.loop_values is not None and (sensor.u is None or len(sensor.u) != len(x)):
         raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
     try:
@@ -302,7 +304,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
                 unfinished,
                 words=looked_at.words,
                 unknown_links=looked_at.unknown_links,
-                trials=pc.max(results.slots["trials"]).as_py(),  # an interrupted study has fewer than its scenario
+                trials=pc.max(slots["trials"]).as_py(),  # an interrupted study has fewer than its scenario
             )
             with closing(recording):
                 _record(recording, results, sensor, peers, trial)
@@ -339,30 +341,24 @@ def _check_shapes(folder: Path, n: int, x: Floats, peers: Mapping[str, PeerSlots
             raise UsageError(f"{folder}: its tables do not have the same slots of {name}; run the scenario again")
 
 
-def _first_trial_of(results: Results) -> int:
-    """The number of the first recorded trial; there is one."""
-    return int(pc.min(results.trials["trial"]).as_py())
-
-
-def _first_trial(results: Results, name: str) -> pa.Table:
+def _first_trial(trials: pa.Table, name: str) -> pa.Table:
     """The rows of a receiver's first recorded trial, slot by slot."""
-    rows = results.trials.filter(pc.field("peer") == name)
+    rows = trials.filter(pc.field("peer") == name)
     if rows.num_rows:
         rows = rows.filter(pc.field("trial") == pc.min(rows["trial"]))
     return rows.sort_by("slot")
 
 
-def _sensor(results: Results, name: str) -> SensorSlots:
+def _sensor(trials: pa.Table, inputs: pa.Table | None, name: str) -> SensorSlots:
     """The sensor in the first recorded trial, with states in absolute values; name: any receiver."""
-    rows = _first_trial(results, name)
+    rows = _first_trial(trials, name)
     words = rows["sent"].cast(pa.string()).to_pylist()
     nu = np.array([word == INNOVATION for word in words], np.bool_)[:, None]
     sent = np.array([word != NOTHING for word in words], np.bool_)[:, None]
     sensor = SensorSlots(0, _matrix(rows["x"])[..., None], nu, sent)
-    inputs = results.inputs
     if inputs is None or not inputs.num_rows:
         return sensor
-    inputs = inputs.filter(pc.field("trial") == pc.min(inputs["trial"])).sort_by("slot")
+    inputs = inputs.filter(pc.field("trial") == pc.min(inputs["trial"])).sort_by("slot").slice(0, rows.num_rows)
     monitored = "statistic" in inputs.schema.names
     return replace(
         sensor,
@@ -378,17 +374,15 @@ def _sums(receiver: ReceiverSlots) -> Floats:
     return receiver.trace
 
 
-def _peer(results: Results, name: str) -> PeerSlots:
-    rows = _first_trial(results, name)
-    means = results.slots.filter(pc.field("peer") == name).sort_by("slot").slice(0, rows.num_rows)
+def _peer(folder: Path, trials: pa.Table, slots: pa.Table, name: str) -> PeerSlots:
+    rows = _first_trial(trials, name)
+    means = slots.filter(pc.field("peer") == name).sort_by("slot").slice(0, rows.num_rows)
     x_hat, P = _matrix(rows["x_hat"]), _matrix(rows["P"])
     n = x_hat.shape[1] if x_hat.ndim == 2 else 0
     words = rows["action"].cast(pa.string()).to_pylist()
     unknown = sorted(set(words) - ACTION_OF.keys())
     if unknown:
-        raise UsageError(
-            f"{results.folder}: trials.parquet has the unknown action {unknown[0]}; run the scenario again"
-        )
+        raise UsageError(f"{folder}: trials.parquet has the unknown action {unknown[0]}; run the scenario again")
     return PeerSlots(
         0,
         x_hat=x_hat,
