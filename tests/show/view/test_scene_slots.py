@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from evedrop import load_results, montecarlo, run
+from evedrop.cli.main import status_of
 from evedrop.errors import UsageError
 from evedrop.results.reading import Results
 from evedrop.score.verdict import distance_text, times_text
@@ -58,6 +59,20 @@ def test_the_view_of_a_run_in_progress_shows_the_slots_that_all_its_tables_have(
     path = replay(study, tmp_path / "r.rrd")
     assert reads == 2
     assert max(rows(path, "error/naive", "Scalars:scalars")) == 69
+
+
+@pytest.mark.parametrize("wanted", [("--picture", "p.png"), ("--video", "v.gif")], ids=["picture", "video"])
+def test_a_slot_is_chosen_before_the_recording_that_must_have_it(
+    wanted: tuple[str, str], study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run in progress has more slots after its recording was made, of which none may be drawn."""
+    folder, calls = shutil.copytree(study, tmp_path / "run", ignore=shutil.ignore_patterns("*.rrd")), list[str]()
+    monkeypatch.setattr("evedrop.show.view.telling_slot.telling_slot", lambda _: calls.append("slot"))
+    monkeypatch.setattr("evedrop.show.view.scene_slots.replay", lambda *_: calls.append("recording"))
+    monkeypatch.setattr("evedrop.show.view.picture.picture_apart", lambda *_: [])
+    monkeypatch.setattr("evedrop.show.view.video.video_apart", lambda *_: [])
+    assert status_of(["view", str(folder), wanted[0], str(tmp_path / wanted[1])]) == 0
+    assert calls == ["slot", "recording"]
 
 
 def test_the_view_of_an_interrupted_study_names_the_trials_that_it_has(tmp_path: Path) -> None:

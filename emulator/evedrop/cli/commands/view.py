@@ -121,6 +121,9 @@ def view(options: argparse.Namespace) -> int:
     if results is not None:
         print(f"evedrop: {results.remark}", file=sys.stderr)
     with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
+        # Chosen first: a recording that is then made of a run in progress has these slots, and perhaps more.
+        slots: Sequence[int] = () if options.video is None else _slots_of(options)
+        slot = _chosen_slot(options.run) if options.picture is not None and options.slot is None else options.slot
         recording = options.run / "recording.rrd"
         if results is not None or not recording.is_file():
             from evedrop.show.view.scene_slots import replay
@@ -129,13 +132,12 @@ def view(options: argparse.Namespace) -> int:
         elif not recording.is_file():
             recording = replay(options.run)
         if options.video is not None:
-            return _film(recording, options, _slots_of(options))
+            return _film(recording, options, slots)
         if options.picture is None:
             _hold("run", open_run(options.run, options.view, web_address, recording))
             return 0
         from evedrop.show.view.picture import SIZE, picture_apart
 
-        slot = _chosen_slot(options.run) if options.slot is None else options.slot
         for complaint in picture_apart(recording, options.picture, slot, options.size or SIZE, options.panel):
             print(complaint, file=sys.stderr)
     return 0
