@@ -19,13 +19,18 @@ from evedrop.cli.api import montecarlo, run
 from evedrop.model.metrics.metric import ScoredSlots
 from evedrop.model.receiver import Action
 from evedrop.results.reading import Results
-from evedrop.scenario.loading import load
+from evedrop.scenario.loading import load, with_event
+from evedrop.scenario.theory import theoretical_traces_of
 from evedrop.score.expectations_held import Evidence
+from evedrop.score.leak import HeardBitsStream
+from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.secrecy import Claim
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary
 from evedrop.score.sums import Tally
 from evedrop.score.watched_tally import SYNCHRONISED, WatchedQuantity, WatchedTally
-from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.montecarlo import Merger, Plan
+from evedrop.simulate.simulation import Mode, Simulation
+from evedrop.simulate.trials import _empty_block, _score, carry_out, tasks_of
 from tests.conftest import Evedrop
 
 SLOTS, TRIALS, FIRST = 90, 12, 30
@@ -278,3 +283,23 @@ def test_one_trial_of_a_study_can_be_watched_whatever_was_expected(evedrop: Eved
     line = next(line for line in done.out.splitlines() if "watch it live: " in line)
     again = evedrop("check", "study", *shlex.split(line.partition("run study ")[2])[2:4])
     assert again.status == 0
+
+
+def test_a_change_by_the_operator_restarts_the_wait_for_a_synchronised_receiver() -> None:
+    """As the same event in the file does: the first state from its slot on counts, and the run goes on."""
+    scenario = load("eavesdroppers", {"slots": 60, "trials": 3, "expect": [{"synchronised": "legitimate", "by": 50}]})
+    changed = with_event(scenario, {"link": "legitimate", "set": {"quality": 0.8}}, 30)
+    (task,) = tasks_of(changed, Mode.EXACT, 1)
+    expected = theoretical_traces_of(scenario)
+    block, keeper = _empty_block(scenario, task, 0, expected, HeardBitsStream(scenario))
+    for chunk in Simulation(changed, range(3), stops=[30]).chunks():
+        if chunk.first == 30:
+            keeper.amend(changed)
+        assert chunk.slots is not None
+        _score(block, keeper, slice(0, 3), chunk, chunk.slots)
+    (steered,) = summary_of(changed, keeper.run_tally, dict.fromkeys(changed.digested), RunOutcome(1.0)).expectations
+    whole = Merger.of(changed, Mode.EXACT, [carry_out(task, lambda _: None, lambda: False)])
+    (in_file,) = whole.summary(RunOutcome(1.0)).expectations
+    assert (steered.held, steered.value) == (in_file.held, in_file.value)
+    assert isinstance(steered.value, int)
+    assert steered.value >= 30

@@ -42,6 +42,7 @@ from evedrop.score.slots import Slots
 from evedrop.score.summary import PeerSummary, SecrecySummary, Summary, SurprisingTrial, Verification
 from evedrop.score.sums import LEVELS, SlotSums, Tally, quantile_of, slot_sums, squared_errors, trial_means
 from evedrop.score.verdict import Compared, Verdict, verdict_of
+from evedrop.score.watched_tally import watches_of
 
 _ENOUGH_TO_SURPRISE = 10  # trials
 
@@ -79,6 +80,9 @@ class Scorekeeper:
 
     def amend(self, scenario: Scenario) -> None:
         """Expect what another scenario lets expect, which is the same for the slots so far. Raises NoAnswer."""
+        for name, watches in watches_of(scenario).items():  # an event restarts the wait for a synchronised receiver
+            tally = self.run_tally.tallies[name]
+            tally.watched.watch(watches, tally.trials)
         theory = _theory_of(scenario)
         for stream in theory.values():
             stream.next_traces(self._slots)

@@ -181,7 +181,14 @@ class WatchedTally:
     """Keeps the tallies of these quantities over R trials."""
 
     def __init__(self, watches: Iterable[WatchedQuantity], trials: int) -> None:
-        self._tallies = {watch: _tally(watch.metric, trials) for watch in watches}
+        self._tallies: dict[WatchedQuantity, MetricTally] = {}
+        self.watch(watches, trials)
+
+    def watch(self, watches: Iterable[WatchedQuantity], trials: int) -> None:
+        """Keep these quantities, too, whose first slots have not been added yet."""
+        for watch in watches:
+            if watch not in self._tallies:
+                self._tallies[watch] = _tally(watch.metric, trials)
 
     def add_slots(self, slots: ScoredSlots) -> None:
         """Add the next slots."""
