@@ -14,11 +14,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.live.launch.gathering import Gathered, Journals, Recorded, Statistics
+from evedrop.live.launch.gathering import Gathered, Journals, Recorded, Statistics, _events
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
 from evedrop.results.writer import ResultsWriter
 from evedrop.scenario.loading import load
+from evedrop.scenario.progress_events import RunEvent
+from evedrop.score.run_tally import RunTally
+from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.slots import Slots
 from evedrop.score.sums import slot_sums, squared_errors
 from tests.examples import examples
@@ -173,3 +176,13 @@ def test_a_shard_that_came_to_less_leaves_the_others_as_they_are(tmp_path: Path,
         assert row["delivered_mask"] == np.packbits(flags, bitorder="little").tobytes()
     trials = tables["trials"].to_pylist()
     assert len(trials) == len(NAMES) * (4 * SLOTS + here)
+
+
+def test_a_run_has_the_events_of_the_shard_that_came_farthest() -> None:
+    """In their order, and each as often as the scenario has it: one may have two notes of the same words in a slot."""
+    note = RunEvent(3, "look", "scenario")
+    events = [note, RunEvent(3, "cut smart", "scenario"), note, RunEvent(9, "heal smart", "scenario")]
+    nothing = summary_of(SCENARIO, RunTally.nothing(SCENARIO, 1), dict.fromkeys(SCENARIO.digested), RunOutcome(1.0))
+    parts = {number: replace(nothing, events=events[:count]) for number, count in ((1, 2), (2, 4), (3, 0))}
+    assert _events(parts) == events
+    assert not _events({})

@@ -191,10 +191,9 @@ def _age_of_metrics(shards: Sequence[Shard], scores: Sequence[RunTally], summari
     return as_of(", ".join(earlier)) if earlier else ""
 
 
-def _events(summaries: Mapping[int, Summary]) -> list[RunEvent]:
-    """The events of all shards: each once, in order of slots."""
-    events = dict.fromkeys(event for summary in summaries.values() for event in summary.events)
-    return sorted(events, key=lambda happening: happening.slot)
+def _events(summaries: Mapping[int, Summary]) -> Sequence[RunEvent]:
+    """The events of the shard that came farthest: all have the scenario's, in the same order."""
+    return max((summary.events for summary in summaries.values()), key=len, default=())
 
 
 def _outages(summaries: Mapping[int, Summary]) -> list[ConnectionOutage]:
