@@ -24,3 +24,21 @@ def test_only_signals_that_interrupt_end_a_process(number: signal.Signals) -> No
     words = [sys.executable, "-c", PROGRAM, str(int(number))]
     done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (INTERRUPTED, "[1]\n", "")
+
+
+NESTED = (
+    "import signal\nfrom evedrop.system.signals import stop_on_signals\n"
+    "with stop_on_signals() as outer:\n"
+    "    with stop_on_signals() as inner:\n"
+    "        signal.raise_signal(signal.SIGTERM)\n"
+    "        assert inner.wait(30.0)\n"
+    "    print(outer.wait(30.0))\n"
+    "with stop_on_signals() as later:\n"
+    "    print(later.is_set())"
+)
+
+
+def test_a_signal_that_comes_as_an_inner_block_ends_is_not_lost() -> None:
+    """`evedrop test` starts no further scenario or seed, even if the one that goes on ends by itself and says nothing."""
+    done = subprocess.run([sys.executable, "-c", NESTED], capture_output=True, text=True, timeout=100, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "True\nFalse\n", "")

@@ -56,12 +56,23 @@ def heed_signals() -> None:
 
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C, SIGTERM and SIGHUP set while the block runs; has no effect outside the main thread."""
+    """An event that Ctrl-C, SIGTERM and SIGHUP set while the block runs; has no effect outside the main thread.
+
+    They set that of such a block around it, too: the inner one may be about to end by itself.
+    """
     import threading  # noqa: PLC0415 - the handlers come first
 
     stop = threading.Event()
-    # By a thread: the main thread may hold the lock of the event right now, and would wait for itself.
-    with _handled(lambda: _thread.start_new_thread(stop.set, ())):
+    around = {signal.getsignal(number) for number in heeded()}
+
+    def interrupt() -> None:
+        # By a thread: the main thread may hold the lock of the event right now, and would wait for itself.
+        _thread.start_new_thread(stop.set, ())
+        for handler in around:
+            if isinstance(handler, _Handler) and handler.stops:
+                handler.interrupt()
+
+    with _handled(interrupt, stops=True):
         yield stop
 
 
@@ -163,18 +174,24 @@ def _ignore(_number: int, _frame: FrameType | None) -> None:
     """The handler of further signals."""
 
 
+class _Handler:
+    """Calls a function upon the first signal; stops: whether it sets an event, which does no harm twice."""
+
+    def __init__(self, interrupt: Callable[[], object], stops: bool) -> None:
+        self.interrupt, self.stops = interrupt, stops
+
+    def __call__(self, _number: int, _frame: FrameType | None) -> None:
+        for number in heeded():  # by a function: Python reports a signal that is under way to SIG_IGN as an error
+            signal.signal(number, _ignore)
+        self.interrupt()
+
+
 @contextmanager
-def _handled(interrupt: Callable[[], object]) -> Iterator[None]:
+def _handled(interrupt: Callable[[], object], stops: bool = False) -> Iterator[None]:
     if not _in_main_thread():
         yield
         return
-
-    def handler(_number: int, _frame: FrameType | None) -> None:
-        for number in heeded():  # by a function: Python reports a signal that is under way to SIG_IGN as an error
-            signal.signal(number, _ignore)
-        interrupt()
-
-    with _handled_by(handler):
+    with _handled_by(_Handler(interrupt, stops)):
         yield
 
 
