@@ -319,3 +319,10 @@ def test_what_is_no_toml_is_said_with_its_place(tmp_path: Path) -> None:
     file.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UsageError, match="UTF-8"):
         load(file)
+
+
+def test_a_change_within_another_one_leaves_that_as_it_was_given() -> None:
+    """A study makes the same changes for many scenarios."""
+    link: dict[str, Any] = {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.5}}
+    load("vehicle", {"legitimate.link": link, "legitimate.link.loss.p": 0.2})
+    assert link == {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.5}}

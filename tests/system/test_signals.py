@@ -33,6 +33,8 @@ NESTED = (
     "        signal.raise_signal(signal.SIGTERM)\n"
     "        assert inner.wait(30.0)\n"
     "    print(outer.wait(30.0))\n"
+    "    with stop_on_signals() as next:\n"
+    "        print(next.is_set())\n"
     "with stop_on_signals() as later:\n"
     "    print(later.is_set())"
 )
@@ -41,4 +43,4 @@ NESTED = (
 def test_a_signal_that_comes_as_an_inner_block_ends_is_not_lost() -> None:
     """`evedrop test` starts no further scenario or seed, even if the one that goes on ends by itself and says nothing."""
     done = subprocess.run([sys.executable, "-c", NESTED], capture_output=True, text=True, timeout=100, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "True\nFalse\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "True\nTrue\nFalse\n", "")

@@ -237,7 +237,7 @@ def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
     inner: Any = tables
     for i, name in enumerate(names):
         last = i == len(names) - 1
-        new = value if last else [] if names[i + 1] == "0" else {}
+        new = _copied(value) if last else [] if names[i + 1] == "0" else {}
         if isinstance(inner, dict) and name:
             _drop_other_form(inner, names[: i + 1])
             if last or name not in inner:
@@ -249,6 +249,13 @@ def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
             inner = inner[int(name)]
         else:
             raise _no_such_key(dotted, name, inner)
+
+
+def _copied(value: Any) -> Any:
+    """A value whose tables and lists later changes may change: it may be set in other tables, too."""
+    if isinstance(value, dict):
+        return {name: _copied(entry) for name, entry in value.items()}
+    return [_copied(entry) for entry in value] if isinstance(value, list) else value
 
 
 def _drop_other_form(table: dict[str, Any], names: list[str]) -> None:

@@ -85,10 +85,10 @@ def play_seeds(
 
     place: the scenario, as it was given; trials: their number, if it was given. Raises Interrupted on Ctrl-C.
     """
-    reference = in_memory(scenario, folder)
     program: Program = pkgutil.resolve_name(simulation.program)
     failed: list[PlayedCase] = []
     with stop_on_signals() as stop:
+        reference = in_memory(scenario, folder)
 
         def play(case: SimulatedCase, reference: RunReference | None = None) -> PlayedCase:
             if stop.is_set():

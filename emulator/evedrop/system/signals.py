@@ -58,19 +58,22 @@ def heed_signals() -> None:
 def stop_on_signals() -> Iterator[threading.Event]:
     """An event that Ctrl-C, SIGTERM and SIGHUP set while the block runs; has no effect outside the main thread.
 
-    They set that of such a block around it, too: the inner one may be about to end by itself.
+    They set that of such a block around it, too: the inner one may be about to end by itself. A block that begins inside such a
+    block after the signal has its event set.
     """
     import threading  # noqa: PLC0415 - the handlers come first
 
     stop = threading.Event()
-    around = {signal.getsignal(number) for number in heeded()}
+    handlers = map(signal.getsignal, heeded())
+    around = [handler for handler in handlers if isinstance(handler, _Handler) and handler.stops]
+    if any(handler.called for handler in around):
+        stop.set()
 
     def interrupt() -> None:
         # By a thread: the main thread may hold the lock of the event right now, and would wait for itself.
         _thread.start_new_thread(stop.set, ())
         for handler in around:
-            if isinstance(handler, _Handler) and handler.stops:
-                handler.interrupt()
+            handler.call()
 
     with _handled(interrupt, stops=True):
         yield stop
@@ -171,19 +174,24 @@ def _in_main_thread() -> bool:
 
 
 def _ignore(_number: int, _frame: FrameType | None) -> None:
-    """The handler of further signals."""
+    """The handler where signals have woken a thread already."""
 
 
 class _Handler:
-    """Calls a function upon the first signal; stops: whether it sets an event, which does no harm twice."""
+    """Calls a function upon the first signal, and ignores further ones; stops: whether it sets an event."""
 
     def __init__(self, interrupt: Callable[[], object], stops: bool) -> None:
-        self.interrupt, self.stops = interrupt, stops
+        self._interrupt, self.stops = interrupt, stops
+        self.called = False
+
+    def call(self) -> None:
+        """Call the function, unless it has been called."""
+        if not self.called:
+            self.called = True
+            self._interrupt()
 
     def __call__(self, _number: int, _frame: FrameType | None) -> None:
-        for number in heeded():  # by a function: Python reports a signal that is under way to SIG_IGN as an error
-            signal.signal(number, _ignore)
-        self.interrupt()
+        self.call()
 
 
 @contextmanager
