@@ -353,8 +353,9 @@ def _of_rounds(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
 def _of_operators(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
     """Whether operators get their answers soon, if nothing else happens to the run."""
     if all(isinstance(fault, OperatorCommand) for fault in struck):
+        most = _ANSWERED_SECONDS + _ANSWERED_SLOTS * case.scenario.pace
+        most += 0.0 if case.program is None else case.program.seconds(case.scenario)  # a step waits for its states
         for words, seconds in run.typed:
-            most = _ANSWERED_SECONDS + _ANSWERED_SLOTS * case.scenario.pace
             if seconds > most:
                 yield f"{words} is answered after {seconds:.1f} s, and not after {most:.1f} s at most"
 
