@@ -120,7 +120,7 @@ def test_a_picture_of_a_panel_has_no_frame(panel: str, simulated: Callable[..., 
 def test_a_panel_that_the_recording_lacks_is_refused(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
     """With the panels that it has, which docs/view.md lists, and a hint; no file appears."""
     rrd = recorded(simulated(60), tmp_path / "r.rrd")
-    with skipped_without_driver(), pytest.raises(UsageError, match="did you mean smart") as told:
+    with pytest.raises(UsageError, match="did you mean smart") as told, skipped_without_driver():
         picture_apart(rrd, tmp_path / "r.png", panel="smurt")
     names = str(told.value).partition("; give ")[2].partition(";")[0].replace(" or ", ", ").split(", ")
     page = (Path(__file__).parents[3] / "docs" / "view.md").read_text(encoding="utf-8")
