@@ -102,8 +102,9 @@ def misses(
     for_good = [fault for fault in struck if fault.seconds is None]
     stopped = {(part_of(fault.target), host_of(fault.target)) for fault in for_good if isinstance(fault, StopProcess)}
     frozen = {host_of(fault.target) for fault in for_good if isinstance(fault, FreezeSsh)}
-    # A program that never hears that the connection has ended resumes nobody.
-    untold = {host for part, host in stopped if part == PROGRAM and (host in frozen or (SESSION, host) in stopped)}
+    # A suspended program resumes nobody. Its launcher resumes it, or the connection's end, if nothing keeps these from it.
+    mute = {(SESSION, host) for host in frozen} | stopped
+    untold = {host for part, host in stopped if part == PROGRAM and {(SESSION, host), (LAUNCHER, "")} & mute}
     deaf = {host_of(name) for name in unheard} - {""} | untold
     broken = [f"{name} is left" for name in run.left if name not in unheard and host_of(name) not in deaf]
     broken += [f"{thread}: {type(error).__name__}: {error}" for thread, error in run.errors]
