@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats, Process
@@ -18,6 +19,7 @@ from evedrop.model.staircase import is_singular
 from evedrop.model.theory.closed_forms import ClosedForm, ReceiverConditions, reference_covariances, reference_limit
 from evedrop.model.theory.covariances import NOBODY, Outcomes, has_infinite_variance, limit_trace, traces_of_slots
 
+Counts = NDArray[np.int64]
 _APART = 64  # critical slots whose consequences are computed each by itself: the first
 _MERGED = 8  # later ones, or equal groups of them, that are merged at a time, in pairs; as many newer ones stay apart
 
@@ -30,9 +32,8 @@ def reference_floor(process: Process, received: float, acknowledged: tuple[float
         E P_k ≥ E[P_k; no critical slot yet] + c Σ_j (1−c)^j F_{j,k},
 
     where F_{j,k} is the error if slot j is the first critical slot, x_{j−1} is known exactly and every later packet is heard:
-    Σ_k for j = 0, then by the recursion of the exact reader. It is exact where c = 0. After the
-    first slots j, neighbours are followed as one, with an error that is at most that of each of them; if Q is singular, that may
-    be 0, and they are left out.
+    Σ_k for j = 0, then by the recursion of the exact reader. It is exact where c = 0. After the first slots j, neighbours are
+    followed as one, with an error that is at most that of each of them; if Q is singular, that may be 0, and they are left out.
     """
     c = acknowledged[1]
     unheard, spared = 1.0 - received - c, 1.0
@@ -60,15 +61,22 @@ def reference_floor(process: Process, received: float, acknowledged: tuple[float
                 bounds[k:] = np.inf
                 break
             bounds[k] = bound
-            for count in sorted(set(counts[_APART:].tolist()), reverse=True) if k % _MERGED == 0 else ():
-                places = _APART + np.flatnonzero(counts[_APART:] == count)
-                if len(places) >= 2 * _MERGED:
-                    older, newer = places[:_MERGED:2], places[1:_MERGED:2]
-                    D[newer], weights[newer] = _least(D[older], D[newer]), weights[older] + weights[newer]
-                    counts[newer] *= 2
-                    kept = np.delete(np.arange(len(D)), older)
-                    D, weights, counts = D[kept], weights[kept], counts[kept]
+            if k % _MERGED == 0:
+                D, weights, counts = _merged(D, weights, counts)
     return bounds
+
+
+def _merged(D: Floats, weights: Floats, counts: Counts) -> tuple[Floats, Floats, Counts]:
+    """The same with fewer factors: of groups of as many slots, the oldest are merged in pairs. counts: slots of each."""
+    for count in sorted(set(counts[_APART:].tolist()), reverse=True):
+        places = _APART + np.flatnonzero(counts[_APART:] == count)
+        if len(places) >= 2 * _MERGED:
+            older, newer = places[:_MERGED:2], places[1:_MERGED:2]
+            D[newer], weights[newer] = _least(D[older], D[newer]), weights[older] + weights[newer]
+            counts[newer] *= 2
+            kept = np.delete(np.arange(len(D)), older)
+            D, weights, counts = D[kept], weights[kept], counts[kept]
+    return D, weights, counts
 
 
 def _least(older: Floats, newer: Floats) -> Floats:

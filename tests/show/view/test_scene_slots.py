@@ -65,7 +65,7 @@ def test_the_view_of_a_run_in_progress_shows_the_slots_that_all_its_tables_have(
 def test_a_slot_is_chosen_before_the_recording_that_must_have_it(
     wanted: tuple[str, str], study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run in progress has more slots after its recording was made, of which none may be drawn."""
+    """A run in progress may have more slots than its recording; none of these is drawn."""
     folder, calls = shutil.copytree(study, tmp_path / "run", ignore=shutil.ignore_patterns("*.rrd")), list[str]()
     monkeypatch.setattr("evedrop.show.view.telling_slot.telling_slot", lambda _: calls.append("slot"))
     monkeypatch.setattr("evedrop.show.view.scene_slots.replay", lambda *_: calls.append("recording"))

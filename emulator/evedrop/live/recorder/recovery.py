@@ -29,9 +29,8 @@ from evedrop.scenario.progress_events import ConnectionOutage, OnEvent
 from evedrop.system.world import world
 
 _POLL_SECONDS = 0.25
-_LEAST_ASKING = (
-    3.0  # seconds for which all are asked: a process that misses a message says so before, if it was sent again twice
-)
+_LEAST_ASKING = 3.0
+"""Seconds for which all are asked: a process that misses a message says so before, if it was sent again twice."""
 
 
 def patience_of(longest_outage: float, pace: float, batch: int, program: bool = False) -> float:

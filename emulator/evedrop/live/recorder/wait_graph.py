@@ -1,4 +1,4 @@
-"""Finds the processes for which a run waits when it stands still, in the graph of who waits for whom.
+"""Finds the processes that hold up a run that stands still, from what each process says it waits for.
 
     recorder ── waits for reports of the process furthest behind ── waits for a message of … ── waits for no process
 
@@ -49,7 +49,9 @@ class WaitGraph:
         """
         idle = [name for name in self._chain if name in self._answers and not self._answers[name].waits]
         mute = [name for name in self._chain if name not in self._answers]
-        return idle or mute or self._unreported() or self._owing() or self._circle_or_behind()
+        if idle or mute:
+            return idle or mute
+        return self._unreported() or self._owing() or (self._behind if self._some_are_further else self._circle())
 
     def _writers(self, name: str) -> dict[str, None]:
         """Whose messages a process waits for; several keys may have one writer."""
@@ -68,9 +70,6 @@ class WaitGraph:
         unsent = unsent or [(writer, name) for writer, name, key in waits if "/progress/" in key]
         owing = {name for pair in unsent for name in pair}
         return [name for name in self._places if name in owing]
-
-    def _circle_or_behind(self) -> list[str]:
-        return self._behind if self._some_are_further else self._circle()
 
     def _circle(self) -> list[str]:
         """The processes that wait for each other; all others wait for these. The recorder waits for those behind."""

@@ -47,7 +47,7 @@ class ErrorAxis:
 
     @property
     def words(self) -> str:
-        """What a caption says of values below the axis, after a semicolon; empty without any."""
+        """The end of a caption, which says that values lie below the axis; empty if none does."""
         return f"; values below {self.low:.3g} lie on the lower edge" if self.below else ""
 
     @classmethod

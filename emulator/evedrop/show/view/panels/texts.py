@@ -63,7 +63,7 @@ class VerdictLine(ViewPanel):
     def _errors(self, slots: SceneSlots) -> dict[str, tuple[Floats, Floats]]:
         """Receiver → its squared errors, and its squared distances, (c,) each: means over all trials.
 
-        NaN for distances of some states in several trials, of which the view has the states of one.
+        Distances are NaN if they count only some states of several trials: the view has the states of one trial alone.
         """
         return {name: (peer.squared_error, self._squares(slots.x, peer)) for name, peer in slots.peers.items()}
 
