@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from evedrop.results.folder import replace_private
 from evedrop.system.disk import write_all
 from evedrop.system.world import world
 from evedrop.virtual.disk import DiskFault
-from tests.disks import at, run_program, simulated
+from evedrop.virtual.scheduler import VirtualTask
+from tests.disks import VIRTUAL_SECONDS, at, run_program, simulated
 
 PAGE = 4096
 
@@ -199,3 +201,25 @@ def test_a_seed_decides_everything(tmp_path: Path) -> None:
     for name in "12":
         (tmp_path / name).mkdir()
     assert after_power_cuts(tmp_path / "1", write, 5) == after_power_cuts(tmp_path / "2", write, 5)
+
+
+def test_the_end_of_the_world_closes_what_a_process_has_open(tmp_path: Path) -> None:
+    """A process that is suspended for good closes nothing itself."""
+    opened: list[int] = []
+    with simulated(tmp_path) as (scheduler, disk):
+
+        def suspended(task: VirtualTask) -> None:
+            with disk.open(disk.root / "file", "wb") as file:
+                opened.extend((disk.again(file).fileno(), disk.hold(disk.root)))
+            scheduler.stop(task)
+            scheduler.sleep(1.0)
+
+        task = scheduler.process("program")
+        scheduler.thread("main", lambda: suspended(task), task).start()
+        scheduler.run(VIRTUAL_SECONDS, lambda: task.stopped)
+        for descriptor in opened:
+            os.fstat(descriptor)
+    assert len(opened) == 2
+    for descriptor in opened:
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            os.fstat(descriptor)

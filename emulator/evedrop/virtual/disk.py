@@ -268,14 +268,14 @@ class VirtualDisk(Disk):
         descriptor = self._real.hold(folder)
         if task is not None:
             release = self._folders[descriptor] = partial(os.close, descriptor)
-            task.held.append(release)
+            task.files.append(release)
         return descriptor
 
     def let_go(self, descriptor: int) -> None:
         """Close a folder."""
         task = self.caller()
         if task is not None:
-            task.held.remove(self._folders.pop(descriptor))
+            task.files.remove(self._folders.pop(descriptor))
         os.close(descriptor)
 
     def again(self, file: IO[bytes]) -> IO[bytes]:
@@ -283,7 +283,7 @@ class VirtualDisk(Disk):
         again = self._real.again(file)
         task = self.caller()
         if task is not None:
-            task.held.append(again.close)
+            task.files.append(again.close)
         return again
 
     def sync(self, path: Path) -> None:
@@ -372,7 +372,7 @@ class _VirtualFile(FileIO):
         self._appends = "a" in mode
         self._release = super().close
         if task is not None:
-            task.held.append(self._release)
+            task.files.append(self._release)
 
     def write(self, data: Any) -> int:
         """Write what arrives."""
@@ -404,7 +404,7 @@ class _VirtualFile(FileIO):
         """Close it."""
         if not self.closed and self._task is not None:
             with suppress(ValueError):  # it could not be opened, or its process is gone
-                self._task.held.remove(self._release)
+                self._task.files.remove(self._release)
         super().close()
 
 

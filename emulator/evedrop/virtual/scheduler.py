@@ -75,13 +75,21 @@ class VirtualTask:
     status: int | None = None
     threads: list[VirtualThread] = field(default_factory=list)
     held: list[Callable[[], object]] = field(default_factory=list)
-    """What its end releases, whatever ended it: connections, locks of files, pipes."""
+    """What its end releases, whatever ended it: connections, pipes."""
+    files: list[Callable[[], object]] = field(default_factory=list)
+    """What closes the real files and folders that it has open: its end, or that of the world."""
     waiting: list[Waiter] = field(default_factory=list)
     """Threads that may go on once it is continued."""
     on_failure: Callable[[BaseException], object] | None = None
     """Called with an error that ends a thread; None: it is told, and the other threads go on."""
     lacks_memory: bool = False
     """Whether its next large allocation fails."""
+
+    def close_files(self) -> None:
+        """Close what it has open."""
+        for close in reversed(self.files):
+            close()
+        self.files.clear()
 
     def allocate(self) -> None:
         """It asks for more memory than a little. Raises MemoryError once, if it lacks memory."""
@@ -249,6 +257,7 @@ class VirtualScheduler:
         for release in reversed(task.held):
             release()
         task.held.clear()
+        task.close_files()
         if self.current is not None and self.current.task is task:
             self.hub.switch()
             raise Ended  # when everything is taken down
@@ -439,6 +448,7 @@ class VirtualScheduler:
         for task in self.tasks:
             task.threads.clear()
             task.held.clear()
+            task.close_files()
             task.waiting.clear()
         self._ready.clear()
         self._timers.clear()
