@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from evedrop.errors import RunError, UnwrittenResults
+from evedrop.errors import Interrupted, RunError, UnwrittenResults
 from evedrop.live.recorder import recorder
 from evedrop.live.recorder.run_end import RunEnd
 
@@ -19,6 +19,27 @@ def test_nobody_is_blamed_for_a_disk(error: RunError, suspects: tuple[str, ...])
     end = RunEnd()
     end.blame(["eve"], error)
     assert end.suspects == suspects
+
+
+def test_who_was_missing_has_not_filled_the_disk_afterwards() -> None:
+    """An interrupted run whose summary cannot be written names the disk alone."""
+    end = RunEnd()
+    end.take(Interrupted("interrupted"))
+    end.blame(["eve"], Interrupted("interrupted"))
+    with end.noted():
+        raise OSError(28, "No space left on device")
+    assert end.how.startswith("the results cannot be written ([Errno 28] No space left on device)")
+    assert end.suspects == ()
+
+
+def test_the_first_failure_names_who_is_at_fault() -> None:
+    """Even if the results cannot be written then."""
+    end = RunEnd()
+    end.take(RunError("why"))
+    end.blame(["eve"], RunError("why"))
+    with end.noted():
+        raise OSError(28, "No space left on device")
+    assert (end.how, end.suspects, end.saved) == ("why", ("eve",), False)
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,9 @@ class RunEnd:
     """The process whose message broke the protocol, if that ended the run."""
 
     def fail(self, how: str) -> None:
-        """Note that the run failed, and why."""
+        """Note that the run failed, and why: nobody is at fault any more for an earlier reason."""
+        if how != self.how:
+            self.suspects, self.accused, self.broken_by = (), (), None
         self.status, self.how = RunError.exit_status, how
 
     def take(self, error: EvedropError) -> None:
