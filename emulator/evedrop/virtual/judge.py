@@ -17,6 +17,7 @@ from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.briefs import LAUNCHED_PATIENCE
 from evedrop.live.launch.other_hosts import TOLERATED
 from evedrop.live.network.session import READY_SECONDS
+from evedrop.live.protocol.keys import writer_of
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.crash_proof_tables import last_round
 from evedrop.results.reading import Results
@@ -553,16 +554,20 @@ def _of_misled(
 ) -> Iterator[str]:
     """Whether the summary counts the messages that processes have dropped, since they came as those of another key.
 
-    Not if a process ends while the run goes on, with what it has counted.
+    Not if a process ends while the run goes on, with what it has counted, nor if the recorder gets its report as a command.
     """
     scenario = reference.scenario
     away = any(scenario.timeline.outages.values())
     if run.status != reference.status or away or not all(isinstance(fault, ConfuseKeys) for fault in struck):
         return
     over = next((message.at for message in run.put if message.said == "end"), math.inf)
-    counts = Counter(name for at, name in run.misled if at < over and name != RELAY)  # which reports nothing
+    counts = Counter(name for at, name, _ in run.misled if at < over)
+    silent = {
+        RELAY,
+        *(writer_of(f"evedrop/run/{key}") for at, name, key in run.misled if at >= over and name == RECORDER),
+    }
     for name, count in sorted(counts.items()):
-        if (dropped := summary.get("misdelivered", {}).get(name, 0)) < count:
+        if name not in silent and (dropped := summary.get("misdelivered", {}).get(name, 0)) < count:
             yield f"{name} has got {count} messages of other keys, and the summary has {dropped}"
 
 

@@ -78,8 +78,8 @@ class SimulatedRun:
     """The messages that all processes have put."""
     typed: list[tuple[str, float]] = field(default_factory=list)
     """The commands of operators, each with the virtual seconds until its answer."""
-    misled: list[tuple[float, str]] = field(default_factory=list)
-    """When a message of another key arrived as a command, and at which process."""
+    misled: list[tuple[float, str, str]] = field(default_factory=list)
+    """When a message of another key arrived as a command, at which process, and that key."""
     happened: list[Occurrence] = field(default_factory=list)
     """All events, if they were kept."""
 
@@ -166,7 +166,7 @@ def run_in(
         elif what == notes.LOST:
             process, key, _, why = words
             if key != f"control/{process}" and why == notes.came_as(f"control/{process}"):
-                run.misled.append((scheduler.now, str(process)))
+                run.misled.append((scheduler.now, str(process), str(key)))
 
     scheduler.watchers.append(watch)
 
