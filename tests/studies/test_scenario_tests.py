@@ -20,6 +20,7 @@ from evedrop.cli import main as cli
 from evedrop.errors import RunError
 from evedrop.results.reading import Results
 from evedrop.results.summary_file import write_summary
+from evedrop.scenario.loading import load
 from evedrop.scenarios import shipped
 from evedrop.studies import scenario_tests as testing
 from evedrop.studies.junit import junit_of
@@ -219,7 +220,7 @@ def test_a_report_holds_what_xml_cannot() -> None:
 def test_resumed_tests_keep_only_complete_results_in_memory(ended: str, mode: str, tmp_path: Path) -> None:
     """The results of a live run, and of one that failed or did not end, say nothing: the test is run again, beside them."""
     written(tmp_path, one=HOLDS)
-    manner = Manner(in_memory=True, trials=3, out=tmp_path / "out", resume=True)
+    manner = Manner(in_memory=True, changes={"trials": 3}, out=tmp_path / "out", resume=True)
     first = testing.carry_out(str(tmp_path / "one.toml"), manner)
     assert first.folder is not None
     assert testing.carry_out(str(tmp_path / "one.toml"), manner).folder == first.folder
@@ -233,7 +234,7 @@ def test_resumed_tests_are_run_again_if_a_file_of_the_scenario_has_changed(tmp_p
     process = HOLDS[HOLDS.index("[process]") : HOLDS.index("[encoding]")]
     given = f'{process}states = ["x", "y"]\nsource = "file"\nstate_file = "path.csv"\n'
     written(tmp_path, one=HOLDS.replace(process, given).replace("slots = 60", "slots = 50"))
-    manner = Manner(in_memory=True, trials=3, out=tmp_path / "out", resume=True)
+    manner = Manner(in_memory=True, changes={"trials": 3}, out=tmp_path / "out", resume=True)
     folders = []
     for speed in (0.0, 0.0, 1.0):
         (tmp_path / "path.csv").write_text("x,y\n" + "".join(f"{speed * k},0.0\n" for k in range(60)))
@@ -245,7 +246,7 @@ def test_resumed_tests_with_a_secret_from_a_file_are_run_again(tmp_path: Path) -
     """The scenario names only the file of the secret, and the results of a complete run do not record the secret."""
     key = tmp_path / "key"
     written(tmp_path, one=HOLDS.replace("[process]", f'secret_file = "{key}"\n\n[process]', 1))
-    manner, folders = Manner(in_memory=True, trials=3, out=tmp_path / "out", resume=True), []
+    manner, folders = Manner(in_memory=True, changes={"trials": 3}, out=tmp_path / "out", resume=True), []
     for number in range(2):
         key.write_bytes(bytes([number]) * 32)
         key.chmod(0o600)
@@ -285,6 +286,21 @@ def test_a_process_without_a_result_is_broken(evedrop: Evedrop, monkeypatch: pyt
     done = evedrop("test", "cases", "--in-memory", "--jobs", "2")
     assert done.status == 3
     assert "its process ended with status 0 and without a result" in done.out
+
+
+def test_every_scenario_is_changed(evedrop: Evedrop) -> None:
+    """By `--set`, also in processes of their own."""
+    written(evedrop.folder / "cases", holds=HOLDS, other=HOLDS)
+    changes = ("--set", "slots=20", "--set", "title=A 'changed' one", "--trials", "2")
+    for jobs in ("1", "2"):
+        done = evedrop.process("test", "cases", "--in-memory", *changes, "--jobs", jobs, "--out", f"kept{jobs}")
+        assert done.status == 0, done
+        for name in ("holds", "other"):
+            scenario = load(str(evedrop.folder / f"kept{jobs}" / name))
+            assert (scenario.title, scenario.slots, scenario.trials) == ("A 'changed' one", 20, 2)
+    wrong = evedrop("test", "cases", "--in-memory", "--set", "sluts=20")
+    assert wrong.status == 2
+    assert wrong.out.count("sluts: is not an entry of this table; did you mean slots?") == 2
 
 
 def in_the_second(*words: str, evedrop: Evedrop) -> Live:

@@ -106,12 +106,12 @@ def test_a_class_that_cannot_be_repeated_breaks_a_promise(evedrop: Evedrop) -> N
     scenario = load(str(evedrop.folder / place))
     seed = next(seed for seed in count(1) if not case_with(scenario, seed).faults)  # or a fault might end it early
     # With two trials, one run in some thousands was repeated by chance.
-    options = ("--simulated", "--trials", "20", "--out", "kept")
+    options = ("--simulated", "--trials", "20", "--set", "title=What's wrong?", "--out", "kept")
     done = evedrop("test", place, *options, "--seed", str(seed), "--seeds", "1", "--junit", "junit.xml")
     assert (done.status, done.err) == (3, "")
     outcome, told, reason, *others = done.out.splitlines()
     assert re.fullmatch(r"BROKEN +\d+\.\d s  own.toml", outcome)
-    assert f"1 runs from seed {seed} on" in told
+    assert f"1 run from seed {seed} on" in told
     found = re.fullmatch(r"    (seed (\d+), .+; see it again: evedrop (.+))", reason)
     assert found is not None
     [smallest] = [line for line in others if "the smallest run found" in line]
@@ -119,8 +119,9 @@ def test_a_class_that_cannot_be_repeated_breaks_a_promise(evedrop: Evedrop) -> N
     assert int(re.findall(r"(\d+) slots", smallest)[0]) < 6
     assert any(re.search(r"launcher +router +sensor +legitimate +mine +recorder", line) for line in others)
     again = evedrop(*shlex.split(found[3]), "--out", "again")
+    assert load(str(evedrop.folder / "again" / "own")).title == "What's wrong?"
     assert again.status == 3
-    assert f"1 runs from seed {found[2]} on, 1 of which broke a promise" in again.out
+    assert f"1 run from seed {found[2]} on, 1 of which broke a promise" in again.out
     [[case]] = ET.parse(evedrop.folder / "junit.xml").getroot()  # noqa: S314 - our own
     error = case.find("error")
     assert error is not None

@@ -136,7 +136,7 @@ class ScenarioItem(pytest.Item):
         options = self.config.option
         manner = Manner(
             options.evedrop_in_memory,
-            options.evedrop_trials,
+            {} if options.evedrop_trials is None else {"trials": options.evedrop_trials},
             options.evedrop_out,
             scheduler=options.evedrop_scheduler,
         )

@@ -12,7 +12,7 @@ from typing import Any
 
 import tomli_w
 
-from evedrop.model.checks import as_toml
+from evedrop.model.checks import as_toml, toml_of
 from evedrop.system.hints import near
 
 __all__ = ["as_toml", "dotted", "listed", "no_entry", "toml_text"]
@@ -33,6 +33,11 @@ def listed(names: Sequence[str]) -> str:
 def dotted(keywords: Mapping[str, Any]) -> dict[str, Any]:
     """Changes by dotted key, of keywords in which `__` stands for the dot."""
     return {name.replace("__", "."): value for name, value in keywords.items()}
+
+
+def options_of(changes: Mapping[str, Any]) -> list[str]:
+    """The words of a command that make these changes."""
+    return [word for key, value in dotted(changes).items() for word in ("--set", f"{key}={toml_of(value)}")]
 
 
 _ITEM = r'(?:"(?:[^"\\\n]|\\.)*"|[-+.\w]+)'

@@ -15,9 +15,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, final
@@ -68,8 +68,8 @@ class Manner:
     """The options for carrying out tests."""
 
     in_memory: bool = False
-    trials: int | None = None
-    """None: the scenario's number."""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    """Dotted key → value: changes of every scenario."""
     out: Path | None = None
     """The folder for all results folders; None: runs/."""
     workers: int | None = None
@@ -155,13 +155,12 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
     Raises Interrupted on Ctrl-C.
     """
     started = time.monotonic()
-    changes = {} if manner.trials is None else {"trials": manner.trials}
 
     def ended(outcome: Outcome, reasons: Sequence[str], **more: Any) -> Finding:
         return Finding(scenario, outcome, time.monotonic() - started, tuple(reasons), **more)
 
     try:
-        made = load(scenario, changes)
+        made = load(scenario, manner.changes)
         if manner.simulation is not None:
             check_simulated(made)
         folder = _folder_for(scenario, made, manner)
@@ -172,7 +171,7 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
     played = None
     try:
         if manner.simulation is not None:
-            played = play_seeds(made, scenario, folder, manner.simulation, manner.trials)
+            played = play_seeds(made, scenario, folder, manner.simulation, manner.changes)
         elif not _is_complete(folder):
             folder = _run(made, folder, manner)
     except Interrupted as error:

@@ -8,12 +8,15 @@ from __future__ import annotations
 import pkgutil
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from evedrop.errors import Interrupted, UsageError
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.words import options_of
+from evedrop.system.counting import counted
 from evedrop.system.signals import stop_on_signals
 from evedrop.virtual.campaign import PlayedCase, play_case
 from evedrop.virtual.cases import SimulatedCase, case_with
@@ -69,21 +72,21 @@ def check_simulated(scenario: Scenario) -> None:
         )
     if scenario.slots > MOST_SLOTS:
         raise UsageError(
-            f"{scenario.slots} slots are too many for --simulated; test a copy with slots = {MOST_SLOTS}, or fewer"
+            f"{scenario.slots} slots are too many for --simulated; give --set slots={MOST_SLOTS}, or fewer"
         )
     if lasting > _MOST_PACED_SECONDS:
         raise UsageError(
             f"{scenario.slots} slots at a pace of {scenario.pace:g} s are {lasting:g} s, too long for --simulated; "
-            f"test a copy that takes {_MOST_PACED_SECONDS:g} s at most"
+            f"give --set pace={_MOST_PACED_SECONDS / scenario.slots:.2g}, or less"
         )
 
 
 def play_seeds(
-    scenario: Scenario, place: str, folder: Path, simulation: SeedsToPlay, trials: int | None = None
+    scenario: Scenario, place: str, folder: Path, simulation: SeedsToPlay, changes: Mapping[str, Any]
 ) -> PlayedSeeds:
     """Play all seeds; writes the results of the same trials in memory, to which every run must come, into a folder.
 
-    place: the scenario, as it was given; trials: their number, if it was given. Raises Interrupted on Ctrl-C.
+    place: the scenario, as it was given; changes: those that were made of it. Raises Interrupted on Ctrl-C.
     """
     program: Program = pkgutil.resolve_name(simulation.program)
     failed: list[PlayedCase] = []
@@ -102,7 +105,7 @@ def play_seeds(
                 failed.append(played)
         seconds = time.monotonic() - started
         told = (
-            f"{simulation.seeds} runs from seed {simulation.first} on, "
+            f"{counted(simulation.seeds, 'run')} from seed {simulation.first} on, "
             f"{len(failed)} of which broke a promise; {simulation.seeds / seconds:.1f} runs/s"
         )
         if not failed:
@@ -110,12 +113,12 @@ def play_seeds(
         story = _story(failed[0], play)
         if stop.is_set():
             raise Interrupted.with_results(folder)
-    return PlayedSeeds(told, _reasons(failed[0], place, trials), story)
+    return PlayedSeeds(told, _reasons(failed[0], place, changes), story)
 
 
-def _reasons(played: PlayedCase, place: str, trials: int | None) -> tuple[str, ...]:
-    few = "" if trials is None else f" --trials {trials}"
-    again = f"evedrop test {shlex.quote(place)} --simulated --seed {played.seed} --seeds 1{few}"
+def _reasons(played: PlayedCase, place: str, changes: Mapping[str, Any]) -> tuple[str, ...]:
+    words = ["evedrop", "test", place, "--simulated", "--seed", str(played.seed), "--seeds", "1", *options_of(changes)]
+    again = shlex.join(words)
     faults = "; ".join(map(str, played.case.faults)) or "no fault"
     first, *others = _first(played.misses)
     return (f"seed {played.seed}, {faults}: {first}; see it again: {again}", *others)

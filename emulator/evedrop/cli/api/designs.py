@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 from evedrop.cli.api.running import scenario_of
 from evedrop.cli.words import for_programs, speaks_python
 from evedrop.errors import UsageError
-from evedrop.model.checks import toml_of
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.arguments import number_argument, refuse_unless
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.words import dotted, listed
+from evedrop.scenario.words import dotted, listed, options_of
+from evedrop.system.counting import counted
 
 if TYPE_CHECKING:
     from evedrop.model.theory.design import Design
@@ -49,8 +49,7 @@ def measuring_command(given: str | Path | Scenario, changes: Mapping[str, Any], 
         "sweep" if constant else "montecarlo",
         "SCENARIO" if isinstance(given, Scenario) else str(given),
     ]
-    for key, value in dotted(changes).items():
-        words += ["--set", f"{key}={toml_of(value)}"]
+    words += options_of(changes)
     if constant:
         words += ["--over", "encoding.state_probability=0.1:0.9:0.1"]
     return shlex.join(words)
@@ -167,12 +166,12 @@ def design_schedule(
     _refuse_texts(whole=True, slots=slots, block=block)
     if not 2 <= slots <= _LONGEST_SCHEDULE:
         raise UsageError(
-            f"a schedule of {slots} slot{'' if slots == 1 else 's'}: "
+            f"a schedule of {counted(slots, 'slot')}: "
             f"expected a whole number from 2 to {_LONGEST_SCHEDULE}, the slots of the run"
         )
     if not 1 <= block < slots:
         raise UsageError(
-            f"blocks of {block} slots: expected a whole number from 1 to {slots - 1}, the slots that share a μ_d"
+            f"blocks of {counted(block, 'slot')}: expected a whole number from 1 to {slots - 1}, the slots that share a μ_d"
         )
     if not 0.0 <= weight <= 1.0:
         raise UsageError(f"a weight of {weight:g}: expected a number from 0 to 1, the weight of the legitimate error")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from evedrop.cli.command import command, flag, option, together
 from evedrop.cli.in_memory import check_resuming, resuming, scheduler
+from evedrop.cli.options import changes, changes_of
 from evedrop.errors import UsageError
 from evedrop.system.output import tell, warn
 
@@ -29,7 +30,8 @@ _TESTS = together(
     flag("--in-memory", "in memory instead of live"),
     flag("--simulated", "in the simulated world, disturbed by faults that seeds decide"),
     option("--seeds", "N", "with --simulated: how many seeds of each scenario; default 100", type=int),
-    option("--seed", "FIRST", "with --simulated: the first seed; default 1", type=int),
+    option("--seed", "FIRST", "with --simulated: the first seed; default 1", type=int, dest="first_seed"),
+    changes,
     option("--trials", "N", "number of trials; default the scenario's", type=int),
     option("--junit", "FILE", "write a report in JUnit XML", type=Path),
     option("--out", "DIR", "folder for the results, with a folder for each scenario; default runs/", type=Path),
@@ -59,7 +61,7 @@ def test(options: argparse.Namespace) -> int:
         check_junit(options.junit)
     manner = Manner(
         options.in_memory,
-        options.trials,
+        changes_of(options),
         options.out,
         scheduler=options.scheduler,
         resume=options.resume,
@@ -97,13 +99,14 @@ def _simulation(options: argparse.Namespace) -> SeedsToPlay | None:
     from evedrop.studies.simulated_tests import SeedsToPlay
 
     if not options.simulated:
-        for name in ("seeds", "seed"):
-            if getattr(options, name) is not None:
+        for name, value in (("seeds", options.seeds), ("seed", options.first_seed)):
+            if value is not None:
                 raise UsageError(f"--{name} is of runs in the simulated world; add --simulated, or leave it out")
         return None
     if options.in_memory:
         raise UsageError("--in-memory and --simulated are two ways to run a scenario; give one of them")
-    seeds, first = 100 if options.seeds is None else options.seeds, 1 if options.seed is None else options.seed
+    seeds = 100 if options.seeds is None else options.seeds
+    first = 1 if options.first_seed is None else options.first_seed
     if seeds < 1:
         raise UsageError(f"--seeds {seeds}: expected 1 or more")
     return SeedsToPlay(first, seeds, _PROGRAM)
