@@ -21,6 +21,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 
+from evedrop.system.counting import counted
+
 MOST_MISTAKES = 100
 """The most mistakes of a scenario in one message: more would not be read."""
 
@@ -63,10 +65,8 @@ class ScenarioError(UsageError):
         self._excerpts = [*excerpts[:MOST_MISTAKES], ""] if more > 0 else excerpts
         short = [line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}…" for line in mistakes[:MOST_MISTAKES]]
         self.mistakes = short if more <= 0 else [*short, f"and {more} more"]
-        count = "1 mistake" if len(mistakes) == 1 else f"{len(mistakes)} mistakes"
-        super().__init__(
-            "\n".join([f"{source}: {count}, nothing was started", *(f"  {line}" for line in self.mistakes)])
-        )
+        told = f"{source}: {counted(len(mistakes), 'mistake')}, nothing was started"
+        super().__init__("\n".join([told, *(f"  {line}" for line in self.mistakes)]))
 
     def numbered(self, line_of: Callable[[str], int | None], excerpt: Callable[[str, int], str]) -> ScenarioError:
         """The same with the line of each mistake's entry.

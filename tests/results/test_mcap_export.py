@@ -141,7 +141,7 @@ def test_the_command_says_what_it_wrote(loop: Results, evedrop: Evedrop) -> None
     """Messages and topics; without --period a slot takes as long as the scenario says."""
     done = evedrop("export", str(loop.folder), "r.mcap")
     back = read_back(evedrop.folder / "r.mcap")
-    assert done.out == f"{sum(map(len, back.values()))} messages on {len(back)} topics are in r.mcap\n"
+    assert done.out == f"r.mcap: {sum(map(len, back.values()))} messages on {len(back)} topics\n"
     scenario = load(loop.folder / "scenario.toml")
     assert scenario.slot_seconds not in {None, 1.0}
     assert back["/truth"][1][0] == 1e9 * (scenario.slot_seconds or 0.0)

@@ -309,9 +309,9 @@ def test_results_hold_the_disturbances_that_their_scenario_names(tmp_path: Path)
         ("", "is empty; expected a line of names such as"),
         ("P_solar\n1\n", 'line 1 has no column "P_load", only "P_solar"; expected P_load among them'),
         ("P_solar,P_load\n1,2\n1,x\n", 'line 3: P_load is "x"; expected a finite number'),
-        ("P_solar,P_load\n1,2\n1\n", "line 3 has 1 columns; expected 2, as the first line has"),
+        ("P_solar,P_load\n1,2\n1\n", "line 3 has 1 column; expected 2, as the first line has"),
         ("P_solar,P_load\n1,nan\n", 'line 2: P_load is "nan"; expected a finite number'),
-        ("P_solar,P_load\n1,2\n", "has 1 rows; expected slots, which is 4, or more"),
+        ("P_solar,P_load\n1,2\n", "has 1 row; expected slots, which is 4, or more"),
     ],
 )
 def test_a_file_that_will_not_do_is_told(text: str, message: str, tmp_path: Path) -> None:

@@ -177,7 +177,7 @@ def test_trials_that_were_cut_short_count_by_their_slots() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"process.directions": {"a": [1.0]}}, "process.directions.a: has 1 entries; expected 2, one for each state"),
+        ({"process.directions": {"a": [1.0]}}, "process.directions.a: has 1 entry; expected 2, one for each state"),
         ({"process.directions": {"a": [0.0, 0.0]}}, "process.directions.a: is zero; expected a direction, such as"),
         ({"process.directions": {"a": "x"}}, "process.directions.a: "),
         ({"process.directions": 3}, "process.directions: "),

@@ -362,7 +362,7 @@ class WireJudge:
             if status not in ({0, UsageError.exit_status} if words in {"links", REPLAY} else {0}):
                 yield f"{words} ends with status {status}: {said.strip()[-300:]}"
         told = "".join(said for words, _, said in self._course.read if words == "export")
-        if told and f"{rows:,} messages are in" not in told and not self._disk:
+        if told and f": {rows:,} message" not in told and not self._disk:
             yield f"the journal has {rows} rows, and {told.strip()}"
 
 

@@ -128,7 +128,7 @@ def test_what_hides_the_loss_model_cuts_the_messages_into_parts(tmp_path: Path) 
     expected = [0 if n % 30 == 29 else 1 for n in range(400) if hidden.get(n) not in {WireFate.CUT, WireFate.OVERFLOW}]
     assert result.series.outcomes.tolist() == expected
     assert result.series.parts == 3
-    assert any("31 messages met a cut" in note for note in result.notes)
+    assert any("31 messages that met a cut" in note for note in result.notes)
     carried(tmp_path / "all", plan_of(settings), {"0/scan/a": 200}, dict.fromkeys(range(0, 200, 5), WireFate.CUT))
     with pytest.raises(TraceError, match="cuts, queues and limits hide"):
         journal_recording(tmp_path / "all", "scan")
@@ -187,8 +187,8 @@ def test_the_command_takes_the_folder_of_a_wire(evedrop: Evedrop) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "has several links; expected --link and one of scan (300 messages), rest (1 messages)"),
-        (("--link", "orders"), 'has no messages on a link "orders"; it has scan (300 messages), rest (1 messages)'),
+        ((), "has several links; expected --link and one of scan (300 messages), rest (1 message)"),
+        (("--link", "orders"), 'has no messages on a link "orders"; it has scan (300 messages), rest (1 message)'),
         (("--link", "scan", "--key", "a//b"), "--key a//b: Zenoh refuses this key expression"),
         (("--link", "scan", "--key", "b"), "has no message on this link and key"),
         (("--link", "scan", "--gaps"), "lacks none of 300 numbers of its senders: nothing was lost before the wire"),
@@ -249,6 +249,6 @@ def test_lossless_messages_are_no_survivals(tmp_path: Path) -> None:
     mixed, alone = (journal_recording(tmp_path / name, "scan") for name in ("mixed", "alone"))
     assert mixed.series.outcomes.tolist() == alone.series.outcomes.tolist()
     assert mixed.delays.tolist() == alone.delays.tolist()
-    assert "300 messages are lossless in wire.toml: left out" in mixed.notes
+    assert "left out: 300 messages that wire.toml has as lossless" in mixed.notes
     with pytest.raises(TraceError, match="only messages that no model decides on"):
         journal_recording(tmp_path / "mixed", "scan", "robot/scan/stop")

@@ -83,7 +83,7 @@ def test_a_wire_without_a_summary_is_summed_up_from_its_journal(
     assert main(["export", str(folder), str(exported)]) == 0
     with exported.open(encoding="utf-8", newline="") as text:
         rows = [*csv.DictReader(text)]
-    assert capfd.readouterr().out == f"{len(rows)} messages are in {exported}\n"
+    assert capfd.readouterr().out == f"{exported}: {len(rows)} messages\n"
     every = pa.concat_tables(journal_tables(folder)).to_pylist()
     latest = Counter(row["reason"] for table in journal_tables(folder, start=2) for row in table.to_pylist())
     assert (latest.pop(None), latest) == (delivered, {"loss": LOST, **dropped})

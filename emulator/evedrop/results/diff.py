@@ -13,6 +13,7 @@ from evedrop.errors import UsageError
 from evedrop.model.digest import BLOCK_SLOTS
 from evedrop.names import CONTROLLER
 from evedrop.results.reading import METRICS_AS_OF, Results
+from evedrop.system.counting import counted
 
 _COMPARED = ("sent", "action", "x", "x_hat", "P")
 _INPUTS = ("u", "d", "failed", "watermark", "statistic")
@@ -54,10 +55,10 @@ def difference(a: Results, b: Results) -> RunDifference:
     )
     in_both = len(blocks_a.keys() & blocks_b.keys())
     apart = {
-        "are in one run only": len(blocks_a) + len(blocks_b) - 2 * in_both,
-        "may lack slots in a run, and were not compared": in_both - len(common),
+        "in one run only": len(blocks_a) + len(blocks_b) - 2 * in_both,
+        "not compared, since a run may lack slots of them": in_both - len(common),
     }
-    rest = "".join(f" ({count} blocks of up to 256 slots {which})" for which, count in apart.items() if count)
+    rest = "".join(f" ({counted(count, 'block')} {which})" for which, count in apart.items() if count)
     if first is not None and (not unequal or first.slot < unequal[0][0] + BLOCK_SLOTS):
         return RunDifference(False, first.text + rest)
     if not unequal:
@@ -68,7 +69,7 @@ def difference(a: Results, b: Results) -> RunDifference:
                 False, f"the digest of {' and of '.join(other)} differs, in trials not recorded; {remedy}{rest}"
             )
         peers = ", ".join(sorted({peer for peer, _, _ in common}))
-        return RunDifference(True, f"no difference in {len(common)} blocks of 256 slots: {peers}{rest}")
+        return RunDifference(True, f"no difference in {counted(len(common), 'block')}: {peers}{rest}")
     block, trial, peer = unequal[0]
     slots = f"slots {block} to {ends_a[peer, block] - 1}"
     remedy = f"record it with --first-trial {trial} --trials 1 in both runs to see the slot and the values"
@@ -84,7 +85,9 @@ def _by_rows_alone(a: Results, b: Results) -> RunDifference:
             False, "the runs have no slot of a recorded trial and receiver in common; compare runs of one scenario"
         )
     return RunDifference(
-        True, f"no difference in {count} rows of recorded trials; the runs have no whole block of 256 slots in common"
+        True,
+        f"no difference in {counted(count, 'row')} of recorded trials; the runs have no whole block of {BLOCK_SLOTS} slots in "
+        "common",
     )
 
 

@@ -49,6 +49,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import expectations_of
 from evedrop.scenario.timeline import numbered_acts
 from evedrop.scenario.words import as_toml, listed
+from evedrop.system.counting import counted
 
 Numbered = tuple[int, Act]
 """An act with the number of its event."""
@@ -247,8 +248,8 @@ def encoding_mistakes(scenario: Scenario) -> Iterator[str]:
     given = scenario.encoding.state_probabilities
     if given is not None and len(given) != scenario.slots:
         yield (
-            f"encoding.state_probability: has {len(given)} numbers; expected one number for each of the {scenario.slots} "
-            "slots, or a single number for all"
+            f"encoding.state_probability: has {counted(len(given), 'number')}; expected one number for each of the "
+            f"{scenario.slots} slots, or a single number for all"
         )
 
 

@@ -23,6 +23,7 @@ from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.process_noise import measured_mistakes
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
+from evedrop.system.counting import counted
 
 
 def labels(names: list[str] | None, units: list[str] | None) -> tuple[str, ...]:
@@ -80,7 +81,7 @@ def loop_mistakes(scenario: Scenario) -> Iterator[str]:
         yield from _plant_and_process(plant, scenario.process)
         rows = plant.disturbance_values
         if plant.disturbances and rows and len(rows) < scenario.slots:
-            yield f"plant.disturbance_values: has {len(rows)} rows; expected slots, which is {scenario.slots}, or more"
+            yield f"plant.disturbance_values: has {counted(len(rows), 'row')}; expected slots, which is {scenario.slots}, or more"
         if controller is not None:
             yield from _controller_and_plant(plant, controller, scenario.process, scenario.slot_seconds or 1.0)
     if controller is not None:
@@ -113,18 +114,18 @@ def given_state_mistakes(scenario: Scenario) -> Iterator[str]:
         )
     rows = process.state_values
     if process.source == "file" and rows and len(rows) < scenario.slots:
-        yield f"process.state_values: has {len(rows)} rows; expected slots, which is {scenario.slots}, or more"
+        yield f"process.state_values: has {counted(len(rows), 'row')}; expected slots, which is {scenario.slots}, or more"
 
 
 def _plant_and_process(plant: PlantTable, process: ProcessTable) -> Iterator[str]:
     n = len(process.A)
     for name, rows in (("input_matrix", plant.input_matrix), ("disturbance_matrix", plant.disturbance_matrix)):
         if rows is not None and len(rows) != n:
-            yield f"plant.{name}: has {len(rows)} rows; expected {n}, one for each state"
+            yield f"plant.{name}: has {counted(len(rows), 'row')}; expected {n}, one for each state"
     yield from noise_mistakes(plant, n)
     inside = {"process.reference": process.around}
     if plant.start is not None and len(plant.start) != n:
-        yield f"plant.start: has {len(plant.start)} entries; expected {n}, one for each state"
+        yield f"plant.start: has {counted(len(plant.start), 'entry')}; expected {n}, one for each state"
     elif plant.start is not None:
         inside["start"] = plant.start
     limits = limit_mistakes("state", plant.state_lower, plant.state_upper, n, "one for each state", inside)
@@ -147,7 +148,7 @@ def _controller_and_plant(
         values = getattr(controller, name)
         if values is not None and len(values) != count:
             wrong = True
-            yield f"controller.{name}: has {len(values)} entries; expected {count}, {why}"
+            yield f"controller.{name}: has {counted(len(values), 'entry')}; expected {count}, {why}"
     if wrong or m == 0 or any(_plant_and_process(plant, process)) or measured_mistakes(plant, n):
         return
     assignment = assignment_of(controller, process.process, plant_of(plant, process.around), slot_seconds)

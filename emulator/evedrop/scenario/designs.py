@@ -24,6 +24,7 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import conditions_of, stated_form
 from evedrop.scenario.words import listed
+from evedrop.system.counting import counted
 
 _SHOWN = 5  # whole thresholds
 
@@ -234,7 +235,7 @@ def _check_numbers(scenario: Scenario, weights: Sequence[float], prices: Sequenc
     most = math.isqrt(_LARGEST_CHAIN // scenario.process.process.n**2)
     if not 2 <= states <= max(2, most):
         raise UsageError(
-            f"{states} state{'' if states == 1 else 's'}: "
+            f"{counted(states, 'state')}: "
             f"expected a whole number from 2 to {max(2, most)}, how many holding times are distinguished"
         )
 

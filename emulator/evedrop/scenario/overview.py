@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from evedrop.scenario.words import as_toml
+from evedrop.system.counting import counted
 
 _SHOWN = ("title", "slots", "seed", "trials", "slot_seconds", "process", "encoding", "legitimate", "eavesdroppers")
 _MOST = 100  # characters of a line's contents
@@ -25,7 +26,7 @@ def overview(tables: Mapping[str, Any], n: int) -> str:
 
 def _rows(tables: Mapping[str, Any], n: int) -> Iterator[tuple[str, str]]:
     seconds = f" of {tables['slot_seconds']:g} s" if "slot_seconds" in tables else ""
-    trials = f", {tables['trials']:,} trials" if tables.get("trials", 1) > 1 else ""
+    trials = f", {counted(tables['trials'], 'trial')}" if tables.get("trials", 1) > 1 else ""
     yield "slots", f"{tables['slots']:,}{seconds}{trials}, seed {tables['seed']}"
     yield "process", _process(tables["process"], n)
     yield "scheme", _named(tables["encoding"], "scheme")
@@ -41,7 +42,7 @@ def _rows(tables: Mapping[str, Any], n: int) -> Iterator[tuple[str, str]]:
 def _process(table: Mapping[str, Any], n: int) -> str:
     units = [f"({unit})" if unit else "" for unit in table.get("units", [""] * n)]
     names = [" ".join(filter(None, pair)) for pair in zip(table.get("states", [""] * n), units, strict=True)]
-    return ("1 state" if n == 1 else f"{n} states") + (f": {', '.join(names)}" if any(names) else "")
+    return counted(n, "state") + (f": {', '.join(names)}" if any(names) else "")
 
 
 def _named(entries: Mapping[str, Any], key: str) -> str:

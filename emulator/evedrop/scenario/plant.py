@@ -21,6 +21,7 @@ from evedrop.model.slot.cores import LARGEST
 from evedrop.scenario.process import row_mistake, word_mistake
 from evedrop.scenario.table import Labels, Matrix, Mistake, Number, Table, one_of, parameter_mistakes
 from evedrop.scenario.words import as_toml
+from evedrop.system.counting import counted
 
 Numbers = list[Number]
 
@@ -99,10 +100,10 @@ def _named_mistakes(
         yield f"{kind}_matrix", f"is missing; expected a row for each state, a number for each of {kind}s"
     wrong = next((row for row in matrix or () if len(row) != len(names)), None)
     if wrong is not None:
-        few = f"has a row of {len(wrong)} numbers; expected {len(names)}, one for each of {kind}s"
+        few = f"has a row of {counted(len(wrong), 'number')}; expected {len(names)}, one for each of {kind}s"
         yield f"{kind}_matrix", few
     if units is not None and len(units) != len(names):
-        yield f"{kind}_units", f"has {len(units)} entries; expected {len(names)}, one for each of {kind}s"
+        yield f"{kind}_units", f"has {counted(len(units), 'entry')}; expected {len(names)}, one for each of {kind}s"
 
 
 def limit_mistakes(
@@ -119,7 +120,7 @@ def limit_mistakes(
     """
     for name, limits in ((f"{kind}_lower", lower), (f"{kind}_upper", upper)):
         if limits is not None and len(limits) != count:
-            yield name, f"has {len(limits)} entries; expected {count}, {why}"
+            yield name, f"has {counted(len(limits), 'entry')}; expected {count}, {why}"
     least = [-math.inf] * count if lower is None or len(lower) != count else lower
     most = [math.inf] * count if upper is None or len(upper) != count else upper
     for i in range(count):
@@ -177,7 +178,7 @@ def noise_mistakes(table: PlantTable, n: int) -> list[str]:
     if table.noise is None:
         return []
     if len(table.noise) != n:
-        return [f"plant.noise: has {len(table.noise)} rows; expected {n}, one for each state"]
+        return [f"plant.noise: has {counted(len(table.noise), 'row')}; expected {n}, one for each state"]
     if any(len(row) != n for row in table.noise):
         return [f"plant.noise: has a row that is not of {n} numbers; expected {n} × {n}, as A is"]
     noise = np.array(table.noise, np.float64)

@@ -19,6 +19,7 @@ from evedrop.model.process import Process, mistakes_of
 from evedrop.model.slot.cores import LARGEST
 from evedrop.scenario.table import Labels, Matrix, Mistake, Number, ProcessName, Table, expected
 from evedrop.scenario.words import as_toml, listed
+from evedrop.system.counting import counted
 
 Source = Literal["model", "file", "zenoh"]
 """Where the true states come from: `model`, the process itself."""
@@ -89,7 +90,7 @@ def source_mistakes(table: ProcessTable, n: int) -> Iterator[Mistake]:
         yield "theory", "is given, but the states are simulated, and theory describes them; remove the line"
     offsets = None if table.zenoh is None else table.zenoh.offsets
     if offsets is not None and len(offsets) != n:
-        yield "zenoh.offsets", f"has {len(offsets)} entries; expected {n}, one for each state"
+        yield "zenoh.offsets", f"has {counted(len(offsets), 'entry')}; expected {n}, one for each state"
     if table.state_values is not None and (sentence := row_mistake(table.state_values, n, "state")) is not None:
         yield "state_values", sentence
 
@@ -106,7 +107,7 @@ def row_mistake(rows: Sequence[Sequence[float]], count: int, each: str) -> str |
     """What is wrong with rows of this many numbers, one for each of what `each` names; None if nothing is."""
     wrong = next((i for i, row in enumerate(rows) if len(row) != count), None)
     if wrong is not None:
-        return f"row {wrong} has {len(rows[wrong])} numbers; expected {count}, one for each {each}"
+        return f"row {wrong} has {counted(len(rows[wrong]), 'number')}; expected {count}, one for each {each}"
     values = np.array(rows, np.float64).reshape(-1, count)
     large = np.argwhere(~(np.abs(values) <= LARGEST))
     if not large.size:
@@ -167,14 +168,14 @@ class ProcessTable(Table):
         yield from (mistake for mistake in mistakes_of(A, Q, initial, self.singular_noise) if mistake[0] in square)
         for name, weights in (self.directions or {}).items():
             if len(weights) != n:
-                yield f"directions.{name}", f"has {len(weights)} entries; expected {n}, one for each state"
+                yield f"directions.{name}", f"has {counted(len(weights), 'entry')}; expected {n}, one for each state"
             elif not any(weights):
                 yield f"directions.{name}", "is zero; expected a direction, such as [1.0, 0.0]"
         yield from source_mistakes(self, n)
         for name in ("reference", "states", "units"):
             values = getattr(self, name)
             if values is not None and len(values) != n:
-                yield name, f"has {len(values)} entries; expected {n}, one for each state"
+                yield name, f"has {counted(len(values), 'entry')}; expected {n}, one for each state"
         if self.states is not None and len({*self.states}) < len(self.states):
             yield "states", "has a name twice; expected different names"
 
@@ -184,8 +185,9 @@ class ProcessTable(Table):
         lengths = {len(row) for row in rows}
         if lengths == {len(rows)}:
             return None
-        count = "1 row" if len(rows) == 1 else f"{len(rows)} rows"
-        shape = f"{count} of {listed([str(n) for n in sorted(lengths)])} numbers" if rows else "no rows"
+        shape = (
+            f"{counted(len(rows), 'row')} of {listed([str(n) for n in sorted(lengths)])} numbers" if rows else "no rows"
+        )
         return f"has {shape}; expected a square matrix, such as {self._example(name)}"
 
     @property

@@ -26,6 +26,7 @@ from evedrop.model.theory.leak import Leaks
 from evedrop.scenario.plant import PlantTable, noise_mistakes, plant_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.tables import Scenario
+from evedrop.system.counting import counted
 
 FILTER = "filter"
 _CERTAINLY, _NEARLY = 1e-13, 1e-9  # singular values, of entries up to 1, that are 0
@@ -116,7 +117,9 @@ def measured_mistakes(plant: PlantTable, n: int) -> list[str]:
         return mistakes
     if not C or any(len(row) != n for row in C):
         wrong = next((len(row) for row in C if len(row) != n), 0)
-        mistakes.append(f"plant.output_matrix: has a row of {wrong} numbers; expected {n}, one for each state")
+        mistakes.append(
+            f"plant.output_matrix: has a row of {counted(wrong, 'number')}; expected {n}, one for each state"
+        )
     noise, p = [*map(len, V)], len(C)
     if noise != [p] * p:
         mistakes.append(

@@ -22,6 +22,7 @@ from evedrop.errors import NotRegistered
 from evedrop.model.registry import Registry, asked
 from evedrop.names import RESERVED
 from evedrop.scenario.words import as_toml, listed, no_entry
+from evedrop.system.counting import counted
 from evedrop.system.hints import near
 from evedrop.system.output import escaped
 
@@ -279,7 +280,7 @@ def _unusable(tables: Any) -> Iterator[str]:
     eavesdroppers = tables.get("eavesdroppers")
     if isinstance(eavesdroppers, dict) and len(eavesdroppers) > MOST_EAVESDROPPERS:
         # Otherwise each of them would be checked and reported.
-        yield f"eavesdroppers: has {len(eavesdroppers)} entries; expected at most {MOST_EAVESDROPPERS}"
+        yield f"eavesdroppers: has {counted(len(eavesdroppers), 'entry')}; expected at most {MOST_EAVESDROPPERS}"
         return
     # An explicit stack: dotted keys can nest tables deeper than Python's recursion limit.
     waiting: list[tuple[tuple[str, ...], Any]] = [((), tables)]

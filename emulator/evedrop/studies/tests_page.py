@@ -16,6 +16,7 @@ from evedrop.show.report.page import Page, Part, facts_table, made
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.travel import circumstances
 from evedrop.studies.scenario_tests import Finding, Outcome
+from evedrop.system.counting import counted
 from evedrop.system.output import warn
 
 TESTS_PAGE = "tests.html"
@@ -40,7 +41,7 @@ def write_tests_page(folder: Path, tested: Sequence[Finding], started: float) ->
 
 def _page(folder: Path, tested: Sequence[Finding], started: float) -> Page:
     counts = [(outcome, sum(finding.outcome is outcome for finding in tested)) for outcome in Outcome]
-    counted = ", ".join(f"{count} {outcome.word}" for outcome, count in counts if count)
+    words = ", ".join(f"{count} {outcome.word}" for outcome, count in counts if count)
     table = TextTable.headed(["scenario", "outcome"], ["time"], ["verdict", "reasons"], wrapped={"verdict", "reasons"})
     for finding in tested:
         mark = "✓" if finding.outcome is Outcome.PASSED else "✗"
@@ -54,16 +55,14 @@ def _page(folder: Path, tested: Sequence[Finding], started: float) -> Page:
             finding.verdict or "–",
             "; ".join(map(_travelling, finding.reasons)) or "–",
         )
-    about = (
-        f"{len(tested)} scenario{'' if len(tested) == 1 else 's'} · {sum(finding.seconds for finding in tested):,.1f} s"
-    )
+    about = f"{counted(len(tested), 'scenario')} · {sum(finding.seconds for finding in tested):,.1f} s"
     facts = {**circumstances(folder), "date": f"{datetime.fromtimestamp(started, UTC):%Y-%m-%d %H:%M} UTC"}
     parts = [
         Part("Scenarios", [made("table", table, "Each scenario with the link to its report")]),
         Part("Made with", [facts_table(facts, "Date and machine")]),
     ]
     good = all(finding.outcome is Outcome.PASSED for finding in tested)
-    return Page("Scenarios as tests", about, counted, good, parts)
+    return Page("Scenarios as tests", about, words, good, parts)
 
 
 def _travelling(reason: str) -> str:

@@ -20,6 +20,7 @@ from typing import Any, Final, final
 
 import zenoh
 
+from evedrop.system.counting import counted
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 from evedrop.system.world import world
 from evedrop.wire.side import SideSession
@@ -141,8 +142,8 @@ class _Gone:
         waited = [
             words
             for number, words in (
-                (self.waited, f"{self.waited:,} messages from this side waited for the wire"),
-                (self.waited_for, f"{self.waited_for:,} messages waited for programs at this side"),
+                (self.waited, f"{counted(self.waited, 'message')} from this side waited for the wire"),
+                (self.waited_for, f"{counted(self.waited_for, 'message')} waited for programs at this side"),
             )
             if number
         ]

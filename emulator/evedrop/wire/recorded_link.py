@@ -26,6 +26,7 @@ from evedrop.scenario.recordings.message_recording import (
     joined,
     series_of,
 )
+from evedrop.system.counting import counted
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal_place import JOURNAL_FOLDER
@@ -99,7 +100,9 @@ class _LinkRows:
         decided = ~np.isin(fates, list(_HIDDEN))
         hidden = int((~decided).sum())
         if hidden:
-            self._notes.append(f"{hidden} messages met a cut, a full queue or a limit before the loss model: left out")
+            self._notes.append(
+                f"left out: {counted(hidden, 'message')} that met a cut, a full queue or a limit before the loss model"
+            )
         if not decided.any():
             self._no("has only messages that met a cut, a full queue or a limit before the loss model")
         follows = (np.diff(streams) == 0) & (np.diff(records["n"]) == 1)
@@ -155,7 +158,7 @@ class _LinkRows:
             return next(iter(counts))
         if link is not None and link in counts:
             return link
-        shown = _some([f"{name} ({count} messages)" for name, count in counts.items()])
+        shown = _some([f"{name} ({counted(count, 'message')})" for name, count in counts.items()])
         if not counts:
             self._no("has no messages on any link")
         if link is not None:
@@ -168,7 +171,7 @@ class _LinkRows:
         never_lost = [key for key in pc.unique(keys).to_pylist() if plan.is_lossless(zenoh.KeyExpr(key))]
         lossy = rows.filter(pc.invert(pc.is_in(keys, pa.array(never_lost, pa.string()))))
         if left_out := rows.num_rows - lossy.num_rows:
-            self._notes.append(f"{left_out} messages are lossless in wire.toml: left out")
+            self._notes.append(f"left out: {counted(left_out, 'message')} that wire.toml has as lossless")
         return lossy
 
     def _has_key(self, rows: pa.Table, key: str) -> pa.Array:

@@ -20,6 +20,7 @@ from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE
 from evedrop.scenario.receivers import PUT
 from evedrop.show.report.wire import wire_failures
 from evedrop.show.view.viewer import Viewer, choose
+from evedrop.system.counting import counted
 from evedrop.system.environment import check_zenoh_runtime
 from evedrop.system.output import warn
 from evedrop.system.world import world
@@ -84,8 +85,8 @@ def run_wire(
             _begin_results(out, plan)
             if journal.recovered:
                 say(
-                    f"{journal.recovered:,} messages were recovered from an earlier start, which was killed or had a full disk; "
-                    "their numbers go on"
+                    f"an earlier start was killed or had a full disk: {counted(journal.recovered, 'message')} of it "
+                    "could be recovered, and the numbers go on"
                 )
             if journal.history.start > 1:
                 say(continuation(journal.history.start, journal.counts))

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from evedrop.show.view import palette
 from evedrop.show.view.lanes import Lane
 from evedrop.show.view.palette import Colour
+from evedrop.system.counting import counted
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.records import UNLINKED, WireFate
 
@@ -353,4 +354,4 @@ def level_of(line: str) -> str:
 
 def introduction(plan: WirePlan) -> str:
     """The first line of the events."""
-    return f"a wire of {len(plan.sides)} sides and {len(plan.links)} links, seed {plan.seed}"
+    return f"a wire of {counted(len(plan.sides), 'side')} and {counted(len(plan.links), 'link')}, seed {plan.seed}"

@@ -26,6 +26,7 @@ from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.comparison import comparison_heading, conclusion, left_out_schemes, pairs_table, schemes_table
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.verdict_matrix import matrix_lines
+from evedrop.system.counting import counted
 from evedrop.system.output import wrapped
 
 if TYPE_CHECKING:
@@ -123,10 +124,8 @@ class RunResults(Results, ReportedResults):
     @property
     def _facts(self) -> str:
         summary = self._typed
-        trials = "1 trial" if summary.trials == 1 else f"{summary.trials:,} trials"
-        return (
-            f"{summary.slots:,} slots, {trials}, {'live' if summary.mode == 'live' else f'in memory ({summary.mode})'}"
-        )
+        mode = "live" if summary.mode == "live" else f"in memory ({summary.mode})"
+        return f"{counted(summary.slots, 'slot')}, {counted(summary.trials, 'trial')}, {mode}"
 
     def _notes(self) -> Iterator[str]:
         if self.remark is not None:
@@ -212,7 +211,7 @@ class SweepResults(ReportedResults):
 
     @property
     def _facts(self) -> str:
-        return f"{', '.join(self.keys)}: {self.points} point{'' if self.points == 1 else 's'}"
+        return f"{', '.join(self.keys)}: {counted(self.points, 'point')}"
 
     def _tables(self) -> list[TextTable]:
         return [sweep_table(self.table.to_pylist(), self.keys)]
@@ -227,7 +226,7 @@ class SweepResults(ReportedResults):
     @property
     def _more(self) -> list[str]:
         more = self.table.num_rows - _MOST_ROWS
-        return [f"and {more} more row{'' if more == 1 else 's'}: .table has all of them"] if more > 0 else []
+        return [f"and {counted(more, 'more row')}: .table has all of them"] if more > 0 else []
 
 
 @dataclass(frozen=True, repr=False)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from evedrop.cli.command import command, number_type, option, together
 from evedrop.errors import UsageError
+from evedrop.system.counting import counted
 
 if TYPE_CHECKING:
     from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults
@@ -85,7 +86,7 @@ def export(options: argparse.Namespace) -> int:
         counts = export_mcap(results, options.file, options.period)
     if results.remark is not None:
         print(results.remark)
-    print(f"{sum(counts.values())} messages on {len(counts)} topics are in {options.file}")
+    print(f"{options.file}: {counted(sum(counts.values()), 'message')} on {counted(len(counts), 'topic')}")
     return 0
 
 
@@ -150,7 +151,7 @@ def _export_wire(options: argparse.Namespace, kind: str) -> int:
     from evedrop.wire.journal_csv import write_journal_csv
 
     rows = write_journal_csv(options.run, options.file)
-    print(f"{rows:,} messages are in {options.file}")
+    print(f"{options.file}: {counted(rows, 'message')}")
     return 0
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from evedrop.cli.command import command, option, together
 from evedrop.cli.options import changes, changes_of
 from evedrop.errors import UsageError
+from evedrop.system.counting import counted
 from evedrop.system.output import YELLOW, tell
 
 
@@ -94,7 +95,9 @@ def check(options: argparse.Namespace) -> int:
             tell(error.illustrated, stream=sys.stderr)
             status = error.exit_status
             continue
-        tell(f"{name}: {scenario.title}: {scenario.slots} slots, {', '.join(scenario.receivers)}: no mistakes")
+        tell(
+            f"{name}: {scenario.title}: {counted(scenario.slots, 'slot')}, {', '.join(scenario.receivers)}: no mistakes"
+        )
         for warning in warnings_of(scenario, several=True):
             tell(f"  warning: {warning}", "warning:", YELLOW)
     return status

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from evedrop.cli.command import command, option, together
 from evedrop.cli.options import as_json
 from evedrop.errors import BriefError, UsageError
+from evedrop.system.counting import counted
 from evedrop.system.output import print_json, warn
 from evedrop.system.world import world
 
@@ -170,10 +171,8 @@ def _answer(run: Path, control: Control, request: OperatorRequest, subject: str,
     if answer is None:
         raise no_run(run, "it ended before it answered, or its router did, which is then restarted")
     if answer.refused:
-        count = "1 mistake" if len(answer.refused) == 1 else f"{len(answer.refused)} mistakes"
-        raise UsageError(
-            "\n".join([f"{subject}: {count}, nothing was changed", *(f"  {line}" for line in answer.refused)])
-        )
+        told = f"{subject}: {counted(len(answer.refused), 'mistake')}, nothing was changed"
+        raise UsageError("\n".join([told, *(f"  {line}" for line in answer.refused)]))
     return answer
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from evedrop.cli.command import command, flag, option, together
 from evedrop.cli.options import changes_of
 from evedrop.errors import UsageError
+from evedrop.system.counting import counted
 from evedrop.system.output import say as complain
 from evedrop.system.output import tell, warn
 
@@ -64,8 +65,8 @@ def wire(options: argparse.Namespace) -> int:
     if options.check:
         lines = [*wire_lines(plan), *key_lines(plan, options.keys)]
         counts = (("side", plan.sides), ("link", plan.links), ("event", plan.events))
-        counted = ", ".join(f"{len(some)} {noun}{'' if len(some) == 1 else 's'}" for noun, some in counts)
-        tell(f"{options.file}: {counted}: no mistakes")
+        parts = ", ".join(counted(len(some), noun) for noun, some in counts)
+        tell(f"{options.file}: {parts}: no mistakes")
         tell("\n".join(f"  {line}" for line in lines))
     for warning in warnings_of_wire(plan):
         warn(warning)

@@ -29,6 +29,7 @@ from evedrop.scenario.events.event import Act
 from evedrop.scenario.loading import with_event
 from evedrop.scenario.progress_events import Held, OnEvent, RunEvent
 from evedrop.scenario.tables import Scenario
+from evedrop.system.counting import counted
 from evedrop.system.world import world
 
 STEP_SECONDS = 1.0
@@ -261,7 +262,7 @@ class Steering:
                     f"another step is under way, to slot {self._step.until - 1}; wait for its end, or pause first"
                 )
             case StepRequest(slots):
-                self._note(k, f"step {slots} slots" if slots > 1 else "step 1 slot", "operator")
+                self._note(k, f"step {counted(slots, 'slot')}", "operator")
                 self._step, self.paused = OperatorStep(order, k, min(k + slots, LAST_SLOT)), False
 
     def _change(self, k: int, order: Order, event: Mapping[str, Any]) -> None:

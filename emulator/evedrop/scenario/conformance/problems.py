@@ -18,6 +18,7 @@ from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiv
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme
 from evedrop.model.streams import Batch, BlockReader
 from evedrop.scenario.conformance.rules import Broken, NamedKeys, calling, expect_array, expect_finite, frozen, key
+from evedrop.system.counting import counted
 
 QUALITY = 0.7
 """The link quality of every problem."""
@@ -31,8 +32,10 @@ class Problem:
     batch: Batch
 
     def __str__(self) -> str:
-        states = "1 state" if self.process.n == 1 else f"{self.process.n} states"
-        return f"{states}, spectral radius {self.process.spectral_radius:.2g}, {self.batch.trials} trials"
+        return (
+            f"{counted(self.process.n, 'state')}, spectral radius {self.process.spectral_radius:.2g}, "
+            f"{counted(self.batch.trials, 'trial')}"
+        )
 
     def part(self, first: int, trials: int) -> Problem:
         """The problem with only some of its trials; first: counted from the problem's own first trial."""
@@ -224,7 +227,9 @@ def _expect_columns(slots: range, packet: Packet | PacketBlock, scheme: Scheme, 
     expect_array(f"{where}: {name}.nu", packet.nu, np.bool_, (*rows, trials), f"{axes}{_TRIALS}")
     if (packet.header is None) != (not scheme.header):
         there = "no header" if packet.header is None else "a header"
-        raise Broken(f"{where}: {subject} {there}, and the scheme's `header` names {len(scheme.header)} numbers")
+        raise Broken(
+            f"{where}: {subject} {there}, and the scheme's `header` names {counted(len(scheme.header), 'number')}"
+        )
     if packet.header is not None:
         shape = (*rows, len(scheme.header), trials)
         expect_array(f"{where}: {name}.header", packet.header, np.int64, shape, f"{axes}unencrypted numbers, R trials")

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from evedrop.errors import DisturbanceError
+from evedrop.system.counting import counted
 from evedrop.system.files import Limit, Unreadable, lines_of
 
 _KILOWATTS = {"W": 1e-3, "kW": 1.0}
@@ -76,7 +77,7 @@ def read_disturbances(
         series.check_times(slot_seconds, recorded)
     count = len(series.numbers)
     if slots is not None and count < slots:
-        few = f"has {count} rows; expected slots, which is {slots}, or more"
+        few = f"has {counted(count, 'row')}; expected slots, which is {slots}, or more"
         raise DisturbanceError(str(path), [f"{few}: a longer file, or slots = {count}" if count else few])
     return series.numbers
 
@@ -266,7 +267,7 @@ def _read_series(
 def _cell_mistakes(rows: Sequence[_Row], width: int, columns: Sequence[_Column]) -> Iterator[str]:
     for row in rows:
         if len(row.cells) != width:
-            yield f"line {row.line} has {len(row.cells)} columns; expected {width}, as the first line has"
+            yield f"line {row.line} has {counted(len(row.cells), 'column')}; expected {width}, as the first line has"
             continue
         for column in columns:
             cell = row.cells[column.place]

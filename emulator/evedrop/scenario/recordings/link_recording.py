@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from evedrop.errors import TraceError
 from evedrop.model.delays import MOST_DELAYS
 from evedrop.model.links.trace import MOST_OUTCOMES
+from evedrop.system.counting import counted
 from evedrop.system.files import Limit, Unreadable, lines_of, opened, why_of
 
 Outcomes = NDArray[np.uint8]
@@ -185,7 +186,10 @@ class LinkRecording:
         place = self._place(names, column)
         for line, row in rows if named else chain([(number, first)], rows):
             if len(row) != len(names):
-                self._no("file", f"line {line} has {len(row)} columns; expected {len(names)}, as the first line has")
+                self._no(
+                    "file",
+                    f"line {line} has {counted(len(row), 'column')}; expected {len(names)}, as the first line has",
+                )
             yield f"line {line}", row[place]
 
     def _parquet_values(self, column: str | None) -> Iterator[tuple[str, str]]:
@@ -219,7 +223,10 @@ class LinkRecording:
                 self._no("column", f"{_shown(column)} is not a column of {self._path.name}; {there}")
             return names.index(column)
         if len(names) != 1:
-            self._no("file", f"has {len(names)} columns without names; expected one column, or a line of names first")
+            self._no(
+                "file",
+                f"has {counted(len(names), 'column')} without names; expected one column, or a line of names first",
+            )
         return 0
 
     def _unreadable(self, error: Exception) -> NoReturn:

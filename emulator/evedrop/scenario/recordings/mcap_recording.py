@@ -28,6 +28,7 @@ from evedrop.scenario.recordings.message_recording import (
     numbers_of_times,
     series_of,
 )
+from evedrop.system.counting import counted
 from evedrop.system.files import Unreadable, is_folder, opened, why_of
 
 if TYPE_CHECKING:
@@ -226,7 +227,9 @@ class _Contents:
         old = np.cumprod(messages.published < self._began - _OLD * 1e9).astype(np.bool_)
         if not old.any() or old.all():  # all: the clocks differ
             return messages
-        self._notes.append(f"{int(old.sum())} messages from before the recording, kept for late subscribers: left out")
+        self._notes.append(
+            f"left out: {counted(int(old.sum()), 'message')} from before the recording, kept for late subscribers"
+        )
         return messages.of(~old)
 
     def _numbered(self, messages: _Messages, longest: float | None) -> MessageSeries:
@@ -301,7 +304,9 @@ class _Contents:
 
     def _some(self, channels: Sequence[_Messages]) -> str:
         """Topics with their messages."""
-        shown = [f"{channel.topic} ({len(channel.sequences)} messages)" for channel in channels[:_MOST_SHOWN]]
+        shown = [
+            f"{channel.topic} ({counted(len(channel.sequences), 'message')})" for channel in channels[:_MOST_SHOWN]
+        ]
         more = [] if len(channels) <= _MOST_SHOWN else [f"{len(channels) - _MOST_SHOWN} more"]
         return ", ".join(shown + more)
 

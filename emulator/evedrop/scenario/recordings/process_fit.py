@@ -19,6 +19,7 @@ from evedrop.model.kernels.elementary import normal_quantile
 from evedrop.model.process import Floats, mistakes_of
 from evedrop.model.slot.cores import LARGEST, deviations
 from evedrop.scenario.recordings.disturbance_file import StateRecording, recorded_states
+from evedrop.system.counting import counted
 
 FEWEST = 10
 """The fewest transitions for each state from which a process can be estimated."""
@@ -126,11 +127,11 @@ def fit_process(path: Path, names: Sequence[str] | None = None, reference: Seque
     n, count = len(recording.names), len(recording.rows) - 1
     if reference is not None and len(reference) != n:
         raise UsageError(
-            f"--reference has {len(reference)} numbers; expected {n}, one for each of {', '.join(recording.names)}"
+            f"--reference has {counted(len(reference), 'number')}; expected {n}, one for each of {', '.join(recording.names)}"
         )
     if count < FEWEST * n:
         raise UsageError(
-            f"{path} has {count + 1} states; expected at least {FEWEST * n + 1}, for a process of {n} states"
+            f"{path} has {counted(count + 1, 'state')}; expected at least {FEWEST * n + 1}, for a process of {n} states"
         )
     around = np.zeros(n) if reference is None else np.array(reference, np.float64)
     x = deviations(np.array(recording.rows), around)

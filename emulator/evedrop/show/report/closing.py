@@ -29,6 +29,7 @@ from evedrop.score.summary import (
 )
 from evedrop.score.verdict import SecrecyOutcome, times_text
 from evedrop.show.report.text_table import TextColumn, TextTable
+from evedrop.system.counting import counted
 
 SWEEP_FILE = "sweep.json"
 """The file that says what a sweep is; its folder has it from the beginning."""
@@ -38,11 +39,11 @@ SWEEP_TABLE = "sweep.parquet"
 
 def amount(summary: Summary) -> str:
     """How much was run, and how fast."""
-    trials = f"{summary.trials:,} trials" if summary.trials > 1 else "1 trial"
+    trials = counted(summary.trials, "trial")
     rate = f"{summary.slots_per_second:,.0f} slots/s"
     if summary.mode != "live":
         rate = f"{summary.slots_per_second * summary.trials:,.0f} trial-slots/s in memory"
-    return f"{summary.slots:,} slots · {trials} · {rate}"
+    return f"{counted(summary.slots, 'slot')} · {trials} · {rate}"
 
 
 def heading(summary: Summary) -> str:
@@ -170,8 +171,8 @@ def _split_lines(summary: Summary) -> Iterator[str]:
             continue
         plain = estimate(shown_metric(peer.all_metrics, _SPLIT), shown_metric(peer.standard_errors, _SPLIT))
         yield (
-            f"{_MARK} {name}: by splitting, {rare.populations} populations of {rare.trials:,} trials, copied after "
-            f"{rare.splits} slot{'' if rare.splits == 1 else 's'}; the mean over the {summary.trials:,} trials is {plain}"
+            f"{_MARK} {name}: by splitting, {counted(rare.populations, 'population')} of {rare.trials:,} trials, copied after "
+            f"{counted(rare.splits, 'slot')}; the mean over the {summary.trials:,} trials is {plain}"
         )
 
 

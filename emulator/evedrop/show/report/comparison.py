@@ -15,6 +15,7 @@ from evedrop.score.summary import RARE_FRACTION
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.closing import rare_events_words
 from evedrop.show.report.text_table import TextTable
+from evedrop.system.counting import counted
 
 if TYPE_CHECKING:
     from evedrop.results.comparison import Cell, Comparison, SimulatedError
@@ -22,9 +23,8 @@ if TYPE_CHECKING:
 
 def comparison_heading(comparison: Comparison) -> str:
     """What was compared, and how much of it."""
-    trials = f"{comparison.trials:,} trials" if comparison.trials > 1 else "1 trial"
     against = " · errors against the sensor's estimate" if comparison.of_estimate else ""
-    return f"{comparison.title} · {comparison.slots:,} slots · {trials}{against}"
+    return f"{comparison.title} · {counted(comparison.slots, 'slot')} · {counted(comparison.trials, 'trial')}{against}"
 
 
 def schemes_done(comparison: Comparison) -> str:

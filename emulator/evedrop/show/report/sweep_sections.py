@@ -34,6 +34,7 @@ from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.travel import OF_PAGE, SCENARIO, circumstances, download
 from evedrop.show.view.axis_name import are_numbers, axis_name
 from evedrop.show.view.palette import paper_inks
+from evedrop.system.counting import counted
 from evedrop.system.files import Unreadable, text_of
 
 _MOST_BYTES = 2**24
@@ -77,8 +78,8 @@ class SweepSource:
             rows = table.to_pylist()
             inks = paper_inks(dict.fromkeys(row["peer"] for row in rows), swept_strategies(table))
             done, planned = len({tuple(row[key] for key in grid) for row in rows}), math.prod(map(len, grid.values()))
-            sizes = (_size([row[name] for row in rows], name) for name in ("slots", "trials"))
-            amount = " · ".join((f"{done:,} points of {', '.join(grid)}", *sizes))
+            sizes = (_size([row[f"{name}s"] for row in rows], name) for name in ("slot", "trial"))
+            amount = " · ".join((f"{counted(done, 'point')} of {', '.join(grid)}", *sizes))
             outcome = "; ".join(sweep_outcome(table.to_pylist(), list(grid), done, planned))
             changes, mode = entries["changes"], entries["mode"]
             lacking = _points_done(done, planned) if done < planned else ""
@@ -114,7 +115,7 @@ def _points_done(done: int, planned: int) -> str:
 def _size(counts: Sequence[int], of: str) -> str:
     """The counts of all points in words, such as "1,000 slots"; their range if the points differ."""
     least, most = min(counts), max(counts)
-    return f"{least:,} {of}" if least == most else f"{least:,} to {most:,} {of}"
+    return counted(least, of) if least == most else f"{least:,} to {counted(most, of)}"
 
 
 def _verdicts(of: SweepSource) -> Iterator[Markup]:
@@ -124,7 +125,7 @@ def _verdicts(of: SweepSource) -> Iterator[Markup]:
         if row["verdict"] is not None:
             counts_of.setdefault(row["peer"], Counter())[SecrecyOutcome(row["verdict"]).headline] += 1
     for name, counts in counts_of.items():
-        word = ", ".join(f"{word} at {count:,} point{'' if count == 1 else 's'}" for word, count in counts.items())
+        word = ", ".join(f"{word} at {counted(count, 'point')}" for word, count in counts.items())
         lines.append(f"{name}: {word}")
     yield made("sentences", lines)
 

@@ -12,6 +12,7 @@ from evedrop.results.wire_summary import WireSummary
 from evedrop.score.summary import failed
 from evedrop.show.report.closing import expectations_outcome
 from evedrop.show.report.text_table import TextTable
+from evedrop.system.counting import counted
 
 WITHOUT_MODEL = {"overflow", "cut", "unlinked", "too_large", "looped", "too_many_keys"}
 """The reasons for which messages are lost before a link's models decide on them."""
@@ -25,7 +26,7 @@ _MARKS = {True: "yes", False: "NO", None: "–"}
 
 def wire_title(summary: WireSummary) -> str:
     """How much a wire did, in a line."""
-    return f"wire · seed {summary.seed} · {summary.heard:,} messages · {summary.seconds:,.1f} s"
+    return f"wire · seed {summary.seed} · {counted(summary.heard, 'message')} · {summary.seconds:,.1f} s"
 
 
 def wire_table(summary: WireSummary) -> TextTable:
@@ -65,7 +66,7 @@ def wire_outcome(summary: WireSummary) -> tuple[str, bool | None]:
     """The outcome of a wire in a sentence, and whether it is good; None if there is nothing to judge."""
     sentence, good = expectations_outcome(summary.expectations, "wire")
     if summary.unaccounted:
-        return f"unaccounted for: {_messages(summary.unaccounted)}; {sentence}", False
+        return f"unaccounted for: {counted(summary.unaccounted, 'message')}; {sentence}", False
     if summary.bypasses:
         return f"no verdict, because programs could speak past the wire; {sentence}", False
     if summary.journal.incomplete_since is not None:
@@ -97,7 +98,7 @@ def wire_sentences(summary: WireSummary) -> Iterator[str]:
 def unlinked_sentence(summary: WireSummary) -> Iterator[str]:
     """How many messages no link took, if there were some."""
     if summary.unlinked:
-        yield f"no link of the file takes {_messages(summary.unlinked)}; add a link, or let programs not publish them"
+        yield f"no link of the file takes {counted(summary.unlinked, 'message')}; add a link, or let programs not publish them"
 
 
 def wire_failures(summary: WireSummary) -> Iterator[str]:
@@ -128,9 +129,9 @@ def wire_faults(summary: WireSummary) -> Iterator[str]:
                 f"{low:.4f} to {high:.4f} were expected"
             )
     if summary.unaccounted:
-        yield f"unaccounted for: {_messages(summary.unaccounted)}; this is a fault of Evedrop"
+        yield f"unaccounted for: {counted(summary.unaccounted, 'message')}; this is a fault of Evedrop"
     if summary.journal.missing:
-        yield f"the journal lacks {_messages(summary.journal.missing)}, because its folder could not be written"
+        yield f"the journal lacks {counted(summary.journal.missing, 'message')}, because its folder could not be written"
     elif summary.journal.incomplete_since is not None:
         yield (
             "the folder of the journal could not be written for some time: the journal has all messages, but perhaps not all "
@@ -145,7 +146,3 @@ def _unfinished(summary: WireSummary) -> str:
 
 def _counted(reasons: Mapping[str, int]) -> str:
     return ", ".join(f"{count:,} by {reason.replace('_', ' ')}" for reason, count in reasons.items())
-
-
-def _messages(count: int) -> str:
-    return "1 message" if count == 1 else f"{count:,} messages"

@@ -17,6 +17,7 @@ from evedrop.model.receiver import INNOVATION, Action, Codes, Flags
 from evedrop.show.view.attacks import Attacks
 from evedrop.show.view.lanes import MISLED_CODE, SILENT_CODE, scheme_of
 from evedrop.show.view.scene import Scene, Shown
+from evedrop.system.counting import counted
 
 _SHORTEST = 3  # packets in a row; missing fewer is normal
 _LINES = 200  # the approximate number of stretches that a receiver may report in a whole run
@@ -119,15 +120,15 @@ class Watcher(_StretchWatcher):
     def _lost(self, *counts: int) -> str:
         deceived, unsent = counts
         if self._legitimate and not unsent:
-            return f"{self._name} lost {self._long} packets in a row"
-        line = f"{self._name} lost synchronisation: {self._long} slots without a state"
+            return f"{self._name} lost {counted(self._long, 'packet')} in a row"
+        line = f"{self._name} lost synchronisation: {counted(self._long, 'slot')} without a state"
         if self._legitimate:
-            line = f"{self._name} had no packet for {self._long} slots"
+            line = f"{self._name} had no packet for {counted(self._long, 'slot')}"
         line = f"{line}, {unsent} of them silent" if unsent else line
         return f"{line}, {deceived} misled" if deceived else line
 
     def _regained(self) -> str:
-        return f"{self._name} regained synchronisation after {self._bad} slots"
+        return f"{self._name} regained synchronisation after {counted(self._bad, 'slot')}"
 
 
 @final
@@ -151,7 +152,7 @@ class AckWatcher(_StretchWatcher):
 
     def _lost(self, *counts: int) -> str:
         attacked = f", {counts[0]} by the attack" if counts[0] else ""
-        return f"the sensor got no acknowledgement for {self._long} slots{attacked}"
+        return f"the sensor got no acknowledgement for {counted(self._long, 'slot')}{attacked}"
 
     def _regained(self) -> str:
-        return f"the sensor got an acknowledgement again after {self._bad} slots"
+        return f"the sensor got an acknowledgement again after {counted(self._bad, 'slot')}"

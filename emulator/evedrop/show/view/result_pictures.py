@@ -37,6 +37,7 @@ from evedrop.show.view.error_floor import ErrorAxis, error_floor
 from evedrop.show.view.figure_style import drawing, save
 from evedrop.show.view.lanes import EAVESDROPPER
 from evedrop.show.view.palette import TRUTH_CURVE, VERDICTS, hexadecimal, paper_inks
+from evedrop.system.counting import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -350,7 +351,7 @@ def shown(comparison: Comparison) -> dict[str, str]:
     return {
         "Rows": ",".join(comparison.schemes),
         "Columns": ",".join(comparison.adversaries),
-        "Size": f"{comparison.slots} slots, {comparison.trials} trials, seed {comparison.seed}",
+        "Size": f"{counted(comparison.slots, 'slot')}, {counted(comparison.trials, 'trial')}, seed {comparison.seed}",
     }
 
 
@@ -430,8 +431,8 @@ def _legend(axes: Axes, comparison: Comparison, left: float) -> None:
         axes.text(place + 0.52, rows + 0.1, meaning, ha="left", va="center", fontsize=8.8)
         place += 1.0 + 0.092 * len(meaning)
     notes = [
-        f"{without_mathematics(comparison.title)}: {comparison.slots:,} slots, "
-        f"{comparison.trials:,} trial{'s' if comparison.trials > 1 else ''}.",
+        f"{without_mathematics(comparison.title)}: {counted(comparison.slots, 'slot')}, "
+        f"{counted(comparison.trials, 'trial')}.",
         "n×: the adversary's error over the legitimate one. legitimate n×: an attack raises the legitimate error n-fold. "
         "·: not defined." + (f" Bold: dominates ({', '.join(comparison.dominant)})." if comparison.dominant else ""),
     ]
