@@ -24,6 +24,7 @@ from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.comparison import comparison_lines, conclusion, verdict
 from evedrop.show.report.comparison_sections import COMPARISON_SECTIONS, ComparisonSource
 from evedrop.show.report.writing import write_report
+from evedrop.show.view.result_pictures import comparison_figure
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.studies.matchups import ATTACKERS, usual_adversaries
@@ -313,6 +314,23 @@ def test_rare_events_that_carry_the_legitimate_error_are_said(tmp_path: Path) ->
     assert naive.rare_events is not None
     assert naive.rare_events.fraction < 0.1
     assert any(line.endswith(": innovation up to more than 99 %") for line in comparison_lines(result))
+
+
+def test_the_picture_says_which_error_is_a_median(literature: Comparison) -> None:
+    """As the table does."""
+
+    def texts(heavy: str) -> list[str]:
+        schemes = {
+            name: replace(scheme, legitimate=replace(scheme.legitimate, infinite_variance=name == heavy))
+            for name, scheme in literature.schemes.items()
+        }
+        axes = comparison_figure(replace(literature, schemes=schemes)).axes[0]
+        return [text.get_text() for text in axes.texts]
+
+    means, medians = texts("none"), texts("plain")
+    assert not any(text.endswith("\nmed") or "med:" in text for text in means)
+    assert sum(text.endswith("\nmed") for text in medians) == 1
+    assert medians[-1].endswith("med: the median trial, since the variance over trials is infinite.")
 
 
 def test_a_scheme_alone_does_not_dominate(literature: Comparison) -> None:

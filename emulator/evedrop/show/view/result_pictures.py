@@ -390,8 +390,9 @@ def _draw_comparison_on(axes: Axes, comparison: Comparison) -> None:
 
 def _facts(scheme: SchemeResult) -> Iterator[str]:
     needs = scheme.needs
-    error = scheme.legitimate.standard_error
-    yield short_text(scheme.legitimate.typical) + (f"\n± {short_text(error)}" if error else "")
+    legitimate = scheme.legitimate
+    scatter = f"\n± {short_text(legitimate.standard_error)}" if legitimate.standard_error else ""
+    yield short_text(legitimate.typical) + ("\nmed" if legitimate.infinite_variance else scatter)
     yield "needed" if needs.acknowledgements else "–"
     yield short_text(needs.bits_per_slot)
     yield f"{needs.energy_per_slot:.3g}"
@@ -436,4 +437,6 @@ def _legend(axes: Axes, comparison: Comparison, left: float) -> None:
         "n×: the adversary's error over the legitimate one. legitimate n×: an attack raises the legitimate error n-fold. "
         "·: not defined." + (f" Bold: dominates ({', '.join(comparison.dominant)})." if comparison.dominant else ""),
     ]
+    if any(scheme.legitimate.infinite_variance for scheme in comparison.schemes.values()):
+        notes.append("med: the median trial, since the variance over trials is infinite.")
     axes.text(-left - 1.9, rows + 0.55, "\n".join(notes), ha="left", va="top", fontsize=8.8, linespacing=1.5)
