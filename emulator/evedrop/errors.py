@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 
-from evedrop.system.counting import counted
+from evedrop.counting import counted
 
 MOST_MISTAKES = 100
 """The most mistakes of a scenario in one message: more would not be read."""

@@ -9,11 +9,11 @@ from itertools import pairwise
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from evedrop.counting import counted
 from evedrop.errors import UsageError
 from evedrop.model.digest import BLOCK_SLOTS
 from evedrop.names import CONTROLLER
 from evedrop.results.reading import METRICS_AS_OF, Results
-from evedrop.system.counting import counted
 
 _COMPARED = ("sent", "action", "x", "x_hat", "P")
 _INPUTS = ("u", "d", "failed", "watermark", "statistic")

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from evedrop.counting import counted
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.links.loss_model import Fate
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
@@ -49,7 +50,6 @@ from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import expectations_of
 from evedrop.scenario.timeline import numbered_acts
 from evedrop.scenario.words import as_toml, listed
-from evedrop.system.counting import counted
 
 Numbered = tuple[int, Act]
 """An act with the number of its event."""

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from evedrop.counting import counted
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.integrity.monitor import MonitorPlan
 from evedrop.model.schemes import SCHEMES
@@ -23,7 +24,6 @@ from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.process_noise import measured_mistakes
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
-from evedrop.system.counting import counted
 
 
 def labels(names: list[str] | None, units: list[str] | None) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evedrop.counting import counted
 from evedrop.errors import UsageError
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.closed_forms import encrypted_fraction, threshold_for
@@ -24,7 +25,6 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.theory import conditions_of, stated_form
 from evedrop.scenario.words import listed
-from evedrop.system.counting import counted
 
 _SHOWN = 5  # whole thresholds
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from evedrop.counting import counted
 from evedrop.scenario.words import as_toml
-from evedrop.system.counting import counted
 
 _SHOWN = ("title", "slots", "seed", "trials", "slot_seconds", "process", "encoding", "legitimate", "eavesdroppers")
 _MOST = 100  # characters of a line's contents

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
 
+from evedrop.counting import counted
 from evedrop.model.controllers import CONTROLLERS, LONGEST_PERIOD, Assignment
 from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.plant import Plant
@@ -21,7 +22,6 @@ from evedrop.model.slot.cores import LARGEST
 from evedrop.scenario.process import row_mistake, word_mistake
 from evedrop.scenario.table import Labels, Matrix, Mistake, Number, Table, one_of, parameter_mistakes
 from evedrop.scenario.words import as_toml
-from evedrop.system.counting import counted
 
 Numbers = list[Number]
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
+from evedrop.counting import counted
 from evedrop.model.process import Process, mistakes_of
 from evedrop.model.slot.cores import LARGEST
 from evedrop.scenario.table import Labels, Matrix, Mistake, Number, ProcessName, Table, expected
 from evedrop.scenario.words import as_toml, listed
-from evedrop.system.counting import counted
 
 Source = Literal["model", "file", "zenoh"]
 """Where the true states come from: `model`, the process itself."""

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from evedrop.counting import counted
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.local_filter import MOST_STATES, FilterStep, Steps, settled
@@ -26,7 +27,6 @@ from evedrop.model.theory.leak import Leaks
 from evedrop.scenario.plant import PlantTable, noise_mistakes, plant_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.tables import Scenario
-from evedrop.system.counting import counted
 
 FILTER = "filter"
 _CERTAINLY, _NEARLY = 1e-13, 1e-9  # singular values, of entries up to 1, that are 0

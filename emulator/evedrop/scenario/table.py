@@ -18,11 +18,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from evedrop.counting import counted
 from evedrop.errors import NotRegistered
 from evedrop.model.registry import Registry, asked
 from evedrop.names import RESERVED
 from evedrop.scenario.words import as_toml, listed, no_entry
-from evedrop.system.counting import counted
 from evedrop.system.hints import near
 from evedrop.system.output import escaped
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from evedrop.counting import counted
 from evedrop.errors import Interrupted, UsageError
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import options_of
-from evedrop.system.counting import counted
 from evedrop.system.signals import stop_on_signals
 from evedrop.virtual.campaign import PlayedCase, play_case
 from evedrop.virtual.cases import SimulatedCase, case_with

@@ -11,12 +11,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import quote
 
+from evedrop.counting import counted
 from evedrop.results.folder import replace_private
 from evedrop.show.report.page import Page, Part, facts_table, made
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.travel import circumstances
 from evedrop.studies.scenario_tests import Finding, Outcome
-from evedrop.system.counting import counted
 from evedrop.system.output import warn
 
 TESTS_PAGE = "tests.html"

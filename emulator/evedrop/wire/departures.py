@@ -20,7 +20,7 @@ from typing import Any, Final, final
 
 import zenoh
 
-from evedrop.system.counting import counted
+from evedrop.counting import counted
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 from evedrop.system.world import world
 from evedrop.wire.side import SideSession

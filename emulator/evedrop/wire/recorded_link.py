@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 import zenoh
 from numpy.typing import NDArray
 
+from evedrop.counting import counted
 from evedrop.errors import TraceError, UsageError
 from evedrop.scenario.recordings.message_recording import (
     MessageArrivals,
@@ -26,7 +27,6 @@ from evedrop.scenario.recordings.message_recording import (
     joined,
     series_of,
 )
-from evedrop.system.counting import counted
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal_place import JOURNAL_FOLDER

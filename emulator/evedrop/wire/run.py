@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from evedrop.counting import counted
 from evedrop.errors import Interrupted, RunError
 from evedrop.live.network.control_file import remove_control
 from evedrop.results.folder import make_private, new_folder, replace_private
@@ -20,7 +21,6 @@ from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE
 from evedrop.scenario.receivers import PUT
 from evedrop.show.report.wire import wire_failures
 from evedrop.show.view.viewer import Viewer, choose
-from evedrop.system.counting import counted
 from evedrop.system.environment import check_zenoh_runtime
 from evedrop.system.output import warn
 from evedrop.system.world import world

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.counting import counted
 from evedrop.show.view import palette
 from evedrop.show.view.lanes import Lane
 from evedrop.show.view.palette import Colour
-from evedrop.system.counting import counted
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.records import UNLINKED, WireFate
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from evedrop.cli.api.running import scenario_of
 from evedrop.cli.words import for_programs, speaks_python
+from evedrop.counting import counted
 from evedrop.errors import UsageError
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
@@ -22,7 +23,6 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario.arguments import number_argument, refuse_unless
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import dotted, listed, options_of
-from evedrop.system.counting import counted
 
 if TYPE_CHECKING:
     from evedrop.model.theory.design import Design

@@ -15,6 +15,7 @@ import pyarrow as pa
 
 from evedrop.cli.api.notebook import OpenView, table_text
 from evedrop.cli.words import WIDTH, in_python
+from evedrop.counting import counted
 from evedrop.model.metrics import shown_metric
 from evedrop.model.metrics.text import number_text
 from evedrop.results.comparison import COMPARISON, Comparison, read_comparison
@@ -26,7 +27,6 @@ from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.comparison import comparison_heading, conclusion, left_out_schemes, pairs_table, schemes_table
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.verdict_matrix import matrix_lines
-from evedrop.system.counting import counted
 from evedrop.system.output import wrapped
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.cli.command import command, number_type, option, together
+from evedrop.counting import counted
 from evedrop.errors import UsageError
-from evedrop.system.counting import counted
 
 if TYPE_CHECKING:
     from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults

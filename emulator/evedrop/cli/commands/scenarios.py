@@ -9,8 +9,8 @@ from typing import Any
 
 from evedrop.cli.command import command, option, together
 from evedrop.cli.options import changes, changes_of
+from evedrop.counting import counted
 from evedrop.errors import UsageError
-from evedrop.system.counting import counted
 from evedrop.system.output import YELLOW, tell
 
 

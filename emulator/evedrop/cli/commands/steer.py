@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from evedrop.cli.command import command, option, together
 from evedrop.cli.options import as_json
+from evedrop.counting import counted
 from evedrop.errors import BriefError, UsageError
-from evedrop.system.counting import counted
 from evedrop.system.output import print_json, warn
 from evedrop.system.world import world
 

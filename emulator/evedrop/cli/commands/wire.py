@@ -8,8 +8,8 @@ from pathlib import Path
 
 from evedrop.cli.command import command, flag, option, together
 from evedrop.cli.options import changes_of
+from evedrop.counting import counted
 from evedrop.errors import UsageError
-from evedrop.system.counting import counted
 from evedrop.system.output import say as complain
 from evedrop.system.output import tell, warn
 

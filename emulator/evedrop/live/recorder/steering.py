@@ -14,6 +14,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
+from evedrop.counting import counted
 from evedrop.errors import RunError, ScenarioError
 from evedrop.live.network.operator import Order
 from evedrop.live.network.session import READY_SECONDS
@@ -29,7 +30,6 @@ from evedrop.scenario.events.event import Act
 from evedrop.scenario.loading import with_event
 from evedrop.scenario.progress_events import Held, OnEvent, RunEvent
 from evedrop.scenario.tables import Scenario
-from evedrop.system.counting import counted
 from evedrop.system.world import world
 
 STEP_SECONDS = 1.0

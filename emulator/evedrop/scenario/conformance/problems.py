@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from evedrop.counting import counted
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, asymmetry
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme
 from evedrop.model.streams import Batch, BlockReader
 from evedrop.scenario.conformance.rules import Broken, NamedKeys, calling, expect_array, expect_finite, frozen, key
-from evedrop.system.counting import counted
 
 QUALITY = 0.7
 """The link quality of every problem."""

@@ -23,8 +23,8 @@ from itertools import islice, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
+from evedrop.counting import counted
 from evedrop.errors import DisturbanceError
-from evedrop.system.counting import counted
 from evedrop.system.files import Limit, Unreadable, lines_of
 
 _KILOWATTS = {"W": 1e-3, "kW": 1.0}

@@ -18,10 +18,10 @@ from typing import Any, NoReturn, final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.counting import counted
 from evedrop.errors import TraceError
 from evedrop.model.delays import MOST_DELAYS
 from evedrop.model.links.trace import MOST_OUTCOMES
-from evedrop.system.counting import counted
 from evedrop.system.files import Limit, Unreadable, lines_of, opened, why_of
 
 Outcomes = NDArray[np.uint8]

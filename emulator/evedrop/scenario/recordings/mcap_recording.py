@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn, final
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.counting import counted
 from evedrop.errors import TraceError
 from evedrop.model.process import Floats
 from evedrop.scenario.recordings.message_recording import (
@@ -28,7 +29,6 @@ from evedrop.scenario.recordings.message_recording import (
     numbers_of_times,
     series_of,
 )
-from evedrop.system.counting import counted
 from evedrop.system.files import Unreadable, is_folder, opened, why_of
 
 if TYPE_CHECKING:

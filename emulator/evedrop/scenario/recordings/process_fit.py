@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from evedrop.counting import counted
 from evedrop.errors import UsageError
 from evedrop.model.checks import toml_of
 from evedrop.model.kernels.elementary import normal_quantile
 from evedrop.model.process import Floats, mistakes_of
 from evedrop.model.slot.cores import LARGEST, deviations
 from evedrop.scenario.recordings.disturbance_file import StateRecording, recorded_states
-from evedrop.system.counting import counted
 
 FEWEST = 10
 """The fewest transitions for each state from which a process can be estimated."""

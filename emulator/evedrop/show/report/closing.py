@@ -10,6 +10,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from evedrop.counting import counted
 from evedrop.model.metrics import all_metrics, columns, error_column, shown_metric, unloadable_metrics, z_column
 from evedrop.model.metrics.text import count_text, estimate, fraction_text, number_text
 from evedrop.model.registry import CLASS_ERRORS, place_of
@@ -29,7 +30,6 @@ from evedrop.score.summary import (
 )
 from evedrop.score.verdict import SecrecyOutcome, times_text
 from evedrop.show.report.text_table import TextColumn, TextTable
-from evedrop.system.counting import counted
 
 SWEEP_FILE = "sweep.json"
 """The file that says what a sweep is; its folder has it from the beginning."""

@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from itertools import groupby
 from typing import TYPE_CHECKING
 
+from evedrop.counting import counted
 from evedrop.model.metrics.text import ShownNumber, estimate, fraction_text, number_text
 from evedrop.scenario.words import listed
 from evedrop.score.summary import RARE_FRACTION
 from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.closing import rare_events_words
 from evedrop.show.report.text_table import TextTable
-from evedrop.system.counting import counted
 
 if TYPE_CHECKING:
     from evedrop.results.comparison import Cell, Comparison, SimulatedError

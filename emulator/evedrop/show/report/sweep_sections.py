@@ -20,6 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from markupsafe import Markup, escape
 
+from evedrop.counting import counted
 from evedrop.errors import UsageError
 from evedrop.model.checks import toml_of
 from evedrop.model.metrics import all_metrics, error_column, shown_metric
@@ -34,7 +35,6 @@ from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.travel import OF_PAGE, SCENARIO, circumstances, download
 from evedrop.show.view.axis_name import are_numbers, axis_name
 from evedrop.show.view.palette import paper_inks
-from evedrop.system.counting import counted
 from evedrop.system.files import Unreadable, text_of
 
 _MOST_BYTES = 2**24

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
+from evedrop.counting import counted
 from evedrop.model.metrics.text import ShownNumber
 from evedrop.results.wire_summary import WireSummary
 from evedrop.score.summary import failed
 from evedrop.show.report.closing import expectations_outcome
 from evedrop.show.report.text_table import TextTable
-from evedrop.system.counting import counted
 
 WITHOUT_MODEL = {"overflow", "cut", "unlinked", "too_large", "looped", "too_many_keys"}
 """The reasons for which messages are lost before a link's models decide on them."""

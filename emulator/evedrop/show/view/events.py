@@ -12,12 +12,12 @@ from typing import NamedTuple, final
 
 import numpy as np
 
+from evedrop.counting import counted
 from evedrop.model.acknowledgements import AckFate
 from evedrop.model.receiver import INNOVATION, Action, Codes, Flags
 from evedrop.show.view.attacks import Attacks
 from evedrop.show.view.lanes import MISLED_CODE, SILENT_CODE, scheme_of
 from evedrop.show.view.scene import Scene, Shown
-from evedrop.system.counting import counted
 
 _SHORTEST = 3  # packets in a row; missing fewer is normal
 _LINES = 200  # the approximate number of stretches that a receiver may report in a whole run

@@ -20,6 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.patches import Patch, Rectangle
 
+from evedrop.counting import counted
 from evedrop.errors import UsageError
 from evedrop.model.metrics import all_metrics, error_column, shown_metric
 from evedrop.model.metrics.text import short_text
@@ -37,7 +38,6 @@ from evedrop.show.view.error_floor import ErrorAxis, error_floor
 from evedrop.show.view.figure_style import drawing, save
 from evedrop.show.view.lanes import EAVESDROPPER
 from evedrop.show.view.palette import TRUTH_CURVE, VERDICTS, hexadecimal, paper_inks
-from evedrop.system.counting import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

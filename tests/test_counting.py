@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from evedrop.system.counting import counted
+from evedrop.counting import counted
 
 
 @pytest.mark.parametrize(
