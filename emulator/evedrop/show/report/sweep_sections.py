@@ -34,6 +34,7 @@ from evedrop.show.report.closing import SWEEP_FILE, SWEEP_TABLE, sweep_doubts, s
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.travel import OF_PAGE, SCENARIO, circumstances, download
 from evedrop.show.view.axis_name import are_numbers, axis_name
+from evedrop.show.view.error_floor import mean_band
 from evedrop.show.view.palette import paper_inks
 from evedrop.system.files import Unreadable, text_of
 
@@ -176,9 +177,7 @@ def _curve(
     y, theory = (_values(rows, names) for names in (marks, lines))
     errors = _values(rows, [error_column(metric) for metric in marks])
     sound = sound_errors(errors, _values(rows, ["rare_fraction"]) * theory)
-    with np.errstate(all="ignore"):
-        factor = np.exp(1.96 * np.nan_to_num(sound) / y)
-    curve = Curve(name, ink, np.array(x), y, y / factor, y * factor, theory, bars=True)
+    curve = Curve(name, ink, np.array(x), y, *mean_band(y, np.nan_to_num(sound)), theory, bars=True)
     return curve, bool((np.isnan(sound) & ~np.isnan(errors)).any())
 
 
