@@ -90,7 +90,8 @@ def test_peers_and_network_stay_light(loaded: dict[str, set[str]]) -> None:
         names = loaded[module]
         assert packages(names) <= MESSAGES | {"numpy", "cryptography", "xxhash", "_cffi_backend"}, module
         assert ours(names) <= {
-            f"evedrop.{name}" for name in ("live", "model", "peers", "scenario", "system", "names", "errors")
+            f"evedrop.{name}"
+            for name in ("live", "model", "peers", "scenario", "system", "counting", "names", "errors")
         }
         of_scenarios = {".".join(name.split(".")[:3]) for name in names if name.startswith("evedrop.scenario.")}
         assert of_scenarios <= {f"evedrop.scenario.{name}" for name in ("conformance", "plugins", "progress_events")}, (
@@ -105,7 +106,7 @@ def test_a_solver_is_loaded_only_when_a_controller_is_made(loaded: dict[str, set
     assert not packages(names) & {"osqp", "scipy"}
 
 
-MATHEMATICS = {f"evedrop.{name}" for name in ("model", "system", "names", "errors")}
+MATHEMATICS = {f"evedrop.{name}" for name in ("model", "system", "counting", "names", "errors")}
 """What the model may import."""
 
 

@@ -163,7 +163,7 @@ def test_the_horizon_is_the_same_slot_by_slot_and_in_halves(n: int, radius: floa
         ("trials = true\n" + BASE, "trials: is true; expected a whole number"),
         (BASE + "[plant]\ninputs = [[1]]\n", "plant.inputs.0: is [1]; expected a string"),
         (BASE + f"[plant]\ninputs = {['u'] * 50_000}\n", "plant.inputs: has 50000 names; expected at most 64"),
-        ("".join(f"[eavesdroppers.e{i}]\n" for i in range(2000)) + BASE, "has 2000 entries; expected at most 64"),
+        ("".join(f"[eavesdroppers.e{i}]\n" for i in range(2000)) + BASE, "has 2,000 entries; expected at most 64"),
     ],
     ids=lambda case: "" if len(case) > 60 else case,
 )  # fmt: skip

@@ -14,7 +14,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from evedrop.counting import counted
 from evedrop.errors import RunError, ScenarioError
 from evedrop.live.network.operator import Order
 from evedrop.live.network.session import READY_SECONDS
@@ -262,7 +261,7 @@ class Steering:
                     f"another step is under way, to slot {self._step.until - 1}; wait for its end, or pause first"
                 )
             case StepRequest(slots):
-                self._note(k, f"step {counted(slots, 'slot')}", "operator")
+                self._note(k, f"step {slots} slots" if slots > 1 else "step 1 slot", "operator")
                 self._step, self.paused = OperatorStep(order, k, min(k + slots, LAST_SLOT)), False
 
     def _change(self, k: int, order: Order, event: Mapping[str, Any]) -> None:

@@ -351,7 +351,7 @@ def shown(comparison: Comparison) -> dict[str, str]:
     return {
         "Rows": ",".join(comparison.schemes),
         "Columns": ",".join(comparison.adversaries),
-        "Size": f"{counted(comparison.slots, 'slot')}, {counted(comparison.trials, 'trial')}, seed {comparison.seed}",
+        "Size": f"{comparison.slots} slots, {comparison.trials} trials, seed {comparison.seed}",
     }
 
 
