@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import re
 import signal
@@ -365,6 +366,7 @@ def test_a_program_that_spins_is_stopped(evedrop_simulated_wire: Opener, monkeyp
         (lambda: queue.Queue[int]().get(timeout=0.1), "a wait of threading or queue"),
         (lambda: threading.Thread(target=print).start(), "threading.Thread.start"),
         (lambda: subprocess.run(["true"], check=True), "subprocess.Popen"),
+        (lambda: os.system("true"), "os.system"),  # noqa: S605 - refused
         (lambda: wire(**WIRE).__enter__(), "subprocess.Popen"),
     ],
 )

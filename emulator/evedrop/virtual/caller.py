@@ -9,6 +9,7 @@ Source: docs/maintainers/simulated-world.md, tests of wires.
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import sys
 import threading
@@ -36,6 +37,7 @@ _REAL: tuple[tuple[Any, str, str], ...] = (
     (threading.Thread, "start", "threading.Thread.start"),
     (threading.Condition, "wait", "a wait of threading or queue"),
     (subprocess.Popen, "__init__", "subprocess.Popen"),
+    (os, "system", "os.system"),
 )
 """What takes real time: place, name, and how users know it."""
 _MOST_TURNS = 100_000
