@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.live.launch.gathering import Gathered, Journals, Recorded, Statistics, _events
+from evedrop.live.launch.gathering import Gathered, Journals, Recorded, Statistics, _accused, _events
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.slot.records import LinkSlots, ReceiverSlots, SensorSlots
 from evedrop.results.writer import ResultsWriter
@@ -186,3 +186,12 @@ def test_a_run_has_the_events_of_the_shard_that_came_farthest() -> None:
     parts = {number: replace(nothing, events=events[:count]) for number, count in ((1, 2), (2, 4), (3, 0))}
     assert _events(parts) == events
     assert not _events({})
+
+
+def test_a_receiver_that_one_shard_accuses_is_accused_in_the_whole_run() -> None:
+    """Otherwise the summary of a run that its contradiction ended would call its metrics verified."""
+    outcomes = (RunOutcome(1.0), RunOutcome(1.0, "smart contradicts router", accused=("smart", "router")))
+    nothing, digests = RunTally.nothing(SCENARIO, 1), dict.fromkeys(SCENARIO.digested)
+    parts = {number: summary_of(SCENARIO, nothing, digests, outcome) for number, outcome in enumerate(outcomes, 1)}
+    assert _accused(parts) == ("smart",)
+    assert _accused({1: parts[1]}) == ()

@@ -124,6 +124,7 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
         replay,
         events=_events(parts),
         outages=_outages(parts),
+        accused=_accused(parts),
         misdelivered=_misdelivered(parts),
     )
     # All have rows of these, also where metrics are earlier.
@@ -202,6 +203,12 @@ def _outages(summaries: Mapping[int, Summary]) -> list[ConnectionOutage]:
         structs.replace(outage, shard=shard) for shard, summary in summaries.items() for outage in summary.outages
     ]
     return sorted(outages, key=lambda outage: outage.slot)
+
+
+def _accused(summaries: Mapping[int, Summary]) -> tuple[str, ...]:
+    """The receivers that a shard's recorder accuses: each shard has a recorded trial, and it verified none of theirs."""
+    verified = [entry for summary in summaries.values() for entry in (summary.verification or {}).items()]
+    return tuple(name for name, verification in verified if not verification.recomputed_trials)
 
 
 def _misdelivered(summaries: Mapping[int, Summary]) -> dict[str, int]:
