@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from evedrop.errors import Interrupted, RunError, UnwrittenResults
+from evedrop.errors import Interrupted, NoAnswer, RunError, UnwrittenResults
 from evedrop.live.recorder import recorder
 from evedrop.live.recorder.run_end import RunEnd
 
@@ -32,14 +32,23 @@ def test_who_was_missing_has_not_filled_the_disk_afterwards() -> None:
     assert end.suspects == ()
 
 
-def test_the_first_failure_names_who_is_at_fault() -> None:
-    """Even if the results cannot be written then."""
+@pytest.mark.parametrize(
+    ("later", "saved"),
+    [
+        (OSError(28, "No space left on device"), False),
+        (NoAnswer("it did not answer within 10 s"), True),
+        (MemoryError(), True),
+    ],
+)
+def test_the_first_failure_names_who_is_at_fault(later: Exception, saved: bool) -> None:
+    """Even if the results cannot be written then, or have no metrics."""
     end = RunEnd()
     end.take(RunError("why"))
     end.blame(["eve"], RunError("why"))
     with end.noted():
-        raise OSError(28, "No space left on device")
-    assert (end.how, end.suspects, end.saved) == ("why", ("eve",), False)
+        raise later
+    end.fail("the summary cannot be written")
+    assert (end.how, end.suspects, end.saved) == ("why", ("eve",), saved)
 
 
 @pytest.mark.parametrize(

@@ -37,10 +37,10 @@ class RunEnd:
     """The process whose message broke the protocol, if that ended the run."""
 
     def fail(self, how: str) -> None:
-        """Note that the run failed, and why: nobody is at fault any more for an earlier reason."""
-        if how != self.how:
+        """Note that the run failed, and why, unless it has failed before: what comes later has not made it fail."""
+        if self.status != RunError.exit_status:
+            self.status, self.how = RunError.exit_status, how
             self.suspects, self.accused, self.broken_by = (), (), None
-        self.status, self.how = RunError.exit_status, how
 
     def take(self, error: EvedropError) -> None:
         """Note the error that ended the run."""
@@ -69,7 +69,7 @@ class RunEnd:
             raise
         except OSError as error:
             self.saved = False
-            self.fail(self.how if self.status == RunError.exit_status else reason_of(error))
+            self.fail(reason_of(error))
         except NoAnswer as error:  # of a class that is asked again after the operator's change of a link
             self.fail(f"an eavesdropper's class could not give its theoretical covariance: {error}")
         except Exception as error:  # a bug in the recorder
