@@ -254,6 +254,17 @@ def test_a_process_starts_again_only_when_its_router_listens(bench: Bench) -> No
     assert bench.starter.begun[begun:] == ["router", "eve"]
 
 
+def test_a_request_that_waits_does_not_speak_for_its_recorder(bench: Bench) -> None:
+    """A recorder that falls silent is noticed, also while a process waits to be started again."""
+    bench.starter.pipes = {"router": BytesIO()}
+    bench.children.start(bench.briefs["router"])
+    bench.children.start(bench.briefs["eve"])
+    bench.tells(ProcessRequest(ProcessAction.START, "eve", 3, 1).line)
+    for _ in range(20):
+        bench.children.next_event(0.01)
+    assert bench.children.silent_seconds > 0.1
+
+
 PROGRESS = RunProgress(3, 2.5, "slots/s", {"eve": float("inf")})
 OUTAGE = ConnectionOutage("router", 3, 5, 0.5)
 

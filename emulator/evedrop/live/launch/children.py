@@ -6,6 +6,7 @@ import contextlib
 import re
 import signal
 import subprocess
+from collections import deque
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty
@@ -46,7 +47,6 @@ SILENCE_SECONDS = 30.0  # after which the launcher gives up on a silent recorder
 _BEGIN_SECONDS = 30.0  # for a living recorder to begin to write its results
 _FINISH_SECONDS = 600.0  # for it to write them: 10⁶ slots take some seconds
 _GONE_SECONDS = 5.0  # for a process that has left the network to end, and to say why in its log
-_AGAIN_SECONDS = 0.02  # until a request that cannot be carried out yet is looked at again
 _LOG_LINES = 12
 _NO_MEMORY = "memory allocation of"  # Zenoh and Rerun end the process when they get no memory
 _HUBS = frozenset({ROUTER, RELAY, RECORDER})
@@ -95,6 +95,8 @@ class Children:
         self.over = False
         """Whether the run is over, and all processes have been told to leave."""
         self._finishing = False
+        self._requests = deque[ProcessRequest]()
+        """The recorder's requests that have not been carried out."""
         self._listening = set[str]()
         """The routers that have said that they listen."""
         self._restarts = 0
@@ -233,16 +235,22 @@ class Children:
         match event:
             case RouterListens(process):
                 self._listening.add(process)
-            case ProcessRequest(ProcessAction.START) if not all(self.listens(name) for name in (ROUTER, RELAY)):
-                self._events.put(event)
-                world().sleep(_AGAIN_SECONDS)
+                self._carry_out()
             case ProcessRequest():
-                self.act(event)
+                self._requests.append(event)
+                self._carry_out()
             case SlotsDone():
                 self.over = True
             case SaveStarted():
                 self._finishing = True
         return None if isinstance(event, Alive | RouterListens | ProcessRequest | SlotsDone | SaveStarted) else event
+
+    def _carry_out(self) -> None:
+        """Carry out the recorder's requests that can be, in order."""
+        while self._requests and (
+            self._requests[0].do != ProcessAction.START or all(self.listens(name) for name in (ROUTER, RELAY))
+        ):
+            self.act(self._requests.popleft())
 
     def conclude(self, on_event: OnEvent, patience: float = 0.0) -> RunEnded | None:
         """End the recorder, at once or after `patience` seconds; returns its `RunEnded`, or None if it sent none.
