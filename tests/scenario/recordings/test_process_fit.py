@@ -115,6 +115,20 @@ def test_a_state_without_noise_is_found(tmp_path: Path) -> None:
     assert result.as_dict()["residual_correlation"][0] is None
 
 
+def test_noise_with_fewer_sources_than_states_is_found(tmp_path: Path) -> None:
+    """An acceleration moves position and speed alike: Q has rank 1, also for a vehicle that starts at rest in the origin."""
+    gain, x = np.array([0.005, 0.1]), [np.zeros(2)]
+    for w in np.random.default_rng(6).standard_normal(2000):
+        x.append(np.array([[1.0, 0.1], [0.0, 0.9]]) @ x[-1] + gain * w)
+    result = fitted(tmp_path, np.array(x))
+    assert result.exact == []
+    assert np.outer(gain, gain) == pytest.approx(result.Q, rel=0.1)
+    assert "the noise of x, y has fewer sources than states, so Q is singular" in result.remarks
+    process = tomllib.loads(result.toml)["process"]
+    rest = {"title": "Fitted", "slots": 100, "encoding": {"scheme": "plain"}, "legitimate": {"link": {"quality": 0.9}}}
+    assert checked({"process": process, **rest}, "file").process.process.singular_noise
+
+
 def test_noise_that_lasts_is_reported(tmp_path: Path) -> None:
     """A process of the first order does not explain a process of the second."""
     result = fitted(tmp_path, np.cumsum(np.cumsum(path_of(3)[:, :1], axis=0), axis=0), ("x",))

@@ -42,6 +42,8 @@ class ProcessFit:
     initial_covariance: Floats
     correlation: Floats
     """The correlation of each state's residuals with those of the slot before, (n,); NaN without residuals."""
+    singular: bool
+    """Whether Q has a direction without variance."""
 
     @property
     def transitions(self) -> int:
@@ -73,7 +75,7 @@ class ProcessFit:
         entries_: dict[str, Any] = {**entries, **({} if recording.units is None else {"units": list(recording.units)})}
         entries_ |= {} if not self.reference.any() else {"reference": self.reference.tolist()}
         entries_ |= {name: getattr(self, name).tolist() for name in ("A", "Q", "initial_covariance")}
-        return {**entries_, **({"singular_noise": True} if self.exact else {}), "theory": True}
+        return {**entries_, **({"singular_noise": True} if self.singular else {}), "theory": True}
 
     @property
     def toml(self) -> str:
@@ -95,6 +97,8 @@ class ProcessFit:
         remarks.append(f"spectral radius {self.spectral_radius:.6g}")
         if self.exact:
             remarks.append(f"{', '.join(self.exact)}: without noise, so Q is singular")
+        elif self.singular:
+            remarks.append(f"the noise of {', '.join(names)} has fewer sources than states, so Q is singular")
         if self.unexplained:
             remarks.append(
                 f"{', '.join(self.unexplained)}: the residuals depend on those before, so no process with white noise explains "
@@ -154,8 +158,9 @@ def fit_process(path: Path, names: Sequence[str] | None = None, reference: Seque
     Q = 0.5 * (Q + Q.T)
     spread = np.sum(np.linalg.inv(np.linalg.qr(scaled, mode="r")) ** 2, axis=1) / size**2  # the diagonal of (X Xᵀ)⁻¹
     own = np.diag(Q)
-    initial = np.diag(np.where(x[0] == 0.0, np.where(own > 0.0, 0.0, size**2), x[0] ** 2)) + Q
-    wrong = mistakes_of(A, Q, initial, not noisy.all())
+    singular = bool(mistakes_of(A, Q, np.eye(n)))  # or there is another mistake, which remains below
+    initial = np.diag(np.where(x[0] == 0.0, size**2 * singular, x[0] ** 2)) + Q
+    wrong = mistakes_of(A, Q, initial, singular)
     if wrong:
         raise UsageError(
             f"{path} is not explained by a process: " + "; ".join(f"{name} {problem}" for name, problem in wrong)
@@ -171,4 +176,5 @@ def fit_process(path: Path, names: Sequence[str] | None = None, reference: Seque
         np.sqrt((np.outer(own, own) + Q * Q) / (count - n)),
         initial,
         correlation,
+        singular,
     )
