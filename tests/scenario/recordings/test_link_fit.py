@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from evedrop.errors import TraceError
+from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import loss_of
 from evedrop.model.links.loss_model import Fate
+from evedrop.model.process import Floats
 from evedrop.scenario.loading import load
 from evedrop.scenario.recordings import link_candidates, link_fit
 from evedrop.scenario.recordings.link_candidates import delay_candidates, wilson
@@ -252,6 +254,20 @@ def test_delays_are_found_again(name: str, delays: Any, spec: dict[str, float], 
     best = min(delay_candidates(delays), key=lambda candidate: candidate.bic(len(delays)))
     assert best.name == name
     assert {entry: best.spec[entry] for entry in spec} == pytest.approx(spec, abs=bound + 1e-12)
+
+
+@pytest.mark.parametrize(
+    "delays",
+    [
+        0.1 + np.random.default_rng(1).exponential(5e-5, 500),
+        10.0 ** np.random.default_rng(1).uniform(-6.0, 6.0, 500),
+    ],
+)
+def test_no_delay_is_proposed_that_a_link_cannot_have(delays: Floats) -> None:
+    """Waits that are very short beside the least delay, or very long, are Pareto's with a shape that is refused."""
+    for candidate in delay_candidates(delays):
+        spec = dict(candidate.spec)
+        assert not DELAY_MODELS[spec.pop("model")].mistakes(spec)
 
 
 def test_intervals_from_few_delays_are_as_wide_as_they_must_be() -> None:

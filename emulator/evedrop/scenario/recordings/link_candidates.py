@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from evedrop.model.delays import Pareto
 from evedrop.model.process import Floats
 from evedrop.scenario.recordings.link_recording import Outcomes
 from evedrop.scenario.recordings.two_states import TwoStates, most_likely
@@ -95,14 +96,14 @@ def _rounded(parameter: str, value: float) -> float:
 
 
 def delay_candidates(delays: Floats) -> list[Candidate]:
-    """Models for delays in slots, (packets,): constant if all are equal, otherwise normal, or Pareto if none is 0."""
+    """Models for delays in slots, (packets,): constant if all are equal, else normal, or Pareto if a link may have its shape."""
     count, least = len(delays), float(delays.min())
     if least == float(delays.max()):
         return [Candidate("constant", {"model": "constant", "value": least}, 0.0, 1)]
     candidates = [_normal(delays)]
-    if least > 0.0:
-        logs = float(np.log(delays / least).sum())
-        shape = count / logs
+    logs = float(np.log(delays / least).sum()) if least > 0.0 else math.inf
+    shape = count / logs
+    if not Pareto.mistakes({"shape": shape}):
         likelihood = count * (math.log(shape) - math.log(least)) - (shape + 1.0) * logs
         candidates.append(
             Candidate(
