@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.links.loss_model import Fate
 from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule, ReceiverOutage, streams_of
+from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
 from tests.examples import examples
 
@@ -159,6 +160,18 @@ def test_fates_are_those_of_the_reference(schedule: LinkSchedule) -> None:
     if fates.delays is not None:
         delivered = codes == Fate.DELIVERED
         assert np.array_equal(fates.delays[delivered], delays[delivered])
+
+
+def test_two_events_of_the_same_losses_in_turn_are_one() -> None:
+    """In the slot in which one ends the other begins: no slot has other losses, so the chain goes on, as in theory."""
+    settings_ = {"loss": {"model": "gilbert-elliott", "p": 0.01, "r": 0.02}}
+    once = LinkSchedule(PLAIN, changes=(Change(20, settings_),))
+    twice = LinkSchedule(PLAIN, changes=(Change(20, settings_), Change(60, PLAIN), Change(60, settings_)))
+    batch = Batch(100, 50)
+    assert same(link(once, batch).fates(range(100)), link(twice, batch).fates(range(100)))
+    distribution = distribution_of(twice)
+    assert distribution is not None
+    assert [segment.continues for segment in distribution.segments] == [False, False, True]
 
 
 @settings(deadline=None, max_examples=examples(30))

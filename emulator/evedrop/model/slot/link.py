@@ -249,18 +249,19 @@ class Link:
         """Consecutive slots in stretches of constant settings; the changes at the beginning of each are applied before it."""
         marks = sorted({change.at for change in self._changes if slots.start < change.at < slots.stop})
         for start, stop in pairwise([slots.start, *marks, slots.stop]):
-            for change in self._changes:
-                if change.at == start:
-                    self._apply(change)
+            self._apply([change for change in self._changes if change.at == start])
             yield range(start, stop)
 
-    def _apply(self, change: Change) -> None:
-        if change.settings is not None:
-            if change.settings["loss"] != self._state.settings["loss"]:
-                self._state.loss = loss_of(change.settings["loss"])
-            self._state.settings = change.settings
-        if change.cut is not None:
-            self._state.cut = change.cut
+    def _apply(self, changes: Iterable[Change]) -> None:
+        """Apply the changes of one slot, in order. A loss model that they leave as it was keeps its memory."""
+        before = self._state.settings["loss"]
+        for change in changes:
+            if change.settings is not None:
+                self._state.settings = change.settings
+            if change.cut is not None:
+                self._state.cut = change.cut
+        if self._state.settings["loss"] != before:
+            self._state.loss = loss_of(self._state.settings["loss"])
 
     def _unchanged(self, slots: range) -> Fates:
         """The fates of slots during which the settings stay the same."""
