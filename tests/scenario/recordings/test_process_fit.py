@@ -143,6 +143,7 @@ def test_noise_that_lasts_is_reported(tmp_path: Path) -> None:
         (path_of(1, 20), "has 20 states; expected at least 21, for a process of 2 states"),
         (np.repeat(path_of(1)[:, :1], 2, axis=1), "the states depend on each other"),
         (np.hstack([path_of(1)[:, :1], np.zeros((400, 1))]), "the states depend on each other, or do not move"),
+        (np.array([[np.cos(0.1 * k), np.sin(0.1 * k)] for k in range(100)]), "every state follows from those before"),
     ],
 )
 def test_what_is_no_recording_of_a_process_is_refused(tmp_path: Path, rows: Floats, message: str) -> None:

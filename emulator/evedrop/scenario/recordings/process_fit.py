@@ -153,6 +153,11 @@ def fit_process(path: Path, names: Sequence[str] | None = None, reference: Seque
     with np.errstate(over="ignore", invalid="ignore"):  # of states that are tiny: then A is refused
         residuals = x[1:] - x[:-1] @ A.T
     noisy = np.sqrt(np.mean(residuals * residuals, axis=0)) > _EXACT * size
+    if not noisy.any() and np.isfinite(residuals).all():
+        raise UsageError(
+            f"{path}: every state follows from those before without noise, so nothing about them is uncertain once one of them "
+            "is received; expected states that noise moves"
+        )
     residuals = residuals * noisy
     Q = residuals.T @ residuals / (count - n)
     Q = 0.5 * (Q + Q.T)
