@@ -77,6 +77,16 @@ def test_a_long_silence_can_be_left_out() -> None:
     assert series.outcomes.tolist() == ([1, 0] * 49 + [1]) * 2
 
 
+@pytest.mark.parametrize(("again", "counts"), [(False, (1, 0)), (True, (0, 1))])
+def test_a_late_message_from_before_a_silence_makes_no_losses_of_it(again: bool, counts: tuple[int, int]) -> None:
+    """It comes after the silence, alone or for the second time: the messages of the silence are still no losses."""
+    numbers = np.concatenate([np.arange(100), 1100 + np.arange(100)])
+    order = np.insert(numbers if again else numbers[numbers != 50], 106, 50)
+    series = series_of(MessageArrivals(order, np.maximum.accumulate(order / 10.0), order / 10.0), longest=5.0)
+    assert (series.outcomes.tolist(), series.parts) == ([1] * 200, 2)
+    assert (series.late, series.repeated) == counts
+
+
 def test_too_many_outcomes_are_refused() -> None:
     """They are refused before memory is allocated for them."""
     arrivals = MessageArrivals(np.array([0, 1, 10**9]), np.array([0.0, 1.0, 1e9]))

@@ -7,6 +7,7 @@ Source: docs/links.md, recordings of messages.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -121,28 +122,37 @@ class _SenderNumbers:
 
     def series(self) -> MessageSeries:
         """The outcomes of all parts."""
-        parts: list[list[int]] = [[0]]  # of each part, places counted from its first message, which may be late
+        parts: list[list[int]] = [[0]]  # of each part, places counted from the first message, which may be late
+        ends: list[float] = []  # of each part but the last, the last place; none where the numbers began again
         top, top_at, place = self._numbers[0], 0, 0
         kept, seen = [True], {0}
         for i in range(1, len(self._numbers)):
             step = self._step(top, self._numbers[i])
-            if step > 0 and not self._breaks(step, top_at, i):
-                place, top, top_at = place + step, self._numbers[i], i
+            if step > 0 or self._is_restart(step, top, top_at, i):
+                if step <= 0:
+                    self.restarts += 1
+                    place, seen = 0, set()
+                    ends.append(-math.inf)
+                    parts.append([])
+                else:
+                    if self._breaks(step, top_at, i):
+                        ends.append(place)
+                        parts.append([])
+                    place += step
+                top, top_at = self._numbers[i], i
                 parts[-1].append(place)
                 seen.add(place)
                 kept.append(True)
                 continue
-            if step > 0 or self._is_restart(step, top, top_at, i):
-                self.restarts += step <= 0
-                top, top_at, place, seen = self._numbers[i], i, 0, {0}
-                parts.append([0])
-                kept.append(True)
-                continue
-            first = place + step not in seen
+            late = place + step
+            first = late not in seen
             self.late, self.repeated = self.late + first, self.repeated + (not first)
             if first:
-                seen.add(place + step)
-                parts[-1].append(place + step)
+                seen.add(late)
+                part = len(ends)
+                while part and late <= ends[part - 1]:  # sent before the numbers broke off
+                    part -= 1
+                parts[part].append(late)
             kept.append(first)
         return MessageSeries(
             np.concatenate(list(_outcomes(parts))),
