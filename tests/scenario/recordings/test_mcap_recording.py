@@ -216,6 +216,16 @@ def test_the_fitted_link_loses_as_the_recorded_one_did(spec: dict[str, Any], tmp
     assert again[1:].sum() / (again[1:] & ~again[:-1]).sum() == pytest.approx(burst, rel=0.04)
 
 
+def test_messages_that_all_come_three_times_are_certain_to_come_twice(tmp_path: Path) -> None:
+    """A link gives a message one second copy at most: two of each are no probability."""
+    messages = heard(lossy(BURSTS, 500), 0.1)
+    again = [(number, sent, arrived + late) for number, sent, arrived in messages for late in (0.0, 0.001, 0.002)]
+    assert (
+        fit_messages(mcap_recording(write(tmp_path / "bag.mcap", [Recorded("/scan", again)]))).settings["duplicate"]
+        == 1.0
+    )
+
+
 def test_the_command_prints_links_for_both(evedrop: Evedrop) -> None:
     """A link for a wire file, with seconds, and one for a scenario, in slots of the messages' distance; --json says the same."""
     random = np.random.default_rng(8)

@@ -57,7 +57,7 @@ class MessageFit:
         series, corrupt = self.recording.series, self.recording.corrupt or 0.0
         # A message that was damaged or dropped does not arrive twice.
         whole = float(series.outcomes.sum()) * (1.0 - corrupt) - self.recording.dropped
-        chances = {"duplicate": series.repeated / whole if whole else 0.0, "corrupt": corrupt}
+        chances = {"duplicate": min(1.0, series.repeated / whole) if whole else 0.0, "corrupt": corrupt}
         return {name: rounded(value) for name, value in chances.items() if value}
 
     def as_dict(self) -> dict[str, Any]:
