@@ -45,6 +45,7 @@ def write(folder: Path, name: str, text: str | bytes) -> Path:
         ("k,received,rssi\n0,1,-60\n1, 1 ,-61\n2,0,\n3,1,-70\n", "received"),
         ("t,received\n0.5,1\n1.5,1\n2.5,0\n3.5,1\n", None),
         ("ok\nTrue\ntrue\nFalse\nTRUE\n", None),
+        ("True\ntrue\nFalse\nTRUE\n", None),
     ],
 )
 def test_a_csv_file_is_read(tmp_path: Path, text: str, column: str | None) -> None:

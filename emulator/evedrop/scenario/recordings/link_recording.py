@@ -105,7 +105,7 @@ class LinkRecording:
             if self._is_parquet:
                 return list(_parquet(self._path).schema_arrow.names)
             first = next(_rows(lines_of(self._path, _LIMIT)), (0, []))[1]
-            return [] if all(map(_is_number, first)) else first
+            return [] if all(map(_is_value, first)) else first
 
     def _column_of_outcomes(self) -> str | None:
         """The column to read if none is named; None for the only one of a file without names."""
@@ -181,7 +181,7 @@ class LinkRecording:
         number, first = next(rows, (0, []))
         if not first:
             return
-        named = column is not None or not all(map(_is_number, first))
+        named = column is not None or not all(map(_is_value, first))
         names = first if named else [""] * len(first)
         place = self._place(names, column)
         for line, row in rows if named else chain([(number, first)], rows):
@@ -218,7 +218,7 @@ class LinkRecording:
         if column is not None:
             if column not in names:
                 there = (
-                    f"there are {_some(names)}" if names and not all(map(_is_number, names)) else "there are no names"
+                    f"there are {_some(names)}" if names and not all(map(_is_value, names)) else "there are no names"
                 )
                 self._no("column", f"{_shown(column)} is not a column of {self._path.name}; {there}")
             return names.index(column)
@@ -283,7 +283,10 @@ def _names_losses(name: str) -> bool:
     return not _NAMES_OF_LOSSES.isdisjoint(re.split(r"[^a-z]+", name.lower()))
 
 
-def _is_number(cell: str) -> bool:
+def _is_value(cell: str) -> bool:
+    """Whether a cell is an outcome or a number, so that its line has no names."""
+    if cell.lower() in _OUTCOMES:
+        return True
     try:
         float(cell)
     except ValueError:
