@@ -111,6 +111,7 @@ def gain(assignment: Assignment) -> Floats:
     return riccati(assignment)[0]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of weights that leave double precision, which are refused
 def riccati(assignment: Assignment) -> tuple[Floats, Floats]:
     """K, as `gain`, and the solution Π of the Riccati equation, (n + m, n + m): [x; u′]ᵀ Π [x; u′] is the cost from there on.
 
