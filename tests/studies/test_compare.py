@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from evedrop import compare, montecarlo
+from evedrop.cli.api.results import ComparisonResults
 from evedrop.errors import UsageError
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
@@ -24,7 +25,6 @@ from evedrop.score.verdict import SecrecyOutcome
 from evedrop.show.report.comparison import comparison_lines, conclusion, verdict
 from evedrop.show.report.comparison_sections import COMPARISON_SECTIONS, ComparisonSource
 from evedrop.show.report.writing import write_report
-from evedrop.show.view.result_pictures import comparison_figure
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.studies.matchups import ATTACKERS, usual_adversaries
@@ -324,7 +324,9 @@ def test_the_picture_says_which_error_is_a_median(literature: Comparison) -> Non
             name: replace(scheme, legitimate=replace(scheme.legitimate, infinite_variance=name == heavy))
             for name, scheme in literature.schemes.items()
         }
-        axes = comparison_figure(replace(literature, schemes=schemes)).axes[0]
+        shown = replace(literature, schemes=schemes)
+        assert isinstance(shown, ComparisonResults)
+        axes = shown.plot().axes[0]
         return [text.get_text() for text in axes.texts]
 
     means, medians = texts("none"), texts("plain")
