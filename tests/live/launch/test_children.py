@@ -25,6 +25,7 @@ from evedrop.live.protocol.launcher_events import ProcessRequest, RouterListens,
 from evedrop.names import ProcessAction
 from evedrop.results.folder import HeldFolder, new_folder
 from evedrop.scenario.progress_events import ConnectionOutage, ProgressEvent, RunEnded, RunProgress, Started, silent
+from evedrop.system.signals import INTERRUPTED
 from tests.conftest import wait_until
 from tests.live.network.bench import small_network
 
@@ -127,6 +128,27 @@ def test_a_signal_that_comes_when_the_run_is_complete_changes_nothing(bench: Ben
     bench.children.start(bench.briefs["recorder"])
     with pytest.raises(Interrupted):
         follow_to_end(bench.children, stop, silent)
+
+
+class LateStop(threading.Event):
+    """A signal to the launcher that comes just after the one to a child."""
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """It comes now."""
+        del timeout
+        self.set()
+        return True
+
+
+def test_nobody_waits_for_a_recorder_that_the_same_signal_has_ended(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was still starting, and says nothing any more."""
+    monkeypatch.setattr(bench.children, "conclude", lambda *_: pytest.fail("it waits for the recorder's end"))
+    bench.starter.status = INTERRUPTED
+    bench.children.start(bench.briefs["recorder"])
+    with pytest.raises(Interrupted):
+        follow_to_end(bench.children, LateStop(), silent)
 
 
 MISSED = LastWord.about(MissingProcesses("eve", ("legitimate", "recorder"), "within 30 s; start them"))

@@ -170,41 +170,48 @@ def _now(held: HeldFolder) -> Path:
 
 def follow_to_end(children: Children, stop: ThreadEvent, on_event: OnEvent) -> int:
     """Follow the run to its end; returns the exit status that the recorder gives it."""
-    early: tuple[ProcessExit, float] | None = None
-    ending: RunEnded | None
-    while True:
-        if early is not None and not children.over and world().monotonic() - early[1] > _EARLY_SECONDS:
-            raise RunError(children.failure_report(early[0], children.conclude(on_event)))
-        if stop.is_set():
-            ending = _stopped(children, on_event)
-            break
-        if children.silent_seconds > SILENCE_SECONDS:
-            raise RunError(children.failure_report(None, RunEnded(RunError.exit_status, "", [RECORDER])))
-        event = children.next_event(_POLL_SECONDS)
-        ending = None
-        if isinstance(event, ProcessExit):
-            if _meant_us_too(event, stop) or (
-                event.process != RECORDER and (event.status == 0 or children.restart_router(event))
-            ):
-                # A process that leaves at the end may be faster than the event that the run is over.
-                early = early or ((event, world().monotonic()) if event.status == 0 else None)
-                continue
-            if event.process != RECORDER:
-                # A recorder that has just ended may still report so; a running one would wait for the lost process in vain.
-                ending = children.conclude(on_event)
-            if ending is None or not ending.well:
-                raise RunError(children.failure_report(event, ending))
-        elif event is not None:
-            on_event(event)
-            ending = event if isinstance(event, RunEnded) else None
-        if ending is not None:
-            break
+    ending = _ending(children, stop, on_event)
     if ending.status == Interrupted.exit_status:
         raise Interrupted
     if not ending.well:
         raise RunError(children.failure_report(None, ending))
     children.wait_all()
     return ending.status
+
+
+def _ending(children: Children, stop: ThreadEvent, on_event: OnEvent) -> RunEnded:
+    """Follow the run until its recorder says how it ended. Raises RunError if that cannot be awaited, Interrupted if stopped."""
+    early: tuple[ProcessExit, float] | None = None
+    while True:
+        if early is not None and not children.over and world().monotonic() - early[1] > _EARLY_SECONDS:
+            raise RunError(children.failure_report(early[0], children.conclude(on_event)))
+        if stop.is_set():
+            return _stopped(children, on_event)
+        if children.silent_seconds > SILENCE_SECONDS:
+            raise RunError(children.failure_report(None, RunEnded(RunError.exit_status, "", [RECORDER])))
+        event = children.next_event(_POLL_SECONDS)
+        if isinstance(event, ProcessExit):
+            if _meant_us_too(event, stop):
+                if event.process == RECORDER:  # it says no more
+                    raise Interrupted
+            elif event.process != RECORDER and (event.status == 0 or children.restart_router(event)):
+                # A process that leaves at the end may be faster than the event that the run is over.
+                early = early or ((event, world().monotonic()) if event.status == 0 else None)
+            else:
+                return _lost(children, event, on_event)
+        elif event is not None:
+            on_event(event)
+            if isinstance(event, RunEnded):
+                return event
+
+
+def _lost(children: Children, lost: ProcessExit, on_event: OnEvent) -> RunEnded:
+    """End a run that has lost a process; returns its end if it was complete before. Raises RunError otherwise."""
+    # A recorder that has just ended may still report so; a running one would wait for the lost process in vain.
+    ending = None if lost.process == RECORDER else children.conclude(on_event)
+    if ending is None or not ending.well:
+        raise RunError(children.failure_report(lost, ending))
+    return ending
 
 
 def _stopped(children: Children, on_event: OnEvent) -> RunEnded:
