@@ -14,6 +14,7 @@ from typing import IO
 import pytest
 
 from evedrop.errors import Interrupted, MalformedMessage, MissingProcesses
+from evedrop.live.launch import process_set
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.children import Children, ProcessExit
 from evedrop.live.launch.ports import endpoints_at
@@ -149,6 +150,17 @@ def test_nobody_waits_for_a_recorder_that_the_same_signal_has_ended(
     bench.children.start(bench.briefs["recorder"])
     with pytest.raises(Interrupted):
         follow_to_end(bench.children, LateStop(), silent)
+
+
+@pytest.mark.parametrize("status", [0, 3])
+def test_a_run_that_is_complete_has_lost_nobody(status: int, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If a process leaves, and the launcher does not hear for a second that the run is over."""
+    monkeypatch.setattr(process_set, "_EARLY_SECONDS", -1.0)
+    monkeypatch.setattr(bench.children, "conclude", lambda _: RunEnded(0, "complete"))
+    monkeypatch.setattr(bench.children, "wait_all", lambda: None)
+    bench.starter.status = status
+    bench.children.start(bench.briefs["eve"])
+    assert follow_to_end(bench.children, threading.Event(), silent) == 0
 
 
 MISSED = LastWord.about(MissingProcesses("eve", ("legitimate", "recorder"), "within 30 s; start them"))

@@ -184,7 +184,7 @@ def _ending(children: Children, stop: ThreadEvent, on_event: OnEvent) -> RunEnde
     early: tuple[ProcessExit, float] | None = None
     while True:
         if early is not None and not children.over and world().monotonic() - early[1] > _EARLY_SECONDS:
-            raise RunError(children.failure_report(early[0], children.conclude(on_event)))
+            return _lost(children, early[0], on_event)
         if stop.is_set():
             return _stopped(children, on_event)
         if children.silent_seconds > SILENCE_SECONDS:
