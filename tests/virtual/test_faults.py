@@ -123,6 +123,22 @@ def test_a_run_that_an_operator_steers_has_the_results_of_its_repetition(
     assert read == done
 
 
+@pytest.mark.parametrize("ends", [faults.InterruptProcess(LAUNCHER, 400), faults.StopProcess("eve", 400)], ids=str)
+def test_a_run_that_was_cut_short_counts_what_its_recorder_has_dropped(
+    ends: Disturbance, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the others have dropped, they say at the end of a complete run."""
+    read: list[Any] = []
+
+    def misses(case: SimulatedCase, run: SimulatedRun, *rest: Any) -> list[str]:
+        read.append(Results.read(run.folder).summary["misdelivered"])
+        return judge.misses(case, run, *rest)
+
+    monkeypatch.setattr(campaign, "misses", misses)
+    disturbed(faults.ConfuseKeys("recorder", RUNS + 60), ends)
+    assert read == [{"recorder": 1}]
+
+
 def test_theory_that_is_not_known_after_a_change_stays_where_it_was_before() -> None:
     """Its rows are written when the link changes."""
     changed, as_it_was = (

@@ -96,7 +96,6 @@ class Conductor:
         before, self._router = self._router, self._session.router_id
         return before != self._router
 
-    @property
     def dropped(self) -> dict[str, int]:
         """Process → how many messages it dropped because they name another key, as far as it has confirmed its end."""
         counts = {**self.misdelivered, RECORDER: self._session.dropped.count}

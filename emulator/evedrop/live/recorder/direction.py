@@ -57,6 +57,7 @@ class Direction:
         self._stall = Stall(patience, flow.batch, lambda: conductor.send_to_all(ReportStatus()), conductor.hub)
         score = run.score
         score.events, score.outages = self._steering.events, self._recovery.outages  # which grow
+        score.misdelivered = conductor.dropped
 
     def start(self) -> None:
         """Wait for all processes, and let the sensor begin. Raises RunError if some do not appear, Interrupted."""

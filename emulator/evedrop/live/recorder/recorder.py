@@ -130,8 +130,6 @@ def _conduct(
         except EvedropError as error:  # a message that breaks the protocol, although all slots are there
             end.blame([], error)
             raise
-        finally:
-            run.score.misdelivered = conductor.dropped
 
 
 def _serve(web_address: WebAddress, folder: Path) -> Viewer:

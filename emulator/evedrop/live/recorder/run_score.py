@@ -5,7 +5,7 @@ Source: docs/results.md, summary.json.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import final
 
@@ -30,8 +30,8 @@ class RunScore:
         """When all processes were there, or at first the recorder's beginning; and when the run was as the summary says."""
         self.events: Sequence[RunEvent] = ()
         self.outages: Sequence[ConnectionOutage] = ()
-        self.misdelivered: Mapping[str, int] = {}
-        """Process → messages with other processes' keys, which it dropped."""
+        self.misdelivered: Callable[[], Mapping[str, int]] = dict
+        """Process → messages with other processes' keys, which it dropped so far."""
         self.run_tally = run_tally
         """The tallies of the slots so far."""
         self.joiner = joiner
@@ -65,6 +65,6 @@ class RunScore:
             events=self.events,
             outages=self.outages,
             accused=accused,
-            misdelivered=self.misdelivered,
+            misdelivered=self.misdelivered(),
         )
         return summary_of(self.scenario, self.run_tally, digests, outcome)
