@@ -156,10 +156,18 @@ def test_a_stranger_that_reads_a_message_is_a_miss(monkeypatch: pytest.MonkeyPat
     assert any("the operator reads" in miss for miss in played.misses), played.misses
 
 
-def test_a_changed_scenario_that_cannot_be_written_costs_no_results() -> None:
-    """The change is not made, and the run ends; its summary is of all rows."""
+def test_a_changed_scenario_that_cannot_be_written_costs_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The change is not made, and the run ends; its summary is of all rows, and lists no such event."""
+    read: list[Any] = []
+
+    def misses(case: SimulatedCase, run: SimulatedRun, *rest: Any) -> list[str]:
+        read.append(Results.read(run.folder).summary["events"])
+        return judge.misses(case, run, *rest)
+
+    monkeypatch.setattr(campaign, "misses", misses)
     scenario = Scenario({**SCENARIO.as_tables(), "slots": 60, "pace": 0.0})
     struck = (outsiders.ChangeLink("legitimate", RUNS), faults.BreakWrite("disk", RUNS))
     played = play_case(SimulatedCase(1, scenario, struck, ahead=3), program)
     assert played.misses == ()
     assert "scenario.toml" in played.run.said
+    assert read == [[]]

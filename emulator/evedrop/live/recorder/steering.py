@@ -280,9 +280,9 @@ class Steering:
                 "get them: each event of a link contains its recorded losses; expected fewer events, or a shorter recording"
             )
             return
+        self._keep(changed)
         self._scenario = changed
         self._note(k, act.text, "operator")
-        self._keep(changed)
         for name in act.names:
             self._changed.add(name)
             changes = tuple(change for change in changed.timeline.changes[name] if change.at >= k)
