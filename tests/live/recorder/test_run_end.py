@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from evedrop.errors import Interrupted, NoAnswer, RunError, UnwrittenResults
+from evedrop.errors import Interrupted, MalformedMessage, NoAnswer, RunError, UnwrittenResults
 from evedrop.live.recorder import recorder
 from evedrop.live.recorder.run_end import RunEnd
 
@@ -102,3 +102,27 @@ def test_nobody_waits_for_a_recorder_that_failed(error: Exception, words: str, m
     with pytest.raises(type(error)):
         recorder._conduct(run, brief, SimpleNamespace(check=None), None, RunEnd(), by_hand=True)  # type: ignore[arg-type]
     assert [why.startswith(words) for why in told] == [True]
+
+
+def test_nobody_waits_for_a_recorder_that_fails_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All slots are done, but the last message of a process breaks the protocol: the others may not have been told to end."""
+    told: list[str] = []
+
+    def ends(_: float) -> None:
+        raise MalformedMessage("evedrop/r/telemetry/eve", "over = 3", "true", b"", "eve")
+
+    conductor = SimpleNamespace(end=ends, abandon=told.append)
+    direction = SimpleNamespace(start=lambda: None, dismiss=lambda: None)
+    monkeypatch.setattr(recorder, "Session", lambda *_, **__: nullcontext())
+    monkeypatch.setattr(recorder, "Conductor", lambda *_: conductor)
+    monkeypatch.setattr(recorder, "Direction", lambda *_: direction)
+    monkeypatch.setattr(recorder, "emit", lambda _: None)
+    score = SimpleNamespace(scenario=SimpleNamespace(digested=(), relayed=False, slots=1), end=lambda: None)
+    rows = SimpleNamespace(save_rows=lambda: None)
+    run = SimpleNamespace(score=score, folder=rows, joiner=SimpleNamespace(complete=lambda _: True))
+    brief = SimpleNamespace(part=SimpleNamespace(recording=False), flow=SimpleNamespace(longest_outage=1.0))
+    end = RunEnd()
+    with pytest.raises(MalformedMessage):
+        recorder._conduct(run, brief, SimpleNamespace(check=None), None, end, by_hand=True)  # type: ignore[arg-type]
+    assert [why.startswith("malformed message on evedrop/r/telemetry/eve") for why in told] == [True]
+    assert end.accused == ("eve",)

@@ -129,6 +129,8 @@ def _conduct(
             conductor.end(max(LEAST_SECONDS, brief.flow.longest_outage))
         except EvedropError as error:  # a message that breaks the protocol, although all slots are there
             end.blame([], error)
+            if by_hand:
+                conductor.abandon(reason_of(error))
             raise
 
 
