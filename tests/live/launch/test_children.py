@@ -266,6 +266,18 @@ def test_a_process_that_is_started_again_has_not_said_why_it_ends(bench: Bench) 
     assert read_brief(bench.private / "eve.json").last_word == str(last_word_file(bench.private, "eve"))
 
 
+def test_the_end_of_a_process_is_noticed_that_has_the_id_of_a_killed_one(bench: Bench) -> None:
+    """In a long run with many kills, the system gives ids again."""
+    bench.starter.pids = itertools.repeat(1)
+    for name in ("recorder", "eve"):
+        bench.children.start(bench.briefs[name])
+    bench.children.act(ProcessRequest(ProcessAction.END, "eve", 3, 1))
+    bench.starter.status = 3
+    bench.children.act(ProcessRequest(ProcessAction.START, "eve", 9, 2))
+    wait_until(lambda: bench.children.next_event(0.01) == ProcessExit("eve", 3), "the end of the process")
+    assert bench.children.failure_report(None, None).startswith("eve ended with status 3")
+
+
 def test_a_process_starts_again_only_when_its_router_listens(bench: Bench) -> None:
     """A router that has just been restarted has not said so: the request waits, and is carried out later."""
     bench.starter.pipes = {"router": BytesIO()}

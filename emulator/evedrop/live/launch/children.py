@@ -140,6 +140,7 @@ class Children:
         if before is not None and before.stdin is not None:
             before.stdin.close()
         self._processes[brief.process] = process
+        self._killed.discard(process.pid)  # of one that ended long ago, if the system gives its id again
         try:
             world().thread(self._follow, brief.process, process, name=f"follows {brief.process}").start()
         except RuntimeError:  # no thread can be started: nobody will read what the process tells
