@@ -102,3 +102,14 @@ def test_regular_messages_are_numbered_by_their_times() -> None:
     assert numbers.tolist() == (kept - kept[0]).tolist()
     assert off == 0.0
     assert numbers_of_times(np.sort(random.uniform(0.0, 200.0, 2000)), 0.1)[1] > 0.3
+
+
+def test_a_message_that_was_sent_late_is_no_loss() -> None:
+    """Late by more than half a period, or with the ones after it; what is lost before and after still is."""
+    kept = np.delete(np.arange(2000), [100, 500, 501, 1500])
+    times = np.array(kept * 0.1, np.float64)
+    times[[300, 900]] += 0.06
+    times[1200:1204] = times[1204] - [0.012, 0.009, 0.006, 0.003]
+    numbers, off = numbers_of_times(times, 0.1)
+    assert numbers.tolist() == kept.tolist()
+    assert 0.0 < off < 0.01

@@ -98,9 +98,12 @@ def numbers_of_times(times: Floats, period: float) -> tuple[NDArray[np.int64], f
     Returns the numbers, and the fraction of messages that are more than a quarter of a period away from where they belong.
     """
     steps = np.diff(times) / period
-    whole = np.maximum(1, np.rint(steps)).astype(np.int64)
-    off = float((np.abs(steps - whole) > 0.25).mean()) if len(steps) else 0.0
-    return np.concatenate([[0], np.cumsum(whole)]).astype(np.int64), off
+    whole = np.rint(steps).astype(np.int64)
+    off = float((np.abs(steps - np.maximum(1, whole)) > 0.25).mean()) if len(steps) else 0.0
+    numbers, order = np.concatenate([[0], np.cumsum(whole)]), np.arange(len(times))
+    # A message that comes as late as the next one has the number before that one's.
+    numbers = np.minimum.accumulate((numbers - order)[::-1])[::-1] + order
+    return numbers - numbers[0], off
 
 
 class _SenderNumbers:
