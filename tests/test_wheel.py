@@ -129,7 +129,7 @@ def test_names_are_theirs_and_little_is_loaded():
     loaded = {name for name in sys.modules if name.partition(".")[0] in {"evedrop", "numpy", "zenoh", "pydantic"}}
     assert loaded <= {
         *("evedrop", "evedrop.cli", "evedrop.cli.pytest_plugin", "evedrop.scenario", "evedrop.scenario.discovery"),
-        *("evedrop.errors", "evedrop.system", "evedrop.system.disk", "evedrop.system.files"),
+        *("evedrop.counting", "evedrop.errors", "evedrop.system", "evedrop.system.disk", "evedrop.system.files"),
     }, loaded
 
 
