@@ -124,15 +124,18 @@ def test_places_are_limited(tmp_path: Path) -> None:
 
 
 def test_a_run_that_is_paused_is_held(tmp_path: Path) -> None:
-    """Until slots are reported again."""
+    """Until slots are reported again; before, it has done all slots before the pause, and does none."""
     metrics = RunMetrics(load("vehicle"), tmp_path, silent)
-    held = []
+    latest = RunProgress(18, 9.0, "slots/s", {"smart": 0.7})
+    names = "evedrop_held", "evedrop_slots_total", "evedrop_slots_per_second"
+    seen = []
     with metrics_served(ANY_PORT, metrics) as page:
-        for event in (Started(), Held(20), RunProgress(21, 5.0, "slots/s", {"smart": 0.5})):
+        for event in (Started(), latest, Held(20), RunProgress(21, 5.0, "slots/s", {"smart": 0.5})):
             metrics.on_event(event)
-            held.append(scraped(page)["evedrop_held",])
-        assert scraped(page)["evedrop_recent_squared_error", "smart"] == 0.5
-    assert held == [0, 1, 0]
+            samples = scraped(page)
+            seen.append(tuple(samples[name,] for name in names))
+        assert samples["evedrop_recent_squared_error", "smart"] == 0.5
+    assert seen == [(0, 0, 0), (0, 18, 9), (1, 20, 0), (0, 21, 5)]
 
 
 def test_metrics_are_those_of_the_folder_and_alarms_of_the_watermark(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
+from msgspec import structs
+
 from evedrop.errors import UsageError
 from evedrop.model.metrics import estimated_metrics
 from evedrop.results.reading import Results
@@ -100,6 +102,7 @@ class RunMetrics:
                     self._running = True
                 case Held():
                     self._held = True
+                    self._progress = structs.replace(self._progress, done=event.before, rate=0.0)
                 case RunProgress():
                     self._progress, self._held = event, False
                 case ConnectionOutage():
