@@ -106,11 +106,11 @@ class RunFolder:
     def complete(self, end: RunEnd) -> None:
         """Write the summary, and note what it says against the run, or why it cannot be written.
 
-        If not all rows are on disk, or a class does not answer, the summary has the last metrics whose rows are.
+        If not all rows are on disk, or the metrics cannot be computed, the summary has the last metrics whose rows are.
         """
         try:
             if end.saved and self._final is None:
-                with suppress(NoAnswer):  # noted when the run was to be settled
+                with suppress(Exception):  # noted when the run was to be settled
                     self._final = self._score.summary(self.now, end.how, end.accused)
                 self._dump_shard()
             if end.saved and self._final is not None:
