@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.errors import BriefError
+from evedrop.errors import BriefError, UsageError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import (
@@ -105,6 +105,20 @@ def test_a_brief_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
     os.truncate(path, 2**30 + 1)
     with pytest.raises(BriefError, match=r"is not a brief of this version \(it has more than 1073741824 bytes\)"):
         read_brief(path)
+
+
+def test_a_brief_that_its_process_would_refuse_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The router's contains the recorded delays of a link once more for every event that sets an entry of the link."""
+    monkeypatch.setattr("evedrop.live.protocol.brief._MOST_BYTES", 100_000)
+    recorded = {"quality": 0.9, "delay": {"model": "trace", "values": [0.25] * 1000}}
+    event = [{"at": slot, "link": "legitimate", "set": {"quality": 0.5}} for slot in range(1, 41)]
+    legitimate = {"window": 4, "link": recorded}
+    read_brief(made(briefed(legitimate=legitimate, event=event[:2]))["router"].write(tmp_path), "router")
+    with pytest.raises(
+        UsageError,
+        match=r"^the brief of router has \d{6} bytes, and a process reads at most 100000: each event .* fewer events",
+    ):
+        made(briefed(legitimate=legitimate, event=event))["router"].write(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o644, 0o610])

@@ -25,7 +25,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from evedrop.errors import BriefError, NotRegistered
+from evedrop.errors import BriefError, NotRegistered, UsageError
 from evedrop.live.protocol.json_tables import plain, read
 from evedrop.live.protocol.keys import KINDS
 from evedrop.live.protocol.last_word import last_word_file
@@ -602,9 +602,14 @@ class Brief(Generic[P_co]):
         return msgspec.json.format(json.dumps(self, default=plain), indent=1)
 
     def write(self, directory: Path) -> Path:
-        """Write `<process>.json`, readable by its owner only."""
-        path = directory / f"{self.process}.json"
-        world().disk.write(path, self.text.encode())
+        """Write `<process>.json`, readable by its owner only. Raises UsageError if it is larger than its process reads."""
+        path, content = directory / f"{self.process}.json", self.text.encode()
+        if len(content) > _MOST_BYTES:
+            raise UsageError(
+                f"the brief of {self.process} has {len(content)} bytes, and a process reads at most {_MOST_BYTES}: each event "
+                "that sets entries of a link contains its recorded losses and delays; give fewer events, or shorter recordings"
+            )
+        world().disk.write(path, content)
         return path
 
     @classes_known()
