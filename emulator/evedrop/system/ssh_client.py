@@ -69,7 +69,7 @@ class SystemSsh:
 
     def send(self, data: bytes, seconds: float) -> bool:
         """Send bytes to the host."""
-        handle, left = self._orders.fileno(), data
+        handle, left = self._orders.fileno(), memoryview(data)  # bytes would be copied for each part
         os.set_blocking(handle, False)
         room = select.poll()
         room.register(handle, select.POLLOUT)
