@@ -44,10 +44,13 @@ def heartbeat() -> Iterator[None]:
 
 def input_lines() -> Iterator[bytes]:
     """The lines that come on standard input until it closes; one that the end cuts off is no line."""
-    rest = b""
+    begun: list[bytes] = []
     while read := world().process.read_input(_MOST_BYTES):
-        *lines, rest = (rest + read).split(b"\n")
-        yield from lines
+        end, *begins = read.split(b"\n")
+        begun.append(end)
+        for begin in begins:
+            yield b"".join(begun)
+            begun = [begin]
 
 
 def when_launcher_is_gone(then: Callable[[], None], hear: Callable[[bytes], None] = lambda _: None) -> None:
