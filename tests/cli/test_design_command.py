@@ -289,6 +289,15 @@ def test_what_is_refused_can_be_measured(evedrop: Evedrop, scenario: str, entrie
             changes(legitimate__link__quality=0.6),
             "no μ_d keeps the error of every eavesdropper above the legitimate one",
         ),
+        (
+            (
+                *changes(legitimate__link__quality=0.8, eavesdroppers="{smart={strategy='smart',link={quality=0.85}}}"),
+                "--max-trace",
+                "6e-4",
+            ),  # below 0.912, where smart's error is larger, the trace is not
+            "no μ_d that keeps the wanted trace keeps the error of every eavesdropper above the legitimate one: ask for a larger "
+            "trace, or improve",
+        ),
         (changes(legitimate__link__quality=1.0), "choose μ_d = 1: the legitimate error is 0; costs 1 ×"),
     ],
 )

@@ -97,7 +97,10 @@ def _answer(design: Design) -> str | None:
         return None
     choice = design.choice or design.suggestion
     if choice is None:
-        return "no μ_d keeps the error of every eavesdropper above the legitimate one: improve the legitimate link"
+        which, also = (
+            ("", "") if design.minimum is None else (" that keeps the wanted trace", "ask for a larger trace, or ")
+        )
+        return f"no μ_d{which} keeps the error of every eavesdropper above the legitimate one: {also}improve the legitimate link"
     perfect = [name for name, ratio in choice.ratios.items() if math.isinf(ratio) and choice.trace > 0.0]
     closest = min(choice.ratios, key=lambda name: choice.ratios[name])
     gives = [f"perfect secrecy against {', '.join(perfect)}"] if perfect else []
