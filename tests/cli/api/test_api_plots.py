@@ -247,6 +247,18 @@ def test_panels_that_a_picture_of_a_sweep_lacks_are_counted() -> None:
     assert figure.get_suptitle() == "the first 6 of 8 combinations"
 
 
+def test_a_receiver_that_only_some_points_have_is_drawn_at_these() -> None:
+    """A sweep over the table of eavesdroppers; it has no other points' places, and hides no other receiver's points."""
+    rows = [
+        {"peer": peer, "over": over, "mean_squared_error": 1.0}
+        for over, peer in zip("abb", ("own", "own", "spy"), strict=True)
+    ]
+    (axes,) = sweep_figure(pa.Table.from_pylist(rows), ["over"]).axes
+    assert [list(marks[0].get_xdata()) for marks in axes.containers] == [[0.0, 1.0], [1.0]]
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["a", "b"]
+    assert axes.get_xlim() == (-0.5, 1.5)
+
+
 @pytest.mark.long
 def test_a_sweep_is_drawn_as_its_file_is() -> None:
     """Errors against the first entry, a panel for each value of the second."""

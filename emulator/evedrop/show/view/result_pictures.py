@@ -274,14 +274,16 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
         words = f"the first {len(axes)} of {len(combinations):,} combinations"
         axes[0].figure.suptitle(words, x=0.02, ha="left", fontsize=9)
     for scheme, values in zip(axes, combinations, strict=False):
+        here = [row for row in rows if tuple(row[key] for key in keys[1:]) == values]
+        swept = list(dict.fromkeys(row[keys[0]] for row in here))
+        numbers, places = are_numbers(swept), dict(zip(swept, _positions(swept), strict=True))
         for (peer, ink), mark in zip(inks.items(), itertools.cycle(_MARKS), strict=False):
-            mine = [row for row in rows if row["peer"] == peer and tuple(row[key] for key in keys[1:]) == values]
-            x = _positions([row[keys[0]] for row in mine])
+            mine = [row for row in here if row["peer"] == peer]  # not at every point if the eavesdroppers are swept
+            x = [places[row[keys[0]]] for row in mine]
             theory = np.array([_height(row, lines) for row in mine])
             errors = np.array([_height(row, [error_column(name) for name in marks]) for row in mine])
             sound = sound_errors(errors, np.array([_height(row, ["rare_fraction"]) for row in mine]) * theory)
             gaps |= bool((np.isnan(sound) & ~np.isnan(errors)).any())
-            numbers = are_numbers(row[keys[0]] for row in mine)
             scheme.plot(x, theory, "-" if numbers else "_", color=ink, linewidth=1.2, markersize=26)
             scheme.errorbar(
                 x,
@@ -294,9 +296,9 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
                 capsize=2.5,
                 label=peer,
             )
-            if not numbers:
-                scheme.set_xticks(x, [without_mathematics(str(row[keys[0]])) for row in mine])
-                scheme.set_xlim(-0.5, len(x) - 0.5)
+        if not numbers:
+            scheme.set_xticks(list(places.values()), [without_mathematics(str(value)) for value in swept])
+            scheme.set_xlim(-0.5, len(swept) - 0.5)
         scheme.set_yscale("log")
         scheme.set_xlabel(as_mathematics(axis_name(keys[0])))
         title = ", ".join(f"{key} = {value}" for key, value in zip(keys[1:], values, strict=True))

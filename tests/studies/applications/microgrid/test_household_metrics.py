@@ -199,6 +199,16 @@ def test_a_sweep_over_a_house_has_its_metrics(evedrop: Evedrop) -> None:
     assert (evedrop.folder / "house" / "household.png").stat().st_size > 10_000
 
 
+def test_a_sweep_over_the_eavesdroppers_of_a_house_is_drawn(evedrop: Evedrop) -> None:
+    """Not every point has every receiver."""
+    over = "eavesdroppers={},{spy={strategy='smart',link={quality=0.8}}}"
+    done = evedrop(
+        "sweep", "microgrid", "--over", over, "--slots", "70", "--trials", "2", "--set=expect=[]", "--out", "house"
+    )
+    assert (done.status, done.err) == (0, "")
+    assert (evedrop.folder / "house" / "household.png").stat().st_size > 10_000
+
+
 def test_the_closing_report_says_what_became_of_the_house(evedrop: Evedrop) -> None:
     """What it buys and sells, and by how much that differs; without active windows nothing on which receiver detects them."""
     done = evedrop("montecarlo", "microgrid", "--slots", "200", "--trials", "1", "--out", "x")

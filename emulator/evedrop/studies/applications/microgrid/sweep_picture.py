@@ -25,6 +25,7 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
     house = mine[peers[0]]
     numbers = all(isinstance(row[key], (int, float)) for row in house)
     x = [float(row[key]) if numbers else float(i) for i, row in enumerate(house)]
+    place = dict(zip((row[key] for row in house), x, strict=True))
     with panels(path, 3, 12.6, 3.9) as (energies, fractions, told):
         for name, colour, mark in (("bought", SLATE, "o"), ("sold", OCHRE, "s")):
             bars = _bars(house, f"{name}_energy")
@@ -47,7 +48,8 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
         fractions.set_title("(b) from a controller that sees the truth")
         for peer, mark in zip(peers, _MARKS * len(peers), strict=False):
             areas = [float("nan") if row["activity_area"] is None else row["activity_area"] for row in mine[peer]]
-            told.errorbar(x, areas, _bars(mine[peer], "activity_area"), fmt=f"{mark}-", color=inks[peer], label=peer)
+            here = [place[row[key]] for row in mine[peer]]  # not at every point if the eavesdroppers are swept
+            told.errorbar(here, areas, _bars(mine[peer], "activity_area"), fmt=f"{mark}-", color=inks[peer], label=peer)
         told.axhline(0.5, color=GREY, linewidth=0.9, linestyle=":", label="a coin")
         told.set_ylim(0.4, 1.02)
         told.set_ylabel("area under the curve")
