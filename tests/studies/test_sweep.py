@@ -20,6 +20,7 @@ from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.model.metrics import expectable_metrics
 from evedrop.scenario.loading import load
+from evedrop.scenario.progress_events import silent
 from evedrop.scenarios import shipped
 from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.writing import write_report
@@ -361,3 +362,16 @@ def test_the_ratio_is_that_of_the_second_half_of_each_trial(tmp_path: Path) -> N
         jackknife = np.sqrt(39 / 40 * ((left_out - left_out.mean()) ** 2).sum())
         assert row["ratio_standard_error"] == pytest.approx(jackknife, rel=0.25)
     assert "times the error" in [column.heading for column in sweep_table(table.to_pylist(), tuple(grid)).columns]
+
+
+def test_a_column_that_the_first_point_lacks_is_kept(tmp_path: Path) -> None:
+    """The error against the true state, of the point whose sensor measures; the first one's sensor sees the state."""
+    noise = {"noise": [[1, 0], [0, 1]]}
+    measuring = {**noise, "output_matrix": [[1, 0]], "measurement_noise": [[1]]}
+    identity = [[1.0, 0.0], [0.0, 1.0]]
+    changes = {"slots": 20, "trials": 3, "process.Q": identity, "process.initial_covariance": identity}
+    table = sweep_over("measured", changes, {"plant": [noise, measuring]}, tmp_path, silent, Plan(workers=1))
+    times = [row["true_times"] for row in table.to_pylist() if row["peer"] != "legitimate"]
+    half = len(times) // 2
+    assert times[:half] == [None] * half
+    assert None not in times[half:]

@@ -163,7 +163,8 @@ def sweep_over(
 
 def _write_table(folder: Path, rows: list[dict[str, Any]], strategies: Mapping[str, str]) -> pa.Table:
     """Write the table of the points so far; replaces the file atomically. strategies: as in `with_strategies`."""
-    table = with_strategies(pa.Table.from_pylist(rows), strategies)
+    columns = dict.fromkeys(itertools.chain(*rows))  # pyarrow takes those of the first row
+    table = with_strategies(pa.Table.from_pylist([{**columns, **rows[0]}, *rows[1:]]), strategies)
     with private_replacement(folder / "sweep.parquet") as unfinished:
         pq.write_table(table, unfinished)
     return table
