@@ -118,7 +118,8 @@ class Outcome:
         """All that is not as README promises, in words."""
         mistakes = [f"`{command}` did not end" for command in commands if command not in self.ended]
         mistakes += [f"`{command}` ended with {status}" for command, (status, _) in self.ended.items() if status]
-        mistakes += [line for line in self.lines if re.match(r"(FAILED|ERROR) \S+\.py\b", line)]
+        # And why each test failed: the summary of pytest, 80 columns wide, has no room for that.
+        mistakes += [line for line in self.lines if re.match(r"(FAILED|ERROR) \S+\.py\b|E   ", line)]
         return mistakes + [f"left behind: {path}" for path in self.left]
 
 

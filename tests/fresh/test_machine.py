@@ -41,11 +41,13 @@ def test_every_machine_has_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_all_that_went_wrong_is_named() -> None:
-    """A command that failed, one that did not end, each failed test, and what is left."""
+    """A command that failed, one that did not end, each failed test and why, and what is left."""
     outcomes = Outcome(
         ended={"make demo": (0, 3), "make test": (2, 5)},
         left=("x.zenoh",),
         lines=(
+            ">       assert b()",
+            "E       assert 0",
             "FAILED tests/a.py::test_b - assert 0",
             "FAILED to be kind",
             "ERROR tests/c.py::test_d",
@@ -57,6 +59,7 @@ def test_all_that_went_wrong_is_named() -> None:
     assert outcomes.mistakes(("make demo", "make test", "make more")) == [
         "`make more` did not end",
         "`make test` ended with 2",
+        "E       assert 0",
         "FAILED tests/a.py::test_b - assert 0",
         "ERROR tests/c.py::test_d",
         "ERROR tests/e.py",

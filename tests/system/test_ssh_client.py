@@ -9,7 +9,7 @@ from tests.conftest import LIMIT
 
 
 def test_what_is_sent_in_many_parts_is_not_copied_for_each() -> None:
-    """A sensor's brief may have 100 MB, of which a pipe takes 64 KiB at a time: the other processes would give up waiting."""
+    """A brief may have 100 MB, and a pipe takes 64 KiB at a time: with a copy for each part, it would take minutes."""
     data = bytes(8_000_000)
     ssh = SystemSsh(["dd", "of=/dev/null", "bs=64k"])
     tracemalloc.start()

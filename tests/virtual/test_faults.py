@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from evedrop.cli.simulated import program
+from evedrop.live.protocol.telemetry import Report
 from evedrop.results.reading import Results
 from evedrop.scenario.tables import Scenario
 from evedrop.virtual import campaign, faults, judge, notes, outsiders
@@ -171,3 +173,26 @@ def test_a_changed_scenario_that_cannot_be_written_costs_no_results(monkeypatch:
     assert played.misses == ()
     assert "scenario.toml" in played.run.said
     assert read == [[]]
+
+
+def test_a_receiver_that_contradicts_itself_in_one_shard_is_verified_in_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run ends with its name, and the summary of all shards does not call its metrics verified."""
+    read: list[Any] = []
+    honest = Report.pack
+
+    def lie(report: Report) -> bytes:
+        return honest(replace(report, slots=replace(report.slots, x_hat=report.slots.x_hat * 0.0 + 7.0)))
+
+    def misses(case: SimulatedCase, run: SimulatedRun, *_: Any) -> list[str]:
+        read.append(Results.read(run.folder).summary)
+        return []
+
+    monkeypatch.setattr(Report, "pack", lie)
+    monkeypatch.setattr(campaign, "misses", misses)
+    scenario = Scenario({**SCENARIO.as_tables(), "trials": 2, "shards": 2})
+    run = play_case(SimulatedCase(1, scenario, ()), program).run
+    (accused,) = {name for name in scenario.receivers if f"{name} contradicts itself" in read[0]["ended"]}
+    assert (run.status, f"{accused} contradicts itself" in run.said) == (3, True), run.said
+    checked = {name: entry["verified"] for name, entry in read[0]["verification"].items()}
+    assert [name for name, verified in checked.items() if not verified] == [accused]
+    assert read[0]["peers"][accused]["digest"] is None

@@ -108,7 +108,7 @@ def test_a_brief_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
 
 
 def test_a_brief_that_its_process_would_refuse_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The router's contains the recorded delays of a link once more for every event that sets an entry of the link."""
+    """For each event that sets an entry of a link, the router's brief has another copy of the link's recorded delays."""
     monkeypatch.setattr("evedrop.live.protocol.brief._MOST_BYTES", 100_000)
     recorded = {"quality": 0.9, "delay": {"model": "trace", "values": [0.25] * 1000}}
     event = [{"at": slot, "link": "legitimate", "set": {"quality": 0.5}} for slot in range(1, 41)]

@@ -103,6 +103,18 @@ def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -
     assert stat.S_IMODE((study / REPORT).stat().st_mode) == 0o600
 
 
+def test_a_picture_whose_bytes_spell_an_address_is_no_request(study: Path, tmp_path: Path) -> None:
+    """The bytes of a wire's pictures differ from run to run; an address elsewhere on the page is a request."""
+    page = (study / REPORT).read_text()
+    picture = re.search(r"(?<=data:image/png;base64,)[^\"]+", page)
+    assert picture
+    (tmp_path / REPORT).write_text(page.replace(picture[0], "AA//aaAA"))
+    checked(tmp_path)
+    (tmp_path / REPORT).write_text(page.replace("</body>", "<p>//elsewhere</p></body>"))
+    with pytest.raises(AssertionError):
+        checked(tmp_path)
+
+
 def test_the_numbers_of_a_column_have_the_same_format() -> None:
     """All with an exponent if one is very small or large; 0, dashes, bounds, units and counts are as they were."""
     table = TextTable.headed(["receiver"], ["error", "theory", "fraction", "count"])
