@@ -226,3 +226,14 @@ def test_no_workers_are_refused(workers: int, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="expected 1 or more"):
         montecarlo("eavesdroppers", trials=3, slots=20, plan=Plan(workers=workers), out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_late_packets_count_in_the_slot_in_which_they_arrive(tmp_path: Path) -> None:
+    """The fractions of the slots have the mean that the summary states."""
+    delay = {"model": "normal", "mean": 1.0, "standard_deviation": 0.7}
+    changes = {"legitimate__window": 3, "legitimate__link": {"quality": 0.9, "delay": delay}}
+    results = montecarlo("eavesdroppers", slots=30, trials=7, out=tmp_path / "run", **changes)
+    assert results.links["legitimate"].late
+    rows = [row for row in results.slots.to_pylist() if row["peer"] == "legitimate"]
+    for name in ("received_fraction", "used_fraction"):
+        assert np.mean([row[name] for row in rows]) == pytest.approx(results.summary["peers"]["legitimate"][name])

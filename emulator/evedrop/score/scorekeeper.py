@@ -142,6 +142,8 @@ class Scorekeeper:
                     receiver.x_hat,
                 )
             )
+            if receiver.late is not None and receiver.late_used is not None:  # the tally has counted them by itself
+                values = values._replace(sums=values.sums.with_late(receiver.late, receiver.late_used))
             scored[name] = values
         return scored
 

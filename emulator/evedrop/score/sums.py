@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, final
 
 import numpy as np
@@ -133,6 +133,10 @@ class SlotSums:
         rows = slice(first, first + len(other.error))
         for column in fields(self):
             getattr(self, column.name)[rows] += getattr(other, column.name)
+
+    def with_late(self, taken: NDArray[np.uint16], used: NDArray[np.uint16]) -> SlotSums:
+        """The sums with the late packets that receivers took in each slot, and those that they used, (c, R) each."""
+        return replace(self, received=self.received + taken.sum(axis=1), used=self.used + used.sum(axis=1))
 
     @property
     def standard_errors(self) -> Floats:
