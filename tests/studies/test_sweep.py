@@ -375,3 +375,11 @@ def test_a_column_that_the_first_point_lacks_is_kept(tmp_path: Path) -> None:
     half = len(times) // 2
     assert times[:half] == [None] * half
     assert None not in times[half:]
+
+
+def test_an_application_that_draws_nothing_leaves_no_file(tmp_path: Path) -> None:
+    """A heated room has columns in the table of a sweep, and no picture."""
+    changes: dict[str, Any] = {"trials": 2}
+    table = sweep_over("heated-room", changes, {"slots": [8, 12]}, tmp_path / "run", lambda _: None, Plan(workers=1))
+    assert "discomfort" in table.column_names
+    assert {path.stem for path in (tmp_path / "run").iterdir()} == {"sweep"}

@@ -339,7 +339,7 @@ class Application(ABC):
 
     @classmethod
     def draw_sweep(cls, path: Path, table: pa.Table, key: str) -> None:
-        """Draw its metrics in a sweep over the entry `key`, as `path`.png and `path`.pdf; by default nothing."""
+        """Draw its metrics in a sweep over the entry `key`, as the new files `path`.png and `path`.pdf; by default nothing."""
         del path, table, key
 
     @classmethod

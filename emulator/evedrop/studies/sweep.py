@@ -175,7 +175,7 @@ def _draw(folder: Path, table: pa.Table, grid: Grid, applications: Iterable[str]
 
     draw_sweep(private_pictures(folder / "sweep"), table, tuple(grid))
     for name in applications:
-        APPLICATIONS[name].draw_sweep(private_pictures(folder / name), table, next(iter(grid)))
+        APPLICATIONS[name].draw_sweep(folder / name, table, next(iter(grid)))
 
 
 def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> Summary | None:

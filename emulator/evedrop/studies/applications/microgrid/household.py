@@ -27,6 +27,7 @@ from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Flags
 from evedrop.model.slot.records import SensorSlots
+from evedrop.results.folder import private_pictures
 from evedrop.scenario.application import (
     RECEIVERS,
     STANDARD_ERRORS,
@@ -462,7 +463,7 @@ class Household(Application):
         """Draw energies, differences and detection."""
         from evedrop.studies.applications.microgrid.sweep_picture import draw  # noqa: PLC0415 - matplotlib takes half a second
 
-        draw(path, table, key)
+        draw(private_pictures(path), table, key)
 
 
 @final
