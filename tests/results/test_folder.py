@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.results.folder import new_folder, private_file
+from evedrop.results.folder import claimed, default_folder, new_folder, private_file
 from evedrop.results.resolved_scenario import resolved
 from evedrop.scenario.loading import load
 from evedrop.show.view.scene_slots import replay
@@ -190,3 +191,16 @@ def check_as_nobody(evedrop: Evedrop, live: Live) -> None:
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert lines[0].startswith("b'"), "the other user must get as far as the folder's neighbours, or nothing is tested"
     assert lines[1:] == ["Permission denied"] * len(places)
+
+
+def test_the_command_that_shares_a_run_shares_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others can reach a run in its default folder after the command of docs/results.md."""
+    monkeypatch.chdir(tmp_path)
+    folder = claimed(default_folder("vehicle"))
+    page = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8")
+    command = re.search(r"`(chmod [^`]*)`\s+shares them", page)
+    assert command
+    assert "runs/my-run" in command[1]
+    subprocess.run(["sh", "-c", command[1].replace("runs/my-run", str(folder))], check=True)
+    assert folder.stat().st_mode & 0o055 == 0o055
+    assert folder.parent.stat().st_mode & 0o011 == 0o011

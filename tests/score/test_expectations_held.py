@@ -303,3 +303,14 @@ def test_a_change_by_the_operator_restarts_the_wait_for_a_synchronised_receiver(
     assert (steered.held, steered.value) == (in_file.held, in_file.value)
     assert isinstance(steered.value, int)
     assert steered.value >= 30
+
+
+def test_a_receiver_is_to_be_synchronised_after_its_last_event() -> None:
+    """Without `since`, the slots before its last event up to `by` do not count."""
+    expect = [{"synchronised": "legitimate", "by": by} for by in (9, 25)]
+    events = [{"from": 10, "to": 20, "kill": "legitimate"}]
+    results = montecarlo(
+        "eavesdroppers", trials=1, slots=40, eavesdroppers={}, encoding={"scheme": "plain"},
+        legitimate__link={"quality": 1.0}, event=events, expect=expect,
+    )  # fmt: skip
+    assert [judged["value"] for judged in results.summary["expectations"]] == [0, 20]

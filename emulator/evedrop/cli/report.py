@@ -54,7 +54,7 @@ _DIGEST_WIDTH = 100
 def print_summary(summary: Summary, folder: str, replay: str | None = None, verbose: bool = False) -> None:
     """Print the closing report on standard output.
 
-    replay: the beginning of the command that shows one trial live; verbose: with everything that the report page says.
+    replay: the beginning of the command that shows one trial live; verbose: with what the report page says of verdicts, too.
     """
     console = terminal()
     if summary.ended != "complete":

@@ -84,7 +84,7 @@ class ExpectTable(Table):
     by: Annotated[Slot | None, Field(examples=[40])] = None
     """The last slot by which it must have done so."""
     since: Annotated[Slot | None, Field(examples=[0])] = None
-    """The first slot that counts; 0 by default."""
+    """The first slot that counts; by default that of the receiver's last event up to slot `by`, or 0."""
 
     def mistakes(self) -> Iterable[Mistake]:
         """Mistakes unless the table has exactly one subject, all the entries that this subject needs, and no others."""

@@ -47,7 +47,7 @@ class NemesisTable(Table):
     ] = None
     """The receivers that faults hit; all by default."""
     every: Annotated[Mean, Field(examples=[200])]
-    """The mean number of slots from the end of a receiver's fault to its next one."""
+    """The mean number of slots from the end of a receiver's fault to its next one, and of a partition to the next one."""
     lasting: Annotated[Mean, Field(examples=[50])]
     """The mean duration of a fault, in slots."""
     start: Annotated[Slot, Field(alias="from", examples=[100])] = 0

@@ -43,7 +43,7 @@ class AfterStart:
     ratio: float
     """The eavesdropper's mean squared error over the legitimate one; inf if the latter is only rounding, NaN without slots."""
     interval: tuple[float, float] | None = None
-    """Of the ratio, at 99 %; None if it is not known."""
+    """Of the ratio, at 99 %, or of a single trial at 98 %; None if it is not known."""
     larger: bool | None = None
     """Whether the eavesdropper's error is larger; False: at most `AS_MUCH` times as large. None: the samples do not decide it."""
     distances: tuple[float, float] | None = None

@@ -279,7 +279,7 @@ class TrueRatio:
 
     ratio: float
     interval: tuple[float, float] | None = None
-    """At 99 %; None if it is not known."""
+    """At 99 %, or of a single trial at 98 %; None if it is not known."""
 
 
 @dataclass(frozen=True)

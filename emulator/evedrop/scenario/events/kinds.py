@@ -304,7 +304,7 @@ class Note(EventKind):
     """`note`: nothing happens; the text appears in the list of events."""
 
     note: Annotated[str, Field(examples=["the door is opened"])]
-    """A text for the journal. Nothing happens."""
+    """A text for the events of the summary. Nothing happens."""
 
     kind = "note"
     does = Nothing
