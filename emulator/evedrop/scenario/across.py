@@ -309,12 +309,18 @@ def lacking_streams(streams: Iterable[str], scheme: type[Scheme]) -> list[str]:
 
 
 def application_mistakes(scenario: Scenario) -> Iterator[str]:
-    """Applications without plant or controller, names that plant and process lack, and eavesdroppers of the same name."""
+    """Applications without plant or controller, wrong names and units, and eavesdroppers of the same name."""
     for name, table in scenario.applications.items():
         if scenario.plant is None or scenario.controller is None:
             yield f"{name}: is given without a [plant] and a [controller]; expected both, or no table [{name}]"
         else:
             yield from _named_mistakes(name, APPLICATIONS[name], table, scenario.process, scenario.plant)
+            yield from _power_mistakes(name, APPLICATIONS[name], table, scenario.process, scenario.plant)
+            if APPLICATIONS[name].powers and scenario.slot_seconds is None:
+                yield (
+                    f"slot_seconds: is missing, and the energies of [{name}] need the duration of a slot; expected it, such as "
+                    "slot_seconds = 60.0"
+                )
         if name in scenario.receivers[1:]:
             yield f"eavesdroppers.{name}: is a name that the {name}'s metrics use; expected another"
 
@@ -335,6 +341,22 @@ def _named_mistakes(
             yield f"{name}.{entry}: is {as_toml(given)}, which is not among {where}; {choice}"
 
 
+def _power_mistakes(
+    name: str, application: type[Application], table: Table, process: ProcessTable, plant: PlantTable
+) -> Iterator[str]:
+    known: dict[Kind, tuple[list[str] | None, list[str] | None]] = {
+        "states": (process.states, process.units),
+        "inputs": (plant.inputs, plant.input_units),
+        "disturbances": (plant.disturbances, plant.disturbance_units),
+    }
+    for entry in application.powers:
+        given, (names, units) = getattr(table, entry), known[application.names[entry]]
+        unit = dict(zip(names or [], units or [], strict=False)).get(given, _POWER)
+        if unit != _POWER:
+            yield f"{name}.{entry}: is {as_toml(given)}, which is in {unit}; expected a power in {_POWER}"
+
+
+_POWER = "kW"
 _ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # the existence of a theory does not depend on the process
 
 

@@ -277,6 +277,8 @@ class Application(ABC):
     """The entries of its table."""
     names: ClassVar[Mapping[str, Kind]]
     """The entries of its table that name an input or a disturbance of the plant, or a state of the process."""
+    powers: ClassVar[tuple[str, ...]] = ()
+    """Those of `names` that are powers in kW: its metrics are energies, which need the duration of a slot."""
     metrics: ClassVar[tuple[str, ...]]
     """Its metrics in the summary that expectations and sweeps can use."""
     receiver_metrics: ClassVar[tuple[str, ...]] = ()

@@ -156,6 +156,7 @@ class Comfort(Application):
 
     table = ComfortTable
     names: ClassVar[Mapping[str, Kind]] = {"temperature": "states", "heater": "inputs"}
+    powers = ("heater",)
     metrics = ("discomfort", "heating_energy")
     receiver_metrics = ("known_fraction",)
 

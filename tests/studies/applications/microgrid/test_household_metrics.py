@@ -29,6 +29,7 @@ SLOTS = 1200
 
 HOUSE: dict[str, Any] = {
     **LOOP,
+    "slot_seconds": 1.0,
     "household": {"grid": "P_grid", "load": "P_load", "sun": "P_solar", "battery": "SOC"},
     "eavesdroppers": {"eve": listener("smart", 0.6)},
 }
@@ -43,6 +44,9 @@ HOUSE: dict[str, Any] = {
         ({"household__battery": "soc"}, "household.battery"),
         ({"process__states": None}, "household.battery"),
         ({"household__grid": None}, "household.grid"),
+        ({"plant__input_units": ["kW", "W"]}, "household.grid"),
+        ({"plant__disturbance_units": ["kW", "W"]}, "household.load"),
+        ({"slot_seconds": None}, "slot_seconds"),
         ({"household__window_seconds": 0.0}, "household.window_seconds"),
         ({"household__stove": "x"}, "household.stove"),
         ({"expect": [{"metric": "household.bought", "below": 1.0}]}, "expect.0.metric"),

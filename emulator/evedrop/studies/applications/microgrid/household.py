@@ -359,6 +359,7 @@ class Household(Application):
         "sun": "disturbances",
         "battery": "states",
     }
+    powers = ("grid", "load", "sun")
     metrics = ("bought_energy", "sold_energy", "net_difference", "total_difference", "summed_difference")
     receiver_metrics = ("activity_area", "detection_rate")
     has_power = True
