@@ -126,7 +126,8 @@ def carry_out(task: TrialsTask, on_progress: OnProgress, stopped: Stopped) -> Ba
     trials = range(task.start, task.stop)
     recorded = max(0, min(scenario.first_trial + scenario.record_trials, task.stop) - task.start)
     simulation = Simulation(scenario, trials, task.mode)
-    scale = float(np.trace(scenario.process.process.Q))
+    process = scenario.process.process
+    scale = float(np.trace(process.Q)) or float(np.trace(process.initial_covariance)) or 1.0  # where there is no noise
     expected = theoretical_traces_of(scenario)
     revealed = HeardBitsStream(scenario)
     blocks, keepers = zip(
