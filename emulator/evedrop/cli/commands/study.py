@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 from dataclasses import asdict
 from pathlib import Path
@@ -176,7 +177,7 @@ def _print_cost(reproduction: SecrecyCost) -> None:
     from evedrop.show.report.text_table import TextTable
 
     names = {"scheme": reproduction.scheme, "plain": "plain", "truth": "the truth"}
-    heads = ("mean", "standard error", "95 % interval")
+    heads = ("mean", "standard error", "95 % from", "to")
     table = TextTable.headed([""], heads, wrapped=["", *heads])
     for name, measured in reproduction.more_than_plain.items():
         table.add(f"{name.replace('_', ' ')}: {reproduction.scheme} less plain", *_cells(measured, 1.0, " Wh"))
@@ -191,13 +192,13 @@ def _print_cost(reproduction: SecrecyCost) -> None:
     console.show(table)
 
 
-def _cells(estimate: MeanEstimate, scale: float, unit: str) -> tuple[str, str, str]:
+def _cells(estimate: MeanEstimate, scale: float, unit: str) -> tuple[str, str, str, str]:
     if not math.isfinite(estimate.mean):  # a fraction of an energy that is 0
         dash = number_text(None)
-        return dash if math.isnan(estimate.mean) else finite_text(estimate.mean) + unit, dash, dash
+        return dash if math.isnan(estimate.mean) else finite_text(estimate.mean) + unit, dash, dash, dash
     mean, low, high = (number_text(scale * value, ".3g") for value in (estimate.mean, estimate.low, estimate.high))
     error = ShownNumber(f"{float(f'{scale * estimate.standard_error:.3g}'):.2g}", scale * estimate.standard_error)
-    return mean + unit, error, f"{low} to {high}{unit}"
+    return mean + unit, error, low + unit, high + unit
 
 
 _ROUNDING = 1e-12  # a standard error that is smaller, over the mean, is rounding
@@ -229,14 +230,14 @@ def _print_learned(rows: list[LearningRow], trials: int) -> None:
 
     console = terminal()
     console.say(
-        f"{trials} trials: the error of each estimate over the truth, median over trials (mean ± standard error)"
+        f"{trials} trials: the error of each estimate over the truth, its median over trials and its mean ± standard error"
     )
-    heads = ["slots", "learner", "A", "Q", "μ_d"]
+    heads = ["slots", "learner", *(head for name in ("A", "Q", "μ_d") for head in (name, f"mean {name}"))]
     table = TextTable.headed([], heads, wrapped=heads)
     for row in rows:
         for learner, values in row.parameters.items():
-            cells = (
-                number_text(measured.median, ".3g") + f" ({_with_error(measured.mean, measured.standard_error)})"
+            cells = itertools.chain.from_iterable(
+                (number_text(measured.median, ".3g"), _with_error(measured.mean, measured.standard_error))
                 for measured in values.values()
             )
             table.add(str(row.stop), learner, *cells)
