@@ -283,3 +283,14 @@ def test_a_table_that_is_not_written_does_not_hide_an_error(evedrop: Evedrop, mo
     assert "warning: bad.csv cannot be written (Is a directory)" in done.err
     assert "evedrop: it failed" in done.err
     assert (evedrop.folder / "table.tex").read_text(encoding="utf-8")
+
+
+def test_a_row_that_begins_with_a_bracket_is_no_length() -> None:
+    r"""LaTeX takes [ after \\ for a length, and * for a form, also on the next line: values of a sweep may be lists."""
+    table = TextTable.headed(["process.Q"], ["mean error"])
+    for value in ("[[1.0]]", "[[2.0]]", "*"):
+        table.add(value, number_text(0.5))
+    lines = latex_text(table).splitlines()
+    assert len(lines) == 9
+    for before, after in itertools.pairwise(lines):
+        assert not (before.endswith(r"\\") and after.startswith(("[", "*")))

@@ -51,8 +51,10 @@ from evedrop.show.report.sweep_sections import sweep_outcome
 from evedrop.show.report.text_table import TextTable, aligned, far
 from evedrop.show.report.writing import REPORT, try_report, write_report
 from evedrop.show.view.axis_name import as_mathematics, axis_name
+from evedrop.show.view.error_floor import mean_band
 from evedrop.show.view.label_places import label_places
 from evedrop.show.view.lanes import Lane
+from evedrop.show.view.result_pictures import sweep_figure
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from tests.conftest import LIMIT, Evedrop
@@ -101,6 +103,14 @@ def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -
     assert page.tags["img"] == 8
     assert (study / REPORT).stat().st_size < 300_000
     assert stat.S_IMODE((study / REPORT).stat().st_mode) == 0o600
+
+
+def test_a_small_z_gives_the_others_no_exponent() -> None:
+    """It is a number between about −4 and 4."""
+    scores = TextTable.headed(["receiver"], ["z"])
+    for z in (1.2, 0.0004):
+        scores.add("a", number_text(z, "+.1f"))
+    assert [row[1] for row in aligned(scores).rows] == ["+1.2", "+0.0"]
 
 
 def test_a_picture_whose_bytes_spell_an_address_is_no_request(study: Path, tmp_path: Path) -> None:
@@ -698,6 +708,40 @@ def test_true_and_false_are_named_on_the_axis_of_a_sweep(tmp_path: Path) -> None
     (axes,) = results.plot().axes
     assert [text.get_text() for text in axes.get_xticklabels()] == ["True", "False"]
     assert all(line.get_linestyle() == "None" for line in axes.get_lines())
+
+
+@pytest.mark.parametrize("trials", [2, 3, 5, 30])
+def test_an_interval_of_95_per_cent_is_one_for_few_trials_too(trials: int) -> None:
+    """Of nearly normal errors around 1."""
+    errors = 1.0 + 0.1 * np.random.default_rng(1).standard_normal((trials, 20_000))
+    low, high = mean_band(errors.mean(axis=0), errors.std(axis=0, ddof=1) / math.sqrt(trials), trials)
+    assert 0.94 < np.mean((low <= 1.0) & (high >= 1.0)) < 0.96
+
+
+def test_a_picture_of_a_sweep_says_that_a_mean_of_0_is_not_drawn() -> None:
+    """Its axis is logarithmic; the legitimate estimator's error is 0 over a link without losses."""
+    row = {"peer": "legitimate", "link.quality": 0.5, "mean_squared_error": 0.02, "theoretical_trace_covariance": 0.02}
+    row |= {"mean_squared_error_standard_error": 0.0, "rare_fraction": 0.0}
+    perfect = {"link.quality": 1.0, "mean_squared_error": 0.0, "theoretical_trace_covariance": 0.0}
+    (axes,) = sweep_figure(pa.Table.from_pylist([row, row | perfect]), ("link.quality",)).axes
+    assert axes.get_ylabel().endswith("not drawn: 0)")
+    (axes,) = sweep_figure(pa.Table.from_pylist([row]), ("link.quality",)).axes
+    assert axes.get_ylabel().endswith("(lines: theory)")
+
+
+@pytest.mark.parametrize(
+    ("x", "ticks"),
+    [
+        ([1_000_001.0, 1_000_002.0, 1_000_003.0], {"1,000,001", "1,000,003"}),
+        ([2e-14, 4e-14, 6e-14], {"2e-14", "6e-14"}),
+        ([-0.2, 0.0, 0.2], {"-0.2", "0", "0.2"}),
+    ],
+)
+def test_the_ticks_of_a_chart_can_be_told_apart(x: list[float], ticks: set[str]) -> None:
+    """Whatever the size of the swept values is."""
+    y = np.ones(3)
+    curve = Curve("eve", "#123456", np.array(x), y, y, y, y, bars=True)
+    assert ticks <= {text.text for text in drawn(LogChart("label", "x", "error", [curve])).iter("text")}
 
 
 def test_a_sweep_has_no_interval_where_rare_events_carry_the_mean(tmp_path: Path) -> None:

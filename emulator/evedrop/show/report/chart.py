@@ -204,7 +204,8 @@ class LogChart:
             axes.set_xticks(range(len(self.x_words)), list(map(printable, self.x_words)))
             left, right = -0.5, len(self.x_words) - 0.5
         else:
-            axes.xaxis.set_major_formatter(lambda at, _: f"{round(at, 12):,g}")
+            rounding = 1e-9 * max(abs(left), abs(right))
+            axes.xaxis.set_major_formatter(lambda at, _: f"{at if abs(at) > rounding else 0.0:,.10g}")
         room = 0.04 * (right - left) if self.x_words is None and any(curve.bars for curve in curves) else 0.0
         room = room or (0.0 if right > left else 0.5)
         axes.set_xlim(left - room, right + room)

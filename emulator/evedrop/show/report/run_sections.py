@@ -208,7 +208,7 @@ class RunSource:
     @cached_property
     def means(self) -> dict[str, SlotMeans]:
         """Receiver → its error in every slot. Raises UsageError if the table cannot be read."""
-        columns = ["slot", "mean_squared_error", "mean_actual_trace_covariance", "standard_error"]
+        columns = ["slot", "trials", "mean_squared_error", "mean_actual_trace_covariance", "standard_error"]
         table = SlotRows(self.results, "slots", self.summary.peers)
         groups = {name: GroupMeans(extent.rows, POINTS, 5) for name, extent in table.extents.items()}
         slots, trials = 1 + max((extent.last for extent in table.extents.values()), default=0), self.summary.trials
@@ -250,7 +250,8 @@ def _means(rows: Mapping[str, Any], rare: Floats | None) -> Floats:
     actual = _numbers(rows["mean_actual_trace_covariance"])
     error = np.where(np.isnan(error), actual, error)
     slot, scatter = _numbers(rows["slot"]), _numbers(rows["standard_error"])
-    low, high = mean_band(error, sound_errors(scatter, None if rare is None else rare[slot.astype(np.int64)]))
+    sound = sound_errors(scatter, None if rare is None else rare[slot.astype(np.int64)])
+    low, high = mean_band(error, sound, _numbers(rows["trials"]))
     theory = _numbers(rows["theoretical_trace_covariance"])
     return np.stack([slot, error, low, high, theory])
 

@@ -177,7 +177,8 @@ def _curve(
     y, theory = (_values(rows, names) for names in (marks, lines))
     errors = _values(rows, [error_column(metric) for metric in marks])
     sound = sound_errors(errors, _values(rows, ["rare_fraction"]) * theory)
-    curve = Curve(name, ink, np.array(x), y, *mean_band(y, np.nan_to_num(sound)), theory, bars=True)
+    band = mean_band(y, np.nan_to_num(sound), np.array([row["trials"] for row in rows]))
+    curve = Curve(name, ink, np.array(x), y, *band, theory, bars=True)
     return curve, bool((np.isnan(sound) & ~np.isnan(errors)).any())
 
 

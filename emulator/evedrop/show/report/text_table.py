@@ -72,20 +72,26 @@ _FAR = 4.0
 
 
 def aligned(table: TextTable) -> TextTable:
-    """The same table, in which the numbers of a column all have an exponent if any of them is very small or large."""
+    """The same table, in which the numbers of a column all have an exponent if any of them is very small or large.
+
+    A z never has one.
+    """
     columns = [[*cells] for cells in zip(*table.rows, strict=True)]
-    for cells in columns:
-        numbers = [cell for cell in cells if isinstance(cell, ShownNumber) and isinstance(cell.value, float)]
-        sizes = [abs(number.value) for number in numbers if number.value and math.isfinite(number.value)]
-        sizes = [size for size in sizes if size > _DUST * max(sizes)]
-        if sizes and (min(sizes) < _SMALL or max(sizes) >= _LARGE):
-            cells[:] = [_with_exponent(cell) if cell in numbers else cell for cell in cells]
+    for cells, column in zip(columns, table.columns, strict=False):  # without rows there are no cells
+        if column.heading == "z":
+            continue
+        values = [cell.value for cell in cells if isinstance(cell, ShownNumber) and isinstance(cell.value, float)]
+        sizes = [abs(value) for value in values if value and math.isfinite(value)]
+        largest = max(sizes, default=0.0)
+        smallest = min((size for size in sizes if size > _DUST * largest), default=1.0)
+        if smallest < _SMALL or largest >= _LARGE:
+            cells[:] = [_with_exponent(cell) for cell in cells]
     return replace(table, rows=list(zip(*columns, strict=True)))
 
 
 def _with_exponent(cell: str) -> str:
-    assert isinstance(cell, ShownNumber)  # noqa: S101 - chosen so
-    assert cell.value is not None  # noqa: S101 - the same
+    if not isinstance(cell, ShownNumber) or not isinstance(cell.value, float):
+        return cell
     text = cell.removesuffix(cell.after)
     if cell.after and text == cell:  # words before the number, such as "≥"
         return cell
@@ -188,7 +194,8 @@ def _without(table: TextTable, heading: str) -> TextTable:
 
 
 def _row(cells: Sequence[str]) -> str:
-    return " & ".join(latex_escaped(_MARKS.sub("", cell)) for cell in cells) + r" \\"
+    row = " & ".join(latex_escaped(_MARKS.sub("", cell)) for cell in cells) + r" \\"
+    return "{}" + row if row.startswith(("[", "*")) else row  # the row above ends with a command that takes these as arguments
 
 
 _MARKS = re.compile(f"^[{''.join(outcome.glyph for outcome in SecrecyOutcome)}] ")

@@ -15,7 +15,6 @@ import numpy as np
 
 from evedrop.model.process import Floats
 
-_INTERVAL = 1.96  # standard errors on either side
 _ROOM = 1.6  # the factor by which the axis goes beyond the errors
 _MOST = 1e30  # times the lowest value shown is the highest
 
@@ -29,10 +28,13 @@ def error_floor(noise: float, trials: int) -> float:
     return 10.0 ** (math.floor(math.log10(noise / trials)) - 1) if noise > 0.0 else 0.0
 
 
-def mean_band(means: Floats, standard_errors: Floats) -> tuple[Floats, Floats]:
-    """The ends of the 95 % intervals of means, by the standard errors of their logarithms: they stay above 0 if the means do."""
+def mean_band(means: Floats, standard_errors: Floats, trials: Floats | int) -> tuple[Floats, Floats]:
+    """The ends of the 95 % intervals of means over trials: Student's, of their logarithms, so they stay above 0 if the means do."""
+    from scipy.special import stdtrit  # noqa: PLC0415 - a run without a view needs none
+
+    reach = stdtrit(np.maximum(trials, 2) - 1, 0.975)  # a single trial has no standard error
     with np.errstate(all="ignore"):
-        factor = np.where(means == 0.0, 1.0, np.exp(_INTERVAL * standard_errors / means))
+        factor = np.where(means == 0.0, 1.0, np.exp(reach * standard_errors / means))
         return means / factor, means * factor
 
 

@@ -173,7 +173,7 @@ class SquaredError(ViewPanel):
         for shown in self.scene.receivers:
             peer = slots.peers[shown.name]
             yield from logarithms(self.scene, f"{_ERROR_PATH}/{shown.name}", slots.numbers, peer.squared_error)
-            edges = zip(_SIDES, mean_band(peer.squared_error, peer.standard_error), strict=True)
+            edges = zip(_SIDES, mean_band(peer.squared_error, peer.standard_error, self.scene.trials), strict=True)
             for side, edge in edges if self._with_bands else ():
                 yield from logarithms(self.scene, f"{_BAND}/{shown.name}/{side}", slots.numbers, edge)
 

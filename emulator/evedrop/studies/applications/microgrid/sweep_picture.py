@@ -51,7 +51,7 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
             here = [place[row[key]] for row in mine[peer]]  # not at every point if the eavesdroppers are swept
             told.errorbar(here, areas, _bars(mine[peer], "activity_area"), fmt=f"{mark}-", color=inks[peer], label=peer)
         told.axhline(0.5, color=GREY, linewidth=0.9, linestyle=":", label="a coin")
-        told.set_ylim(0.4, 1.02)
+        told.set_ylim(min(0.4, told.get_ylim()[0]), 1.02)
         told.set_ylabel("area under the curve")
         told.set_title("(c) who can tell when somebody is at it")
         for axes in (energies, fractions, told):
