@@ -461,3 +461,15 @@ def test_squares_beyond_double_precision_are_infinite() -> None:
     quantiles = merger.summary(RunOutcome(1.0)).peers["deaf"].error_quantiles
     assert quantiles is not None
     assert quantiles["0.95"] == math.inf
+
+
+def test_quantiles_of_a_process_without_noise_are_finite(tmp_path: Path) -> None:
+    """Only the first covariance gives errors, and histograms have their scale from it."""
+    process = {"A": [[1.0]], "Q": [[0.0]], "initial_covariance": [[1.0]], "singular_noise": True}
+    results = montecarlo(
+        "numerical", slots=4, trials=6, eavesdroppers={}, expect=[], process=process, out=tmp_path / "out",
+        legitimate__link__quality=0.2, plan=Plan(Mode.COVARIANCE_ONLY),
+    )  # fmt: skip
+    values = results.slots["error_quantile_0.95"].to_numpy()
+    assert (values > 0.0).any()
+    assert not np.isinf(values).any()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def test_the_command(evedrop: Evedrop) -> None:
     done = evedrop(*arguments, "--trials", "1")
     assert done.status == 0, done.err
     assert "learning / it" in done.out
-    assert "0.167 (0.167)" in done.out
+    assert re.search(r"^ *8 +learning .* 0.167 +0.167 *$", done.out, re.MULTILINE)
     rows = json.loads(evedrop(*arguments, "--trials", "2", "--json").out)
     assert [row["stop"] for row in rows] == [8, 12]
     assert rows[0]["parameters"]["learning"]["mu_d"]["mean"] == pytest.approx(1.0 / 6.0)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from evedrop.cli.command import command, flag, option, together
 from evedrop.cli.in_memory import MEMORY, check_resuming, crew, default_trials, keeping, plan_of, resuming, studied
 from evedrop.cli.options import as_json, changes_of, entries, loaded, output, over_wire, print_so_far, scenario, tables
+from evedrop.counting import counted
 from evedrop.errors import Interrupted, UsageError
 from evedrop.model.metrics.text import ShownNumber, finite_text, number_text
 from evedrop.system.output import print_json
@@ -230,7 +231,7 @@ def _print_learned(rows: list[LearningRow], trials: int) -> None:
 
     console = terminal()
     console.say(
-        f"{trials} trials: the error of each estimate over the truth, its median over trials and its mean ± standard error"
+        f"{counted(trials, 'trial')}: the error of each estimate over the truth, its median over trials and its mean ± standard error"
     )
     heads = ["slots", "learner", *(head for name in ("A", "Q", "μ_d") for head in (name, f"mean {name}"))]
     table = TextTable.headed([], heads, wrapped=heads)
