@@ -19,7 +19,8 @@ EvedropError                    exit status
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 from evedrop.counting import counted
 
@@ -42,6 +43,17 @@ class EvedropError(Exception):
     def illustrated(self) -> str:
         """The message as a terminal shows it: with the lines of a file that it is about, where there are any."""
         return str(self)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """What a copy is made from, in another process too: not the constructor's arguments, of which the message is made."""
+        return _copied, (type(self), self.args, self.__dict__)
+
+
+def _copied(kind: type[EvedropError], args: tuple[Any, ...], state: Mapping[str, Any]) -> EvedropError:
+    """The copy of an error, made without its constructor."""
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(state)
+    return error
 
 
 class UsageError(EvedropError):

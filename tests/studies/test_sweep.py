@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.cli.api import montecarlo
-from evedrop.errors import UsageError
+from evedrop.errors import ScenarioError, UsageError
 from evedrop.model.metrics import expectable_metrics
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import silent
@@ -383,3 +383,9 @@ def test_an_application_that_draws_nothing_leaves_no_file(tmp_path: Path) -> Non
     table = sweep_over("heated-room", changes, {"slots": [8, 12]}, tmp_path / "run", lambda _: None, Plan(workers=1))
     assert "discomfort" in table.column_names
     assert {path.stem for path in (tmp_path / "run").iterdir()} == {"sweep"}
+
+
+def test_a_date_is_refused_where_the_entry_takes_none(tmp_path: Path) -> None:
+    """TOML has dates."""
+    with pytest.raises(ScenarioError, match="title"):
+        sweep_over("numerical", {}, grid_of(["title=2024-01-01,2024-01-02"]), tmp_path / "s", lambda _: None, Plan())

@@ -44,7 +44,8 @@ from evedrop.system.output import say
 
 TASKS = "finished_tasks"
 """The folder in a results folder."""
-_STUDY = "study.json"
+STUDY = "study.json"
+"""The file in it that says what is studied."""
 _SECONDS = "seconds.json"
 _MAGIC = b"evedrop finished task 2\n"
 _NAME = re.compile(r"([0-9a-f]{32})-([0-9]+)-([0-9]+)")
@@ -101,7 +102,7 @@ def finished_tasks(folder: Path, study: Study, resume: bool) -> Iterator[Finishe
         new_folder(folder)
         with disk_errors(folder):
             make_private(folder / TASKS)
-            write_private(folder / TASKS / _STUDY, json.dumps(study, ensure_ascii=False, indent=1) + "\n")
+            write_private(folder / TASKS / STUDY, json.dumps(study, ensure_ascii=False, indent=1) + "\n")
     tasks = FinishedTasks(folder / TASKS, study, resumed=began, had_folder=had_folder)
     try:
         if began:
@@ -119,14 +120,14 @@ def finished_tasks(folder: Path, study: Study, resume: bool) -> Iterator[Finishe
 def _check(folder: Path, study: Study) -> None:
     """Raise UsageError unless a folder has this study, and no process works in it."""
     try:
-        there = json.loads((folder / TASKS / _STUDY).read_text(encoding="utf-8"))
+        there = json.loads((folder / TASKS / STUDY).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UsageError(
-            f"{folder} has no interrupted study: there is no {TASKS}/{_STUDY} in it, so its study is complete, or is not one "
+            f"{folder} has no interrupted study: there is no {TASKS}/{STUDY} in it, so its study is complete, or is not one "
             "of a version that keeps finished trials; give another folder"
         ) from None
     except (OSError, ValueError) as error:
-        raise UsageError(f"{folder / TASKS / _STUDY} cannot be read ({error}); give another folder") from error
+        raise UsageError(f"{folder / TASKS / STUDY} cannot be read ({error}); give another folder") from error
     if there != study:
         raise UsageError(
             f"{folder} has another study: {'; '.join(_differences(there, study))}; give the same scenario and options, or "

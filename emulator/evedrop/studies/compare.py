@@ -65,6 +65,8 @@ def compare_all(matchups: Matchups, folder: Path, on_event: OnEvent, plan: Plan,
         raise UsageError(
             f"a comparison follows packets, which the mode {plan.mode.value} does not have; leave the mode out"
         )
+    if plan.rare:
+        raise UsageError("rare=True is for montecarlo, and a comparison does not split trials; leave it out")
     groups = matchups.groups
     wanted = {"schemes": [*matchups.schemes], "adversaries": [*matchups.adversaries]}
     study = study_of("compare", wanted, [group.scenario for group in groups])

@@ -109,6 +109,8 @@ def sweep_over(
     scenario of any point has mistakes, before any point is run; Interrupted, or RunError if a worker fails, with the points
     done so far in the folder.
     """
+    if plan.rare:
+        raise UsageError("rare=True is for montecarlo, and a sweep does not split trials; leave it out")
     scenarios = _checked(source, changes, grid, plan)
     total = sum(scenario.trials * scenario.slots for _, scenario in scenarios)
     rows: list[dict[str, Any]] = []
@@ -232,14 +234,14 @@ def _kind(value: Any) -> type | None:
 
 def _in_table(value: Any) -> Any:
     """A value as it is in the table: a list or a table as JSON."""
-    return json.dumps(value) if _kind(value) is None else value
+    return json.dumps(value, default=str) if _kind(value) is None else value  # TOML has dates, too
 
 
 def _stored(point: Point, grid: Grid) -> Point:
     """A point as it is in the table, where the values of an entry are of one kind: all of them text if they differ."""
     mixed = {key for key, values in grid.items() if len(set(map(_kind, values))) > 1}
     return {
-        key: json.dumps(value) if key in mixed and not isinstance(value, str) else _in_table(value)
+        key: json.dumps(value, default=str) if key in mixed and not isinstance(value, str) else _in_table(value)
         for key, value in point.items()
     }
 

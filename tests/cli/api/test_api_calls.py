@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import gc
 import json
@@ -30,7 +31,7 @@ from evedrop.cli.api import RunResults
 from evedrop.cli.api.running import results_of
 from evedrop.cli.main import parser_of
 from evedrop.cli.options import changes_of
-from evedrop.errors import RunError, ScenarioError, UsageError
+from evedrop.errors import EvedropError, Gap, MissingProcesses, RunError, ScenarioError, TraceError, UsageError
 from evedrop.model.metrics import all_metrics
 from evedrop.results.reading import ByName
 from evedrop.scenario.loading import load
@@ -376,3 +377,78 @@ def _module(**names: Any) -> ModuleType:
     module = ModuleType("IPython")
     vars(module).update(names)
     return module
+
+
+@pytest.mark.parametrize("name", ["summary.json", "shards"])
+def test_overwrite_never_removes_what_only_looks_like_results(tmp_path: Path, name: str) -> None:
+    """Other programs write a summary.json, or a folder of shards, too."""
+    (tmp_path / "thesis.tex").write_text("years of work")
+    if name == "shards":
+        (tmp_path / name).mkdir()
+    else:
+        (tmp_path / name).write_text('{"accuracy": 0.93}')
+    with pytest.raises(UsageError, match="is not a results folder, and overwrite=True replaces only those"):
+        montecarlo(SMALL, out=tmp_path, overwrite=True)
+    assert (tmp_path / "thesis.tex").exists()
+
+
+@pytest.mark.parametrize(
+    "again",
+    [
+        lambda out: sweep(SMALL, {"slots": [-1]}, trials=2, out=out, overwrite=True),
+        lambda out: sweep(SMALL, {"slots": [3]}, trials=2, out=out, overwrite=True, workers=0),
+        lambda out: montecarlo("late", trials=2, out=out, overwrite=True, plan=Plan(mode=Mode.COVARIANCE_ONLY)),
+        lambda out: montecarlo(SMALL, trials=2, out=out, overwrite=True, on_event="x"),
+        lambda out: run(SMALL, out=out, overwrite=True, listen="bad"),
+    ],
+    ids=["mistake", "workers", "mode", "events", "listen"],
+)
+def test_a_call_that_is_refused_leaves_the_earlier_results(tmp_path: Path, again: Any) -> None:
+    """All of them, and nothing beside them."""
+    out = tmp_path / "out"
+    first = montecarlo(SMALL, trials=2, out=out)
+    with pytest.raises(UsageError):
+        again(out)
+    assert load_results(out).summary == first.summary
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_results_that_cannot_be_set_aside_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the folder is a disk of its own, say, or one file of it may not be moved."""
+    out = tmp_path / "out"
+    first, rename = montecarlo(SMALL, trials=2, out=out), Path.rename
+
+    def refused(path: Path, target: Path) -> Path:
+        if path == out / "slots.parquet":
+            raise OSError(errno.EXDEV, os.strerror(errno.EXDEV))
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", refused)
+    with pytest.raises(UsageError, match=r"its results cannot be set aside \(Invalid cross-device link\)"):
+        montecarlo(SMALL, trials=2, out=out, overwrite=True)
+    assert load_results(out).summary == first.summary
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ScenarioError("s", ["a: b"]),
+        TraceError("walk.csv", "file", "is empty"),
+        Gap("k", 1, 2),
+        MissingProcesses("sensor", ("smart",), "in 3 s"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_an_error_comes_from_another_process_as_it_was_raised(error: EvedropError) -> None:
+    """Or a pool of processes would wait for it for ever."""
+    error.add_note("a note")
+    copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - as it comes from another process
+    assert (type(copy), str(copy), vars(copy)) == (type(error), str(error), vars(error))
+
+
+@pytest.mark.parametrize("call", [lambda plan: sweep(SMALL, {"slots": [3]}, plan=plan), lambda plan: compare(SMALL, plan=plan)])
+def test_only_trials_of_one_scenario_are_split(call: Any) -> None:
+    """An option that does nothing would be taken for one that works."""
+    with pytest.raises(UsageError, match="rare=True is for montecarlo"):
+        call(Plan(rare=True))

@@ -14,17 +14,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from evedrop.cli.api.notebook import progress, shown_when_open, view_in
-from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults
+from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults, study_in
 from evedrop.cli.words import speaks_python
 from evedrop.errors import EvedropError, UsageError
 from evedrop.results.crash_proof_tables import goes_on
+from evedrop.results.folder import UNFINISHED
 from evedrop.scenario.arguments import CHANGES, path_argument, refuse_unless, table_argument
-from evedrop.scenario.discovery import OF_RESULTS
 from evedrop.scenario.loading import plain_tables, prepared
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import dotted
 from evedrop.show.view.viewer import NOTEBOOK
+from evedrop.simulate.finished_tasks import STUDY, TASKS
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.studies.parts import StudyPlace
@@ -73,6 +74,7 @@ def results_of(
     """
     if resume and (out is None or overwrite):
         raise UsageError(_NO_FOLDER)
+    earlier: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
     if out is None:
         folder = Path(tempfile.mkdtemp(prefix="evedrop-"))
     else:
@@ -80,10 +82,10 @@ def results_of(
         refuse_unless(isinstance(overwrite, bool), "overwrite", overwrite, "True or False")
         folder = Path(out)
         if not resume:
-            _clear(folder, overwrite)
+            earlier = _set_aside(folder, overwrite)
     kept = out is not None
     try:
-        with progress(on_event, total) as emit:
+        with earlier, progress(on_event, total) as emit:
             results = study(folder, emit)
         if not kept:
             weakref.finalize(results, shutil.rmtree, folder, ignore_errors=True)
@@ -121,21 +123,56 @@ def _say_how_to_resume(error: EvedropError) -> None:
         error.add_note(f"The same call with out={error.resumable!r} and resume=True goes on where it stopped.")
 
 
-def _clear(folder: Path, overwrite: bool) -> None:
-    """Empty a results folder that may be overwritten."""
+def _has_results(folder: Path) -> bool:
+    """Whether a folder has what only Evedrop writes: files of other programs are called summary.json, too."""
+    if (folder / TASKS / STUDY).is_file():
+        return True
+    if (folder / "scenario.toml").is_file() and any((folder / name).is_dir() for name in (UNFINISHED, "shards")):
+        return True
+    try:
+        study_in(folder)
+    except UsageError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _set_aside(folder: Path, overwrite: bool) -> Iterator[None]:
+    """Empty a results folder that may be overwritten, for the block; if the block leaves nothing there, all of it comes back."""
     if not folder.is_dir() or not any(folder.iterdir()):
+        yield
         return
     if not overwrite:
         raise UsageError(f"{folder} is not empty; give another out, or overwrite=True to replace the results in it")
-    if not any((folder / name).exists() for name in OF_RESULTS):
-        raise UsageError(f"{folder} is not a results folder, and overwrite=True replaces only those; give another out")
     if goes_on(folder):
         raise UsageError(f"{folder} belongs to a run in progress; wait for its end, or give another out")
-    for inside in folder.iterdir():
-        if inside.is_dir() and not inside.is_symlink():
-            shutil.rmtree(inside)
+    if not _has_results(folder):
+        raise UsageError(f"{folder} is not a results folder, and overwrite=True replaces only those; give another out")
+    place = folder.resolve()
+    try:
+        aside = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))  # on the same disk
+        try:
+            _move_all(place, aside)
+        except OSError:  # no right, or the folder is a disk of its own
+            _move_all(aside, place)
+            aside.rmdir()
+            raise
+    except OSError as error:
+        raise UsageError(f"{folder}: its results cannot be set aside ({error.strerror}); give another out") from error
+    try:
+        yield
+    finally:
+        if place.is_dir() and any(place.iterdir()):
+            shutil.rmtree(aside)
         else:
-            inside.unlink()
+            place.mkdir(mode=0o700, exist_ok=True)
+            _move_all(aside, place)
+            aside.rmdir()
+
+
+def _move_all(folder: Path, to: Path) -> None:
+    for inside in [*folder.iterdir()]:
+        inside.rename(to / inside.name)
 
 
 @speaks_python
