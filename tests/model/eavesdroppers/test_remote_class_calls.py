@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import re
 import select
 import subprocess
@@ -164,3 +166,21 @@ def test_an_interrupt_ends_the_process_that_was_asked(
         calls.call("mine:Class", "class", "STRATEGIES")
     assert started[-1].poll() is not None
     assert json.dumps(calls.of(["mine:Class"])) == "{}"
+
+
+def test_a_forked_process_asks_children_of_its_own(calls: RemoteCalls, tmp_path: Path) -> None:
+    """On one pipe, each would read the answers to the other's questions."""
+    name = written(tmp_path, method("betrayed", "return parameters['slot']"))
+    assert calls.call(name, "betrayed", "STRATEGIES", {"slot": 0}) == 0
+    ours, theirs = os.pipe()
+    process = os.fork()
+    if process == 0:  # while the other one does nothing, its child has answers for it only
+        with contextlib.suppress(BaseException):
+            os.write(theirs, f"{len(calls._children)} {calls.call(name, 'betrayed', 'STRATEGIES', {'slot': 1})}".encode())
+            calls.forget()
+        os._exit(0)
+    os.waitpid(process, 0)
+    assert os.read(ours, 100) == b"0 1"
+    os.close(ours)
+    os.close(theirs)
+    assert calls.call(name, "betrayed", "STRATEGIES", {"slot": 2}) == 2

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self, final
@@ -50,6 +51,14 @@ class RemoteCalls:
         self._lock = threading.Lock()
         self.folder: str | None = None
         """The folder in which modules are looked for first."""
+        ours = weakref.ref(self)
+        os.register_at_fork(after_in_child=lambda: None if (calls := ours()) is None else calls._forked())
+
+    def _forked(self) -> None:
+        """Leave the children to the process that forked this one: on one pipe, each would read answers to the other's questions."""
+        for child in self._children.values():
+            child.leave()
+        self._children, self._lock = {}, threading.Lock()
 
     def call(self, name: str, do: str, *given: Any) -> Any:
         """The answer of the class `name` to one question, as decoded JSON.
@@ -152,6 +161,12 @@ class _Child:
                 raise NoAnswer(f"the process that was to answer for it ended (status {status})") from error
             raise
         return reply
+
+    def leave(self) -> None:
+        """Close the pipes of a process that is another one's child."""
+        self._process.returncode = 0  # it is not ours to wait for
+        for pipe in filter(None, (self._process.stdin, self._process.stdout)):
+            pipe.close()
 
     def end(self) -> None:
         """End the process."""
