@@ -102,14 +102,15 @@ def _ask_for_theory(scenario: Scenario, table: EavesdropperTable) -> None:
 
 def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
     for receiver in scenario.receivers:
-        link = scenario.link(receiver)
-        yield from _settings_mistakes(scenario.link_path(receiver), link.settings(scenario.slot_seconds), problem)
+        settings, window = scenario.link(receiver).settings(scenario.slot_seconds), scenario.window(receiver)
+        yield from _settings_mistakes(scenario.link_path(receiver), settings, problem, scenario.slots, window)
     for i, event in enumerate(scenario.event):
         # An event's models are checked when tables are compared: mistakes are reported there, not here.
         for act in event.acts():
             settings = act.effect.entries
             if settings is not None and _describes_models(settings):
-                yield from _settings_mistakes(f"event.{i}.{act.entry}", settings, problem)
+                window = max(map(scenario.window, {*act.names} & {*scenario.receivers}), default=0)
+                yield from _settings_mistakes(f"event.{i}.{act.entry}", settings, problem, scenario.slots, window)
 
 
 def _describes_models(settings: Mapping[str, Any]) -> bool:
@@ -122,20 +123,30 @@ def _describes_models(settings: Mapping[str, Any]) -> bool:
     return True
 
 
-def _settings_mistakes(path: str, settings: Mapping[str, Any], problem: Problem) -> Iterator[str]:
+def _settings_mistakes(
+    path: str, settings: Mapping[str, Any], problem: Problem, slots: int, window: int
+) -> Iterator[str]:
+    """slots, window: of the scenario, for which theory asks the models."""
     losses, delay = settings.get("loss"), settings.get("delay")
     for spec in single_specs(losses) if losses else ():
-        yield from _model_mistakes(f"{path}.loss", LOSS_MODELS, LossChecks, spec, problem)
+        yield from _model_mistakes(f"{path}.loss", LOSS_MODELS, LossChecks, spec, problem, range(slots))
     if delay:
         in_slots = {name: value for name, value in delay.items() if name != "unit"}
-        yield from _model_mistakes(f"{path}.delay", DELAY_MODELS, DelayChecks, in_slots, problem)
+        yield from _model_mistakes(f"{path}.delay", DELAY_MODELS, DelayChecks, in_slots, problem, window + 1)
 
 
 def _model_mistakes(
-    path: str, models: Registry[Any], checks: type[LossChecks | DelayChecks], spec: Mapping[str, Any], problem: Problem
+    path: str,
+    models: Registry[Any],
+    checks: type[LossChecks] | type[DelayChecks],
+    spec: Mapping[str, Any],
+    problem: Problem,
+    stated: Any,
 ) -> Iterator[str]:
+    """stated: the slots, or how many lags, of which the model must state probabilities."""
     if models.foreign(spec["model"]):
         parameters = {name: value for name, value in spec.items() if name != "model"}
-        broken = how_broken(checks(models[spec["model"]], parameters).shapes, problem)
+        made = checks(models[spec["model"]], parameters)
+        broken = how_broken(made.shapes, problem) or how_broken(made.stated, stated)
         if broken is not None:
             yield f"{path}.model: is {as_toml(spec['model'])}; in a dry run: {broken}"

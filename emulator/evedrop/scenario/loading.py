@@ -8,6 +8,7 @@ Source: docs/scenario.md; docs/python.md.
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 import tomllib
@@ -20,7 +21,7 @@ from typing import Any, final
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from evedrop.errors import ScenarioError, UsageError
+from evedrop.errors import NoAnswer, ScenarioError, UsageError
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.links import LOSS_MODELS
@@ -40,6 +41,7 @@ from evedrop.scenario.stream_keys import secret_in
 from evedrop.scenario.table import sentences, unusable
 from evedrop.scenario.tables import Builders
 from evedrop.scenario.tables import Scenario as Scenario  # noqa: PLC0414 - exported with its builders, which are set here
+from evedrop.scenario.theory import expectations_of
 from evedrop.scenario.words import listed
 from evedrop.scenarios import shipped
 from evedrop.system.files import Unreadable, is_folder, is_there, shown, text_of
@@ -205,6 +207,8 @@ def checked(
     broken = dry_run(scenario)
     # A class that breaks in a dry run breaks again when it is asked about itself: report that only once.
     mistakes = broken + _across(scenario, beyond_horizon, silent=bool(broken))
+    if not mistakes and has_foreign(scenario):
+        mistakes += _untold(scenario)
     if scenario.nemesis is not None:
         tables, of_nemesis = with_faults(tables, scenario)
         mistakes += of_nemesis
@@ -226,6 +230,19 @@ def _across(scenario: Scenario, beyond_horizon: bool, silent: bool = False) -> l
         if silent:
             return []
         return [f"modules: a class raised {place_of(error)} when it was asked about itself; expected no error"]
+
+
+def _untold(scenario: Scenario) -> list[str]:
+    """Mistakes of classes that are not built in which only show when theory asks about all slots and links of this scenario."""
+    try:
+        for name, expectation in expectations_of(scenario).items():
+            traces = expectation.traces(scenario.slots)
+            if not isinstance(traces, np.ndarray) or traces.shape != (scenario.slots,):
+                raise NoAnswer(f"the closed form of {name} has not one trace for each of the {scenario.slots} slots")
+            math.isinf(expectation.limit)
+    except CLASS_ERRORS as error:
+        return [f"modules: theory cannot ask a class: {place_of(error)}; expected no error, or None: no closed form"]
+    return []
 
 
 def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:

@@ -75,6 +75,11 @@ _FOLLOWS = """Mine(Naive):
         return found, last"""
 
 LATER = {
+    "nan_delays": ("legitimate.link.delay.model", "Mine(ConstantDelay):\n    parameters = {}\n"
+                   "    def __init__(self): super().__init__(1.0)\n"
+                   "    def delays(self, first, numbers):\n"
+                   "        return super().delays(first, numbers) * (1.0 if first < 32 else np.nan)",
+                   "legitimate's link (later_nan_delays:Mine) failed in slots 32 to 63, trials {trials}: ValueError: delays() gave nan"),
     "packet": ("encoding.scheme", "Mine(Sends):\n    def packet(self, k, x):\n"
                "        return Packet(x * (np.nan if k == 30 else 1.0), np.zeros(x.shape[1], bool))",
                "the scheme later_packet:Mine failed in slot 30, trials {trials}: Packet.z, trial {first}, is nan; "),
@@ -152,6 +157,8 @@ def later(evedrop: Evedrop, case: str) -> tuple[str, ...]:
     (evedrop.folder / "mine.toml").write_text(SCENARIO.replace("slots = 40", "slots = 100\nfirst_trial = 5"))
     if entry == ENTRY["link"]:
         return ("--set", f'legitimate.link={{loss = {{model = "later_{case}:Mine"}}}}')
+    if entry == ENTRY["delay"]:
+        return ("--set", f'legitimate.link.delay={{model = "later_{case}:Mine"}}', "--set", "legitimate.window=3")
     return ("--set", f"{entry}=later_{case}:Mine")
 
 
@@ -159,7 +166,7 @@ OFTEN = ("packet", "uses", "block", "follow")
 """One case for each way into a class; the other cases use the same code."""
 
 
-@pytest.mark.parametrize("case", mostly_long(LATER, [*OFTEN, "fates", "leaves", "file", "mutates", "acts", "hears"]))
+@pytest.mark.parametrize("case", mostly_long(LATER, [*OFTEN, "fates", "nan_delays", "leaves", "file", "mutates", "acts", "hears"]))
 def test_what_breaks_in_a_later_slot_ends_a_study_in_memory(case: str, evedrop: Evedrop) -> None:
     """Status 3, as live, with class, slot and trials; and never an exit as if all were well."""
     changes = later(evedrop, case)
@@ -206,3 +213,25 @@ def test_what_breaks_in_a_later_slot_ends_a_live_run(case: str, evedrop: Evedrop
     message = re.escape(LATER[case][2].format(trials="5 to 7", first=5, slots="SLOTS")).replace("SLOTS", r"\d+ to \d+")
     assert re.search(message, done.err), done.err
     assert "Traceback" not in done.err
+
+
+@pytest.mark.parametrize(
+    ("body", "change", "message"),
+    [
+        ("Mine(Bernoulli):\n    parameters = {}\n    chain = None\n    def __init__(self): super().__init__(0.9)\n"
+         "    def quality_at(self, slots): return np.full(50, 0.9)[slots.start:slots.stop]",
+         'legitimate.link={loss = {model = "stating:Mine"}}', "quality_at() of slots 0 to 99 has shape (50,)"),
+        ("Mine(ConstantDelay):\n    parameters = {}\n    def __init__(self): super().__init__(1.0)\n"
+         "    def arrived(self, lag): return (0.0, 1.0, 1.0, 1.0)[lag]",
+         'legitimate={link = {quality = 0.9, delay = {model = "stating:Mine"}}, window = 6}', "arrived() of 0 to 99 raised IndexError"),
+        ('Mine(Plain):\n    closed_forms = {"legitimate": lambda scheme, conditions: 1 / 0}',
+         'encoding={scheme = "stating:Mine"}', "theory cannot ask a class: ZeroDivisionError"),
+    ],
+    ids=["quality_at", "arrived", "closed_forms"],
+)  # fmt: skip
+def test_what_a_class_states_is_checked_for_all_slots(evedrop: Evedrop, body: str, change: str, message: str) -> None:
+    """Before anything is started, not at the end of the study."""
+    (evedrop.folder / "stating.py").write_text(f"{HEAD}\n\nclass {body}\n")
+    (evedrop.folder / "mine.toml").write_text(SCENARIO.replace("slots = 40", "slots = 100"))
+    done = evedrop("check", "mine.toml", "--set", change)
+    assert (done.status, message in done.err, "Traceback" in done.err) == (2, True, False), done.err

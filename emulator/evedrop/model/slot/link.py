@@ -84,6 +84,18 @@ class ReceiverOutage(NamedTuple):
 
 
 _READ_AT_ONCE = 65_536  # slots
+
+
+def _expect_delays(delays: Any, shape: tuple[int, ...]) -> None:
+    """Raise ValueError unless these are delays: cast to whole slots, NaN and negative numbers would be very late packets."""
+    if not isinstance(delays, np.ndarray) or delays.dtype != np.float64 or delays.shape != shape:
+        found = f"{delays.dtype} of shape {delays.shape}" if isinstance(delays, np.ndarray) else type(delays).__name__
+        raise ValueError(f"delays() gave {found}; expected an array of float64, shape {shape}: slots, R trials")
+    if not (delays >= 0.0).all():
+        wrong = delays[~(delays >= 0.0)].flat[0]
+        raise ValueError(f"delays() gave {wrong}; expected slots, 0 or more")
+
+
 _SETTINGS = frozenset({"loss", "delay", "reorder", "duplicate", "corrupt", "rate", "queue"})
 MOST_RATE = 1e6
 """The highest rate of a link, in packets a slot."""
@@ -297,6 +309,8 @@ class Link:
         reader = self._reader("delay", 1)
         numbers = (reader.normals(slots) if model.normal else reader.uniforms(slots))[:, 0]
         delays = model.delays(slots.start, numbers)
+        if DELAY_MODELS.foreign(settings["delay"]["model"]):
+            _expect_delays(delays, numbers.shape)
         if chances is not None and settings.get("reorder"):
             delays = np.where(chances[:, 1] < settings["reorder"], 0.0, delays)
         return delays

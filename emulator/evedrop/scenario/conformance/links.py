@@ -17,10 +17,10 @@ import numpy as np
 from evedrop.model.delays import DelayModel
 from evedrop.model.links.chain import Chain
 from evedrop.model.links.loss_model import Fate, LossModel
-from evedrop.model.process import Floats
+from evedrop.model.process import Floats, parts_of
 from evedrop.model.receiver import Codes, Flags
 from evedrop.model.streams import BlockReader
-from evedrop.scenario.conformance.problems import Problem, large, small
+from evedrop.scenario.conformance.problems import Problem, large, slots_text, small
 from evedrop.scenario.conformance.receivers import SIGMAS
 from evedrop.scenario.conformance.rules import (
     Array,
@@ -37,6 +37,7 @@ from evedrop.scenario.conformance.rules import (
 )
 
 Model = TypeVar("Model", bound=LossModel | DelayModel)
+_LAGS = 100  # slots by which a receiver may wait for late packets, at least
 _COLUMN = "compute each trial from its own column of numbers alone"
 _PIECES = "let a slot depend only on the model's memory and the slot's numbers, not on how many slots are asked for"
 
@@ -125,16 +126,21 @@ class LossChecks(_ModelChecks[LossModel]):
     def shapes(self, problem: Problem) -> None:
         """Fates, and the numbers that the model states, have the right shapes and types."""
         self._whole(problem)
-        model, slots = self._made(), range(problem.slots)
+        self.stated(range(problem.slots))
+
+    def stated(self, slots: range) -> None:
+        """The numbers that the model states of these slots have the right shapes and types."""
+        model = self._made()
         with calling("quality, quality_at(), rate_variance()", self._kind):
-            quality, each, variance = model.quality, model.quality_at(slots), model.rate_variance(slots)
+            quality, variance = model.quality, model.rate_variance(slots)
             settles, memoryless, chain = model.settles, model.memoryless, model.chain
         expect_probability("quality", quality)
-        expect_array("quality_at()", each, np.float64, (len(slots),), "one for each of the slots")
-        if not 0.0 <= quality <= 1.0 or not ((each >= 0.0) & (each <= 1.0)).all():
-            raise Broken(
-                f"quality is {quality}, quality_at() from {each.min()} to {each.max()}; expected probabilities"
-            )
+        for part in parts_of(slots):
+            with calling(f"quality_at() of {slots_text(part)}", self._kind):
+                each = model.quality_at(part)
+            expect_array(f"quality_at() of {slots_text(part)}", each, np.float64, (len(part),), "one for each of the slots")
+            if not ((each >= 0.0) & (each <= 1.0)).all():
+                raise Broken(f"quality_at() is from {each.min()} to {each.max()}; expected probabilities")
         if not 0.0 <= variance <= 0.25 + 1e-12:
             raise Broken(f"rate_variance() is {variance}; expected a variance of a fraction, 0 to 0.25")
         if type(settles) is not bool or type(memoryless) is not bool:
@@ -234,8 +240,12 @@ class DelayChecks(_ModelChecks[DelayModel]):
     def shapes(self, problem: Problem) -> None:
         """Delays, and the probabilities that the model states, have the right shapes and types."""
         self._whole(problem)
-        with calling("arrived()", self._kind):
-            probabilities = [self._made().arrived(lag) for lag in range(4)]
+        self.stated(_LAGS)
+
+    def stated(self, lags: int) -> None:
+        """The probabilities that the model states of the first lags have the right types, and do not fall."""
+        with calling(f"arrived() of 0 to {lags - 1}", self._kind):
+            probabilities = [self._made().arrived(lag) for lag in range(lags)]
         given = [probability for probability in probabilities if probability is not None]
         for lag, probability in enumerate(probabilities):
             if probability is not None:
@@ -244,7 +254,7 @@ class DelayChecks(_ModelChecks[DelayModel]):
             len(given) < len(probabilities) or given != sorted(given) or not 0.0 <= given[0] <= given[-1] <= 1.0
         ):
             raise Broken(
-                f"arrived() of 0 to 3 is {probabilities}; expected probabilities that do not fall, or None always"
+                f"arrived() of 0 to {lags - 1} is {probabilities!r:.200}; expected probabilities that do not fall, or None always"
             )
 
     def says(self, problem: Problem) -> None:
