@@ -239,3 +239,11 @@ def test_rare_events_are_said_below_the_table(evedrop: Evedrop) -> None:
         fraction = max(error["rare_events"]["fraction"] for error in errors)
         assert fraction > 0.1
         assert f"{scheme} up to {fraction_text(fraction)}" in line
+
+
+def test_a_wire_gives_adversaries_the_links_of_those_whose_link_they_have() -> None:
+    """And names no eavesdropper that is not there."""
+    wire = {"seed": 7, "key": "robot/pose", "links": {"legitimate": "radio", "smart": "air", "equal": "other"}}
+    (group,) = matchups_of(load("numerical", {"wire": wire}), ["innovation"], ["smart", "genie"]).groups
+    assert group.scenario.wire is not None
+    assert group.scenario.wire.links == {"legitimate": "radio", "smart": "air", "genie": "air"}

@@ -246,6 +246,8 @@ def with_encoding(
         "record_trials": 1,
     }
     tables[LEGITIMATE]["link"].pop("correlation", None)  # with an eavesdropper that may not be in this scenario
+    if "wire" in tables:
+        tables["wire"] = {**tables["wire"], "links": _wire_links(scenario, matches)}
     ack_channel = tables.pop("acknowledgements", _ACK_CHANNEL)
     if SCHEMES[scheme].needs_acknowledgements:
         flip = ack_channel.get("flip", _FLIP)
@@ -291,6 +293,18 @@ def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:
     if "learns_at" in kind.parameters:
         made.setdefault("learns_at", scenario.slots // 2)
     return _alone({**kind.parameters, **made})
+
+
+def _wire_links(scenario: Scenario, matches: Sequence[Match]) -> dict[str, str]:
+    """Receiver → its link of the scenario's wire: an adversary has that of the receiver whose link it has."""
+    assert scenario.wire is not None  # noqa: S101 - the caller knows
+    links, names = scenario.wire.links, dict.fromkeys([LEGITIMATE], LEGITIMATE)
+    for match in matches:
+        if match.strategy is not None and not STRATEGIES[match.strategy].pools_links:
+            own = (name for name, table in scenario.eavesdroppers.items() if table.strategy == match.strategy)
+            any_ = (name for name, table in scenario.eavesdroppers.items() if table.link is not None)
+            names[match.receiver] = next(own, None) or next(any_, LEGITIMATE)
+    return {receiver: links[name] for receiver, name in names.items() if name in links}
 
 
 def _alone(table: Tables) -> Tables:
