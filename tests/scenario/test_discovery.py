@@ -86,3 +86,19 @@ def test_a_folder_without_a_scenario_does_not_stop_the_others(
     assert f"warning: no scenario in {bare}; a scenario is a TOML file" in capsys.readouterr().err
     with pytest.raises(UsageError, match=re.escape(f"no scenario in {bare}; ")):
         scenarios_of([bare])
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
+def test_a_scenario_in_another_encoding_is_reported(tmp_path: Path, encoding: str) -> None:
+    """A test that is left out would pass."""
+    path = tmp_path / "mine.toml"
+    path.write_bytes("# für uns\n[process]\nA = 1\n[encoding]\nscheme = 'plain'\n".encode(encoding))
+    assert is_scenario(path)
+    path.write_bytes("# für uns\n[project]\nname = 'encoding of a process'\n".encode(encoding))
+    assert not is_scenario(path)
+
+
+def test_a_link_to_itself_is_reported_when_it_is_read(tmp_path: Path) -> None:
+    """It is a scenario with a mistake, because it was named."""
+    (tmp_path / "loop.toml").symlink_to("loop.toml")
+    assert scenarios_of([str(tmp_path / "loop.toml")])

@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from evedrop.scenario.words import toml_text
+from evedrop.scenario.words import dotted, toml_text
 
 ROWS = """\
 title = "[ 1,"
@@ -49,3 +49,8 @@ def test_a_row_has_a_line() -> None:
 def test_reading_gives_the_same_tables(tables: dict[str, Any]) -> None:
     """It does so for any text, and for any nesting of lists and tables."""
     assert tomllib.loads(toml_text(tables)) == tables
+
+
+def test_a_key_with_a_dot_is_one_already() -> None:
+    """Names may contain what stands for the dot in a keyword."""
+    assert dotted({"a.b__c.d": 1, "a__b": 2}) == {"a.b__c.d": 1, "a.b": 2}

@@ -6,7 +6,7 @@ import argparse
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -176,7 +176,7 @@ def _commands_of_packages() -> Iterator[Command]:
     taken = {*MODULES}
     for point in entry_points(group=GROUP):
         try:
-            commands: Sequence[Command] = import_module(point.value).COMMANDS
+            commands = _usable(import_module(point.value).COMMANDS)
         except Exception as error:  # a mistake in the package
             warn(f"the commands of {point.value} cannot be loaded ({type(error).__name__}: {error})")
             continue
@@ -186,6 +186,20 @@ def _commands_of_packages() -> Iterator[Command]:
             else:
                 taken.add(command.name)
                 yield command
+
+
+def _usable(commands: Iterable[Command]) -> list[Command]:
+    """The commands of a package. Raises whatever is wrong with them, or with the functions that add their options."""
+    from evedrop.cli.command import Command
+
+    listed = list(commands)
+    for command in listed:
+        if not isinstance(command, Command):
+            raise TypeError(f"COMMANDS has {command!r:.60}, which is no Command")
+        tried = Parser()
+        for option in command.options:
+            option(tried)
+    return listed
 
 
 class _Version(argparse.Action):

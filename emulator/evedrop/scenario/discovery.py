@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-from evedrop.system.files import Unreadable, text_of
+from evedrop.system.files import Unreadable, contents
 
 _HEADINGS = tuple(re.compile(rf"^\s*\[{name}\]", re.MULTILINE) for name in ("process", "encoding"))
 _MOST_BYTES = 2**28  # as for every scenario
@@ -23,14 +23,19 @@ def is_scenario(path: Path) -> bool:
     """Whether a file looks like a user's scenario: TOML with the tables `process` and `encoding`.
 
     False for a name that begins with an underscore, and for the copies in a results folder. True for a file that is not
-    valid TOML but has both headings: a scenario with a mistake to report.
+    valid TOML, or not in UTF-8, but has both headings: a scenario with a mistake to report.
     """
     if path.suffix != ".toml" or path.name.startswith("_") or _is_copy(path):
         return False
     try:
-        text = text_of(path, _MOST_BYTES)
+        content = contents(path, _MOST_BYTES)
     except Unreadable:
         return False
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:  # in Latin-1, or in UTF-16 as some editors of Windows save it: `load` says what is wrong
+        text = content.replace(b"\0", b"").decode("latin-1")
+        return all(heading.search(text) for heading in _HEADINGS)
     if "process" not in text or "encoding" not in text:
         return False
     try:

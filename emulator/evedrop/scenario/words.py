@@ -31,8 +31,8 @@ def listed(names: Sequence[str]) -> str:
 
 
 def dotted(keywords: Mapping[str, Any]) -> dict[str, Any]:
-    """Changes by dotted key, of keywords in which `__` stands for the dot."""
-    return {name.replace("__", "."): value for name, value in keywords.items()}
+    """Changes by dotted key, of keywords in which `__` stands for the dot. A key with a dot is one already: names may have `__`."""
+    return {name if "." in name else name.replace("__", "."): value for name, value in keywords.items()}
 
 
 def options_of(changes: Mapping[str, Any]) -> list[str]:

@@ -71,6 +71,7 @@ def results() -> RunResults:
         (design_schedule, ["vehicle", 10], {"max_trace": 5.0, "block": 1.5}, "block=1.5: expected a whole number"),
         (design_policy, ["acknowledged"], {"weights": 3}, "weights=3: expected a list of numbers"),
         (design_policy, ["acknowledged"], {"prices": ["x"]}, "prices='x': expected a number"),
+        (design_policy, ["acknowledged"], {"weights": []}, r"weights=\[\]: expected a list of numbers, at least one"),
         (design_policy, ["acknowledged"], {"states": 2.5}, "states=2.5: expected a whole number"),
         (design_budget, ["vehicle", "x"], {}, "budget='x': expected a number"),
         (compare, [SMALL], {"schemes": "innovation"}, "schemes='innovation': expected a list"),
@@ -98,6 +99,14 @@ def test_a_picture_is_of_a_range_of_slots(results: RunResults) -> None:
     for slots in (3, [1, 2]):
         with pytest.raises(UsageError, match="expected a range of slots"):
             results.plot(slots=slots)  # type: ignore[arg-type]
+
+
+def test_a_panel_is_a_name(results: RunResults) -> None:
+    """A list of them is refused as any other word is."""
+    with pytest.raises(UsageError, match=r"there is no panel \['errors'\]; expected "):
+        results.plot(["errors"])  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match=r"width=\['page'\]: expected"):
+        results.plot(width=["page"])  # type: ignore[arg-type]
 
 
 def test_a_metric_that_there_is_not_is_an_error(results: RunResults) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
+import pytest
+
 from evedrop.cli.commands import MODULES
 from tests.conftest import Evedrop
 from tests.packages import install
@@ -48,3 +50,20 @@ def test_every_command_is_in_the_module_that_the_registry_says() -> None:
         for command in import_module(f"evedrop.cli.commands.{name}").COMMANDS:
             modules[command.group or command.name] = name
     assert modules == dict(MODULES)
+
+
+@pytest.mark.parametrize(
+    ("commands", "why"),
+    [
+        ('Command("greet", greet, "say hello")', "TypeError"),
+        ('("greet",)', "TypeError: COMMANDS has 'greet', which is no Command"),
+        ('(Command("greet", greet, "say hello", (3,)),)', "TypeError"),
+    ],
+    ids=["no tuple", "a word", "a wrong option"],
+)
+def test_commands_that_are_none_break_no_help(evedrop: Evedrop, commands: str, why: str) -> None:
+    """The comma of a tuple of one is easily forgotten."""
+    lone = f"{COMMAND.rpartition('COMMANDS')[0]}COMMANDS = {commands}\n"
+    install(evedrop.folder, {"lone.py": lone}, {"evedrop.commands": {"greet": "lone"}})
+    done = evedrop.process("--help", env={**evedrop.environment, "PYTHONPATH": str(evedrop.folder)})
+    assert (done.status, f"the commands of lone cannot be loaded ({why}" in done.err) == (0, True), done.err

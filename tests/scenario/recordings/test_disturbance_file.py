@@ -11,7 +11,7 @@ import pytest
 
 from evedrop.errors import DisturbanceError
 from evedrop.scenario.recordings import disturbance_file as plant_data
-from evedrop.scenario.recordings.disturbance_file import read_disturbances, table_text
+from evedrop.scenario.recordings.disturbance_file import read_disturbances, recorded_states, table_text
 from tests.builders import mistakes_of
 from tests.golden.pages import Golden
 
@@ -141,3 +141,10 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     for units in (None, UNITS):
         path = write(tmp_path, table_text(NAMES, units, rows))
         assert read_disturbances(path, NAMES, units) == rows
+
+
+def test_states_without_a_line_of_names_are_refused(tmp_path: Path) -> None:
+    """The first states would be taken for names."""
+    (tmp_path / "pose.csv").write_text("0.1,0.2\n0.3,0.4\n")
+    with pytest.raises(DisturbanceError, match="line 1 has only numbers; expected a line of names first"):
+        recorded_states(tmp_path / "pose.csv")

@@ -74,6 +74,7 @@ def test_delays_are_read(tmp_path: Path) -> None:
     [
         ("walk.csv", None, None, "file"),
         ("walk.csv", "", None, "file"),
+        ("walk.csv", "received,received\n1,0\n0,1\n", "received", "column"),
         ("walk.csv", "received\n", None, "file"),
         ("walk.csv", "1\n0\n2\n", None, "file"),
         ("walk.csv", "2\n0\n1\n", None, "file"),

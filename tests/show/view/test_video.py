@@ -223,6 +223,7 @@ def test_a_missing_ffmpeg_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         (("--video", "v.gif", "--slot", "3"), "--slots"),
         (("--video", "v.gif", "--times", "0:1"), "--slots"),
         (("--video", "v.gif", "--slots", "0:2.5"), "whole numbers"),
+        (("--video", "v.gif", "--slots", "0:1e19"), "more than a run can have"),
         (("--picture", "v.png", "--slots", "0:9"), "--video"),
         (("--picture", "v.svg"), "pixels"),
         (("--panel", "scene"), "--picture or --video"),

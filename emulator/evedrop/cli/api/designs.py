@@ -42,7 +42,12 @@ def measuring_command(given: str | Path | Scenario, changes: Mapping[str, Any], 
     if for_programs():
         grid = [f"{{'encoding.state_probability': {[i / 10 for i in range(1, 10)]}}}"] if constant else []
         words = ["SCENARIO" if isinstance(given, Scenario) else repr(str(given)), *grid]
-        words += [f"{key.replace('.', '__')}={value!r}" for key, value in dotted(changes).items()]
+        given_changes = dotted(changes)
+        keywords = {key.replace(".", "__"): value for key, value in given_changes.items()}
+        if all(word.isidentifier() for word in keywords) and dotted(keywords) == given_changes:
+            words += [f"{word}={value!r}" for word, value in keywords.items()]
+        else:  # a name such as much-better is no part of a keyword
+            words.append(f"**{given_changes!r}")
         return f"{'sweep' if constant else 'montecarlo'}({', '.join(words)})"
     words = [
         "evedrop",
@@ -213,15 +218,18 @@ def design_policy(
     from evedrop.cli.api.shown_designs import ShownPolicyDesign, shown_as  # a run does not need it
     from evedrop.scenario.designs import policies_of  # the same
 
+    lists = {}
     for name, several in (("weights", weights), ("prices", prices)):
         refuse_unless(
             isinstance(several, Iterable) and not isinstance(several, str), name, several, "a list of numbers"
         )
-        for value in several:
+        lists[name] = list(several)  # which may be read only once
+        refuse_unless(bool(lists[name]), name, lists[name], "a list of numbers, at least one")
+        for value in lists[name]:
             number_argument(name, value)
     number_argument("states", states, whole=True)
     made = scenario_of(scenario, changes or {}, beyond_horizon=True)
-    return shown_as(ShownPolicyDesign, policies_of(made, weights, prices, states))
+    return shown_as(ShownPolicyDesign, policies_of(made, lists["weights"], lists["prices"], states))
 
 
 @speaks_python

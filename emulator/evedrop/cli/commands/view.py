@@ -186,9 +186,13 @@ def _slots_of(options: argparse.Namespace) -> Sequence[int]:
             return [(slots - 1) * i // max(1, count - 1) for i in range(count)]
         first = max(0, min(slots - frames, slot - int(_BEFORE * frames)))
         return range(first, min(slots, first + frames))
+    from evedrop.model.checks import LAST_SLOT
+
     first, last, step = options.slots
     if not all(float(part).is_integer() for part in options.slots if part is not None):
         raise UsageError("--slots has a fraction of a slot; give whole numbers")
+    if last > LAST_SLOT:
+        raise UsageError(f"--slots up to {last:g} are more than a run can have; give slots of the run")
     return range(int(first), int(last) + 1, int(step or 1))
 
 

@@ -101,6 +101,11 @@ def recorded_states(path: Path, names: Sequence[str] | None = None) -> StateReco
     Raises DisturbanceError as `read_disturbances` does; times may scatter by a tenth of their mean distance.
     """
     head, rows = _begun(path, MOST_NUMBERS, 1, "x, y")
+    if all(_is_finite(cell, 1.0) for cell in head.cells):
+        raise DisturbanceError(
+            str(path),
+            [f"line {head.line} has only numbers; expected a line of names first, such as x, y, then a line for each state"],
+        )
     there = [match["name"] if (match := _HEADER.match(cell)) else cell for cell in head.cells]
     names = [name for name in there if name != _TIME] if names is None else names
     series, seconds = _read_series(path, head, rows, names, None, None), None

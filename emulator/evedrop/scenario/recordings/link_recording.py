@@ -221,6 +221,8 @@ class LinkRecording:
                     f"there are {_some(names)}" if names and not all(map(_is_value, names)) else "there are no names"
                 )
                 self._no("column", f"{_shown(column)} is not a column of {self._path.name}; {there}")
+            if names.count(column) > 1:
+                self._no("column", f"{_shown(column)} is the name of {names.count(column)} columns; expected each name once")
             return names.index(column)
         if len(names) != 1:
             self._no(

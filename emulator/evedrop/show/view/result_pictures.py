@@ -71,10 +71,10 @@ def run_figure(
     """Draw these panels, all of them if none is named, one below the other; arguments and errors as `RunResults.plot`."""
     names = list(wanted) or list(_HEIGHTS)
     for name in names:
-        if name not in _HEIGHTS:
+        if not isinstance(name, str) or name not in _HEIGHTS:
             raise UsageError(f"plot: there is no panel {name!r}; expected {', '.join(_HEIGHTS)}")
     refuse_unless(slots is None or isinstance(slots, range), "slots", slots, "a range of slots, such as range(0, 50)")
-    refuse_unless(width in _WIDTHS, "width", width, '"page", or "column" for a column of a journal')
+    refuse_unless(isinstance(width, str) and width in _WIDTHS, "width", width, '"page", or "column" for a column of a journal')
     column = width == "column"
     rows = results.slots
     last = pc.max(rows["slot"]).as_py()
@@ -269,7 +269,7 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
         [name for name, scheme in all_metrics().items() if scheme.sweep_picture == way] for way in ("marks", "lines")
     )
     inks = paper_inks(dict.fromkeys(row["peer"] for row in rows), strategies)
-    combinations, gaps = _others(rows, keys), False
+    combinations, gaps, zeros = _others(rows, keys), False, False
     if len(combinations) > len(axes):
         words = f"the first {len(axes)} of {len(combinations):,} combinations"
         axes[0].figure.suptitle(words, x=0.02, ha="left", fontsize=9)
@@ -284,10 +284,12 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
             errors = np.array([_height(row, [error_column(name) for name in marks]) for row in mine])
             sound = sound_errors(errors, np.array([_height(row, ["rare_fraction"]) for row in mine]) * theory)
             gaps |= bool((np.isnan(sound) & ~np.isnan(errors)).any())
+            means = [_height(row, marks) for row in mine]
+            zeros |= 0.0 in means
             scheme.plot(x, theory, "-" if numbers else "_", color=ink, linewidth=1.2, markersize=26)
             scheme.errorbar(
                 x,
-                [_height(row, marks) for row in mine],
+                means,
                 sound,
                 fmt=mark,
                 color=ink,
@@ -306,7 +308,8 @@ def _draw_sweep_on(axes: list[Axes], table: pa.Table, keys: Sequence[str]) -> No
     limits = [limit for scheme in axes for limit in scheme.get_ylim()]
     for scheme in axes:
         scheme.set_ylim(min(limits), max(limits))
-    axes[0].set_ylabel("mean error ± standard error (lines: theory" + (";\nno ±: rare events)" if gaps else ")"))
+    more = (";\nno ±: rare events" if gaps else "") + (";\nnot drawn: 0" if zeros else "")
+    axes[0].set_ylabel(f"mean error ± standard error (lines: theory{more})")
     axes[0].legend()
 
 
