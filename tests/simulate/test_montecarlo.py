@@ -231,7 +231,7 @@ def test_no_workers_are_refused(workers: int, tmp_path: Path) -> None:
 def test_late_packets_count_in_the_slot_in_which_they_arrive(tmp_path: Path) -> None:
     """The fractions of the slots have the mean that the summary states."""
     delay = {"model": "normal", "mean": 1.0, "standard_deviation": 0.7}
-    changes = {"legitimate__window": 3, "legitimate__link": {"quality": 0.9, "delay": delay}}
+    changes: dict[str, Any] = {"legitimate__window": 3, "legitimate__link": {"quality": 0.9, "delay": delay}}
     results = montecarlo("eavesdroppers", slots=30, trials=7, out=tmp_path / "run", **changes)
     assert results.links["legitimate"].late
     rows = [row for row in results.slots.to_pylist() if row["peer"] == "legitimate"]

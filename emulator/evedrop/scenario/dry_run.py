@@ -107,10 +107,10 @@ def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
     for i, event in enumerate(scenario.event):
         # An event's models are checked when tables are compared: mistakes are reported there, not here.
         for act in event.acts():
-            settings = act.effect.entries
-            if settings is not None and _describes_models(settings):
+            entries = act.effect.entries
+            if entries is not None and _describes_models(entries):
                 window = max(map(scenario.window, {*act.names} & {*scenario.receivers}), default=0)
-                yield from _settings_mistakes(f"event.{i}.{act.entry}", settings, problem, scenario.slots, window)
+                yield from _settings_mistakes(f"event.{i}.{act.entry}", entries, problem, scenario.slots, window)
 
 
 def _describes_models(settings: Mapping[str, Any]) -> bool:

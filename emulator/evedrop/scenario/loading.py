@@ -207,8 +207,6 @@ def checked(
     broken = dry_run(scenario)
     # A class that breaks in a dry run breaks again when it is asked about itself: report that only once.
     mistakes = broken + _across(scenario, beyond_horizon, silent=bool(broken))
-    if not mistakes and has_foreign(scenario):
-        mistakes += _untold(scenario)
     if scenario.nemesis is not None:
         tables, of_nemesis = with_faults(tables, scenario)
         mistakes += of_nemesis
@@ -222,14 +220,16 @@ def checked(
 
 def _across(scenario: Scenario, beyond_horizon: bool, silent: bool = False) -> list[str]:
     """Mistakes across tables; an error that a custom class raises when asked is a mistake too, unless silent."""
+    foreign = has_foreign(scenario)
     try:
-        return mistakes_across(scenario, beyond_horizon)
+        mistakes = mistakes_across(scenario, beyond_horizon)
     except CLASS_ERRORS as error:
-        if not has_foreign(scenario):
+        if not foreign:
             raise
         if silent:
             return []
         return [f"modules: a class raised {place_of(error)} when it was asked about itself; expected no error"]
+    return mistakes if mistakes or silent or not foreign else _untold(scenario)
 
 
 def _untold(scenario: Scenario) -> list[str]:

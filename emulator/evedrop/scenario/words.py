@@ -31,7 +31,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def dotted(keywords: Mapping[str, Any]) -> dict[str, Any]:
-    """Changes by dotted key, of keywords in which `__` stands for the dot. A key with a dot is one already: names may have `__`."""
+    """Changes by dotted key, of keywords in which `__` stands for the dot, and of dotted keys, whose names may contain `__`."""
     return {name if "." in name else name.replace("__", "."): value for name, value in keywords.items()}
 
 

@@ -140,7 +140,9 @@ def scenarios_of(places: Sequence[str]) -> list[str]:
             if not paths:
                 empty.append(place)
         for path in paths:
-            scenarios.setdefault(Path(os.path.realpath(path)), str(path))  # a link to itself is reported when it is read
+            scenarios.setdefault(
+                Path(os.path.realpath(path)), str(path)
+            )  # a link to itself is reported when it is read
     if empty:
         told = f"no scenario in {listed(empty)}; a scenario is a TOML file with [process] and [encoding]"
         if not scenarios:

@@ -398,7 +398,7 @@ def test_overwrite_never_removes_what_only_looks_like_results(tmp_path: Path, na
         lambda out: sweep(SMALL, {"slots": [-1]}, trials=2, out=out, overwrite=True),
         lambda out: sweep(SMALL, {"slots": [3]}, trials=2, out=out, overwrite=True, workers=0),
         lambda out: montecarlo("late", trials=2, out=out, overwrite=True, plan=Plan(mode=Mode.COVARIANCE_ONLY)),
-        lambda out: montecarlo(SMALL, trials=2, out=out, overwrite=True, on_event="x"),
+        lambda out: montecarlo(SMALL, trials=2, out=out, overwrite=True, on_event="x"),  # type: ignore[arg-type]
         lambda out: run(SMALL, out=out, overwrite=True, listen="bad"),
     ],
     ids=["mistake", "workers", "mode", "events", "listen"],
@@ -447,7 +447,9 @@ def test_an_error_comes_from_another_process_as_it_was_raised(error: EvedropErro
     assert (type(copy), str(copy), vars(copy)) == (type(error), str(error), vars(error))
 
 
-@pytest.mark.parametrize("call", [lambda plan: sweep(SMALL, {"slots": [3]}, plan=plan), lambda plan: compare(SMALL, plan=plan)])
+@pytest.mark.parametrize(
+    "call", [lambda plan: sweep(SMALL, {"slots": [3]}, plan=plan), lambda plan: compare(SMALL, plan=plan)]
+)
 def test_only_trials_of_one_scenario_are_split(call: Any) -> None:
     """An option that does nothing would be taken for one that works."""
     with pytest.raises(UsageError, match="rare=True is for montecarlo"):

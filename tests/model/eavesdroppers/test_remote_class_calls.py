@@ -176,7 +176,9 @@ def test_a_forked_process_asks_children_of_its_own(calls: RemoteCalls, tmp_path:
     process = os.fork()
     if process == 0:  # while the other one does nothing, its child has answers for it only
         with contextlib.suppress(BaseException):
-            os.write(theirs, f"{len(calls._children)} {calls.call(name, 'betrayed', 'STRATEGIES', {'slot': 1})}".encode())
+            os.write(
+                theirs, f"{len(calls._children)} {calls.call(name, 'betrayed', 'STRATEGIES', {'slot': 1})}".encode()
+            )
             calls.forget()
         os._exit(0)
     os.waitpid(process, 0)

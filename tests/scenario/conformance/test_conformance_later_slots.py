@@ -79,7 +79,8 @@ LATER = {
                    "    def __init__(self): super().__init__(1.0)\n"
                    "    def delays(self, first, numbers):\n"
                    "        return super().delays(first, numbers) * (1.0 if first < 32 else np.nan)",
-                   "legitimate's link (later_nan_delays:Mine) failed in slots 32 to 63, trials {trials}: ValueError: delays() gave nan"),
+                   "legitimate's link (later_nan_delays:Mine) failed in slots 32 to 63, trials {trials}: ValueError: "
+                   "delays() gave nan"),
     "packet": ("encoding.scheme", "Mine(Sends):\n    def packet(self, k, x):\n"
                "        return Packet(x * (np.nan if k == 30 else 1.0), np.zeros(x.shape[1], bool))",
                "the scheme later_packet:Mine failed in slot 30, trials {trials}: Packet.z, trial {first}, is nan; "),
@@ -166,7 +167,9 @@ OFTEN = ("packet", "uses", "block", "follow")
 """One case for each way into a class; the other cases use the same code."""
 
 
-@pytest.mark.parametrize("case", mostly_long(LATER, [*OFTEN, "fates", "nan_delays", "leaves", "file", "mutates", "acts", "hears"]))
+@pytest.mark.parametrize(
+    "case", mostly_long(LATER, [*OFTEN, "fates", "nan_delays", "leaves", "file", "mutates", "acts", "hears"])
+)
 def test_what_breaks_in_a_later_slot_ends_a_study_in_memory(case: str, evedrop: Evedrop) -> None:
     """Status 3, as live, with class, slot and trials; and never an exit as if all were well."""
     changes = later(evedrop, case)
@@ -223,7 +226,8 @@ def test_what_breaks_in_a_later_slot_ends_a_live_run(case: str, evedrop: Evedrop
          'legitimate.link={loss = {model = "stating:Mine"}}', "quality_at() of slots 0 to 99 has shape (50,)"),
         ("Mine(ConstantDelay):\n    parameters = {}\n    def __init__(self): super().__init__(1.0)\n"
          "    def arrived(self, lag): return (0.0, 1.0, 1.0, 1.0)[lag]",
-         'legitimate={link = {quality = 0.9, delay = {model = "stating:Mine"}}, window = 6}', "arrived() of 0 to 99 raised IndexError"),
+         'legitimate={link = {quality = 0.9, delay = {model = "stating:Mine"}}, window = 6}',
+         "arrived() of 0 to 99 raised IndexError"),
         ('Mine(Plain):\n    closed_forms = {"legitimate": lambda scheme, conditions: 1 / 0}',
          'encoding={scheme = "stating:Mine"}', "theory cannot ask a class: ZeroDivisionError"),
     ],

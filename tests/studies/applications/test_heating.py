@@ -94,7 +94,7 @@ def test_the_view_is_given_every_curve_of_its_panels() -> None:
         ({"comfort.heater": "P_grid"}, 'comfort.heater: is "P_grid", which is not among plant.inputs; expected one of P_heat'),
         ({"comfort.temperature": "T"}, 'comfort.temperature: is "T", which is not among process.states; expected one of T_room'),
         ({"plant.input_units": ["W"]}, 'comfort.heater: is "P_heat", which is in W; expected a power in kW'),
-        ({"slot_seconds": None}, "slot_seconds: is missing, and the energies of [comfort] need the duration of a slot; expected it"),
+        ({"slot_seconds": None}, "slot_seconds: is missing, and the energies of [comfort] need the duration of a slot; expe"),
         ({"comfort.lowest": 25.0}, "comfort.lowest: is 25.0, and highest is 22.5; expected lowest < highest"),
         ({"comfort.lowest": "warm"}, "comfort.lowest: is \"warm\"; expected a number, such as 20.0"),
         ({"comfort.window": 3}, "comfort.window: "),

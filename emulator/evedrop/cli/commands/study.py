@@ -231,17 +231,17 @@ def _print_learned(rows: list[LearningRow], trials: int) -> None:
 
     console = terminal()
     console.say(
-        f"{counted(trials, 'trial')}: the error of each estimate over the truth, its median over trials and its mean ± standard error"
+        f"{counted(trials, 'trial')}: the error of each estimate over the truth, median over trials, and mean ± standard error"
     )
     heads = ["slots", "learner", *(head for name in ("A", "Q", "μ_d") for head in (name, f"mean {name}"))]
     table = TextTable.headed([], heads, wrapped=heads)
     for row in rows:
         for learner, values in row.parameters.items():
-            cells = itertools.chain.from_iterable(
+            pairs = (
                 (number_text(measured.median, ".3g"), _with_error(measured.mean, measured.standard_error))
                 for measured in values.values()
             )
-            table.add(str(row.stop), learner, *cells)
+            table.add(str(row.stop), learner, *itertools.chain.from_iterable(pairs))
     console.show(table)
     console.say("mean |x − x̂|² of the slots between, ± standard error, and the learner's over it")
     ratios_of = [f"{name} / it" for name in rows[0].parameters]

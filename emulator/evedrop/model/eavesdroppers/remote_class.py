@@ -55,7 +55,7 @@ class RemoteCalls:
         os.register_at_fork(after_in_child=lambda: None if (calls := ours()) is None else calls._forked())
 
     def _forked(self) -> None:
-        """Leave the children to the process that forked this one: on one pipe, each would read answers to the other's questions."""
+        """Leave the children to the process that forked this one: on one pipe, each would read the other's answers."""
         for child in self._children.values():
             child.leave()
         self._children, self._lock = {}, threading.Lock()

@@ -138,7 +138,9 @@ class LossChecks(_ModelChecks[LossModel]):
         for part in parts_of(slots):
             with calling(f"quality_at() of {slots_text(part)}", self._kind):
                 each = model.quality_at(part)
-            expect_array(f"quality_at() of {slots_text(part)}", each, np.float64, (len(part),), "one for each of the slots")
+            expect_array(
+                f"quality_at() of {slots_text(part)}", each, np.float64, (len(part),), "one for each of the slots"
+            )
             if not ((each >= 0.0) & (each <= 1.0)).all():
                 raise Broken(f"quality_at() is from {each.min()} to {each.max()}; expected probabilities")
         if not 0.0 <= variance <= 0.25 + 1e-12:

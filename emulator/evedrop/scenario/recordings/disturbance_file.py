@@ -104,7 +104,9 @@ def recorded_states(path: Path, names: Sequence[str] | None = None) -> StateReco
     if all(_is_finite(cell, 1.0) for cell in head.cells):
         raise DisturbanceError(
             str(path),
-            [f"line {head.line} has only numbers; expected a line of names first, such as x, y, then a line for each state"],
+            [
+                f"line {head.line} has only numbers; expected a line of names first, such as x, y, then a line for each state"
+            ],
         )
     there = [match["name"] if (match := _HEADER.match(cell)) else cell for cell in head.cells]
     names = [name for name in there if name != _TIME] if names is None else names

@@ -222,7 +222,9 @@ class LinkRecording:
                 )
                 self._no("column", f"{_shown(column)} is not a column of {self._path.name}; {there}")
             if names.count(column) > 1:
-                self._no("column", f"{_shown(column)} is the name of {names.count(column)} columns; expected each name once")
+                self._no(
+                    "column", f"{_shown(column)} is the name of {names.count(column)} columns; expected each name once"
+                )
             return names.index(column)
         if len(names) != 1:
             self._no(

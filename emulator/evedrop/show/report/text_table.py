@@ -195,7 +195,9 @@ def _without(table: TextTable, heading: str) -> TextTable:
 
 def _row(cells: Sequence[str]) -> str:
     row = " & ".join(latex_escaped(_MARKS.sub("", cell)) for cell in cells) + r" \\"
-    return "{}" + row if row.startswith(("[", "*")) else row  # the row above ends with a command that takes these as arguments
+    return (
+        "{}" + row if row.startswith(("[", "*")) else row
+    )  # the row above ends with a command that takes these as arguments
 
 
 _MARKS = re.compile(f"^[{''.join(outcome.glyph for outcome in SecrecyOutcome)}] ")

@@ -29,7 +29,7 @@ def error_floor(noise: float, trials: int) -> float:
 
 
 def mean_band(means: Floats, standard_errors: Floats, trials: Floats | int) -> tuple[Floats, Floats]:
-    """The ends of the 95 % intervals of means over trials: Student's, of their logarithms, so they stay above 0 if the means do."""
+    """The ends of the 95 % intervals of means over trials: Student's, of logarithms, so they stay above 0 if the means do."""
     from scipy.special import stdtrit  # noqa: PLC0415 - a run without a view needs none
 
     reach = stdtrit(np.maximum(trials, 2) - 1, 0.975)  # a single trial has no standard error

@@ -74,7 +74,9 @@ def run_figure(
         if not isinstance(name, str) or name not in _HEIGHTS:
             raise UsageError(f"plot: there is no panel {name!r}; expected {', '.join(_HEIGHTS)}")
     refuse_unless(slots is None or isinstance(slots, range), "slots", slots, "a range of slots, such as range(0, 50)")
-    refuse_unless(isinstance(width, str) and width in _WIDTHS, "width", width, '"page", or "column" for a column of a journal')
+    refuse_unless(
+        isinstance(width, str) and width in _WIDTHS, "width", width, '"page", or "column" for a column of a journal'
+    )
     column = width == "column"
     rows = results.slots
     last = pc.max(rows["slot"]).as_py()
