@@ -186,3 +186,18 @@ def test_a_forked_process_asks_children_of_its_own(calls: RemoteCalls, tmp_path:
     os.close(ours)
     os.close(theirs)
     assert calls.call(name, "betrayed", "STRATEGIES", {"slot": 2}) == 2
+
+
+def test_a_forked_process_leaves_the_children_to_the_other_one(
+    calls: RemoteCalls, tmp_path: Path, started: list[subprocess.Popen[bytes]]
+) -> None:
+    """They end when nobody has their pipes any more, and it waits for none of them."""
+    name = written(tmp_path, method("betrayed", "return parameters['slot']"))
+    assert calls.call(name, "betrayed", "STRATEGIES", {"slot": 0}) == 0
+    calls._forked()  # as after a fork, in the child
+    (left,) = started
+    assert left.poll() == 0
+    left.returncode = None  # this process is the other one, too
+    assert left.wait() == 0
+    assert calls.call(name, "betrayed", "STRATEGIES", {"slot": 1}) == 1
+    assert len(started) == 2

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.model.delays import DELAY_MODELS, delay_of
+from evedrop.model.delays import DELAY_MODELS, ConstantDelay, delay_of
 from evedrop.model.links.loss_model import Fate
+from evedrop.model.process import Floats
 from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule, ReceiverOutage, streams_of
 from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
@@ -249,6 +251,43 @@ def test_wrong_delays_are_named(model: str, given_: dict[str, Any], entries: lis
     mistakes = DELAY_MODELS[model].mistakes(given_)
     assert [entry for entry, _ in mistakes] == entries
     assert all("expected" in sentence for _, sentence in mistakes)
+
+
+class Returns(ConstantDelay):
+    """A delay model that returns what a test wants."""
+
+    parameters = MappingProxyType[str, Any]({})
+    result: ClassVar[Any] = None
+
+    def __init__(self) -> None:
+        super().__init__(1.0)
+
+    def delays(self, first: int, numbers: Floats) -> Any:
+        """Whatever the test wants."""
+        return super().delays(first, numbers) if self.result is None else self.result
+
+
+@pytest.mark.parametrize(
+    ("result", "says"),
+    [
+        (np.full((4, 3), -5.0), r"delays\(\) gave -5.0; expected slots, 0 or more"),
+        (np.array([[1.0, 2.0, np.nan]] * 4), r"delays\(\) gave nan; expected"),
+        (np.ones((4, 2)), r"gave float64 of shape \(4, 2\); expected an array of float64, shape \(4, 3\)"),
+        (np.ones((4, 3), np.int64), r"gave int64 of shape \(4, 3\); expected"),
+        ([1.0], "gave list; expected an array"),
+    ],
+)
+def test_delays_of_a_class_that_is_not_built_in_are_checked(
+    result: Any, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As whole slots, what is no number would be a packet that is late for ever."""
+    schedule = LinkSchedule({**PLAIN, "delay": {"model": f"{__name__}:Returns"}}, window=2)
+    fates = link(schedule, Batch(4, 3)).fates(range(4))
+    assert fates.delays is not None
+    assert (fates.delays == 1).all()
+    monkeypatch.setattr(Returns, "result", result)
+    with pytest.raises(ValueError, match=says):
+        link(schedule, Batch(4, 3)).fates(range(4))
 
 
 def test_fates_of_packets_that_are_not_sent() -> None:
