@@ -69,8 +69,7 @@ def replaced(plan: WirePlan, scenario: Scenario | None = None) -> Scenario:
 
 def delivered(results: Results, receiver: str) -> list[bool]:
     """Whether the packet of each slot was delivered in its own slot, in the only trial."""
-    rows = results.slots.to_pylist()
-    return [row["received_fraction"] == 1.0 for row in rows if row["peer"] == receiver]
+    return [row["action"] != "dropped" for row in results.trials.to_pylist() if row["peer"] == receiver]
 
 
 def fates_on(plan: WirePlan, name: str, slots: int) -> list[bool]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
+from scipy.special import stdtrit
 
 from evedrop.show.view.column import laid_out
 from evedrop.show.view.panels.curves import SquaredError, StateOverTime, TraceOfP, WhatMovesThePlant
@@ -74,13 +75,13 @@ def test_styles_come_before_the_first_slot(rrd: Path) -> None:
 
 
 def test_bands_of_several_trials(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
-    """Their edges are 1.96 standard errors of the logarithm from the mean, in every slot; a single trial has none."""
+    """Their edges are those of the 95 % intervals of logarithms, in every slot; a single trial has none."""
     several, alone = simulated(30, trials=12), simulated(30)
     record(several, tmp_path / "several.rrd")
     for name, peer in several.slots.peers.items():
         for side, sign in (("low", -1), ("high", 1)):
             shown = rows(tmp_path / "several.rrd", f"band/{name}/{side}", "Scalars:scalars")
-            edge = peer.squared_error * np.exp(sign * 1.96 * peer.standard_error / peer.squared_error)
+            edge = peer.squared_error * np.exp(sign * stdtrit(11, 0.975) * peer.standard_error / peer.squared_error)
             assert sorted(shown) == list(range(30))
             # A tenth of tr Q / trials = 0.04 / 12, rounded down to a power of ten, is the least that is shown.
             heights = [shown[k][0] for k in range(30)]
@@ -94,7 +95,7 @@ def test_bands_of_several_trials(simulated: Callable[..., Simulated], tmp_path: 
 
 
 def test_bands_do_not_fall_to_the_floor(simulated: Callable[..., Simulated]) -> None:
-    """A band around a mean above the floor stays within a factor of ten of it, although the mean minus 1.96 errors is below 0."""
+    """A band around a mean above the floor stays within a factor of ten of it, although the mean minus two errors is below 0."""
     run = simulated(3, trials=20)
     mean, error = np.array([1.0, 0.05, 0.0]), np.array([0.9, 0.04, 0.0])
     peers = {name: peer.changed(squared_error=mean, standard_error=error) for name, peer in run.slots.peers.items()}
