@@ -28,6 +28,7 @@ _ADVICE: Sequence[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]]] 
         re.compile(r"\bevedrop compare SCENARIO --schemes (\S+) --out DIR\b"),
         lambda match: f"compare(SCENARIO, schemes={match[1].split(',')}, out=DIR)",
     ),
+    (re.compile(r"--(covariance-only|error-coordinates)\b"), r'mode="\1"'),
     (re.compile(r"--(trials|listen|relay)(?: (?=\S)|(?=:))"), r"\1="),
 )
 """Advice for a command → the same for a program."""

@@ -9,6 +9,7 @@ from evedrop.cli.main import main
 from evedrop.cli.words import in_python
 from evedrop.errors import UsageError
 from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
 from tests.builders import GOOD
 
 SMALL = Scenario(GOOD).replace(slots=12)
@@ -35,6 +36,8 @@ def test_errors_of_python_name_arguments(capsys: pytest.CaptureFixture[str]) -> 
         cost("microgrid", trials=1, slots=10)
     with pytest.raises(UsageError, match=r"^listen=tls/10\.0\.0\.1:1 is not a loopback endpoint"):
         run(SMALL, listen="tls/10.0.0.1:1")
+    with pytest.raises(UsageError, match='leave mode="covariance-only" out'):
+        montecarlo("late", trials=2, plan=Plan(Mode.COVARIANCE_ONLY))
     changes = {"eavesdroppers.jammer.link.quality": 0.5}
     with pytest.raises(UsageError) as caught:
         design("acknowledged", changes=changes)

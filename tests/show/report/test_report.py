@@ -105,6 +105,15 @@ def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -
     assert stat.S_IMODE((study / REPORT).stat().st_mode) == 0o600
 
 
+def test_the_chart_of_a_covariance_only_study_shows_traces(tmp_path: Path) -> None:
+    """It has no estimates, so no errors."""
+    plan = Plan(Mode.COVARIANCE_ONLY, workers=1)
+    results = montecarlo("eavesdroppers", slots=8, trials=4, expect=[], plan=plan, out=tmp_path / "out")
+    texts = checked(results.report().parent).texts
+    assert any(text.startswith("Mean trace of the actual covariance over 4 trials; ") for text in texts)
+    assert not any("squared error over" in text for text in texts)
+
+
 def test_a_small_z_gives_the_others_no_exponent() -> None:
     """It is a number between about −4 and 4."""
     scores = TextTable.headed(["receiver"], ["z"])

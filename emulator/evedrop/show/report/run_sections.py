@@ -20,6 +20,7 @@ import pyarrow as pa
 from markupsafe import Markup
 
 from evedrop.errors import UsageError
+from evedrop.model.metrics.metric import COVARIANCE_ONLY
 from evedrop.model.metrics.text import number_text, percent_text
 from evedrop.model.process import Floats
 from evedrop.model.receiver import NOTHING, SILENT, Codes, Flags
@@ -311,8 +312,9 @@ def _errors(of: RunSource) -> Iterator[Markup]:
     bands = "bands: its 95 % interval; " if several else ""
     if several and any(np.isnan(mean.low).any() for mean in of.means.values()):
         bands = "bands: its 95 % interval (none where rare events carry the mean); "
-    caption = f"Mean squared error{against} over {of.summary.trials:,} trials"
-    caption = caption if several else f"Squared error{against} of the trial"
+    what = "trace of the actual covariance" if of.summary.mode == COVARIANCE_ONLY else "squared error"
+    caption = f"Mean {what}{against} over {of.summary.trials:,} trials"
+    caption = caption if several else f"{what.capitalize()}{against} of the trial"
     chart = LogChart(
         f"{caption} in every slot, by receiver, with what theory expects. The table above has its means.",
         "slot",
@@ -320,7 +322,7 @@ def _errors(of: RunSource) -> Iterator[Markup]:
         curves,
         x_range=(min(curve.first for curve in of.means.values()), max(curve.last for curve in of.means.values())),
         floor=error_floor(of.noise, of.summary.trials),
-        y_axis=f"squared error{of.unit}",
+        y_axis=f"{what}{of.unit}",
     )
     yield chart.figure or Markup()
 
