@@ -459,6 +459,22 @@ def test_the_end_of_a_killed_run_says_which_slot_its_metrics_are_of(tmp_path: Pa
     ]
 
 
+def test_a_recorder_that_is_killed_while_it_removes_what_is_no_longer_needed_has_told_all(tmp_path: Path) -> None:
+    """Its own summary, of all rows, is there: it is not said to be of an earlier moment."""
+    scenario = microgrid()
+    summary = summary_of(scenario, RunTally.nothing(scenario, 1), dict.fromkeys(scenario.digested), RunOutcome(0.0, ""))
+
+    def record(writer: ResultsWriter) -> None:
+        for receiver in scenario.receivers:
+            writer.slot_rows(0, receiver, sums(10), np.zeros(10))
+        writer.settle("slot 10", replace(summary, slots=10))
+
+    folder = killed(tmp_path, record)
+    (folder / UNFINISHED / "summary.json").rename(folder / "summary.json")
+    note_end(folder, scenario, "recorder was ended by signal 9")
+    assert Results.read(folder).summary["ended"] == "recorder was ended by signal 9"
+
+
 def sizes(folder: Path) -> dict[str, int]:
     """File → its size, of an unfinished results folder."""
     return {path.name: path.stat().st_size for path in (folder / UNFINISHED).iterdir()}

@@ -32,7 +32,7 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
     """
     left_behind = is_unfinished(folder)
     rows = last_round(folder)
-    how = noted(how, age_of_metrics(folder) or _age_told(folder))
+    how = noted(how, _age_told(folder) if (folder / "summary.json").exists() else age_of_metrics(folder))
     try:
         summary = replace(Results.read(folder).typed_summary, ended=how)
     except UsageError:  # there are no metrics
@@ -55,7 +55,7 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
 
 
 def _age_told(folder: Path) -> str:
-    """The note on the age of the metrics in the summary of a folder, if the recorder has written one; empty otherwise."""
+    """The note on the age of the metrics in the summary that the recorder has written itself; empty if there is none."""
     with contextlib.suppress(UsageError):
         told = re.search(r" \(the metrics are as of [^()]*\)", Results.read(folder).typed_summary.ended)
         return "" if told is None else told[0]
