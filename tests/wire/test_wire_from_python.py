@@ -209,6 +209,17 @@ def test_a_wire_that_cannot_begin_says_why(tmp_path: Path) -> None:
         pytest.fail("it has begun")
 
 
+def test_a_wire_in_the_folder_of_another_is_refused_and_does_not_steer_it(tmp_path: Path) -> None:
+    """In the words of the command, although the other one answers there."""
+    with wire(wire_plan(), out=tmp_path / "wire") as first:
+        second = wire(wire_plan(), out=tmp_path / "wire")
+        with pytest.raises(UsageError, match="another wire writes to"), second:
+            pytest.fail("it has begun")
+        with pytest.raises(UsageError, match=r"this wire does not run; the control\.json in .* is that of another one"):
+            second.partition("robot", "base")
+        assert first.status().events == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "entries", "error", "message"),
     [

@@ -20,7 +20,7 @@ from typing import IO, TYPE_CHECKING, Any, Protocol, Self
 import zenoh
 
 from evedrop.errors import EvedropError, RunError, UsageError
-from evedrop.live.network.control_file import no_run, read_control
+from evedrop.live.network.control_file import Control, no_run, read_control
 from evedrop.live.network.operator import Answer, ask
 from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest, WireStatus
 from evedrop.results.folder import claimed, default_folder, write_private
@@ -95,6 +95,10 @@ def described_wire(
 
 class ProcessOfWire(KillableProcess, Protocol):
     """The part of `subprocess.Popen` that is used here."""
+
+    @property
+    def pid(self) -> int:
+        """Its id."""
 
     @property
     def returncode(self) -> int | None:
@@ -268,7 +272,7 @@ class RunningWire:
 
     def _ask(self, request: OperatorRequest) -> Answer:
         """The wire's answer. Raises UsageError if it does not run."""
-        control = read_control(self.folder)
+        control = self._control()
         try:
             answer = ask(control, request, _PATIENCE)
         except zenoh.ZError as error:
@@ -276,6 +280,13 @@ class RunningWire:
         if answer is None:
             raise no_run(self.folder, "it ended before it answered")
         return answer
+
+    def _control(self) -> Control:
+        """How this wire is steered. Raises UsageError if it does not run, although another one may, in the same folder."""
+        control = read_control(self.folder)
+        if self._process is None or control.process != self._process.pid:
+            raise UsageError(f"this wire does not run; the control.json in {self.folder} is that of another one")
+        return control
 
     def _hear_errors(self, process: ProcessOfWire) -> None:
         assert process.stderr is not None  # noqa: S101 - it is a pipe
