@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from evedrop.errors import UsageError
+from evedrop.errors import RunError, UsageError
 from evedrop.wire import running
 from evedrop.wire.file import wire_of
 from evedrop.wire.running import RunningWire
@@ -35,3 +37,26 @@ def test_a_file_that_cannot_be_written_keeps_the_wire_from_beginning(
     with pytest.raises(UsageError, match=r"cannot write the wire's file \(No space left on device\); set TMPDIR"):
         RunningWire(PLAN, tmp_path).__enter__()
     assert [folder.exists() for folder in folders] == [False]
+
+
+def program(code: str) -> subprocess.Popen[str]:
+    """A process with this program, in place of a wire."""
+    return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize(
+    ("errors", "status", "error", "message"),
+    [
+        (["warning: a", "scam is no link", "  (or is it?)"], 2, UsageError, "^scam is no link\\n  \\(or is it\\?\\)$"),
+        (["warning: a", "warning: b"], 4, RunError, "ended with status 4; warning: a; warning: b$"),
+        ([], 4, RunError, "ended with status 4$"),
+    ],
+)
+def test_a_warning_is_not_the_reason_of_a_failure(
+    errors: list[str], status: int, error: type[Exception], message: str, tmp_path: Path
+) -> None:
+    """It follows only where there is no other one."""
+    lines = "".join(f"{'' if line.startswith(' ') else 'evedrop: '}{line}\n" for line in errors)
+    code = f"import sys; sys.stderr.write({lines!r}); sys.exit({status})"
+    with pytest.raises(error, match=message):
+        RunningWire(PLAN, tmp_path, start=lambda *_: program(code)).__enter__()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -218,6 +219,18 @@ def test_a_wire_in_the_folder_of_another_is_refused_and_does_not_steer_it(tmp_pa
         with pytest.raises(UsageError, match=r"this wire does not run; the control\.json in .* is that of another one"):
             second.partition("robot", "base")
         assert first.status().events == []
+
+
+def test_a_wire_of_a_background_job_is_ended(tmp_path: Path) -> None:
+    """In order: all that it starts ignores SIGINT."""
+    running = wire(wire_plan(), out=tmp_path / "wire")
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        running.__enter__()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    running.__exit__(None, None, None)
+    assert running.typed_summary().state == "ended"
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,7 @@ from evedrop.scenario.words import listed
 from evedrop.show.report.wire import expectation_failures, wire_faults
 from evedrop.system.killable import KillableProcess
 from evedrop.system.native_log import MARK
+from evedrop.system.output import is_warning
 from evedrop.system.processes import kill, wait_for
 from evedrop.system.world import world
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
@@ -176,7 +177,7 @@ class RunningWire:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End the wire. Raises ExpectationFailed or RunError, unless the `with` block raised an error itself."""
-        status = self._stop(signal.SIGINT)
+        status = self._stop(signal.SIGTERM)  # a background job and all that it starts ignore SIGINT
         if error is not None or status == 0:
             return
         with suppress(UsageError):
@@ -306,8 +307,10 @@ class RunningWire:
 
     def _failure(self, status: int) -> EvedropError:
         """The error for a process that failed, in its own words."""
-        errors = "".join(self._errors).strip().removeprefix("evedrop: ")
-        text = errors or f"the wire in {self.folder} ended with status {status}"
+        told = [line.removeprefix("evedrop: ") for line in self._errors if not is_warning(line)]
+        warned = [line.removeprefix("evedrop: ").rstrip() for line in self._errors if is_warning(line)]
+        ended = f"the wire in {self.folder} ended with status {status}"
+        text = "".join(told).strip() or "; ".join([ended, *warned])
         return UsageError(text) if status == UsageError.exit_status else RunError(text)
 
 
