@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
@@ -39,6 +43,22 @@ def test_a_file_that_cannot_be_written_keeps_the_wire_from_beginning(
     assert [folder.exists() for folder in folders] == [False]
 
 
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[subprocess.Popen[str]]]:
+    """Let wires be processes that begin for ever; gives those that were started."""
+    processes: list[subprocess.Popen[str]] = []
+
+    def start(*_: str) -> subprocess.Popen[str]:
+        processes.append(program("import time; time.sleep(600)"))
+        return processes[-1]
+
+    monkeypatch.setattr(running, "_started", start)
+    yield processes
+    for process in processes:
+        with process:
+            process.kill()
+
+
 def program(code: str) -> subprocess.Popen[str]:
     """A process with this program, in place of a wire."""
     return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
@@ -60,3 +80,31 @@ def test_a_warning_is_not_the_reason_of_a_failure(
     code = f"import sys; sys.stderr.write({lines!r}); sys.exit({status})"
     with pytest.raises(error, match=message):
         RunningWire(PLAN, tmp_path, start=lambda *_: program(code)).__enter__()
+
+
+def test_ctrl_c_while_a_wire_begins_ends_it(
+    started: list[subprocess.Popen[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing else would: `__exit__` is not called."""
+
+    def interrupted(_: RunningWire) -> NoReturn:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunningWire, "status", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        RunningWire(PLAN, tmp_path).__enter__()
+    assert [process.poll() for process in started] == [-signal.SIGTERM]
+
+
+def test_a_wire_that_nobody_could_listen_to_is_ended(
+    started: list[subprocess.Popen[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where the machine lacks threads."""
+
+    def lacking(_: threading.Thread) -> NoReturn:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", lacking)
+    with pytest.raises(RuntimeError, match="can't start new thread"):
+        RunningWire(PLAN, tmp_path).__enter__()
+    assert [process.poll() for process in started] == [-signal.SIGTERM]

@@ -32,6 +32,7 @@ from evedrop.system.killable import KillableProcess
 from evedrop.system.native_log import MARK
 from evedrop.system.output import is_warning
 from evedrop.system.processes import kill, wait_for
+from evedrop.system.threads import Thread
 from evedrop.system.world import world
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.journal_reading import journal_tables
@@ -135,16 +136,25 @@ class RunningWire:
         self._process: ProcessOfWire | None = None
         self._endpoints: Mapping[str, Sequence[str]] = {}
         self._errors: list[str] = []
+        self._listener: Thread | None = None
 
     def __enter__(self) -> Self:
         """Start the wire, and wait until programs can connect. Raises UsageError or RunError if it cannot begin."""
+        if self.is_running:
+            raise UsageError(f"the wire in {self.folder} runs already; expected one `with` statement after the other")
+        self._endpoints, self._errors, self._listener = {}, [], None
         with self._file() as file:
             self._process = self._start(
                 "wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds:g} s", "--quiet"
             )
-            self._listener = world().thread(self._hear_errors, self._process, name="wire")
-            self._listener.start()
-            self._wait()
+            try:
+                listener = world().thread(self._hear_errors, self._process, name="wire")
+                listener.start()
+                self._listener = listener
+                self._wait()
+            except BaseException:  # such as Ctrl-C: no `__exit__` follows
+                self._stop(signal.SIGTERM)
+                raise
         return self
 
     @contextmanager
@@ -302,7 +312,8 @@ class RunningWire:
         if process.poll() is None:
             process.send_signal(number)
         kill(*wait_for([process], _PATIENCE))
-        self._listener.join(_PATIENCE)
+        if self._listener is not None:
+            self._listener.join(_PATIENCE)
         return -signal.SIGKILL if process.returncode is None else process.returncode
 
     def _failure(self, status: int) -> EvedropError:
