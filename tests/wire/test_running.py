@@ -8,12 +8,14 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NoReturn
+from types import SimpleNamespace
+from typing import Any, NoReturn
 
 import pytest
 
+from evedrop.cli.pytest_plugin import _opening
 from evedrop.errors import RunError, UsageError
 from evedrop.wire import running
 from evedrop.wire.file import wire_of
@@ -108,3 +110,31 @@ def test_a_wire_that_nobody_could_listen_to_is_ended(
     with pytest.raises(RuntimeError, match="can't start new thread"):
         RunningWire(PLAN, tmp_path).__enter__()
     assert [process.poll() for process in started] == [-signal.SIGTERM]
+
+
+def test_results_are_where_the_program_was_when_it_made_the_wire(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Although it changes its folder later."""
+    monkeypatch.chdir(tmp_path)
+    wire = RunningWire(PLAN, Path("wire"))
+    monkeypatch.chdir("/")
+    assert wire.folder == tmp_path / "wire"
+
+
+def test_results_of_a_test_are_where_pytest_was_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Although it changes its folder before it has a wire, or before it opens one."""
+    for name in ("elsewhere", "there"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    options = SimpleNamespace(evedrop_out=Path("art"))
+    config = SimpleNamespace(option=options, invocation_params=SimpleNamespace(dir=tmp_path))
+    node = SimpleNamespace(name="test_a", user_properties=[])
+    made: Callable[..., Any] = lambda **entries: RunningWire(PLAN, entries["out"])  # noqa: E731 - with its type
+    request: Any = SimpleNamespace(config=config, node=node)
+    opened = _opening(request, tmp_path, made)
+    monkeypatch.chdir(tmp_path / "there")
+    folder = tmp_path / "art" / "test_a" / "wire-1"
+    assert opened().folder == folder
+    assert folder.parent.is_dir()
+    assert node.user_properties == [("evedrop_results", str(folder))]

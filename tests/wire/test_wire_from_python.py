@@ -173,8 +173,8 @@ def test_the_fixture_ends_the_wires_of_a_test_that_fails(tmp_path: Path) -> None
     assert "at side robot is in mode peer" in report
     assert re.search(r"; scan lost \d+ by loss, of \d+ heard", report)
     folders = [tmp_path / "art" / name / "wire-1" for name in ("test_that_fails", "test_that_expects")]
-    assert 'name="evedrop_results" value="art/test_that_expects/wire-1"' in report
-    assert "results: art/test_that_expects/wire-1" in done.stdout
+    assert f'name="evedrop_results" value="{folders[1]}"' in report
+    assert f"results: {folders[1]}" in done.stdout
     for folder in folders:
         assert (folder / "summary.json").is_file()
         assert not (folder / "control.json").exists()

@@ -129,7 +129,7 @@ class RunningWire:
     ) -> None:
         """start: starts a process of Evedrop with these words; by default one of the machine."""
         self.plan = plan
-        self.folder = folder
+        self.folder = folder.absolute()
         """The results folder."""
         self._seconds = seconds
         self._start: Start = _started if start is None else start
