@@ -17,6 +17,7 @@ import pytest
 
 from evedrop.cli.pytest_plugin import _opening
 from evedrop.errors import RunError, UsageError
+from evedrop.live.network.operator import Answer
 from evedrop.wire import running
 from evedrop.wire.file import wire_of
 from evedrop.wire.running import RunningWire
@@ -138,3 +139,10 @@ def test_results_of_a_test_are_where_pytest_was_started(tmp_path: Path, monkeypa
     assert opened().folder == folder
     assert folder.parent.is_dir()
     assert node.user_properties == [("evedrop_results", str(folder))]
+
+
+def test_a_state_that_is_refused_is_not_that_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one that is too large to be sent."""
+    monkeypatch.setattr(RunningWire, "_ask", lambda *_: Answer(refused=("the answer has 2 GB",)))
+    with pytest.raises(UsageError, match="^the answer has 2 GB$"):
+        RunningWire(PLAN, tmp_path).status()

@@ -233,10 +233,10 @@ class RunningWire:
 
     def status(self) -> WireStatus:
         """The state of the wire now. Raises UsageError if it does not run."""
-        status = self._ask(StatusRequest()).wire
-        if status is None:
-            raise UsageError(f"{self.folder} is the folder of a run; expected that of a wire")
-        return status
+        answer = self._ask(StatusRequest())
+        if answer.wire is None:
+            raise UsageError("; ".join(answer.refused))
+        return answer.wire
 
     def rows(self) -> pa.Table:
         """The journal so far: a row for each message and link (docs/wire/results.md, the journal)."""
