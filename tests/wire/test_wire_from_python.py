@@ -239,6 +239,9 @@ def test_a_wire_of_a_background_job_is_ended(tmp_path: Path) -> None:
         (("missing.toml",), {}, UsageError, "cannot be read"),
         ((), {"side": ["robot", "desk"], "link": [LINK]}, ScenarioError, 'link.0.to: is "base"'),
         ((wire_plan(),), {"seed": 3}, UsageError, "expected no entries with a plan"),
+        ((), {"side": {"robot": 1}.keys(), "link": [LINK]}, ScenarioError, "side: is a dict_keys; expected .* a list"),
+        ((), {"side": ["robot", "robot", "base"], "link": [LINK]}, ScenarioError, "side: is .*; expected a table"),
+        ((), {"side": ["robot", {"base": {}}], "link": [LINK]}, ScenarioError, "side: is .*; expected a table"),
     ],
 )
 def test_mistakes_are_said_before_anything_begins(
@@ -257,6 +260,34 @@ def test_an_entry_of_a_file_is_changed_by_its_dotted_key(tmp_path: Path) -> None
     changed = wire(tmp_path / "radio.toml", out=tmp_path / "wire", seed=8, link__0__quality=0.9)
     assert changed.plan.seed == 8
     assert changed.plan.links[0].settings["loss"]["quality"] == 0.9
+
+
+def test_numbers_of_numpy_are_numbers_and_paths_are_texts(tmp_path: Path) -> None:
+    """Also in lists and tables, as for a link that is steered; an entry that is None is not given."""
+    loss = {"model": "markov", "transitions": np.full((2, 2), 0.5), "loss": np.array([0, 1])}
+    tls = {"certificate": Path("c.pem"), "key": Path("k.pem")}
+    entries = {
+        "side": {"robot": {"listen": "tls/127.0.0.1:0", "tls": tls}, "base": {}},
+        "link": ({"name": "scan", "from": "robot", "to": "base", "loss": loss},),
+        "query_seconds": None,
+    }
+    made = wire(**entries, seed=np.int64(3), out=tmp_path).plan
+    assert made.seed == 3
+    assert made.links[0].settings["loss"]["transitions"] == [[0.5, 0.5], [0.5, 0.5]]
+    assert made.sides["robot"].tls is not None
+    assert wire(made, out=tmp_path).plan is made
+
+
+def test_a_bound_may_be_a_number_of_numpy(tmp_path: Path) -> None:
+    """Such as a mean that was computed; what can be no number is refused by its type."""
+    plan = wire_plan()
+    with WireJournal(tmp_path, plan):
+        running = wire(plan, out=tmp_path)
+        running.expect("scan.heard", below=np.int64(3), above=None)
+        with pytest.raises(ExpectationFailed, match=r"scan\.heard above 3: FAILED"):
+            running.expect("scan.heard", above=np.array(3))
+        with pytest.raises(ScenarioError, match="above: is a dict_values; expected a number"):
+            running.expect("scan.heard", above={"a": 3}.values())
 
 
 def test_metrics_from_the_disk_are_those_of_the_wire(tmp_path: Path) -> None:

@@ -77,6 +77,7 @@ def described_wire(
     source: str | Path | WirePlan | None, out: str | Path | None, entries: dict[str, Any]
 ) -> tuple[WirePlan, Path]:
     """The plan of a wire, and its results folder, from the arguments of `wire`."""
+    entries = plain_tables(entries, "wire")  # numbers of numpy as well
     if isinstance(source, WirePlan):
         if entries:
             raise UsageError(
@@ -87,9 +88,9 @@ def described_wire(
         plan = load_wire(source, {entry.replace("__", "."): value for entry, value in entries.items()})
         name = Path(source).stem
     else:
-        side = entries.get("side")
-        if isinstance(side, Sequence) and not isinstance(side, str):
-            entries["side"] = {side_name: {} for side_name in side}
+        names = entries.get("side")
+        if isinstance(names, list) and all(isinstance(side, str) and names.count(side) == 1 for side in names):
+            entries["side"] = {side: {} for side in names}
         plan, name = wire_of(entries), "wire"
     folder = claimed(default_folder(f"wire-{name}")) if out is None else Path(out)
     return plan, folder
@@ -258,7 +259,7 @@ class RunningWire:
 
         The arguments are the entries of an `[[expect]]` of a wire file, such as `"scan.delivery", above=0.5`, or `link="scan"`.
         """
-        table = {"metric": metric, **bounds} if metric is not None else bounds
+        table = plain_tables({"metric": metric, **bounds}, "expect")
         plan = wire_of({**tomllib.loads(resolved_wire(self.plan)), "expect": [table]})
         summary = scorekeeper_on_disk(self.folder, plan).summary()
         if summary.failed_expectations:
