@@ -13,14 +13,16 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NoReturn
 
+import numpy as np
 import pytest
 
 from evedrop.cli.pytest_plugin import _opening
-from evedrop.errors import RunError, UsageError
+from evedrop.errors import EvedropError, RunError, UsageError
 from evedrop.live.network.operator import Answer
 from evedrop.wire import running
 from evedrop.wire.file import wire_of
 from evedrop.wire.running import RunningWire
+from evedrop.wire.tables import seconds_of
 
 PLAN = wire_of(
     {
@@ -144,5 +146,29 @@ def test_results_of_a_test_are_where_pytest_was_started(tmp_path: Path, monkeypa
 def test_a_state_that_is_refused_is_not_that_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As one that is too large to be sent."""
     monkeypatch.setattr(RunningWire, "_ask", lambda *_: Answer(refused=("the answer has 2 GB",)))
-    with pytest.raises(UsageError, match="^the answer has 2 GB$"):
+    with pytest.raises(UsageError, match=r"^the answer has 2 GB$"):
         RunningWire(PLAN, tmp_path).status()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        ("20 ms", "0.02 s"),
+        ("2 h", "7200.0 s"),
+        (np.int64(60), "60.0 s"),
+        (123456.75, "123456.75 s"),
+        (1e6, "1000000.0 s"),
+    ],
+)
+def test_a_wire_lasts_as_long_as_it_is_told(seconds: Any, words: str, tmp_path: Path) -> None:
+    """A number, or a text with a unit; not a rounded one."""
+    commands: list[tuple[str, ...]] = []
+
+    def start(*command: str) -> NoReturn:
+        commands.append(command)
+        raise EvedropError
+
+    with pytest.raises(EvedropError):
+        RunningWire(PLAN, tmp_path, seconds, start).__enter__()
+    assert words in commands[0]
+    assert seconds_of(words, "--for") == seconds_of(str(seconds), "--for")

@@ -239,6 +239,8 @@ def test_a_wire_of_a_background_job_is_ended(tmp_path: Path) -> None:
         (("missing.toml",), {}, UsageError, "cannot be read"),
         ((), {"side": ["robot", "desk"], "link": [LINK]}, ScenarioError, 'link.0.to: is "base"'),
         ((wire_plan(),), {"seed": 3}, UsageError, "expected no entries with a plan"),
+        ((wire_plan(),), {"seconds": "300 h"}, UsageError, "seconds 300 h: expected more than 0 and at most 1000000 s"),
+        ((wire_plan(),), {"seconds": None}, UsageError, "seconds None: expected more than 0 .* such as"),
         ((), {"side": {"robot": 1}.keys(), "link": [LINK]}, ScenarioError, "side: is a dict_keys; expected .* a list"),
         ((), {"side": ["robot", "robot", "base"], "link": [LINK]}, ScenarioError, "side: is .*; expected a table"),
         ((), {"side": ["robot", {"base": {}}], "link": [LINK]}, ScenarioError, "side: is .*; expected a table"),
@@ -266,7 +268,7 @@ def test_numbers_of_numpy_are_numbers_and_paths_are_texts(tmp_path: Path) -> Non
     """Also in lists and tables, as for a link that is steered; an entry that is None is not given."""
     loss = {"model": "markov", "transitions": np.full((2, 2), 0.5), "loss": np.array([0, 1])}
     tls = {"certificate": Path("c.pem"), "key": Path("k.pem")}
-    entries = {
+    entries: dict[str, Any] = {
         "side": {"robot": {"listen": "tls/127.0.0.1:0", "tls": tls}, "base": {}},
         "link": ({"name": "scan", "from": "robot", "to": "base", "loss": loss},),
         "query_seconds": None,

@@ -38,6 +38,7 @@ from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.on_disk import ended_summary, scorekeeper_on_disk
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.tables import seconds_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -58,14 +59,15 @@ def wire(
     source: str | Path | WirePlan | None = None,
     *,
     out: str | Path | None = None,
-    seconds: float = LONGEST_SECONDS,
+    seconds: float | str = LONGEST_SECONDS,
     **entries: Any,
 ) -> RunningWire:
     """A wire in a process of its own, which begins with the `with` statement and ends with it.
 
     source: a wire file, or a plan; None: the entries are the whole wire, such as `side=["robot", "base"]` and
     `link=[{"from": "robot", "to": "base", "quality": 0.6}]`. out: the results folder; seconds: after which the wire ends by
-    itself. entries: with a file, changes by dotted key, with `__` for the dot, such as `seed=8` or `side__base__listen=[]`.
+    itself, or a text such as "10 min". entries: with a file, changes by dotted key, with `__` for the dot, such as `seed=8` or
+    `side__base__listen=[]`.
 
     Raises ScenarioError with every mistake of the wire. The `with` statement raises UsageError or RunError if the wire cannot
     begin, and ExpectationFailed if one of its `[[expect]]` failed, or programs could speak past it.
@@ -126,13 +128,13 @@ class RunningWire:
     """A wire in a process of its own; use it as a context manager."""
 
     def __init__(
-        self, plan: WirePlan, folder: Path, seconds: float = LONGEST_SECONDS, start: Start | None = None
+        self, plan: WirePlan, folder: Path, seconds: float | str = LONGEST_SECONDS, start: Start | None = None
     ) -> None:
-        """start: starts a process of Evedrop with these words; by default one of the machine."""
+        """seconds: a number, or a text with a unit. start: starts a process of Evedrop; by default one of the machine."""
         self.plan = plan
         self.folder = folder.absolute()
         """The results folder."""
-        self._seconds = seconds
+        self._seconds = seconds_of(str(seconds), "seconds")
         self._start: Start = _started if start is None else start
         self._process: ProcessOfWire | None = None
         self._endpoints: Mapping[str, Sequence[str]] = {}
@@ -146,7 +148,7 @@ class RunningWire:
         self._endpoints, self._errors, self._listener = {}, [], None
         with self._file() as file:
             self._process = self._start(
-                "wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds:g} s", "--quiet"
+                "wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds} s", "--quiet"
             )
             try:
                 listener = world().thread(self._hear_errors, self._process, name="wire")
