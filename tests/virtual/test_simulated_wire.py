@@ -209,6 +209,21 @@ def test_wires_of_two_tests_at_once_are_in_different_places(tmp_path: Path, monk
     assert first != second
 
 
+def test_a_wire_is_opened_again(evedrop_simulated_wire: Opener) -> None:
+    """After its end, and with other endpoints; the second start goes on in the folder of the first."""
+    radio = evedrop_simulated_wire(**WIRE)
+    first = radio.endpoint("robot")
+    with pytest.raises(UsageError, match="runs already"):
+        radio.__enter__()
+    radio.start(drive, radio.config("robot"), 1.0, radio.clock).result()
+    radio.__exit__(None, None, None)
+    with radio:
+        assert radio.endpoint("robot") != first
+        radio.start(drive, radio.config("robot"), 1.0, radio.clock).result()
+    assert radio.summary()["start"] == 2
+    assert radio.summary()["heard"] > 0
+
+
 @pytest.mark.campaign
 def test_an_order_decides_again_what_it_has_decided(tmp_path: Path) -> None:
     """The same order is the same test to the last digit; another one is another."""

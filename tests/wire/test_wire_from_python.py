@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -172,8 +173,8 @@ def test_the_fixture_ends_the_wires_of_a_test_that_fails(tmp_path: Path) -> None
     assert "at side robot is in mode peer" in report
     assert re.search(r"; scan lost \d+ by loss, of \d+ heard", report)
     folders = [tmp_path / "art" / name / "wire-1" for name in ("test_that_fails", "test_that_expects")]
-    assert 'name="evedrop_results" value="art/test_that_expects/wire-1"' in report
-    assert "results: art/test_that_expects/wire-1" in done.stdout
+    assert f'name="evedrop_results" value="{folders[1]}"' in report
+    assert f"results: {folders[1]}" in done.stdout
     for folder in folders:
         assert (folder / "summary.json").is_file()
         assert not (folder / "control.json").exists()
@@ -209,12 +210,40 @@ def test_a_wire_that_cannot_begin_says_why(tmp_path: Path) -> None:
         pytest.fail("it has begun")
 
 
+def test_a_wire_in_the_folder_of_another_is_refused_and_does_not_steer_it(tmp_path: Path) -> None:
+    """In the words of the command, although the other one answers there."""
+    with wire(wire_plan(), out=tmp_path / "wire") as first:
+        second = wire(wire_plan(), out=tmp_path / "wire")
+        with pytest.raises(UsageError, match="another wire writes to"), second:
+            pytest.fail("it has begun")
+        with pytest.raises(UsageError, match=r"this wire does not run; the control\.json in .* is that of another one"):
+            second.partition("robot", "base")
+        assert first.status().events == []
+
+
+def test_a_wire_of_a_background_job_is_ended(tmp_path: Path) -> None:
+    """In order: all that it starts ignores SIGINT."""
+    running = wire(wire_plan(), out=tmp_path / "wire")
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        running.__enter__()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    running.__exit__(None, None, None)
+    assert running.typed_summary().state == "ended"
+
+
 @pytest.mark.parametrize(
     ("arguments", "entries", "error", "message"),
     [
         (("missing.toml",), {}, UsageError, "cannot be read"),
         ((), {"side": ["robot", "desk"], "link": [LINK]}, ScenarioError, 'link.0.to: is "base"'),
         ((wire_plan(),), {"seed": 3}, UsageError, "expected no entries with a plan"),
+        ((wire_plan(),), {"seconds": "300 h"}, UsageError, "seconds 300 h: expected more than 0 and at most 1000000 s"),
+        ((wire_plan(),), {"seconds": None}, UsageError, "seconds None: expected more than 0 .* such as"),
+        ((), {"side": {"robot": 1}.keys(), "link": [LINK]}, ScenarioError, "side: is a dict_keys; expected .* a list"),
+        ((), {"side": ["robot", "robot", "base"], "link": [LINK]}, ScenarioError, "side: is .*; expected a table"),
+        ((), {"side": ["robot", {"base": {}}], "link": [LINK]}, ScenarioError, "side: is .*; expected a table"),
     ],
 )
 def test_mistakes_are_said_before_anything_begins(
@@ -233,6 +262,34 @@ def test_an_entry_of_a_file_is_changed_by_its_dotted_key(tmp_path: Path) -> None
     changed = wire(tmp_path / "radio.toml", out=tmp_path / "wire", seed=8, link__0__quality=0.9)
     assert changed.plan.seed == 8
     assert changed.plan.links[0].settings["loss"]["quality"] == 0.9
+
+
+def test_numbers_of_numpy_are_numbers_and_paths_are_texts(tmp_path: Path) -> None:
+    """Also in lists and tables, as for a link that is steered; an entry that is None is not given."""
+    loss = {"model": "markov", "transitions": np.full((2, 2), 0.5), "loss": np.array([0, 1])}
+    tls = {"certificate": Path("c.pem"), "key": Path("k.pem")}
+    entries: dict[str, Any] = {
+        "side": {"robot": {"listen": "tls/127.0.0.1:0", "tls": tls}, "base": {}},
+        "link": ({"name": "scan", "from": "robot", "to": "base", "loss": loss},),
+        "query_seconds": None,
+    }
+    made = wire(**entries, seed=np.int64(3), out=tmp_path).plan
+    assert made.seed == 3
+    assert made.links[0].settings["loss"]["transitions"] == [[0.5, 0.5], [0.5, 0.5]]
+    assert made.sides["robot"].tls is not None
+    assert wire(made, out=tmp_path).plan is made
+
+
+def test_a_bound_may_be_a_number_of_numpy(tmp_path: Path) -> None:
+    """Such as a mean that was computed; what can be no number is refused by its type."""
+    plan = wire_plan()
+    with WireJournal(tmp_path, plan):
+        running = wire(plan, out=tmp_path)
+        running.expect("scan.heard", below=np.int64(3), above=None)
+        with pytest.raises(ExpectationFailed, match=r"scan\.heard above 3: FAILED"):
+            running.expect("scan.heard", above=np.array(3))
+        with pytest.raises(ScenarioError, match="above: is a dict_values; expected a number"):
+            running.expect("scan.heard", above={"a": 3}.values())
 
 
 def test_metrics_from_the_disk_are_those_of_the_wire(tmp_path: Path) -> None:

@@ -103,7 +103,9 @@ def _opening(request: pytest.FixtureRequest, tmp_path: Path, open_wire: Callable
     from evedrop.results.folder import claimed  # needed only by tests that open a wire
 
     out: Path | None = request.config.option.evedrop_out
-    place = tmp_path if out is None else claimed(out / re.sub(r"\W", "_", request.node.name)[:_LONGEST_NAME])
+    name = re.sub(r"\W", "_", request.node.name)[:_LONGEST_NAME]
+    # The test may have another folder by now.
+    place = tmp_path if out is None else claimed(request.config.invocation_params.dir / out / name)
     folders = (place / f"wire-{number}" for number in count(1))
 
     def opened(*arguments: Any, **entries: Any) -> _Wire:

@@ -149,9 +149,17 @@ def say(text: str, alarm: str = "", colour: str = RED) -> None:
         tell(f"evedrop: {text}", alarm, colour, sys.stderr)
 
 
+_WARNING = "warning:"
+
+
 def warn(text: str) -> None:
     """Write a warning to standard error, as `say` does."""
-    say(f"warning: {text}", "warning:", YELLOW)
+    say(f"{_WARNING} {text}", _WARNING, YELLOW)
+
+
+def is_warning(line: str) -> bool:
+    """Whether `warn` wrote this line, not on a terminal."""
+    return line.startswith(f"evedrop: {_WARNING}")
 
 
 def print_json(value: object) -> None:

@@ -459,6 +459,11 @@ class ChildProcess:
         machine.begin(name, partial(machine.program, words), self.process)
 
     @property
+    def pid(self) -> int:
+        """Its id."""
+        return self.process.pid
+
+    @property
     def returncode(self) -> int | None:
         """Its exit status; None while it runs."""
         return self.process.task.status

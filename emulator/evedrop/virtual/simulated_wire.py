@@ -122,7 +122,7 @@ class SimulatedProgram(Generic[T]):
 class SimulatedWire(RunningWire):
     """A wire in a simulated process, and programs at it."""
 
-    def __init__(self, plan: WirePlan, folder: Path, seconds: float, world: CallerWorld) -> None:
+    def __init__(self, plan: WirePlan, folder: Path, seconds: float | str, world: CallerWorld) -> None:
         super().__init__(plan, folder, seconds, self._started)
         self.clock = SimulatedClock(world)
         """For the programs, in place of the module `time`."""
@@ -172,7 +172,7 @@ class SimulatedWires:
         source: str | Path | WirePlan | None = None,
         *,
         out: str | Path | None = None,
-        seconds: float = LONGEST_SECONDS,
+        seconds: float | str = LONGEST_SECONDS,
         order: int = 1,
         **entries: Any,
     ) -> SimulatedWire:

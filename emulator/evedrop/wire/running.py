@@ -20,7 +20,7 @@ from typing import IO, TYPE_CHECKING, Any, Protocol, Self
 import zenoh
 
 from evedrop.errors import EvedropError, RunError, UsageError
-from evedrop.live.network.control_file import no_run, read_control
+from evedrop.live.network.control_file import Control, no_run, read_control
 from evedrop.live.network.operator import Answer, ask
 from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest, WireStatus
 from evedrop.results.folder import claimed, default_folder, write_private
@@ -30,12 +30,15 @@ from evedrop.scenario.words import listed
 from evedrop.show.report.wire import expectation_failures, wire_faults
 from evedrop.system.killable import KillableProcess
 from evedrop.system.native_log import MARK
+from evedrop.system.output import is_warning
 from evedrop.system.processes import kill, wait_for
+from evedrop.system.threads import Thread
 from evedrop.system.world import world
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.on_disk import ended_summary, scorekeeper_on_disk
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.tables import seconds_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -56,14 +59,15 @@ def wire(
     source: str | Path | WirePlan | None = None,
     *,
     out: str | Path | None = None,
-    seconds: float = LONGEST_SECONDS,
+    seconds: float | str = LONGEST_SECONDS,
     **entries: Any,
 ) -> RunningWire:
     """A wire in a process of its own, which begins with the `with` statement and ends with it.
 
     source: a wire file, or a plan; None: the entries are the whole wire, such as `side=["robot", "base"]` and
     `link=[{"from": "robot", "to": "base", "quality": 0.6}]`. out: the results folder; seconds: after which the wire ends by
-    itself. entries: with a file, changes by dotted key, with `__` for the dot, such as `seed=8` or `side__base__listen=[]`.
+    itself, or a text such as "10 min". entries: with a file, changes by dotted key, with `__` for the dot, such as `seed=8` or
+    `side__base__listen=[]`.
 
     Raises ScenarioError with every mistake of the wire. The `with` statement raises UsageError or RunError if the wire cannot
     begin, and ExpectationFailed if one of its `[[expect]]` failed, or programs could speak past it.
@@ -75,6 +79,7 @@ def described_wire(
     source: str | Path | WirePlan | None, out: str | Path | None, entries: dict[str, Any]
 ) -> tuple[WirePlan, Path]:
     """The plan of a wire, and its results folder, from the arguments of `wire`."""
+    entries = plain_tables(entries, "wire")  # numbers of numpy as well
     if isinstance(source, WirePlan):
         if entries:
             raise UsageError(
@@ -85,9 +90,9 @@ def described_wire(
         plan = load_wire(source, {entry.replace("__", "."): value for entry, value in entries.items()})
         name = Path(source).stem
     else:
-        side = entries.get("side")
-        if isinstance(side, Sequence) and not isinstance(side, str):
-            entries["side"] = {side_name: {} for side_name in side}
+        names = entries.get("side")
+        if isinstance(names, list) and all(isinstance(side, str) and names.count(side) == 1 for side in names):
+            entries["side"] = {side: {} for side in names}
         plan, name = wire_of(entries), "wire"
     folder = claimed(default_folder(f"wire-{name}")) if out is None else Path(out)
     return plan, folder
@@ -95,6 +100,10 @@ def described_wire(
 
 class ProcessOfWire(KillableProcess, Protocol):
     """The part of `subprocess.Popen` that is used here."""
+
+    @property
+    def pid(self) -> int:
+        """Its id."""
 
     @property
     def returncode(self) -> int | None:
@@ -119,27 +128,36 @@ class RunningWire:
     """A wire in a process of its own; use it as a context manager."""
 
     def __init__(
-        self, plan: WirePlan, folder: Path, seconds: float = LONGEST_SECONDS, start: Start | None = None
+        self, plan: WirePlan, folder: Path, seconds: float | str = LONGEST_SECONDS, start: Start | None = None
     ) -> None:
-        """start: starts a process of Evedrop with these words; by default one of the machine."""
+        """seconds: a number, or a text with a unit. start: starts a process of Evedrop; by default one of the machine."""
         self.plan = plan
-        self.folder = folder
+        self.folder = folder.absolute()
         """The results folder."""
-        self._seconds = seconds
+        self._seconds = seconds_of(str(seconds), "seconds")
         self._start: Start = _started if start is None else start
         self._process: ProcessOfWire | None = None
         self._endpoints: Mapping[str, Sequence[str]] = {}
         self._errors: list[str] = []
+        self._listener: Thread | None = None
 
     def __enter__(self) -> Self:
         """Start the wire, and wait until programs can connect. Raises UsageError or RunError if it cannot begin."""
+        if self.is_running:
+            raise UsageError(f"the wire in {self.folder} runs already; expected one `with` statement after the other")
+        self._endpoints, self._errors, self._listener = {}, [], None
         with self._file() as file:
             self._process = self._start(
-                "wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds:g} s", "--quiet"
+                "wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds} s", "--quiet"
             )
-            self._listener = world().thread(self._hear_errors, self._process, name="wire")
-            self._listener.start()
-            self._wait()
+            try:
+                listener = world().thread(self._hear_errors, self._process, name="wire")
+                listener.start()
+                self._listener = listener
+                self._wait()
+            except BaseException:  # such as Ctrl-C: no `__exit__` follows
+                self._stop(signal.SIGTERM)
+                raise
         return self
 
     @contextmanager
@@ -172,7 +190,7 @@ class RunningWire:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End the wire. Raises ExpectationFailed or RunError, unless the `with` block raised an error itself."""
-        status = self._stop(signal.SIGINT)
+        status = self._stop(signal.SIGTERM)  # a background job and all that it starts ignore SIGINT
         if error is not None or status == 0:
             return
         with suppress(UsageError):
@@ -218,10 +236,10 @@ class RunningWire:
 
     def status(self) -> WireStatus:
         """The state of the wire now. Raises UsageError if it does not run."""
-        status = self._ask(StatusRequest()).wire
-        if status is None:
-            raise UsageError(f"{self.folder} is the folder of a run; expected that of a wire")
-        return status
+        answer = self._ask(StatusRequest())
+        if answer.wire is None:
+            raise UsageError("; ".join(answer.refused))
+        return answer.wire
 
     def rows(self) -> pa.Table:
         """The journal so far: a row for each message and link (docs/wire/results.md, the journal)."""
@@ -243,7 +261,7 @@ class RunningWire:
 
         The arguments are the entries of an `[[expect]]` of a wire file, such as `"scan.delivery", above=0.5`, or `link="scan"`.
         """
-        table = {"metric": metric, **bounds} if metric is not None else bounds
+        table = plain_tables({"metric": metric, **bounds}, "expect")
         plan = wire_of({**tomllib.loads(resolved_wire(self.plan)), "expect": [table]})
         summary = scorekeeper_on_disk(self.folder, plan).summary()
         if summary.failed_expectations:
@@ -268,7 +286,7 @@ class RunningWire:
 
     def _ask(self, request: OperatorRequest) -> Answer:
         """The wire's answer. Raises UsageError if it does not run."""
-        control = read_control(self.folder)
+        control = self._control()
         try:
             answer = ask(control, request, _PATIENCE)
         except zenoh.ZError as error:
@@ -276,6 +294,13 @@ class RunningWire:
         if answer is None:
             raise no_run(self.folder, "it ended before it answered")
         return answer
+
+    def _control(self) -> Control:
+        """How this wire is steered. Raises UsageError if it does not run, although another one may, in the same folder."""
+        control = read_control(self.folder)
+        if self._process is None or control.process != self._process.pid:
+            raise UsageError(f"this wire does not run; the control.json in {self.folder} is that of another one")
+        return control
 
     def _hear_errors(self, process: ProcessOfWire) -> None:
         assert process.stderr is not None  # noqa: S101 - it is a pipe
@@ -290,13 +315,16 @@ class RunningWire:
         if process.poll() is None:
             process.send_signal(number)
         kill(*wait_for([process], _PATIENCE))
-        self._listener.join(_PATIENCE)
+        if self._listener is not None:
+            self._listener.join(_PATIENCE)
         return -signal.SIGKILL if process.returncode is None else process.returncode
 
     def _failure(self, status: int) -> EvedropError:
         """The error for a process that failed, in its own words."""
-        errors = "".join(self._errors).strip().removeprefix("evedrop: ")
-        text = errors or f"the wire in {self.folder} ended with status {status}"
+        told = [line.removeprefix("evedrop: ") for line in self._errors if not is_warning(line)]
+        warned = [line.removeprefix("evedrop: ").rstrip() for line in self._errors if is_warning(line)]
+        ended = f"the wire in {self.folder} ended with status {status}"
+        text = "".join(told).strip() or "; ".join([ended, *warned])
         return UsageError(text) if status == UsageError.exit_status else RunError(text)
 
 

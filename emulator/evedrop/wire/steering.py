@@ -134,7 +134,7 @@ class WireControl:
             Questions(self._key, Dropped("the wire"), self._answer).declare(session)
             stack.callback(remove_control, self._folder)
             try:
-                Control(self._run, router, OPERATOR, password).write(self._folder)
+                Control(self._run, router, OPERATOR, password, process=world().process.pid).write(self._folder)
             except OSError as error:
                 warn(f"the wire cannot be steered, because control.json cannot be written ({error})")
             self._stack = stack.pop_all()

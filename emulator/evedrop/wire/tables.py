@@ -17,6 +17,7 @@ import zenoh
 from pydantic import AfterValidator, BeforeValidator, Field, ModelWrapValidatorHandler, model_validator
 from pydantic_core import PydanticCustomError
 
+from evedrop.errors import UsageError
 from evedrop.model.checks import as_toml
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS
@@ -49,10 +50,16 @@ def in_seconds(text: str) -> float | None:
     return in_unit(text, _TIMES)
 
 
-def seconds_of(text: str) -> float | None:
-    """The seconds in a text such as "20 ms" or "0.02", up to `LONGEST_SECONDS`; None if it is neither."""
+def seconds_of(text: str, entry: str) -> float:
+    """The seconds in a text such as "20 ms" or "0.02". Raises UsageError unless they are within 0 and `LONGEST_SECONDS`.
+
+    entry: what has this value.
+    """
     seconds = in_seconds(text if text.strip()[-1:].isalpha() else f"{text} s")
-    return seconds if seconds is not None and seconds <= LONGEST_SECONDS else None
+    if seconds is None or not 0.0 < seconds <= LONGEST_SECONDS:
+        wanted = f'more than 0 and at most {LONGEST_SECONDS:.0f} seconds, such as 60 or "60 s"'
+        raise UsageError(f"{entry} {text}: expected {wanted}")
+    return seconds
 
 
 def _seconds(value: Any) -> Any:

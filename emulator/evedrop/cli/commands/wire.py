@@ -59,8 +59,9 @@ def wire(options: argparse.Namespace) -> int:
             f"wire {options.file} {options.keys[0]}: keys are for --check, which says which link a key takes"
         )
     from evedrop.wire.file import key_lines, warnings_of_wire, wire_lines
+    from evedrop.wire.tables import seconds_of
 
-    seconds = None if options.seconds is None else _seconds(options.seconds)
+    seconds = None if options.seconds is None else seconds_of(options.seconds, "wire --for")
     plan = load_wire(options.file, changes_of(options))
     if options.check:
         lines = [*wire_lines(plan), *key_lines(plan, options.keys)]
@@ -96,16 +97,6 @@ def _say(line: str) -> None:
 
 def _hush(line: str) -> None:
     """Print nothing."""
-
-
-def _seconds(text: str) -> float:
-    """The length of time of `--for`. Raises UsageError."""
-    from evedrop.wire.tables import seconds_of
-
-    seconds = seconds_of(text)
-    if seconds is None or seconds == 0.0:
-        raise UsageError(f'wire --for {text}: expected seconds, or a length of time such as "60 s"')
-    return seconds
 
 
 COMMANDS = (wire,)

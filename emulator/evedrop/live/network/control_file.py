@@ -34,6 +34,8 @@ class Control:
     password: str = field(repr=False)
     identity: Identity | None = None
     """The operator's certificate and key, if the run's router takes certificates."""
+    process: int | None = None
+    """The id of the process, if it is a wire."""
 
     def write(self, folder: Path) -> None:
         """Write the file into a results folder, readable by its owner only."""
