@@ -58,6 +58,8 @@ class WireRelay:
         """What its threads do, once it is open."""
         self.links: Mapping[str, RunningLink] = {link.name: RunningLink(link, plan, journal) for link in plan.links}
         """By their names."""
+        self.failures: list[str] = []
+        """Why messages of a side no longer cross, in sentences: the wire has failed."""
         self._journal, self._tell, self._happened = journal, tell, happened
         self._stack = contextlib.ExitStack()
         self._duty = Duty("in the list of what programs declare")
@@ -95,7 +97,7 @@ class WireRelay:
         self._queries = QueryRelay(self.sides, links, send_queues, plan, journal, self._tell)
         stack.callback(self._queries.close)
         relays = [
-            PublicationRelay(side, links, publishers, send_queues, plan, journal, self._tell)
+            PublicationRelay(side, links, publishers, send_queues, plan, journal, self._fail)
             for side in self.sides.values()
         ]
         for relay in relays:
@@ -124,6 +126,10 @@ class WireRelay:
         stack.callback(self._woken.set)
         stack.callback(self._ended.set)
         stack.callback(departures.close)
+
+    def _fail(self, line: str) -> None:
+        self.failures.append(line)
+        self._tell(line)
 
     def _note_bypass(self, line: str) -> None:
         """Tell a way past the wire, and note it in the journal."""
