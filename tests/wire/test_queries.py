@@ -258,6 +258,29 @@ def test_ros_finds_a_service_of_the_other_side(tmp_path: Path) -> None:
         wait_until(lambda: not list(asker.get(SERVICE, target=COMPLETE)), "it is gone")
 
 
+def test_a_service_that_zenoh_refuses_once_is_offered_at_the_next_look(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Although no program declares anything since."""
+    taker = QueryRelay._taker
+    refused: list[str] = []
+
+    def refusing(relay: QueryRelay, name: str, key: str | None, *earlier: Any) -> Any:
+        if key is not None and not refused:
+            refused.append(key)
+            raise zenoh.ZError("busy")
+        return taker(relay, name, key, *earlier)
+
+    monkeypatch.setattr(QueryRelay, "_taker", refusing)
+    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as asker, wire.program("base") as server:
+        offer(server, SERVICE, b"sum", complete=True)
+        token = server.liveliness().declare_token(SERVER)
+        wait_until(lambda: answers(asker, SERVICE, target=COMPLETE) == [b"sum"], "it is mirrored")
+        assert refused == [SERVICE]
+        assert [line for line in wire.told if "busy" in line]
+        del token
+
+
 def test_each_query_is_asked_once(tmp_path: Path) -> None:
     """Although the mirrored queryable and the one for everything hear it."""
     heard: list[str] = []
