@@ -165,7 +165,7 @@ class WireRelay:
         self._liveliness.mirror()
 
     def _keep_up(self) -> None:
-        due = 0.0
+        due, told = 0.0, ""
         while not self._ended.is_set():
             self._woken.wait(max(0.0, due - world().monotonic()))
             self._woken.clear()
@@ -175,7 +175,9 @@ class WireRelay:
                     if world().monotonic() >= due:
                         self._neighbours.update()
                         self._bypasses.update()
-                        due = world().monotonic() + _POLL_SECONDS
+                        due, told = world().monotonic() + _POLL_SECONDS, ""
             except Exception as error:  # whatever it is: the next look may succeed
-                if not self._ended.is_set():
-                    self._tell(f"Zenoh does not say what programs declare ({error!r}); trying again")
+                due, line = world().monotonic() + _POLL_SECONDS, f"Zenoh does not say what programs declare ({error!r})"
+                if line != told and not self._ended.is_set():
+                    self._tell(f"{line}; trying again")
+                told = line
