@@ -20,6 +20,8 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER
+from evedrop.system.files import try_lock
+from evedrop.system.world import world
 from evedrop.wire import journal_reading
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_place import part_names
@@ -179,6 +181,23 @@ def test_another_wire_on_the_same_folder_is_refused(tmp_path: Path) -> None:
         assert journal.counts == {("scan", "scan/1", "put"): 1}
         put(journal, 1)
     assert [row["n"] for row in rows_of(tmp_path)] == [0, 1]
+
+
+def test_a_folder_that_is_just_being_read_is_not_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who reads the journal of a killed wire has it locked for an instant: here, until the starting wire has waited once."""
+    with WireJournal(tmp_path, wire_plan()) as journal:
+        put(journal, 0)
+    readers = [os.open(tmp_path / "journal", os.O_RDONLY)]
+    assert try_lock(readers[0], shared=True)
+
+    def sleep(_: float) -> None:
+        while readers:
+            os.close(readers.pop())
+
+    monkeypatch.setattr(world(), "sleep", sleep)
+    with WireJournal(tmp_path, wire_plan()) as journal:
+        assert journal.counts == {("scan", "scan/1", "put"): 1}
+    assert not readers
 
 
 def test_amended_rows(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,9 +13,11 @@ from zenoh.ext import CacheConfig, MissDetectionConfig, RecoveryConfig
 from zenoh.ext import declare_advanced_publisher as advanced_publisher
 from zenoh.ext import declare_advanced_subscriber as advanced_subscriber
 
+from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import LOST_HISTORY_SECONDS, Side
 from evedrop.wire.queries import QueryRelay
 from evedrop.wire.records import Kind, WireFate
+from evedrop.wire.relay import WireRelay
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import (
     ANYWHERE,
@@ -256,6 +259,58 @@ def test_ros_finds_a_service_of_the_other_side(tmp_path: Path) -> None:
             assert not answers(asker, "open", target=COMPLETE)
             del token
         wait_until(lambda: not list(asker.get(SERVICE, target=COMPLETE)), "it is gone")
+
+
+def test_a_service_that_zenoh_refuses_once_is_offered_at_the_next_look(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Although no program declares anything since."""
+    taker = QueryRelay._taker
+    refused: list[str] = []
+
+    def refusing(relay: QueryRelay, name: str, key: str | None, *earlier: Any) -> Any:
+        if key is not None and not refused:
+            refused.append(key)
+            raise zenoh.ZError("busy")
+        return taker(relay, name, key, *earlier)
+
+    monkeypatch.setattr(QueryRelay, "_taker", refusing)
+    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as asker, wire.program("base") as server:
+        offer(server, SERVICE, b"sum", complete=True)
+        token = server.liveliness().declare_token(SERVER)
+        wait_until(lambda: answers(asker, SERVICE, target=COMPLETE) == [b"sum"], "it is mirrored")
+        assert refused == [SERVICE]
+        assert [line for line in wire.told if "busy" in line]
+        del token
+
+
+def test_an_error_that_lasts_is_told_once_and_not_looked_for_without_a_pause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zenoh says what programs declare to the first look, to no other until the fifth, and not to the last."""
+    told: list[str] = []
+    waits: list[float] = []
+    plan = both_ways()
+    with WireJournal(tmp_path, plan) as journal:
+        relay = WireRelay(plan, journal, told.append)
+
+        def wait(seconds: float) -> None:
+            waits.append(seconds)
+            if len(waits) > 6:
+                relay._ended.set()
+
+        def poll() -> None:
+            if len(waits) not in {1, 5}:
+                raise zenoh.ZError("closed")
+
+        monkeypatch.setattr(relay, "_woken", SimpleNamespace(wait=wait, clear=lambda: None))
+        monkeypatch.setattr(relay, "_poll", poll)
+        for name in ("_neighbours", "_bypasses"):
+            monkeypatch.setattr(relay, name, SimpleNamespace(update=lambda: None), raising=False)
+        monkeypatch.setattr("evedrop.wire.relay.world", lambda: SimpleNamespace(monotonic=lambda: sum(waits)))
+        relay._keep_up()
+    assert waits == pytest.approx([0.0, *6 * [0.2]])
+    assert told == 2 * ["Zenoh does not say what programs declare (ZError('closed')); trying again"]
 
 
 def test_each_query_is_asked_once(tmp_path: Path) -> None:

@@ -216,6 +216,23 @@ def test_a_key_that_was_forgotten_goes_on(lossy: RunningLink, lossless: bool) ->
     assert lossy.lane("put", "pose", lossless)(0.0, 1)[0] == 0
 
 
+@pytest.mark.parametrize("lossless_first", [False, True])
+def test_histories_of_a_key_share_their_numbers_although_only_some_are_lossless(
+    lossy: RunningLink, lossless_first: bool
+) -> None:
+    """`lossless` may name the history of one publisher of a key: those of the others have the fates of their numbers."""
+    lossy.change(LOSSY)
+    fates, decisions = key_fates(lossy.link, "map/@adv/pub", "put", 7), []
+    for _ in range(2):
+        keys = {lossless: f"map/@adv/pub/{lossless}/1/_" for lossless in (lossless_first, not lossless_first)}
+        lanes = {lossless: lossy.lane("put", key, lossless) for lossless, key in keys.items()}
+        decisions += [lanes[lossless](0.0, 1)[:2] for lossless in [True, False, False] * 20]
+        for key in keys.values():
+            lossy.forget("put", key)
+    due = [fates.next()[0] for _ in range(120)]
+    assert decisions == [(n, due[n] if n % 3 else 0) for n in range(120)]
+
+
 def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

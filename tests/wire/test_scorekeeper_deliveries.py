@@ -24,7 +24,7 @@ POOR: dict[str, Any] = {"loss": LOSSES["gilbert-elliott"], "corrupt": 0.2}
 RANGES = (range(100), range(150, 151), range(160, 700), range(800, 2000))
 
 
-def expected(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Iterable[range]) -> tuple[float, float]:
+def expected(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Sequence[range]) -> tuple[float, float]:
     """Mean and variance of the messages that get through."""
     stream = KeyDeliveries(settings, changes, ranges)
     return stream.mean, stream.variance
@@ -118,7 +118,7 @@ def test_bounds_without_a_distribution_are_those_of_a_normal_variable() -> None:
     many = np.full((9, 9), 1.0 / 9.0)
     for stream in (
         KeyDeliveries({"loss": {"model": "markov", "transitions": many.tolist(), "loss": [0.5] * 9}}, [], [range(100)]),
-        KeyDeliveries({"loss": LOSSES["bernoulli"]}, [], [range(200)], sampled=100),
+        KeyDeliveries({"loss": LOSSES["bernoulli"]}, [], [range(200)], [100]),
     ):
         assert bounds([stream], 100) == normal_bounds(stream.mean, stream.variance, 100)
 
@@ -189,8 +189,38 @@ def test_variance_of_a_recording_that_begins_anywhere() -> None:
 
 def test_a_sample_of_messages_that_are_never_lost_does_not_vary() -> None:
     """The mean of 7 of 25 messages is rounded to more than 7, which once gave a variance below 0, and ended the wire."""
-    sample = KeyDeliveries({"loss": {"model": "bernoulli", "quality": 1.0}}, [], [range(25)], 7)
+    sample = KeyDeliveries({"loss": {"model": "bernoulli", "quality": 1.0}}, [], [range(25)], [7])
     assert bounds([sample], 7) == pytest.approx((7.0, 7.0), abs=1e-4)
+
+
+@pytest.mark.parametrize("taken", ["at random", "in turn", "later fewer"])
+@pytest.mark.parametrize("model", ["bernoulli", "gilbert-elliott"])
+def test_bounds_of_samples_hold(model: str, taken: str) -> None:
+    """Of 4000 wires whose losses change half way, 99 % are within them; they scatter at least as the sample's variance says."""
+    count, wires, rng = 2000, 4000, np.random.default_rng(SEED)
+    first, second = ({"loss": LOSSES[name]} for name in (model, "markov"))
+    passed = np.empty((count, wires), np.bool_)
+    for begin, settings in ((0, first), (count // 2, second)):
+        loss = loss_of(settings["loss"])
+        for start in range(begin, begin + count // 2, 20):
+            passed[start : start + 20] = loss.fates(start, rng.random((20, loss.uniforms_per_slot, wires))) == 0
+    n = np.arange(count)
+    numbers = {
+        "at random": np.flatnonzero(rng.random(count) < 0.4),
+        "in turn": n[::3],
+        "later fewer": n[(n < count // 2) | (n % 5 == 0)],
+    }[taken]
+    ranges, counts = [], []
+    for start in range(0, count, 50):
+        within = numbers[(numbers >= start) & (numbers < start + 50)]
+        ranges.append(range(int(within[0]), int(within[-1]) + 1))
+        counts.append(len(within))
+    stream = KeyDeliveries(first, [Change(count // 2, second)], ranges, counts)
+    delivered = passed[numbers].sum(axis=0)
+    assert stream.mean == pytest.approx(delivered.mean(), abs=4.5 * math.sqrt(stream.variance / wires))
+    low, high = bounds([stream], len(numbers))
+    assert ((low <= delivered) & (delivered <= high)).mean() >= 0.99 - 4.5 * math.sqrt(0.01 / wires)
+    assert 0.9 < stream.variance / float(np.var(delivered)) < 1.5
 
 
 def test_a_change_of_the_loss_model_begins_a_new_memory() -> None:

@@ -44,8 +44,9 @@ def check_stream(rows: list[tuple[int, int]], records: Records, sizes: list[int]
     pairs = [(float(record["time"]), record["fate"] == 0) for record in records]
     assert (stream.longest, stream.silence) == by_hand(pairs)
     decided = [n for n, (_, fate) in enumerate(rows) if fate in {0, 1}]
-    assert [n for start, stop in stream.ranges for n in range(start, stop)] == decided
-    assert all(stop < start for (_, stop), (start, _) in pairwise(stream.ranges))
+    assert [n for start, stop, _ in stream.ranges for n in range(start, stop)] == decided
+    assert all(stop - start == count for start, stop, count in stream.ranges)
+    assert all(before.stop < after.start for before, after in pairwise(stream.ranges))
     assert (stream.tried, stream.passed) == (len(decided), sum(fate == 0 for _, fate in rows))
 
 
@@ -74,13 +75,29 @@ def test_gaps_and_numbers_do_not_depend_on_the_blocks(rows: list[tuple[int, int]
     check_stream(rows, records, [size])
 
 
-def test_a_stream_with_many_interruptions_is_judged_as_a_sample() -> None:
-    """Numbers that are too scattered to be kept count as one range."""
-    stream, records = StreamTally(), np.zeros(6000, RECORD)
-    records["n"] = np.arange(6000)
-    records["fate"][::2] = WireFate.OVERFLOW
+@pytest.mark.parametrize("part", [6000, 7])
+def test_a_stream_with_many_interruptions_keeps_how_many_of_each_part_of_its_numbers_count(part: int) -> None:
+    """Numbers that are too scattered to be kept are counted by cells, no larger than they must be."""
+    stream, records = StreamTally(), np.zeros(12_000, RECORD)
+    records["n"] = np.arange(12_000)
+    records["fate"][3001::2] = WireFate.OVERFLOW
+    for first in range(0, len(records), part):
+        stream.add(records[first : first + part], True)
+    assert stream.scattered
+    assert 1024 < len(stream.ranges) < 2048
+    assert stream.ranges[0] == (0, 3001, 3001)
+    assert all(some.counted == (some.stop - some.start + 1) // 2 <= 4 for some in stream.ranges[1:])
+    assert sum(some.counted for some in stream.ranges) == stream.tried == 7500
+
+
+def test_a_late_number_counts_in_the_range_that_contains_it() -> None:
+    """Threads may hand over messages in another order than that of their numbers."""
+    stream, records = StreamTally(), np.zeros(2500, RECORD)
+    records["n"] = 2 * np.arange(2500)
     stream.add(records, True)
-    assert (stream.scattered, stream.ranges, stream.tried) == (True, [(1, 6000)], 3000)
+    before = stream.ranges
+    stream.add_one(0.0, 1001, 0, True)
+    assert stream.ranges == [some._replace(counted=some.counted + (some.start < 1001 < some.stop)) for some in before]
 
 
 def test_quantiles_of_delays_are_exact_until_there_are_too_many_to_keep() -> None:

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from evedrop.errors import RunError
 from evedrop.wire.file import wire_of
+from evedrop.wire.publications import PublicationRelay
 from evedrop.wire.run import run_wire
-from tests.wire.wire_at_work import sending
+from tests.wire.wire_at_work import both_ways, sending
 
 
 @pytest.mark.thorough
@@ -31,3 +33,16 @@ def test_a_failed_expectation_is_told_apart_from_the_rest(tmp_path: Path) -> Non
     assert wrong == ["expected robot-base.delivery below 0.5: FAILED, found 1"]
     assert "expected robot-base.delivery above 0.5: held, found 1" in messages
     assert wrong[0] not in messages
+
+
+def test_a_wire_over_which_messages_no_longer_cross_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A fault of Evedrop is told when it shows, and once more at the end, with the status of a failed run."""
+    monkeypatch.setattr(PublicationRelay, "_take_all", lambda *_: 1 / 0)
+    said: list[str] = []
+    why = r"messages from the side robot no longer cross \(ZeroDivisionError.*the side base no longer cross"
+    with pytest.raises(RunError, match=why):
+        run_wire(both_ways(), tmp_path / "out", seconds=0.0, say=said.append)
+    assert capsys.readouterr().err.count("no longer cross") >= 2
+    assert said[-1] == f"results: {tmp_path / 'out'}"

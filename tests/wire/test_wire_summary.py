@@ -162,9 +162,27 @@ def test_a_link_on_many_of_whose_messages_no_model_decides_is_judged_as_a_sample
     assert link.expected_rate == pytest.approx(quality)
     assert link.within_bounds is True
     assert link.bounds is not None
-    # Of all messages the models let a binomial number through, and of those tried it is a sample: (1 + 1/4) times its variance.
-    standard_deviation = math.sqrt(1.25 * quality * (1.0 - quality) / tried)
+    standard_deviation = math.sqrt(quality * (1.0 - quality) / tried)
     assert link.bounds[1] - link.bounds[0] == pytest.approx(2 * 2.576 * standard_deviation, rel=0.03)
+
+
+def test_a_link_that_becomes_worse_and_overflows_at_once_agrees_with_its_models_of_each_time(tmp_path: Path) -> None:
+    """However often the queue was full since: most of its good messages are those of before, and the model says so."""
+    plan = wire_plan(link={"loss": {"model": "bernoulli", "quality": 0.9}})
+    worse = {"loss": {"model": "bernoulli", "quality": 0.5}}
+    with WireJournal(tmp_path, plan) as journal:
+        keeper = WireScorekeeper(plan, journal)
+        fates, key = key_fates(plan.links[0], "link/1", "put", 7), journal.words.key_code("link/1")
+        for n in range(32_000):
+            if n == 10_000:
+                journal.change("link", worse, {("link/1", "put"): fates.change(worse)})
+            fate = fates.next()[0]
+            if n >= 10_000 and n % 10:
+                fate = WireFate.OVERFLOW
+            journal.records.record(n / 10, n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
+    link = keeper.links()["link"]
+    assert link.expected_rate == pytest.approx((10_000 * 0.9 + 2200 * 0.5) / 12_200, rel=1e-3)
+    assert link.within_bounds is True
 
 
 def test_the_keys_of_a_history_have_the_bounds_of_one_key(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ Source: docs/mathematics/links.md, losses in bursts.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate, pairwise
@@ -32,6 +33,7 @@ _FARTHEST = (
 )
 _SMOOTHED = 1.5  # points of the grid, where it is coarser than the counts
 _MARGIN = 16  # points
+_ROUNDED = 1e-12  # of the mean: what rounding leaves of a variance that is 0
 _MOST_PARTS, _POWERS = 2048, 16  # ranges of different streams, and how many of them the powers of a chain cost
 
 
@@ -40,7 +42,7 @@ class KeyDeliveries:
     """The number of messages of one key that get through.
 
     settings: `WireLink.settings`; changes: as for `PerKeyLinks`; ranges: the numbers of the messages, disjoint and ascending;
-    sampled: how many of them count, picked at random; None: all.
+    counts: how many of each range count, as if picked at random; None: all.
 
     The variance is exact for losses without a memory, and for those of a Markov chain, whatever is left out. For other losses
     with a memory it is as exact as the model's `rate_variance` for a single range, and an upper bound for several.
@@ -52,19 +54,25 @@ class KeyDeliveries:
         self,
         settings: Mapping[str, Any],
         changes: Iterable[Change],
-        ranges: Iterable[range],
-        sampled: int | None = None,
+        ranges: Sequence[range],
+        counts: Sequence[int] | None = None,
     ) -> None:
-        self._pieces = _pieces(settings, changes, ranges)
-        self.sampled = sampled is not None
-        self.mean = self.variance = 0.0
+        counts = [len(some) for some in ranges] if counts is None else counts
+        shares = [min(1.0, count / len(some)) for some, count in zip(ranges, counts, strict=True)]
+        self._pieces = _pieces(settings, changes, ranges, shares)
+        self.sampled = any(share < 1.0 for share in shares)
+        self.variance = 0.0
+        starts, means = [some.start for some in ranges], [0.0] * len(ranges)
         for loss, parts in self._pieces:
-            self.mean += sum_in_order(part.passes * loss.count_mean(part.slots) for part in parts)
+            for part in parts:
+                means[bisect_right(starts, part.slots.start) - 1] += part.passes * loss.count_mean(part.slots)
             self.variance += loss.count_variance(parts)
-        if sampled is not None:  # a sample of a known range: the range varies as a whole, and the sample within it
-            fraction = sampled / sum(len(part.slots) for _, parts in self._pieces for part in parts)
-            self.mean = min(self.mean * fraction, sampled)  # the product is rounded
-            self.variance = self.variance * fraction**2 + self.mean * (1.0 - self.mean / sampled)
+        means = [min(mean, count) for mean, count in zip(means, counts, strict=True)]  # the products are rounded
+        self.mean = sum_in_order(means)
+        if self.sampled:  # each message counted by chance so far; but how many of a range count is known
+            known = zip(means, counts, shares, strict=True)
+            self.variance -= sum_in_order((1.0 - share) * mean * mean / count for mean, count, share in known)
+            self.variance = self.variance if self.variance > _ROUNDED * self.mean else 0.0
 
     @property
     def parts(self) -> int:
@@ -130,19 +138,22 @@ def normal_bounds(mean: float, variance: float, count: int) -> tuple[float, floa
 
 
 def _pieces(
-    settings: Mapping[str, Any], changes: Iterable[Change], ranges: Iterable[range]
+    settings: Mapping[str, Any], changes: Iterable[Change], ranges: Sequence[range], shares: Sequence[float]
 ) -> list[tuple[LossModel, list[Thinned]]]:
-    """The loss models in turn, each with the messages on which it decides, in parts within which no setting changes."""
+    """The loss models in turn, each with the messages on which it decides, in parts within which no setting changes.
+
+    shares: the fraction of each range that counts.
+    """
     marks = stretches(LinkSchedule(settings, changes=tuple(changes)))
     models = accumulate((new["loss"] != old["loss"] for (_, old, _), (_, new, _) in pairwise(marks)), initial=0)
     ends = [*(start for start, _, _ in marks[1:]), NEVER]
     spans = [*zip(models, marks, ends, strict=True)]
     pieces: dict[int, tuple[LossModel, list[Thinned]]] = {}
-    for some in ranges:
+    for some, share in zip(ranges, shares, strict=True):
         for model, (start, new, _), stop in spans:
             slots = range(max(some.start, start), min(some.stop, stop))
             if slots:
                 if model not in pieces:
                     pieces[model] = (loss_of(new["loss"]), [])
-                pieces[model][1].append(Thinned(slots, 1.0 - new.get("corrupt", 0.0)))
+                pieces[model][1].append(Thinned(slots, share * (1.0 - new.get("corrupt", 0.0))))
     return [*pieces.values()]

@@ -18,12 +18,14 @@ from typing import final
 from evedrop.errors import UsageError
 from evedrop.results.folder import make_private
 from evedrop.system.files import try_lock
+from evedrop.system.waiting import wait_until
 from evedrop.system.world import world
 
 JOURNAL_FOLDER = "journal"
 """The folder inside a wire's folder that contains its journal."""
 UNFINISHED = "unfinished"
 """The folder inside that one for records that are not yet in a Parquet file."""
+_PATIENCE, _STEP = 1.0, 0.01  # seconds: who reads the folder has it locked for an instant
 
 
 @final
@@ -115,7 +117,7 @@ class JournalPlace:
 def locked(folder: Path) -> int:
     """The descriptor of a folder that this process alone may use until it closes it. Raises UsageError if another one does."""
     descriptor = world().disk.hold(folder)
-    if not try_lock(descriptor):
+    if not wait_until(lambda: try_lock(descriptor), _PATIENCE, _STEP):
         world().disk.let_go(descriptor)
         raise UsageError(f"another wire writes to {folder.parent}; end it, or give another folder")
     return descriptor

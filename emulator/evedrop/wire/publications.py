@@ -140,15 +140,15 @@ class PublicationRelay:
         send_queues: Mapping[str, SendQueue],
         plan: WirePlan,
         journal: WireJournal,
-        tell: Callable[[str], None],
+        fail: Callable[[str], None],
     ) -> None:
-        """links, publishers, send_queues: by the names of links and of sides; tell: for what the user must know."""
+        """links, publishers, send_queues: by the names of links and of sides; fail: is told why messages no longer cross."""
         self._links, self._publishers, self._send_queues = links, publishers, send_queues
         self._plan, self._journal = plan, journal
         links_away = [link for link in plan.links if link.source == side.name]
         self._targets = [name for name in publishers if name in {link.target for link in links_away}]
         self._has_one_target = len({link.target for link in links_away if not link.tap}) == 1
-        self._side, self._name, self._tell = side, side.name, tell
+        self._side, self._name, self._fail = side, side.name, fail
         self.duties: list[Duty] = []
         self.backlogs: list[Backlog] = []
         """The messages of each subscription that wait for the wire."""
@@ -185,7 +185,7 @@ class PublicationRelay:
         try:
             self._take_all(backlog, earlier, duty)
         except Exception as error:  # whatever it is: nothing may silently stop crossing
-            self._tell(f"messages from the side {self._name} no longer cross ({error!r}); end the wire and report this")
+            self._fail(f"messages from the side {self._name} no longer cross ({error!r}); end the wire and report this")
 
     def _take_all(self, backlog: Backlog, earlier: tuple[zenoh.KeyExpr, ...], duty: Duty) -> None:
         take = self._taker()

@@ -145,7 +145,6 @@ class QueryRelay:
         now = (frozenset(services), tuple(state.looped for state in self._states))
         if now == self._services:
             return
-        self._services = now
         keys: dict[str, dict[str, zenoh.KeyExpr]] = {name: {} for name in self._sides}
         for side, key in now[0]:
             keys[side][key] = zenoh.KeyExpr(key)
@@ -168,6 +167,7 @@ class QueryRelay:
                 )
                 with self._lock:
                     mirrored[key] = (wanted[key], queryable)
+        self._services = now  # at the end: what Zenoh refuses is tried again
 
     def _taker(self, name: str, key: str | None, earlier: Sequence[zenoh.KeyExpr] = ()) -> Any:
         """What takes the queries of a queryable, except those of queryables declared `earlier` with these expressions."""

@@ -58,6 +58,8 @@ class WireRelay:
         """What its threads do, once it is open."""
         self.links: Mapping[str, RunningLink] = {link.name: RunningLink(link, plan, journal) for link in plan.links}
         """By their names."""
+        self.failures: list[str] = []
+        """Why messages of a side no longer cross, in sentences: the wire has failed."""
         self._journal, self._tell, self._happened = journal, tell, happened
         self._stack = contextlib.ExitStack()
         self._duty = Duty("in the list of what programs declare")
@@ -95,7 +97,7 @@ class WireRelay:
         self._queries = QueryRelay(self.sides, links, send_queues, plan, journal, self._tell)
         stack.callback(self._queries.close)
         relays = [
-            PublicationRelay(side, links, publishers, send_queues, plan, journal, self._tell)
+            PublicationRelay(side, links, publishers, send_queues, plan, journal, self._fail)
             for side in self.sides.values()
         ]
         for relay in relays:
@@ -124,6 +126,10 @@ class WireRelay:
         stack.callback(self._woken.set)
         stack.callback(self._ended.set)
         stack.callback(departures.close)
+
+    def _fail(self, line: str) -> None:
+        self.failures.append(line)
+        self._tell(line)
 
     def _note_bypass(self, line: str) -> None:
         """Tell a way past the wire, and note it in the journal."""
@@ -159,7 +165,7 @@ class WireRelay:
         self._liveliness.mirror()
 
     def _keep_up(self) -> None:
-        due = 0.0
+        due, told = 0.0, ""
         while not self._ended.is_set():
             self._woken.wait(max(0.0, due - world().monotonic()))
             self._woken.clear()
@@ -169,7 +175,9 @@ class WireRelay:
                     if world().monotonic() >= due:
                         self._neighbours.update()
                         self._bypasses.update()
-                        due = world().monotonic() + _POLL_SECONDS
+                        due, told = world().monotonic() + _POLL_SECONDS, ""
             except Exception as error:  # whatever it is: the next look may succeed
-                if not self._ended.is_set():
-                    self._tell(f"Zenoh does not say what programs declare ({error!r}); trying again")
+                due, line = world().monotonic() + _POLL_SECONDS, f"Zenoh does not say what programs declare ({error!r})"
+                if line != told and not self._ended.is_set():
+                    self._tell(f"{line}; trying again")
+                told = line

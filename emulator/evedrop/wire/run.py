@@ -53,8 +53,8 @@ def run_wire(
     out: its results folder, empty or that of an earlier start; say: for a line about each side and each event, and for the
     summary; complain: for what went wrong, by default as `say`; view: as `live_view` takes it.
 
-    Raises UsageError if the folder, a side or `ZENOH_RUNTIME` cannot be used, and RunError if the folder was removed while the
-    wire ran, or if the machine lacks threads.
+    Raises UsageError if the folder, a side or `ZENOH_RUNTIME` cannot be used, and RunError if the folder was removed or messages
+    of a side ceased to cross while the wire ran, or if the machine lacks threads.
     """
     check_zenoh_runtime()
     _shown(view)
@@ -116,6 +116,8 @@ def run_wire(
     if journal.place.removed is not None:
         raise RunError(_removed(journal.place.removed, out))
     say(f"results: {out}")
+    if relay.failures:
+        raise RunError("; ".join(dict.fromkeys(relay.failures)))
     return status
 
 

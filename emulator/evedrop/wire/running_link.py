@@ -374,16 +374,22 @@ class RunningLink:
         return decide
 
     def _never(self, stream: _Stream) -> Lane:
-        """For messages that are never lost: they take no fates, but they are numbered, and must not go round."""
-        lock, largest, numbers = self._lock, self._largest, self._numbers
+        """For messages that are never lost: they are numbered, and must not go round; the fates of their numbers do not count."""
+        lock, largest, numbers, lossy = self._lock, self._largest, self._numbers, self._fates
         with lock:
-            numbers.setdefault(stream, self._counted(stream))
+            if stream not in lossy:
+                numbers.setdefault(stream, self._counted(stream))
             self._lanes[stream] = self._lanes.get(stream, 0) + 1
 
         def decide(_now: float, size: int) -> Decision:
             with lock:
-                at = numbers[stream]
-                numbers[stream] = at + 1
+                fates = lossy.get(stream)
+                if fates is None:
+                    at = numbers[stream]
+                    numbers[stream] = at + 1
+                else:  # of another history of this key, which shares its numbers
+                    at = fates.n
+                    fates.next()
             if size > largest:
                 return at, _TOO_LARGE, 0.0, False
             return at, _LOOPED if self.looped else 0, 0.0, False

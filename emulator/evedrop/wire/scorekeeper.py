@@ -240,17 +240,17 @@ class WireScorekeeper:
         is like all others. Raises UsageError if a message has two fates, which only a journal on disk that was changed can say.
         """
         changes = self._journal.history.changes_of(link.name, self._journal.key_of(key), Kind(kind).stream)
-        numbers = tuple(sorted(tally.ranges))
-        name = (tuple((change.at, id(change.settings)) for change in changes), numbers, tally.tried)
+        numbers = tuple(tally.ranges)
+        name = (tuple((change.at, id(change.settings)) for change in changes), numbers)
         if name not in shared:
-            ranges = [range(*pair) for pair in numbers]
+            ranges = [range(start, stop) for start, stop, _ in numbers]
             for before, after in pairwise(ranges):
                 if after.start < before.stop:
                     raise UsageError(
                         f"the journal has two fates for message {after.start} of {self._journal.key_of(key)!r} on the link "
                         f"{link.name!r}; a file of it was changed, so give the results folder as the wire wrote it"
                     )
-            shared[name] = KeyDeliveries(link.settings, changes, ranges, tally.tried if tally.scattered else None)
+            shared[name] = KeyDeliveries(link.settings, changes, ranges, [some.counted for some in numbers])
         return shared[name]
 
 

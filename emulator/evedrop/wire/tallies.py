@@ -28,6 +28,16 @@ for _fate in WireFate:
     _TRIED[_fate], _PASSED[_fate] = _fate.decided, _fate.passed
 
 
+class NumberRange(NamedTuple):
+    """Consecutive numbers of messages, of which some count."""
+
+    start: int
+    stop: int
+    """The first number after them."""
+    counted: int
+    """How many of them count."""
+
+
 @final
 @dataclass(slots=True)
 class StreamTally:
@@ -41,19 +51,24 @@ class StreamTally:
     """The most messages in a row that were not delivered."""
     silence: float = 0.0
     """The longest time, in seconds, from a delivered message to the next one, if messages between them were not delivered."""
-    scattered: bool = False
-    """Whether their numbers are too scattered to be kept: then `ranges` is one that contains all of them."""
     _start: int = 0
     _stop: int = 0
-    _earlier: list[tuple[int, int]] | None = None  # most streams have one range, and no need for a list
+    _earlier: list[NumberRange] | None = None  # most streams have one range, and no need for a list
+    _cell: int = 1  # ranges that begin in the same so many numbers are kept as one
     _missing: int = 0
     _since: float | None = None  # when the latest delivered message was heard, or else the first message
 
     @property
-    def ranges(self) -> list[tuple[int, int]]:
-        """The numbers of the messages in `tried`: first, and first after; in no particular order."""
-        latest = [(self._start, self._stop)] if self._stop else []
-        return [*(self._earlier or ()), *latest]
+    def scattered(self) -> bool:
+        """Whether their numbers are too scattered to be kept: then `ranges` contain others as well, and do not overlap."""
+        return self._cell > 1
+
+    @property
+    def ranges(self) -> list[NumberRange]:
+        """The numbers of the messages in `tried`, in ascending order."""
+        latest = [NumberRange(self._start, self._stop, self._stop - self._start)] if self._stop else []
+        ranges = [*(self._earlier or ()), *latest]
+        return _joined(ranges, self._cell) if self.scattered else sorted(ranges)
 
     def add_one(self, time: float, n: int, fate: int, decided: bool) -> None:
         """Add a message, as `add` does: for few messages, which are most of all where keys are many, arrays cost more."""
@@ -106,20 +121,33 @@ class StreamTally:
             self._add_range(start, stop)
 
     def _add_range(self, start: int, stop: int) -> None:
-        if not self._stop:
-            self._start, self._stop = start, stop
-        elif self.scattered:
-            self._start, self._stop = min(start, self._start), max(stop, self._stop)
-        elif start == self._stop:
+        if self._stop and start == self._stop:
             self._stop = stop
-        else:
+            return
+        if self._stop:
             earlier = self._earlier = self._earlier or []
-            earlier.append((self._start, self._stop))
-            self._start, self._stop = start, stop
+            earlier.append(NumberRange(self._start, self._stop, self._stop - self._start))
             if len(earlier) == _MOST_RANGES:
-                self.scattered, self._earlier = True, None
-                self._start = min(start, *(first for first, _ in earlier))
-                self._stop = max(stop, *(last for _, last in earlier))
+                self._earlier = _joined(earlier, self._cell)
+                while len(self._earlier) > _MOST_RANGES // 2:
+                    self._cell *= 2
+                    self._earlier = _joined(earlier, self._cell)
+        self._start, self._stop = start, stop
+
+
+def _joined(ranges: list[NumberRange], cell: int) -> list[NumberRange]:
+    """Ranges in ascending order, as one where they begin in the same `cell` numbers, or overlap.
+
+    Which numbers of a range count is then forgotten; at most `cell` of them do not, so it stays known what settings they met.
+    """
+    made: list[NumberRange] = []
+    for some in sorted(ranges):
+        last = made[-1] if made else None
+        if last is not None and (some.start // cell == last.start // cell or some.start < last.stop):
+            made[-1] = NumberRange(last.start, max(last.stop, some.stop), last.counted + some.counted)
+        else:
+            made.append(some)
+    return made
 
 
 @final

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -194,6 +195,28 @@ def test_a_change_known_late_is_one_known_early(at: int, kind: str, name: str) -
     rest = channel.amended(at, [change])
     parts = [part.codes for part in (before, planned, rest) if part is not None]
     assert np.array_equal(np.concatenate(parts), expected.codes)
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
+def test_changes_that_were_applied_are_not_kept(name: str) -> None:
+    """A link whose settings change for weeks needs no more memory for it, and has the fates of one that knew all changes."""
+    schedule, batch = SCHEDULES[name], Batch(400, 3)
+    losses: list[Mapping[str, Any] | None] = [BURSTS, FULL, None]
+    made = [
+        Change(at, losses[at % 3], [None, True, False][at // 3 % 3]) for at in range(2, 400) if at % 16 not in {3, 4}
+    ]
+    knowing = LinkSchedule(schedule.settings, schedule.window, tuple(made), schedule.outages, schedule.correlation)
+    expected, channel = link(knowing, batch).fates(range(400)), link(schedule, batch)
+    fates = channel.planned(range(16))
+    codes = []
+    for k in range(400):
+        if k and k % 16 == 0:
+            fates = channel.planned(range(k, k + 16))
+        if changes := [change for change in made if change.at == k]:
+            fates = channel.amended(k, changes)
+            assert len(channel._changes) <= 16
+        codes.append(fates.codes[-(16 - k % 16)])
+    assert np.array_equal(np.array(codes), expected.codes)
 
 
 def test_correlation_ties_losses_and_leaves_each_link_alone() -> None:

@@ -238,7 +238,7 @@ class Link:
         self._state, slots = self._before
         if at > slots.start:
             self.fates(range(slots.start, at))
-        earlier = [change for change in self._changes if change.at < at]
+        earlier = [change for change in self._changes if slots.start <= change.at < at]  # the state has those before
         self._changes = sorted([*earlier, *changes], key=lambda change: change.at)
         return self.planned(range(at, slots.stop))
 
