@@ -9,7 +9,7 @@ Source: docs/wire/results.md, the view.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -30,7 +30,7 @@ from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_place import JOURNAL_FOLDER
 from evedrop.wire.on_disk import closing_lines
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.relay import WireRelay
+from evedrop.wire.relay import WireRelay, open_sides
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.steering import WireConductor, WireControl
 from evedrop.wire.watchdog import ANSWER_SECONDS, WORK_SECONDS, Duty, Watchdog, end_at_once
@@ -71,30 +71,34 @@ def run_wire(
         Watchdog(lambda problem: leave(f"the wire no longer answers: {problem}", RunError.exit_status)) as watchdog,
         world().process.stop_or_leave_on_signals(lambda: leave("interrupted again", Interrupted.exit_status)) as stop,
     ):
-        # The journal first: it refuses a folder that another wire uses, whose recording must stay.
-        with WireJournal(out, plan) as journal, live_view(plan, out, view, say) as shown:
-            scorekeeper = WireScorekeeper(plan, journal)
-            if shown is not None:
-                shown.follow(journal)
+        # The journal first: it refuses a folder that another wire uses, whose recording must stay. It begins after all that may
+        # refuse this start: an earlier one then stays the latest.
+        with closing(WireJournal(out, plan)) as journal, ExitStack() as opened:
+            opening = Duty("while the sides were opened", ANSWER_SECONDS)
+            with watchdog.doing(opening):
+                sides = opened.enter_context(open_sides(plan))
+            with live_view(plan, out, view, say) as shown, journal, opened.pop_all() as stack:
+                scorekeeper = WireScorekeeper(plan, journal)
+                if shown is not None:
+                    shown.follow(journal)
 
-            def happened(line: str) -> None:
-                events.append(line)
-                journal.note(line.partition(": ")[2])
-                say(line)
+                def happened(line: str) -> None:
+                    events.append(line)
+                    journal.note(line.partition(": ")[2])
+                    say(line)
 
-            _begin_results(out, plan)
-            if journal.recovered:
-                say(
-                    f"an earlier start was killed or had a full disk: {counted(journal.recovered, 'message')} of it "
-                    "could be recovered, and the numbers go on"
-                )
-            if journal.history.start > 1:
-                say(continuation(journal.history.start, journal.counts))
-            relay = WireRelay(plan, journal, warn, happened)
-            # Before the sides open: it applies what is in force at first.
-            conductor = WireConductor(plan, relay, happened)
-            with ExitStack() as stack:
-                with watchdog.doing(Duty("while the sides were opened", ANSWER_SECONDS)):
+                _begin_results(out, plan)
+                if journal.recovered:
+                    say(
+                        f"an earlier start was killed or had a full disk: {counted(journal.recovered, 'message')} of it "
+                        "could be recovered, and the numbers go on"
+                    )
+                if journal.history.start > 1:
+                    say(continuation(journal.history.start, journal.counts))
+                relay = WireRelay(plan, journal, sides, warn, happened)
+                # Before anything crosses: it applies what is in force at first.
+                conductor = WireConductor(plan, relay, happened)
+                with watchdog.doing(opening):
                     stack.enter_context(relay)
                 for name, endpoints in relay.endpoints.items():
                     say(f"{name} {' '.join(endpoints)}")
@@ -105,8 +109,10 @@ def run_wire(
                 watchdog.hurry()
                 with watchdog.doing(Duty("while the wire was ended", waits=True)):
                     stack.close()
-            with watchdog.doing(Duty("in the journal, while its last files were written", end_seconds=WORK_SECONDS)):
-                journal.close()
+                with watchdog.doing(
+                    Duty("in the journal, while its last files were written", end_seconds=WORK_SECONDS)
+                ):
+                    journal.close()
         status = scorekeeper.finish(out) if out.is_dir() else RunError.exit_status
     summary = scorekeeper.summary()
     for line in closing_lines(summary):
