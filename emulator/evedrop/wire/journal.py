@@ -133,7 +133,7 @@ class WireJournal:
         """The number of records that an earlier start left behind, because it was killed or the disk was full."""
         self.counts: dict[Numbered, int] = dict(self.history.counts)
         """(link, key, kind of stream) → the number of its next message, as of the records handed to the listeners."""
-        self.history.begin(plan, world().time(), self.recovered)
+        self.history.begin(plan, self.place.clock.time(), self.recovered)
         self._began = world().monotonic()  # the recovery of an earlier start does not count
         admits = KeyLimit(plan.links, self.counts, self._tell).admits
         self.words = JournalWords(self.place.unfinished, self.history.start, self.place.miss, admits)
@@ -167,11 +167,11 @@ class WireJournal:
     def change(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int]) -> None:
         """Note other settings of a link. since: (key, kind of stream) → the number of its first message that has them."""
         with self.place.noting_errors():
-            self.history.change(link, settings, since, world().time())
+            self.history.change(link, settings, since, self.place.clock.time())
 
     def note(self, line: str, *, bypass: bool = False) -> None:
         """Note an event that happens now, and tell the listeners. bypass: whether it tells a way past the wire."""
-        now = world().time()
+        now = self.place.clock.time()
         with self.place.noting_errors():
             self.history.note(line, now, bypass)
         self.event_listeners.hear(now, line)
@@ -214,7 +214,7 @@ class WireJournal:
     def _finish(self) -> None:
         try:
             self.records.write_all()
-            self.history.end(self.counts, world().time(), self.completeness)
+            self.history.end(self.counts, self.place.clock.time(), self.completeness)
             world().disk.remove_tree(self.place.unfinished)
         except OSError as error:
             self._tell(
@@ -238,7 +238,7 @@ class WireJournal:
             with self.place.noting_errors():
                 self.history.sync()
             self.place.poll()
-            self.records.tend(world().time())
+            self.records.tend(self.place.clock.time())
 
 
 def recover(journal: Path, history: WireHistory) -> int:

@@ -145,7 +145,7 @@ class WireRelay:
 
     def _leave(self, relays: Sequence[PublicationRelay]) -> None:
         """Limit the time in which messages that wait still cross."""
-        until = world().time() + _LAST_SECONDS
+        until = world().monotonic() + _LAST_SECONDS
         for relay in relays:
             relay.leave(until)
 

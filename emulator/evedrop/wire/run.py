@@ -23,6 +23,7 @@ from evedrop.show.report.wire import wire_failures
 from evedrop.show.view.viewer import Viewer, choose
 from evedrop.system.environment import check_zenoh_runtime
 from evedrop.system.output import warn
+from evedrop.system.waiting import SteadyClock
 from evedrop.system.world import world
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import Numbered
@@ -77,7 +78,7 @@ def run_wire(
             opening = Duty("while the sides were opened", ANSWER_SECONDS)
             with watchdog.doing(opening):
                 sides = opened.enter_context(open_sides(plan))
-            with live_view(plan, out, view, say) as shown, journal, opened.pop_all() as stack:
+            with live_view(plan, out, view, say, journal.place.clock) as shown, journal, opened.pop_all() as stack:
                 scorekeeper = WireScorekeeper(plan, journal)
                 if shown is not None:
                     shown.follow(journal)
@@ -181,11 +182,13 @@ def _shown(mode: str) -> str:
 
 
 @contextmanager
-def live_view(plan: WirePlan, out: Path, mode: str, say: Callable[[str], None]) -> Iterator[WireView | None]:
+def live_view(
+    plan: WirePlan, out: Path, mode: str, say: Callable[[str], None], clock: SteadyClock
+) -> Iterator[WireView | None]:
     """A view of a wire that starts now, for the time of a `with` block; None for "off".
 
     mode: as `evedrop run --view`, or the name of a file that ends in .rrd: the recording is written there, and nothing is shown.
-    out: the wire's folder. say: for the line with the address of the page.
+    out: the wire's folder. say: for the line with the address of the page. clock: that of the wire's journal.
 
     Raises UsageError for any other mode, and if a viewer cannot be started.
     """
@@ -202,7 +205,7 @@ def live_view(plan: WirePlan, out: Path, mode: str, say: Callable[[str], None]) 
             say(f"the wire is shown to anybody who has this address:\n{viewer.address}")
         if viewer is not None and viewer.warning is not None:
             warn(viewer.warning)
-        view = WireView(path, plan, out.resolve().name, world().time())
+        view = WireView(path, plan, out.resolve().name, clock.time(), clock=clock.time)
         try:
             yield view
         finally:
