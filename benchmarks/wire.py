@@ -37,7 +37,7 @@ from evedrop.wire.deliveries import KeyDeliveries, bounds
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.records import Records, WireFate
-from evedrop.wire.relay import WireRelay
+from evedrop.wire.relay import WireRelay, open_sides
 from evedrop.wire.side import SideSession
 
 _ANYWHERE = ("tcp/127.0.0.1:0",)
@@ -94,7 +94,8 @@ def a_wire(*links: tuple[str, Mapping[str, Any]]) -> Iterator[MeasuredWire]:
     with (
         tempfile.TemporaryDirectory() as folder,
         WireJournal(Path(folder), plan) as journal,
-        WireRelay(plan, journal) as relay,
+        open_sides(plan) as sides,
+        WireRelay(plan, journal, sides) as relay,
     ):
         yield MeasuredWire(relay, journal)
 

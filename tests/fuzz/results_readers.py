@@ -148,7 +148,7 @@ def _killed_wire() -> dict[str, bytes]:
     """The files of a wire that was killed in its second start, by their paths."""
     with TemporaryDirectory() as name:
         for start in range(2):
-            journal = WireJournal(Path(name), wire_plan(), part_rows=8)
+            journal = WireJournal(Path(name), wire_plan(), part_rows=8).begin()
             for n in range(8 * start, 8 * start + 12):
                 key, source = journal.words.key_code(f"scan/{n % 2}"), journal.words.source_code("gid")
                 journal.records.record(1e9 + n, n // 2, n, 0.25, key, source, 64, 0, 0, n % 3)

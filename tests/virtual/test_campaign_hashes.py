@@ -11,7 +11,7 @@ import pytest
 
 from tests.virtual.simulated import played
 
-HASH = "bf6775026deead97"
+HASH = "df90534fb9d75b93"
 """Of the seeds 1 to 30."""
 _PLAY = """
 from evedrop.results.reading import Results

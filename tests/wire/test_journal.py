@@ -165,7 +165,7 @@ def test_records_without_a_history_are_not_written_over(tmp_path: Path) -> None:
     with pytest.raises(
         UsageError, match="has records of start 1, but its history lacks that start; give another folder"
     ):
-        WireJournal(tmp_path, wire_plan())
+        WireJournal(tmp_path, wire_plan()).begin()
     assert rows_of(tmp_path) == before
 
 
@@ -333,7 +333,7 @@ def test_a_record_whose_beginning_was_lost_is_not_read(tmp_path: Path) -> None:
 
 def test_the_settings_that_each_message_had_are_known_after_a_restart(tmp_path: Path) -> None:
     """Changes by events and the operator, and those of the file between two starts, for old and new keys."""
-    first = WireJournal(tmp_path, wire_plan())
+    first = WireJournal(tmp_path, wire_plan()).begin()
     for n in range(10):
         put(first, n)
     first.change("scan", BETTER, {("scan/1", "put"): 6})
@@ -390,7 +390,7 @@ recorded = np.frombuffer(mmap.mmap(-1, 8), np.int64)  # struct.pack_into clears 
 
 
 def write(first):
-    journal = WireJournal(folder, wire_plan(), part_rows=3000)
+    journal = WireJournal(folder, wire_plan(), part_rows=3000).begin()
     assert journal.counts.get(("scan", "scan/1", "put"), 0) >= first
     n = first = journal.counts.get(("scan", "scan/1", "put"), 0)
     key = journal.words.key_code("scan/1")
@@ -517,7 +517,7 @@ def test_a_journal_is_read_whole_whatever_its_wire_does_meanwhile(
     place: str, happens: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A new key has its name, and no part is lost or refused."""
-    journals = [WireJournal(tmp_path, wire_plan(), part_rows=100)]
+    journals = [WireJournal(tmp_path, wire_plan(), part_rows=100).begin()]
     put(journals[0], 0)
 
     def meanwhile() -> None:
@@ -525,7 +525,7 @@ def test_a_journal_is_read_whole_whatever_its_wire_does_meanwhile(
         if happens != "a new key":
             journals[-1].close()
         if happens == "the next start":
-            journals.append(WireJournal(tmp_path, wire_plan(), part_rows=100))
+            journals.append(WireJournal(tmp_path, wire_plan(), part_rows=100).begin())
         if happens != "the end":
             put(journals[-1], 0, key="scan/2")
 

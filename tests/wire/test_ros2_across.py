@@ -16,7 +16,7 @@ from evedrop.wire.file import load_wire
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.plan import Side, WireLink, WirePlan
-from evedrop.wire.relay import WireRelay
+from evedrop.wire.relay import WireRelay, open_sides
 from tests.conftest import LIMIT, wait_until
 from tests.wire.rmw import Node, ReceivedMessage, ros_context
 from tests.wire.wire_links import key_fates
@@ -57,7 +57,8 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Field]:
     folder = tmp_path_factory.mktemp("wire")
     with (
         WireJournal(folder, PLAN) as journal,
-        WireRelay(PLAN, journal) as relay,
+        open_sides(PLAN) as sides,
+        WireRelay(PLAN, journal, sides) as relay,
         ros_context(relay.endpoints["robot"][0]) as robot,
         ros_context(relay.endpoints["base"][0]) as base,
     ):
@@ -175,7 +176,8 @@ def test_what_a_link_loses_of_a_reliable_topic_that_is_kept_is_fetched_again(tmp
     plan = load_wire(tmp_path / "wire.toml")
     with (
         WireJournal(tmp_path, plan) as journal,
-        WireRelay(plan, journal) as relay,
+        open_sides(plan) as sides,
+        WireRelay(plan, journal, sides) as relay,
         ros_context(relay.endpoints["robot"][0]) as robot,
         ros_context(relay.endpoints["base"][0]) as base,
     ):

@@ -25,7 +25,7 @@ class Queue:
 
     def __init__(self, folder: Path, **limits: Any) -> None:
         plan = both_ways(held_messages=limits.pop("held_messages", 100))
-        self.folder, self.journal = folder, WireJournal(folder, plan)
+        self.folder, self.journal = folder, WireJournal(folder, plan).begin()
         self.told: list[str] = []
         self.sent: list[int] = []
         self.lost: list[int] = []

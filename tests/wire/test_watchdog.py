@@ -190,7 +190,7 @@ def test_a_second_signal_ends_a_wire_at_once(how: str, tmp_path: Path) -> None:
         if how == "an_end":
             put_until_heard(wire, wire.endpoints(), "scan")
         else:
-            wait_until((wire.out / "wire.toml").is_file, "it opens its sides")
+            wait_until((wire.out / "journal" / "unfinished").is_dir, "it opens its sides")
         wait_until(lambda: wire.signal(signal.SIGTERM), "it ends")
         status, errors = wire.ended()
     assert status == Interrupted.exit_status

@@ -7,11 +7,13 @@ import fcntl
 import json
 import os
 import shutil
+import socket
 import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import pyarrow as pa
 import pytest
@@ -19,6 +21,7 @@ import pytest
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WIRE_FILE
+from evedrop.show.view.viewer import Viewer
 from evedrop.system.files import is_locked
 from evedrop.system.world import world
 from evedrop.wire import journal as journal_module
@@ -27,6 +30,7 @@ from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import WireJournal, recover
 from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.on_disk import summary_of_wire
+from evedrop.wire.plan import Side
 from evedrop.wire.records import HELD, Kind, WireFate
 from evedrop.wire.run import _begin_results, run_wire
 from tests.pages import checked
@@ -118,6 +122,42 @@ def test_the_summary_of_an_earlier_start_does_not_outlive_it(tmp_path: Path) -> 
     assert there[0] is False
     assert there[-1] is True
     assert json.loads((out / "summary.json").read_text())["start"] == 2
+
+
+@pytest.mark.parametrize("earlier", ["ended", "killed"])
+@pytest.mark.parametrize("lacks", ["a port", "a viewer"])
+def test_a_start_that_cannot_begin_leaves_the_folder_as_it_was(
+    earlier: str, lacks: str, folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The report is about the latest start that ran: it has its summary, or was killed as before."""
+    plan, out = both_ways(LOSSY), folders["killed"]
+    if earlier == "ended":
+        out = tmp_path / "ended"
+        assert run_wire(plan, out, seconds=0.01, say=lambda _: None) == 0
+    (out / "recording.rrd").write_bytes(b"of the start before")
+    before = contents(out)
+
+    def start(*_: object) -> NoReturn:
+        raise UsageError("no viewer")
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        if lacks == "a port":
+            taken = Side("base", (f"tcp/127.0.0.1:{server.getsockname()[1]}",))
+            plan = both_ways(LOSSY, sides={"base": taken})
+        else:
+            monkeypatch.setattr(Viewer, "start", start)
+        with pytest.raises(UsageError, match="side base cannot listen" if lacks == "a port" else "no viewer"):
+            run_wire(plan, out, seconds=0.01, say=lambda _: None, view=str(out / "recording.rrd"))
+    assert contents(out) == before
+    summary = summary_of_wire(out)
+    assert (summary.state, summary.start) == (earlier, 1 if earlier == "ended" else 2)
+    assert run_wire(both_ways(LOSSY), out, seconds=0.01, say=lambda _: None) == 0
+    assert summary_of_wire(out).start == summary.start + 1
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The files of a folder, by their paths."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_a_wire_that_heard_nothing_has_lasted_until_it_was_last_alive(tmp_path: Path) -> None:

@@ -20,11 +20,10 @@ import zenoh
 from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest
-from evedrop.wire.journal import WireJournal
 from evedrop.wire.on_disk import scorekeeper_on_disk
 from evedrop.wire.publications import publish
 from evedrop.wire.records import WireFate
-from evedrop.wire.relay import WireRelay
+from evedrop.wire.relay import open_sides
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.send_queue import SendQueue
 from evedrop.wire.side import ZenohConfig, side_config
@@ -269,7 +268,6 @@ def test_the_users_own_runtime_of_zenoh_is_kept(
     monkeypatch.setenv("ZENOH_RUNTIME", given or "")
     if given is None:
         monkeypatch.delenv("ZENOH_RUNTIME")
-    plan = plan_of(link("robot", "base"))
-    with WireJournal(tmp_path, plan) as journal:
-        WireRelay(plan, journal)
+    with open_sides(plan_of(link("robot", "base"))):
+        pass
     assert os.environ["ZENOH_RUNTIME"] == used

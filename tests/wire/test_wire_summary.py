@@ -582,7 +582,7 @@ def test_the_summary_of_an_earlier_start_is_not_that_of_a_wire_that_was_killed(t
     plan = wire_plan(radio=BURSTS)
     run(tmp_path, plan)
     (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
-    journal = WireJournal(tmp_path, plan)
+    journal = WireJournal(tmp_path, plan).begin()
     assert (summary_of_wire(tmp_path).start, summary_of_wire(tmp_path).state) == (2, "running")
     journal.close()
     (tmp_path / "journal" / "history.jsonl").write_text("{\n")

@@ -17,11 +17,13 @@ from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WireSummary
 from evedrop.show.view import recording
+from evedrop.system.waiting import SteadyClock
+from evedrop.system.world import world
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.panels import Pace
 from evedrop.wire.plan import WireEvent
 from evedrop.wire.recording import WireView, replay_wire
-from evedrop.wire.records import WireFate
+from evedrop.wire.records import Kind, WireFate
 from evedrop.wire.run import live_view, run_wire
 from evedrop.wire.time_steps import LaneState
 from tests.conftest import LIMIT, wait_until
@@ -34,15 +36,15 @@ class Text(str):
     """A text to which there can be a weak reference."""
 
 
-class Clocks:
-    """The system's clock and a steady clock, as a test sets them."""
+class Clock:
+    """The clock of a wire, as a test sets it."""
 
     def __init__(self) -> None:
-        self._now = (START, 77.0)
+        self._now = START
         self._calls = 0
 
-    def __call__(self) -> tuple[float, float]:
-        """What both show."""
+    def __call__(self) -> float:
+        """The time that it shows."""
         self._calls += 1
         return self._now
 
@@ -52,15 +54,11 @@ class Clocks:
         After the second look it has all messages from before, and it has shown the time of the first.
         """
         last = self._calls + count
-        wait_until(lambda: self._calls >= last, "the thread looks at the clocks")
+        wait_until(lambda: self._calls >= last, "the thread looks at the clock")
 
     def advance(self, by: float) -> None:
         """Let the time go on."""
-        self._now = (self._now[0] + by, self._now[1] + by)
-
-    def set(self, by: float) -> None:
-        """Set the system's clock."""
-        self._now = (self._now[0] + by, self._now[1])
+        self._now += by
 
 
 def states(rrd: Path, lane: str, step: float, steps: int) -> list[str]:
@@ -88,12 +86,12 @@ def unhurried() -> Any:
 @pytest.fixture(scope="module")
 def rrd(rows: NDArray[Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Their recording, as made while the wire ran."""
-    path, clocks = tmp_path_factory.mktemp("wire_view") / "recording.rrd", Clocks()
-    view = WireView(path, robot_plan(), "wire", START, Pace(0.2, SECONDS, True), clocks)
+    path, clock = tmp_path_factory.mktemp("wire_view") / "recording.rrd", Clock()
+    view = WireView(path, robot_plan(), "wire", START, Pace(0.2, SECONDS, True), clock)
     view.note(START + 6.0, "WARN", "a note")
     for block in np.array_split(rows, 30):
         view.add(block)
-    clocks.advance(SECONDS)
+    clock.advance(SECONDS)
     assert view.close()
     assert view.failure is None
     return path
@@ -161,13 +159,13 @@ def test_events_tell_of_stretches_and_notes(rrd: Path) -> None:
 
 def test_time_goes_on_without_messages(tmp_path: Path) -> None:
     """A live view shows a silence as it lasts, and no rate from before it."""
-    clocks = Clocks()
-    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
+    clock = Clock()
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clock)
     view.add(traffic(robot_plan(), 2.0, RATES))
-    clocks.advance(2.0)
+    clock.advance(2.0)
     for _ in range(6):
-        clocks.advance(1.0)
-        clocks.wait_for_rounds(1)
+        clock.advance(1.0)
+        clock.wait_for_rounds(1)
     assert view.close()
     rates = shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")
     assert rates[-1][0] > 6.0
@@ -177,57 +175,44 @@ def test_time_goes_on_without_messages(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("by", [3600.0, -3600.0])
-def test_a_clock_that_is_set_does_not_stop_the_view(by: float, tmp_path: Path) -> None:
-    """The view goes on as if the clock had not been set, and a line says so."""
-    clocks = Clocks()
-    rows = traffic(robot_plan(), 4.0, RATES)
-    before, after = rows[rows["time"] < START + 2.0], rows[rows["time"] >= START + 2.0]
-    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
-    view.add(before)
-    clocks.advance(2.0)
-    clocks.wait_for_rounds(2)
-    clocks.set(by)
-    clocks.wait_for_rounds(1)
-    after["time"] += by
-    view.add(after)
-    clocks.advance(2.0)
+def test_a_clock_that_is_set_does_not_stop_the_view(by: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The system's clock is set after 2 of 4 seconds: the view goes on as if it had not been."""
+    passed, set_by, shown_time = [0.0], [0.0], Clock()
+    monkeypatch.setattr(world(), "monotonic", lambda: passed[0])
+    monkeypatch.setattr(world(), "time", lambda: START + passed[0] + set_by[0])
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, clock=shown_time)
+    with WireJournal(tmp_path, robot_plan()) as journal:
+        view.follow(journal)
+        key = journal.words.key_code("scan")
+        for n in range(400):
+            at = journal.place.clock.time()
+            journal.records.record(at, n, -1, 0.0, key, 0, 1, 0, Kind.PUT, WireFate.DELIVERED)
+            passed[0] = (n + 1) / 100
+            set_by[0] = by if n >= 200 else 0.0
+        journal.note("an event")
+    shown_time.advance(4.0)
     assert view.close()
     rates = shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")
     assert abs(rates[-1][0] - 4.0) < 0.3
-    assert all(rate[3] == pytest.approx(100.0) for _, rate in rates)
-    way = "forward" if by > 0 else "back"
-    assert [text for _, text in texts(tmp_path / "r.rrd")][1:] == [
-        f"the system's clock was set 3600.0 s {way}; the view goes on"
-    ]
-
-
-def test_rows_from_before_the_clock_was_set_back_are_not_in_the_future(tmp_path: Path) -> None:
-    """They count for the present step: the window does not move to a time that has not come."""
-    clocks = Clocks()
-    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
-    clocks.advance(2.0)
-    clocks.set(-3600.0)
-    clocks.wait_for_rounds(1)
-    view.add(traffic(robot_plan(), 2.0, RATES))
-    assert view.close()
-    assert shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")[-1][0] < 3.0
+    assert all(rate[3] == pytest.approx(100.0, abs=4.0) for _, rate in rates)
+    assert [(round(seconds, 6), text) for seconds, text in texts(tmp_path / "r.rrd")][1:] == [(4.0, "an event")]
 
 
 @pytest.mark.parametrize("pause", [0.0, 100.0])
 def test_the_graph_of_a_running_wire_forgets_what_is_old(pause: float, tmp_path: Path) -> None:
     """It shows the losses in its window of time, also after a silence; the table counts from the start."""
-    clocks, path = Clocks(), tmp_path / "r.rrd"
+    clock, path = Clock(), tmp_path / "r.rrd"
     rows = traffic(robot_plan(), 6.0, {"scan": 100.0})
     early, late = rows[:300], rows[300:]
     early["fate"], late["fate"] = WireFate.LOST, WireFate.DELIVERED
     late["time"] += pause
     if pause:  # so that only the silence is longer than the window
         late = late[:50]
-    view = WireView(path, robot_plan(), "wire", START, Pace(0.2, 2.0), clocks)
+    view = WireView(path, robot_plan(), "wire", START, Pace(0.2, 2.0), clock)
     for part in (early, late):
         view.add(part)
-        clocks.advance(float(part["time"][-1]) - clocks()[0] + 0.01)
-        clocks.wait_for_rounds(2)
+        clock.advance(float(part["time"][-1]) - clock() + 0.01)
+        clock.wait_for_rounds(2)
     assert view.close()
     assert shown(path, "graph", "GraphNodes:labels")[-1][1][3] == "scan: 0 % lost"
     assert "300 lost" in shown(path, "table", "TextDocument:text")[-1][1][0]
@@ -251,13 +236,13 @@ def test_a_view_that_is_far_behind_gives_up(tmp_path: Path, rows: NDArray[Any]) 
     """Instead of taking ever more memory, or holding up the wire."""
     looking, going_on = threading.Event(), threading.Event()
 
-    def clocks() -> tuple[float, float]:
+    def clock() -> float:
         if threading.current_thread() is not threading.main_thread():
             looking.set()
             assert going_on.wait(LIMIT)
-        return START, 77.0
+        return START
 
-    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks, most_rows=5000)
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clock, most_rows=5000)
     assert looking.wait(LIMIT)  # the thread stands still
     blocks = [rows.copy() for _ in range(10)]
     kept = [weakref.ref(block) for block in blocks]
@@ -271,9 +256,9 @@ def test_a_view_that_is_far_behind_gives_up(tmp_path: Path, rows: NDArray[Any]) 
 
 def test_amended_fates_are_in_the_table(tmp_path: Path) -> None:
     """A message that was still delayed when the wire ended is not shown as delivered."""
-    clocks, rows = Clocks(), traffic(robot_plan(), 1.0, {"scan": 100.0})
-    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
-    clocks.advance(1.0)
+    clock, rows = Clock(), traffic(robot_plan(), 1.0, {"scan": 100.0})
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clock)
+    clock.advance(1.0)
     view.add(rows)
     for row in np.flatnonzero(rows["fate"] == 0)[-5:]:
         view.amend(rows[row : row + 1], WireFate.UNDERWAY)
@@ -282,34 +267,13 @@ def test_amended_fates_are_in_the_table(tmp_path: Path) -> None:
     assert "5 underway" in table
 
 
-@pytest.mark.parametrize("by", [3600.0, -3600.0])
-def test_fates_that_change_after_the_clock_was_set_are_in_their_steps(by: float, tmp_path: Path) -> None:
-    """And not in a time that has not come, nor in one that is over."""
-    clocks, rows = Clocks(), traffic(robot_plan(), 2.0, {"scan": 100.0})
-    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
-    clocks.advance(2.0)
-    clocks.set(by)
-    clocks.wait_for_rounds(1)
-    rows["time"] += by
+def test_fates_that_change_are_in_their_steps(tmp_path: Path) -> None:
+    """In those of their messages, although these were counted before."""
+    clock, rows = Clock(), traffic(robot_plan(), 2.0, {"scan": 100.0})
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clock)
     view.add(rows)
-    late = rows[(rows["fate"] == 0) & (rows["time"] >= START + by + 1.8)]
-    view.amend(late, WireFate.CONGESTED)
-    assert view.close()
-    assert shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")[-1][0] < 3.0
-    assert states(tmp_path / "r.rrd", "1_scan", 0.2, 10)[-1] == LaneState.OWN.word
-
-
-@pytest.mark.parametrize("by", [3600.0, -3600.0])
-def test_fates_of_messages_from_before_the_clock_was_set_are_in_their_steps(by: float, tmp_path: Path) -> None:
-    """They have the time of the clock as it was."""
-    clocks, rows = Clocks(), traffic(robot_plan(), 2.0, {"scan": 100.0})
-    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
-    view.add(rows)
-    clocks.advance(2.0)
-    clocks.wait_for_rounds(2)
-    clocks.set(by)
-    clocks.advance(0.1)
-    clocks.wait_for_rounds(1)
+    clock.advance(2.0)
+    clock.wait_for_rounds(2)
     view.amend(rows[(rows["fate"] == 0) & (rows["time"] >= START + 1.8)], WireFate.CONGESTED)
     assert view.close()
     assert shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")[-1][0] < 2.1
@@ -347,9 +311,12 @@ def test_a_view_follows_a_running_wire(tmp_path: Path, capfd: pytest.CaptureFixt
 
 def test_a_word_that_is_not_a_view_is_refused(tmp_path: Path) -> None:
     """Before the wire starts."""
-    with pytest.raises(UsageError, match="is not a way to view"), live_view(robot_plan(), tmp_path, "pdf", print):
+    with (
+        pytest.raises(UsageError, match="is not a way to view"),
+        live_view(robot_plan(), tmp_path, "pdf", print, SteadyClock()),
+    ):
         pass
-    with live_view(robot_plan(), tmp_path, "off", print) as view:
+    with live_view(robot_plan(), tmp_path, "off", print, SteadyClock()) as view:
         assert view is None
     assert not [*tmp_path.iterdir()]
 

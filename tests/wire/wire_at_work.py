@@ -15,7 +15,7 @@ import zenoh
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.records import RECORD, Records, WireFate
-from evedrop.wire.relay import WireRelay
+from evedrop.wire.relay import WireRelay, open_sides
 from tests.conftest import LIMIT, wait_until
 
 PERFECT: Mapping[str, Any] = {"loss": {"model": "bernoulli", "quality": 1.0}}
@@ -90,10 +90,10 @@ def at_work(plan: WirePlan, folder: Path) -> Iterator[WireAtWork]:
     """A wire that runs in this process."""
     told: list[str] = []
     rows: list[Records] = []
-    with WireJournal(folder, plan, tell=told.append) as journal:
+    with WireJournal(folder, plan, tell=told.append) as journal, open_sides(plan) as sides:
         journal.listeners.append(lambda block: rows.append(block.copy()))
         happened: list[str] = []
-        with WireRelay(plan, journal, told.append, happened.append) as relay:
+        with WireRelay(plan, journal, sides, told.append, happened.append) as relay:
             yield WireAtWork(relay, journal, told, happened, rows)
 
 

@@ -88,3 +88,17 @@ class SystemClock:
 
 
 SYSTEM_CLOCK: Clock = SystemClock()
+
+
+@final
+class SteadyClock:
+    """Seconds since 1970 by a clock that goes on evenly when the system's clock is set."""
+
+    def __init__(self) -> None:
+        """Agree with the system's clock now."""
+        self.ahead = world().time() - world().monotonic()
+        """What it adds to the monotonic clock."""
+
+    def time(self) -> float:
+        """The time now."""
+        return self.ahead + world().monotonic()

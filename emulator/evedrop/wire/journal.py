@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Generic, ParamSpec, final
+from typing import Any, Generic, ParamSpec, Self, final
 
 import numpy as np
 import pyarrow as pa
@@ -26,6 +26,7 @@ import pyarrow.parquet as pq
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import JournalState, JournalSummary
 from evedrop.system.output import warn
+from evedrop.system.threads import Thread
 from evedrop.system.waiting import wait_for_thread
 from evedrop.system.world import world
 from evedrop.wire.history import Numbered, WireHistory, highest
@@ -76,7 +77,7 @@ class WireJournal:
     def __init__(
         self, folder: Path, plan: WirePlan, *, tell: Callable[[str], None] = warn, part_rows: int = PART_ROWS
     ) -> None:
-        """Recover the records of an earlier start, and begin. folder: the wire's; tell: for what the user must know.
+        """Lock the folder, and read what earlier starts left. folder: the wire's; tell: for what the user must know.
 
         Raises UsageError if another wire uses the folder, if it was made with another seed, or if it cannot be written.
         """
@@ -93,29 +94,46 @@ class WireJournal:
         self._handing = world().rlock()  # so that listeners get blocks in order
         self._ended = world().event()
         self._stopped = math.inf
-        try:
+        self._plan, self._part_rows = plan, part_rows
+        self._thread: Thread | None = None
+        with self._opening() as stack:
             self.place = JournalPlace(folder / JOURNAL_FOLDER, tell)
-            try:
-                self._begin(plan, part_rows)
-            except BaseException:
-                self.place.close()
-                raise
-        except OSError as error:
-            raise UsageError(
-                f"{folder} cannot be written ({error.strerror}); make room, or give another folder"
-            ) from error
+            stack.callback(self.close)
+            self.history = WireHistory.read(self.place.folder)
+            self.history.expect_settings()
+            self.history.expect_seed(plan)
+            stack.pop_all()
+
+    def begin(self) -> Self:
+        """Recover the records of an earlier start, and begin the next one. Before it, this start has changed nothing.
+
+        Raises UsageError if the folder is damaged or cannot be written; then the journal is closed.
+        """
+        with self._opening() as stack:
+            stack.callback(self.close)
+            self._begin(self._plan, self._part_rows)
+            stack.pop_all()
         self._thread = world().thread(self._tend, name="journal")
         self._thread.start()
+        return self
+
+    @contextlib.contextmanager
+    def _opening(self) -> Iterator[contextlib.ExitStack]:
+        """A stack for what is undone after an error."""
+        try:
+            with contextlib.ExitStack() as stack:
+                yield stack
+        except OSError as error:
+            raise UsageError(
+                f"{self.folder} cannot be written ({error.strerror}); make room, or give another folder"
+            ) from error
 
     def _begin(self, plan: WirePlan, part_rows: int) -> None:
-        self.history = WireHistory.read(self.place.folder)
-        self.history.expect_settings()
-        self.history.expect_seed(plan)  # before the recovery: a start that is refused changes nothing
         self.recovered = recover(self.place.folder, self.history)
         """The number of records that an earlier start left behind, because it was killed or the disk was full."""
         self.counts: dict[Numbered, int] = dict(self.history.counts)
         """(link, key, kind of stream) → the number of its next message, as of the records handed to the listeners."""
-        self.history.begin(plan, world().time(), self.recovered)
+        self.history.begin(plan, self.place.clock.time(), self.recovered)
         self._began = world().monotonic()  # the recovery of an earlier start does not count
         admits = KeyLimit(plan.links, self.counts, self._tell).admits
         self.words = JournalWords(self.place.unfinished, self.history.start, self.place.miss, admits)
@@ -149,11 +167,11 @@ class WireJournal:
     def change(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int]) -> None:
         """Note other settings of a link. since: (key, kind of stream) → the number of its first message that has them."""
         with self.place.noting_errors():
-            self.history.change(link, settings, since, world().time())
+            self.history.change(link, settings, since, self.place.clock.time())
 
     def note(self, line: str, *, bypass: bool = False) -> None:
         """Note an event that happens now, and tell the listeners. bypass: whether it tells a way past the wire."""
-        now = world().time()
+        now = self.place.clock.time()
         with self.place.noting_errors():
             self.history.note(line, now, bypass)
         self.event_listeners.hear(now, line)
@@ -177,7 +195,12 @@ class WireJournal:
         if self._ended.is_set():
             return
         self._ended.set()
-        wait_for_thread(self._thread)
+        if self._thread is not None:
+            self._end(self._thread)
+        self.place.close()
+
+    def _end(self, thread: Thread) -> None:
+        wait_for_thread(thread)
         self._stopped = world().monotonic()
         self.records.end()
         self.flush()
@@ -187,12 +210,11 @@ class WireJournal:
         else:
             self._finish()
         self.words.close()
-        self.place.close()
 
     def _finish(self) -> None:
         try:
             self.records.write_all()
-            self.history.end(self.counts, world().time(), self.completeness)
+            self.history.end(self.counts, self.place.clock.time(), self.completeness)
             world().disk.remove_tree(self.place.unfinished)
         except OSError as error:
             self._tell(
@@ -201,8 +223,8 @@ class WireJournal:
                 "files"
             )
 
-    def __enter__(self) -> WireJournal:
-        return self
+    def __enter__(self) -> Self:
+        return self.begin()
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -216,7 +238,7 @@ class WireJournal:
             with self.place.noting_errors():
                 self.history.sync()
             self.place.poll()
-            self.records.tend(world().time())
+            self.records.tend(self.place.clock.time())
 
 
 def recover(journal: Path, history: WireHistory) -> int:

@@ -18,7 +18,7 @@ from typing import final
 from evedrop.errors import UsageError
 from evedrop.results.folder import make_private
 from evedrop.system.files import try_lock
-from evedrop.system.waiting import wait_until
+from evedrop.system.waiting import SteadyClock, wait_until
 from evedrop.system.world import world
 
 JOURNAL_FOLDER = "journal"
@@ -38,6 +38,8 @@ class JournalPlace:
         Raises UsageError if another wire uses the folder, and OSError if it cannot be written.
         """
         self._tell = tell
+        self.clock = SteadyClock()
+        """The clock of all times in the journal of this start."""
         self.folder = journal
         """The journal's folder."""
         self.incomplete_since: float | None = None
@@ -61,7 +63,7 @@ class JournalPlace:
         """Note that the wire is alive now. Raises OSError."""
         assert self._alive is not None  # noqa: S101 - it has begun
         self._alive.seek(0)
-        self._alive.write(struct.pack("<d", world().time()))
+        self._alive.write(struct.pack("<d", self.clock.time()))
 
     def poll(self) -> None:
         """Check whether the folder is still there, and report at once if it is not."""
@@ -70,7 +72,7 @@ class JournalPlace:
                 return
             self.removed = self._lost()
             if self.removed is not None:
-                self.incomplete_since = self.incomplete_since or world().time()
+                self.incomplete_since = self.incomplete_since or self.clock.time()
                 self._tell(
                     f"{self.removed} was removed or moved while the wire runs, so the wire no longer has a journal; it goes on; "
                     "end it, and start it again"
@@ -81,7 +83,7 @@ class JournalPlace:
         with self._telling:
             self.poll()
             if self.incomplete_since is None:
-                self.incomplete_since = world().time()
+                self.incomplete_since = self.clock.time()
                 at = time.strftime("%H:%M:%S", time.localtime(self.incomplete_since))
                 self._tell(
                     f"the journal is incomplete from {at} on, because {self.folder} cannot be written ({error.strerror}); the "

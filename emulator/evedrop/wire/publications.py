@@ -170,7 +170,7 @@ class PublicationRelay:
             thread.start()
 
     def leave(self, until: float) -> None:
-        """Let messages that wait after a time, in seconds since 1970, be underway: to take them all may last too long."""
+        """Let messages that wait after a time of the monotonic clock be underway: to take them all may last too long."""
         self._until = until
 
     def close(self) -> None:
@@ -199,7 +199,7 @@ class PublicationRelay:
     def _taker(self) -> Callable[[zenoh.Sample], None]:
         """The function that is called for every message: it looks up as little as possible."""
         ways_of: dict[str, _Ways] = {}
-        now, clock, way_to = world().time, world().monotonic, self._way_to
+        ahead, clock, way_to = self._journal.place.clock.ahead, world().monotonic, self._way_to
         records = self._journal.records
         record, amend, sent = records.record, records.amend, records.sent
         read = SenderReader(self._journal.words.source_code)
@@ -208,7 +208,7 @@ class PublicationRelay:
         refused = WireFate.REFUSED
 
         def take(sample: zenoh.Sample) -> None:
-            heard, since = now(), clock()
+            since = clock()
             key = str(sample.key_expr)
             ready = ways_of.get(key)
             ways, code = way_to(ways_of, key, sample.key_expr) if ready is None else ready
@@ -223,16 +223,16 @@ class PublicationRelay:
             is_put = sample.kind == put
             kind = put_kind if is_put else delete_kind
             if not ways:
-                record(heard, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, unlinked)
+                record(ahead + since, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, unlinked)
             for way in ways:
                 way.used = ready is not None
                 n, fate, delay, again = way.decide(since, size)
-                if heard > self._until and not fate:
+                if since > self._until and not fate:
                     fate, delay, again = underway, 0.0, False
                 send_queue = way.send_queue
                 at_once = not delay and way.order is None and send_queue.is_free and (way.alone or way.drops(sample))
                 row = record(
-                    heard,
+                    ahead + since,
                     n,
                     sequence,
                     delay,
@@ -278,7 +278,7 @@ class PublicationRelay:
         code = self._journal.words.key_code(key, self._name)
         taken = [self._plan.link_of(self._name, target, expression) for target in self._targets]
         states = [self._links[link.name] for link in taken if link is not None]
-        ended = world().time() > self._until
+        ended = world().monotonic() > self._until
         if code and not ended:
             lossless = self._plan.is_lossless(expression)
             decisions = [state.lane("put", key, lossless) for state in states]

@@ -34,25 +34,17 @@ _MOST_WAITING = 100_000
 _ROUTING = 0  # the identifier of Zenoh's routing, which no queryable has
 
 
-_Times = tuple[float, float]
-"""The same moment in seconds since 1970, and in seconds of the monotonic clock."""
-
-
-def _now() -> _Times:
-    return world().time(), world().monotonic()
-
-
 @final
 class _Asked:
     """A query that was heard, until all its replies have arrived: then the asker is told that there are no more."""
 
     def __init__(
-        self, query: zenoh.Query, side: str, heard: _Times, send_queue: SendQueue, query_seconds: float
+        self, query: zenoh.Query, side: str, heard: float, send_queue: SendQueue, query_seconds: float
     ) -> None:
-        """heard: when; send_queue: of the side at which it was asked."""
+        """heard: when, by the monotonic clock; send_queue: of the side at which it was asked."""
         self.query, self.side, self.heard, self._send_queue = query, side, heard, send_queue
         self.key = str(query.key_expr)
-        self._over = heard[1] + reply_seconds(self.key, query_seconds)
+        self._over = heard + reply_seconds(self.key, query_seconds)
         self._open = 1
         self._lock = world().lock()
 
@@ -105,7 +97,7 @@ class QueryRelay:
         self._lock = world().rlock()
         self._read = SenderReader(journal.words.source_code)
         self._patience = Scheduler(_MOST_WAITING, 0, lambda _: None)
-        self._heard: Queue[tuple[str, str | None, zenoh.Query, _Times] | None] = world().queue()
+        self._heard: Queue[tuple[str, str | None, zenoh.Query, float] | None] = world().queue()
         self.duty = Duty("among the queries")
         self._thread = world().thread(self._run, name="queries")
         self._queryables: list[tuple[str, Any]] = []
@@ -174,7 +166,7 @@ class QueryRelay:
 
         def take(query: zenoh.Query) -> None:
             if not any(expression.intersects(query.key_expr) for expression in earlier):
-                self._heard.put((name, key, query, _now()))
+                self._heard.put((name, key, query, world().monotonic()))
 
         # On the thread that Zenoh calls it on: the queries of a program stay in order.
         return world().zenoh.handlers.Callback(take, indirect=False)
@@ -244,7 +236,7 @@ class QueryRelay:
         else:
             key, expression = asked.key, query.key_expr
             message = _Message(lambda: query.reply_err(error.payload, encoding=error.encoding), error.payload)
-        self._cross(Kind.REPLY, asked, (source, asked.side), key, expression, message, _now())
+        self._cross(Kind.REPLY, asked, (source, asked.side), key, expression, message, world().monotonic())
 
     def _cross(
         self,
@@ -254,23 +246,25 @@ class QueryRelay:
         key: str,
         expression: zenoh.KeyExpr,
         message: _Message,
-        heard: _Times,
+        since: float,
     ) -> None:
-        """Let the link between two sides decide on a message, record it, and send it when it is due. heard: when."""
-        (now, since), size = heard, message.size
+        """Let the link between two sides decide on a message, record it, and send it when it is due. since: when it was heard."""
+        heard, size = self._journal.place.clock.ahead + since, message.size
         with self._lock:
             sender, sequence = self._read(message.attachment, message.source)
         code = self._journal.words.key_code(key, way[0])
         state = self._link(*way, expression)
         if state is None:
-            self._journal.records.record(now, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, WireFate.UNLINKED)
+            self._journal.records.record(
+                heard, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, WireFate.UNLINKED
+            )
             return
         n, fate, delay, again = -1, int(WireFate.TOO_MANY_KEYS), 0.0, False
         if code:
             n, fate, delay, again = self._decided(state, kind.stream, key, expression, since, size)
         mark = int(kind) | AGAIN if again else int(kind)
         row = self._journal.records.record(
-            now, n, sequence, delay, code, sender, size, state.link.number, mark, fate or HELD
+            heard, n, sequence, delay, code, sender, size, state.link.number, mark, fate or HELD
         )
         if fate:
             self._wait_in_vain(asked)

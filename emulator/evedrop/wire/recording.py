@@ -8,14 +8,12 @@ Source: docs/wire/results.md, the view.
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
 import pyarrow.compute as pc
 import rerun as rr
 import rerun.blueprint as rrb
@@ -24,6 +22,7 @@ from numpy.typing import NDArray
 from evedrop.errors import UsageError
 from evedrop.results.wire_summary import WIRE_FILE
 from evedrop.show.view.recording import Chunk, RecordingThread
+from evedrop.system.waiting import SteadyClock
 from evedrop.system.world import world
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
@@ -38,7 +37,6 @@ from evedrop.wire.time_steps import Notice, StepCounter, WireSteps, introduction
 _MOST_ROWS = 2_000_000  # 100 MB
 _LATE = 0.3  # seconds after which the rows of a step are there
 _BATCH = 0.5  # seconds between two additions to the recording, each of which takes some kilobytes
-_JUMP = 1.0  # seconds by which the system's clock and a steady clock may differ
 
 
 class _WireRecording(RecordingThread[Chunk, Notice]):
@@ -47,8 +45,8 @@ class _WireRecording(RecordingThread[Chunk, Notice]):
     _panels: WirePanels
 
     @abstractmethod
-    def _steps(self, chunks: list[Chunk], notes: list[Notice]) -> Iterable[WireSteps]:
-        """The steps that follow from what came since the last call; may add notes before it gives the first of them."""
+    def _steps(self, chunks: list[Chunk]) -> Iterable[WireSteps]:
+        """The steps that follow from what came since the last call."""
 
     def _layout(self) -> rrb.Blueprint:
         return self._panels.layout()
@@ -57,7 +55,7 @@ class _WireRecording(RecordingThread[Chunk, Notice]):
         self._panels.style(to)
 
     def _send(self, chunks: list[Chunk], notes: list[Notice], to: rr.RecordingStream) -> bool:
-        every = [*self._steps(chunks, notes)]
+        every = [*self._steps(chunks)]
         self._panels.notes(notes, to)
         for steps in every:
             self._panels.send(steps, to)
@@ -77,22 +75,18 @@ class WireView(_WireRecording[NDArray[Any]]):
         name: str,
         start: float,
         pace: Pace | None = None,
-        clocks: Callable[[], tuple[float, float]] = lambda: (world().time(), world().monotonic()),
+        clock: Callable[[], float] | None = None,
         most_rows: int = _MOST_ROWS,
     ) -> None:
         """name: identifies the recording. start: when the wire started, in seconds since 1970.
 
-        clocks: seconds since 1970, and those of a clock that is never set; called once by each round of the thread.
+        clock: the time of the wire, by default that of a `SteadyClock`; called once by each round of the thread.
         most_rows: that the thread may be behind.
         """
         self._pace = Pace() if pace is None else pace
         self._panels = WirePanels(plan, self._pace)
         self._counter = StepCounter(len(plan.links), self._pace.step, start)
-        self._start, self._clocks, self._most_rows = start, clocks, most_rows
-        now, steady = clocks()
-        self._ahead, self._shift = now - steady, 0.0
-        # By how much the clock was set before it was last set, and until when messages have the time of before.
-        self._shift_before, self._until = 0.0, -math.inf
+        self._start, self._clock, self._most_rows = start, clock or SteadyClock().time, most_rows
         self._amended: list[tuple[NDArray[Any], int]] = []
         self._sent = 0.0
         super().__init__(path, name, [Notice(0.0, "INFO", introduction(plan))])
@@ -121,40 +115,21 @@ class WireView(_WireRecording[NDArray[Any]]):
                 self._amended.append((rows, fate))
 
     def _elapsed(self, time: float) -> float:
-        return max(0.0, time - self._start - self._shift)
+        return max(0.0, time - self._start)
 
-    def _steps(self, chunks: list[NDArray[Any]], notes: list[Notice]) -> Iterator[WireSteps]:
+    def _steps(self, chunks: list[NDArray[Any]]) -> Iterator[WireSteps]:
         with self._changed:
             amended, self._amended = self._amended, []
-        now = self._now(notes)
+        now = self._clock()
         for rows in chunks:
-            yield from self._counter.add(self._timed(rows, now))
+            yield from self._counter.add(rows)
         for rows, fate in amended:
-            self._counter.amend(self._timed(rows, now), fate)
-        if self._last or not 0.0 <= now - self._sent < _BATCH:
+            self._counter.amend(rows, fate)
+        if self._last or now - self._sent >= _BATCH:
             self._sent = now
             yield from self._counter.close(now - _LATE)
             if self._last:
                 yield from self._counter.finish()
-
-    def _timed(self, rows: NDArray[Any], now: float) -> NDArray[Any]:
-        """The rows with times as if the system's clock had never been set, and not after `now`."""
-        timed, times = rows.copy(), rows["time"] - self._shift
-        before = (rows["time"] < self._until) | (times > now + _JUMP)  # heard before the clock was set forward, or back
-        timed["time"] = np.minimum(np.where(before, rows["time"] - self._shift_before, times), now)
-        return timed
-
-    def _now(self, notes: list[Notice]) -> float:
-        """The time as if the system's clock had never been set, in seconds since 1970; adds a note when it was set."""
-        now, steady = self._clocks()
-        by = now - steady - self._ahead
-        if abs(by - self._shift) >= _JUMP:
-            moved, self._shift_before, self._shift = by - self._shift, self._shift, by
-            self._until = now - moved / 2.0 if moved > 0 else -math.inf
-            way = "forward" if moved > 0 else "back"
-            text = f"the system's clock was set {abs(moved):.1f} s {way}; the view goes on"
-            notes.append(Notice(self._elapsed(now), "WARN", text))
-        return now - self._shift
 
 
 PICTURE_SIZE = (1200, 720)
@@ -212,7 +187,7 @@ class _Replay(_WireRecording[WireSteps]):
         """Record further steps; waits for a file that is far behind."""
         self._append(steps, len(steps.counts), _MOST_STEPS, _WRITE_SECONDS)
 
-    def _steps(self, chunks: list[WireSteps], _notes: list[Notice]) -> list[WireSteps]:
+    def _steps(self, chunks: list[WireSteps]) -> list[WireSteps]:
         return chunks
 
 

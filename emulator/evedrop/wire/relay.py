@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Self, final
 
 from evedrop.live.network.connecting import LOGGED
@@ -35,9 +35,21 @@ _RECEIVERS = (
 _LAST_SECONDS = 1.0  # for the messages that wait for the wire when it ends; a longer backlog is not worth the wait
 
 
+@contextlib.contextmanager
+def open_sides(plan: WirePlan) -> Iterator[Mapping[str, SideSession]]:
+    """The sessions of a wire's sides, by their names. Programs can connect; nothing crosses before there is a `WireRelay`.
+
+    Raises UsageError if a side cannot be opened.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_RECEIVERS}))")  # read with the first session
+    world().zenoh.init_log_from_env_or(LOGGED)
+    with contextlib.ExitStack() as stack:
+        yield {name: stack.enter_context(SideSession(side, plan.largest)) for name, side in plan.sides.items()}
+
+
 @final
 class WireRelay:
-    """The open sides of a wire and what crosses between them; use it as a context manager.
+    """What crosses between the open sides of a wire; use it as a context manager.
 
     `apply` may be called by any thread.
     """
@@ -46,14 +58,15 @@ class WireRelay:
         self,
         plan: WirePlan,
         journal: WireJournal,
+        sides: Mapping[str, SideSession],
         tell: Callable[[str], None] = warn,
         happened: Callable[[str], None] = lambda _: None,
     ) -> None:
         """tell: for what the user must know while the wire runs; happened: for lines about programs that lost their connection.
 
-        These begin with the seconds since the wire started. Raises UsageError if a side cannot be opened.
+        These begin with the seconds since the wire started.
         """
-        self.plan = plan
+        self.plan, self.sides = plan, sides
         self.duties: Sequence[Duty] = ()
         """What its threads do, once it is open."""
         self.links: Mapping[str, RunningLink] = {link.name: RunningLink(link, plan, journal) for link in plan.links}
@@ -65,8 +78,6 @@ class WireRelay:
         self._duty = Duty("in the list of what programs declare")
         self._ended = world().event()
         self._woken = world().event()
-        os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_RECEIVERS}))")  # read with the first session
-        world().zenoh.init_log_from_env_or(LOGGED)
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
@@ -90,7 +101,6 @@ class WireRelay:
 
     def _open(self, stack: contextlib.ExitStack) -> None:
         plan, journal, links = self.plan, self._journal, self.links
-        self.sides = {name: stack.enter_context(SideSession(side, plan.largest)) for name, side in plan.sides.items()}
         send_queues = {name: SendQueue(name, plan, journal.records, self._tell) for name in plan.sides}
         stack.callback(self._end_send_queues, [*send_queues.values()])
         publishers = {name: Publishers(side.session) for name, side in self.sides.items()}
@@ -141,7 +151,7 @@ class WireRelay:
 
     def _leave(self, relays: Sequence[PublicationRelay]) -> None:
         """Limit the time in which messages that wait still cross."""
-        until = world().time() + _LAST_SECONDS
+        until = world().monotonic() + _LAST_SECONDS
         for relay in relays:
             relay.leave(until)
 

@@ -9,7 +9,7 @@ Source: docs/wire/results.md, the view.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -23,6 +23,7 @@ from evedrop.show.report.wire import wire_failures
 from evedrop.show.view.viewer import Viewer, choose
 from evedrop.system.environment import check_zenoh_runtime
 from evedrop.system.output import warn
+from evedrop.system.waiting import SteadyClock
 from evedrop.system.world import world
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import Numbered
@@ -30,7 +31,7 @@ from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_place import JOURNAL_FOLDER
 from evedrop.wire.on_disk import closing_lines
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.relay import WireRelay
+from evedrop.wire.relay import WireRelay, open_sides
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.steering import WireConductor, WireControl
 from evedrop.wire.watchdog import ANSWER_SECONDS, WORK_SECONDS, Duty, Watchdog, end_at_once
@@ -71,30 +72,34 @@ def run_wire(
         Watchdog(lambda problem: leave(f"the wire no longer answers: {problem}", RunError.exit_status)) as watchdog,
         world().process.stop_or_leave_on_signals(lambda: leave("interrupted again", Interrupted.exit_status)) as stop,
     ):
-        # The journal first: it refuses a folder that another wire uses, whose recording must stay.
-        with WireJournal(out, plan) as journal, live_view(plan, out, view, say) as shown:
-            scorekeeper = WireScorekeeper(plan, journal)
-            if shown is not None:
-                shown.follow(journal)
+        # The journal first: it refuses a folder that another wire uses, whose recording must stay. It begins after all that may
+        # refuse this start: an earlier one then stays the latest.
+        with closing(WireJournal(out, plan)) as journal, ExitStack() as opened:
+            opening = Duty("while the sides were opened", ANSWER_SECONDS)
+            with watchdog.doing(opening):
+                sides = opened.enter_context(open_sides(plan))
+            with live_view(plan, out, view, say, journal.place.clock) as shown, journal, opened.pop_all() as stack:
+                scorekeeper = WireScorekeeper(plan, journal)
+                if shown is not None:
+                    shown.follow(journal)
 
-            def happened(line: str) -> None:
-                events.append(line)
-                journal.note(line.partition(": ")[2])
-                say(line)
+                def happened(line: str) -> None:
+                    events.append(line)
+                    journal.note(line.partition(": ")[2])
+                    say(line)
 
-            _begin_results(out, plan)
-            if journal.recovered:
-                say(
-                    f"an earlier start was killed or had a full disk: {counted(journal.recovered, 'message')} of it "
-                    "could be recovered, and the numbers go on"
-                )
-            if journal.history.start > 1:
-                say(continuation(journal.history.start, journal.counts))
-            relay = WireRelay(plan, journal, warn, happened)
-            # Before the sides open: it applies what is in force at first.
-            conductor = WireConductor(plan, relay, happened)
-            with ExitStack() as stack:
-                with watchdog.doing(Duty("while the sides were opened", ANSWER_SECONDS)):
+                _begin_results(out, plan)
+                if journal.recovered:
+                    say(
+                        f"an earlier start was killed or had a full disk: {counted(journal.recovered, 'message')} of it "
+                        "could be recovered, and the numbers go on"
+                    )
+                if journal.history.start > 1:
+                    say(continuation(journal.history.start, journal.counts))
+                relay = WireRelay(plan, journal, sides, warn, happened)
+                # Before anything crosses: it applies what is in force at first.
+                conductor = WireConductor(plan, relay, happened)
+                with watchdog.doing(opening):
                     stack.enter_context(relay)
                 for name, endpoints in relay.endpoints.items():
                     say(f"{name} {' '.join(endpoints)}")
@@ -105,8 +110,10 @@ def run_wire(
                 watchdog.hurry()
                 with watchdog.doing(Duty("while the wire was ended", waits=True)):
                     stack.close()
-            with watchdog.doing(Duty("in the journal, while its last files were written", end_seconds=WORK_SECONDS)):
-                journal.close()
+                with watchdog.doing(
+                    Duty("in the journal, while its last files were written", end_seconds=WORK_SECONDS)
+                ):
+                    journal.close()
         status = scorekeeper.finish(out) if out.is_dir() else RunError.exit_status
     summary = scorekeeper.summary()
     for line in closing_lines(summary):
@@ -177,11 +184,13 @@ def _shown(mode: str) -> str:
 
 
 @contextmanager
-def live_view(plan: WirePlan, out: Path, mode: str, say: Callable[[str], None]) -> Iterator[WireView | None]:
+def live_view(
+    plan: WirePlan, out: Path, mode: str, say: Callable[[str], None], clock: SteadyClock
+) -> Iterator[WireView | None]:
     """A view of a wire that starts now, for the time of a `with` block; None for "off".
 
     mode: as `evedrop run --view`, or the name of a file that ends in .rrd: the recording is written there, and nothing is shown.
-    out: the wire's folder. say: for the line with the address of the page.
+    out: the wire's folder. say: for the line with the address of the page. clock: that of the wire's journal.
 
     Raises UsageError for any other mode, and if a viewer cannot be started.
     """
@@ -198,7 +207,7 @@ def live_view(plan: WirePlan, out: Path, mode: str, say: Callable[[str], None]) 
             say(f"the wire is shown to anybody who has this address:\n{viewer.address}")
         if viewer is not None and viewer.warning is not None:
             warn(viewer.warning)
-        view = WireView(path, plan, out.resolve().name, world().time())
+        view = WireView(path, plan, out.resolve().name, clock.time(), clock=clock.time)
         try:
             yield view
         finally:
