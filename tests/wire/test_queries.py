@@ -292,7 +292,7 @@ def test_an_error_that_lasts_is_told_once_and_not_looked_for_without_a_pause(
     waits: list[float] = []
     plan = both_ways()
     with WireJournal(tmp_path, plan) as journal:
-        relay = WireRelay(plan, journal, told.append)
+        relay = WireRelay(plan, journal, {}, told.append)
 
         def wait(seconds: float) -> None:
             waits.append(seconds)

@@ -89,13 +89,8 @@ def run_wire(
                     say(line)
 
                 _begin_results(out, plan)
-                if journal.recovered:
-                    say(
-                        f"an earlier start was killed or had a full disk: {counted(journal.recovered, 'message')} of it "
-                        "could be recovered, and the numbers go on"
-                    )
-                if journal.history.start > 1:
-                    say(continuation(journal.history.start, journal.counts))
+                for line in _earlier(journal):
+                    say(line)
                 relay = WireRelay(plan, journal, sides, warn, happened)
                 # Before anything crosses: it applies what is in force at first.
                 conductor = WireConductor(plan, relay, happened)
@@ -126,6 +121,17 @@ def run_wire(
     if relay.failures:
         raise RunError("; ".join(dict.fromkeys(relay.failures)))
     return status
+
+
+def _earlier(journal: WireJournal) -> Iterator[str]:
+    """What a wire says of earlier starts in its folder."""
+    if journal.recovered:
+        yield (
+            f"an earlier start was killed or had a full disk: {counted(journal.recovered, 'message')} of it could be recovered, "
+            "and the numbers go on"
+        )
+    if journal.history.start > 1:
+        yield continuation(journal.history.start, journal.counts)
 
 
 def continuation(start: int, counts: Mapping[Numbered, int]) -> str:
