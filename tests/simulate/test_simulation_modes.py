@@ -321,7 +321,7 @@ def test_who_reads_packets_is_refused(plan: Plan, strategy: str, tmp_path: Path)
     }
     more = entries.get(strategy, {"link": {"quality": 0.5}})
     of = studied(MARGINAL, 20, eve={"strategy": strategy, **more}, smart=SMART)
-    option = f"--{plan.mode.value}"
+    option = f'mode="{plan.mode.value}"'
     message = rf"{option} follows .* the actions of eve \(strategy {strategy}\).*; leave {option} out, or remove eve"
     with pytest.raises(UsageError, match=message):
         montecarlo(of, trials=2, plan=plan, out=tmp_path / "run")

@@ -162,6 +162,7 @@ def test_a_simulated_radio_loses_what_the_real_one_loses(evedrop_simulated_wire:
     heard: list[str] = []
     with zenoh.open(radio.config("base")) as base, zenoh.open(radio.config("robot")) as robot:
         base.declare_subscriber("chatter/numbers", lambda sample: heard.append(sample.payload.to_string()))
+        radio.clock.sleep(0.1)  # until the side knows of the subscriber
         for number in range(200):
             robot.put("chatter/numbers", str(number))
             radio.clock.sleep(0.01)
