@@ -141,6 +141,20 @@ def test_a_run_that_was_cut_short_counts_what_its_recorder_has_dropped(
     assert read == [{"recorder": 1}]
 
 
+def test_a_run_that_was_cut_short_has_no_digest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even that of a receiver which was ahead of the one that froze: it would be of another run than the rows."""
+    read: list[Any] = []
+
+    def misses(case: SimulatedCase, run: SimulatedRun, *rest: Any) -> list[str]:
+        read.append(Results.read(run.folder).summary)
+        return judge.misses(case, run, *rest)
+
+    monkeypatch.setattr(campaign, "misses", misses)
+    assert disturbed(faults.FreezeConnection("eve", RUNS + 100)).run.status == 3
+    assert read[0]["slots"] < SCENARIO.slots
+    assert {peer["digest"] for peer in read[0]["peers"].values()} == {None}
+
+
 def test_theory_that_is_not_known_after_a_change_stays_where_it_was_before() -> None:
     """Its rows are written when the link changes."""
     changed, as_it_was = (
