@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -59,6 +60,13 @@ def test_a_run_ends_as_it_must(fault: Disturbance, status: int, said: str) -> No
     """With the right status, the right words, and all results so far."""
     run = disturbed(fault).run
     assert (run.status, said in run.said) == (status, True), run.said
+
+
+@pytest.mark.parametrize("kind", [faults.CutConnection, faults.FreezeConnection])
+def test_a_short_fault_does_not_end_one_that_lasts(kind: Callable[..., Disturbance]) -> None:
+    """Who is cut off for good stays so when it is cut off again, for a moment."""
+    run = disturbed(kind("eve", RUNS), kind("eve", RUNS + 5, 0.01)).run
+    assert (run.status, "eve" in run.said) == (3, True), run.said
 
 
 @pytest.mark.campaign
