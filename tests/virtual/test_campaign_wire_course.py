@@ -20,8 +20,9 @@ from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.running_link import _CUT, RunningLink
 from evedrop.wire.send_queue import SendQueue
-from tests.virtual.wire_cases import ENDPOINTS, SimulatedWireCase
+from tests.virtual.wire_cases import SimulatedWireCase
 from tests.virtual.wire_course import wrong_order, wrong_reasons
+from tests.virtual.wire_draws import ENDPOINTS
 from tests.virtual.wire_programs import Content, Course, Message, WireProgram
 
 _FILE = f"""
@@ -171,7 +172,7 @@ def test_an_export_with_other_numbers_is_seen(monkeypatch: pytest.MonkeyPatch) -
 def test_messages_that_overtake_each_other_are_seen() -> None:
     """On a link that keeps their order."""
     course = Course()
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"link": "down", "n": n, "kind": "put", "fate": "delivered", "key": "base/data", "size": size}
         for n, size in enumerate((8, 9))
     ]
