@@ -5,12 +5,14 @@ The disk is a simulated one, so that every operation of the writer is disturbed 
 
 from __future__ import annotations
 
+import errno
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from itertools import accumulate
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pyarrow as pa
@@ -173,10 +175,36 @@ def test_a_round_of_which_a_page_is_lost_does_not_count(tmp_path: Path) -> None:
 
 
 def test_a_power_cut_after_the_end_takes_nothing(tmp_path: Path) -> None:
-    """But perhaps the summary of the whole run: then there is that of an earlier moment."""
+    """Nor the summary: the run is as complete as its writer said."""
     for seed in range(examples(20)):
         (tmp_path / str(seed)).mkdir()
         with simulated(tmp_path / str(seed), seed) as (scheduler, disk):
             run_program(scheduler, partial(record, disk.root / "run", []))
             disk.power_cut()
-            assert slots_of(Results.read(disk.root / "run").slots) == SLOTS
+            results = Results.read(disk.root / "run")
+            assert slots_of(results.slots) == SLOTS
+            assert results.summary["ended"] == "complete"
+
+
+def test_a_summary_whose_name_cannot_be_synced_is_there_all_the_same(tmp_path: Path) -> None:
+    """The run is complete."""
+    with simulated(tmp_path) as (scheduler, disk):
+        folder = disk.root / "run"
+        run_program(scheduler, partial(record, folder, []))
+        syncs: list[Path] = []
+
+        def fails() -> None:
+            honest = disk.sync
+
+            def sync(path: Path) -> None:
+                syncs.append(path)
+                if path.name == "summary.json":
+                    raise OSError(errno.EIO, "Input/output error")
+                honest(path)
+
+            with patch.object(type(disk), "sync", lambda _, path: sync(path)):
+                write_summary(folder, metrics(SLOTS))
+
+        run_program(scheduler, fails)
+        assert folder / "summary.json" in syncs
+        assert Results.read(folder).summary["ended"] == "complete"

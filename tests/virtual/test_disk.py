@@ -70,6 +70,23 @@ def test_a_full_disk_stays_full_until_there_is_room(fault: DiskFault, tmp_path: 
         assert (disk.root / "third").read_bytes() == b"abcdefgh"
 
 
+def test_a_disk_that_is_full_for_some_time_has_room_again_though_nobody_has_written(tmp_path: Path) -> None:
+    """Meanwhile; a fault that comes later is another one."""
+    with simulated(tmp_path) as (scheduler, disk):
+
+        def wait_and_write() -> None:
+            world().sleep(3.0)
+            write_twice(disk.root / "file")
+
+        disk.fail_next(DiskFault.FULL, 2.0)
+        run_program(scheduler, wait_and_write)
+        assert (disk.root / "file").read_bytes() == b"abcdefgh"
+        disk.fail_next(DiskFault.FULL, 2.0)
+        disk.fail_next(DiskFault.BROKEN)
+        with pytest.raises(OSError, match="Input/output error"):
+            run_program(scheduler, wait_and_write)
+
+
 @pytest.mark.parametrize("name", ["beside", "disk/../beside"])
 def test_no_program_writes_outside_its_disk(name: str, tmp_path: Path) -> None:
     """The files of the machine are no part of the simulation."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -59,6 +60,13 @@ def test_a_run_ends_as_it_must(fault: Disturbance, status: int, said: str) -> No
     """With the right status, the right words, and all results so far."""
     run = disturbed(fault).run
     assert (run.status, said in run.said) == (status, True), run.said
+
+
+@pytest.mark.parametrize("kind", [faults.CutConnection, faults.FreezeConnection])
+def test_a_short_fault_does_not_end_one_that_lasts(kind: Callable[..., Disturbance]) -> None:
+    """Who is cut off for good stays so when it is cut off again, for a moment."""
+    run = disturbed(kind("eve", RUNS), kind("eve", RUNS + 5, 0.01)).run
+    assert (run.status, "eve" in run.said) == (3, True), run.said
 
 
 @pytest.mark.campaign
@@ -139,6 +147,20 @@ def test_a_run_that_was_cut_short_counts_what_its_recorder_has_dropped(
     monkeypatch.setattr(campaign, "misses", misses)
     disturbed(faults.ConfuseKeys("recorder", RUNS + 60), ends)
     assert read == [{"recorder": 1}]
+
+
+def test_a_run_that_was_cut_short_has_no_digest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even that of a receiver which was ahead of the one that froze: it would be of another run than the rows."""
+    read: list[Any] = []
+
+    def misses(case: SimulatedCase, run: SimulatedRun, *rest: Any) -> list[str]:
+        read.append(Results.read(run.folder).summary)
+        return judge.misses(case, run, *rest)
+
+    monkeypatch.setattr(campaign, "misses", misses)
+    assert disturbed(faults.FreezeConnection("eve", RUNS + 100)).run.status == 3
+    assert read[0]["slots"] < SCENARIO.slots
+    assert {peer["digest"] for peer in read[0]["peers"].values()} == {None}
 
 
 def test_theory_that_is_not_known_after_a_change_stays_where_it_was_before() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,12 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
+from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario.progress_events import RunProgress
 from evedrop.scenario.tables import Scenario
+from evedrop.score.scorekeeper import verification_of
 from evedrop.virtual import campaign
+from evedrop.virtual.broken_messages import BreakMessage
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, Disturbance
 from evedrop.virtual.faults import (
@@ -25,11 +29,14 @@ from evedrop.virtual.faults import (
     HangProcess,
     InterruptProcess,
     KillProcess,
+    RemoveResults,
     ShortenMessage,
     StopProcess,
 )
-from evedrop.virtual.judge import misses
+from evedrop.virtual.judge import _confused, _falsified, _of_folder, _of_metrics, misses
+from evedrop.virtual.metrics import unlike_prefix, wrong_course
 from evedrop.virtual.notes import PutMessage
+from evedrop.virtual.outsiders import LetStrangerIn
 from evedrop.virtual.programs import DrawnProgram
 from evedrop.virtual.reference import RunReference
 from evedrop.virtual.results import wrong_outages
@@ -77,10 +84,33 @@ def with_outage(first: int, end: int) -> Scenario:
 @pytest.mark.parametrize(("seconds", "late"), [(56.0, False), (58.0, True)])
 def test_a_run_that_ends_late_is_a_miss(seconds: float, late: bool, tmp_path: Path) -> None:
     """1 s of slots, 5 of any run, 15 of a fault, twice the longest outage, and 30 for processes that do not appear."""
-    broken = judged(
-        tmp_path, {KILLED: 0.5}, status=3, said="evedrop: legitimate was ended by signal 9", seconds=seconds
-    )
+    hangs = HangProcess("legitimate", 50)
+    broken = judged(tmp_path, {hangs: 0.5}, status=3, said="evedrop: legitimate: alive, and silent", seconds=seconds)
     assert broken == (["the run took 58.0 s, and not 57.0 s at most"] if late else [])
+
+
+@pytest.mark.parametrize(("seconds", "told", "late"), [(3.4, "go 5", False), (3.6, "go 5", True), (3.6, "end", False)])
+def test_a_process_that_ends_ends_its_run_at_once(seconds: float, told: str, late: bool, tmp_path: Path) -> None:
+    """Its launcher waits for it, and asks nobody; but the report of a process on a run that is over may be waited for."""
+    put = [PutMessage(0.6, "control/legitimate", told)]
+    said = "evedrop: legitimate was ended by signal 9"
+    broken = judged(tmp_path, {KILLED: 0.5}, status=3, said=said, seconds=seconds, put=put)
+    assert any("the run goes on for" in miss for miss in broken) is late
+
+
+@pytest.mark.parametrize(("target", "missed"), [("launcher", False), ("recorder", False), ("legitimate", True)])
+def test_only_who_is_told_that_the_run_ends_is_interrupted(target: str, missed: bool, tmp_path: Path) -> None:
+    """A signal to any other process is a failure of that process."""
+    broken = judged(tmp_path, {InterruptProcess(target, 50): 0.5}, status=130, seconds=1.0)
+    assert any("by which none of this ends a run" in miss for miss in broken) is missed
+
+
+@pytest.mark.parametrize(("sent", "missed"), [(1.4, False), (1.6, True)])
+def test_a_run_does_not_end_well_without_its_folder(sent: float, missed: bool, tmp_path: Path) -> None:
+    """If it goes on after that was removed."""
+    removed = RemoveResults("results", 50)
+    broken = judged(tmp_path, {removed: 0.5}, status=0, seconds=2.0, put=[PutMessage(sent, "uplink", "3")])
+    assert ("the run ends with status 0, although its results were removed at 0.50 s" in broken) is missed
 
 
 @pytest.mark.parametrize(("seconds", "kept"), [(0.5, False), (2.0, True)])
@@ -256,6 +286,85 @@ def test_who_gets_a_broken_message_is_not_to_blame(tmp_path: Path) -> None:
     assert f"legitimate is blamed for a message that it got: {said}" in broken
 
 
+@pytest.mark.parametrize(("value", "wrong"), [(None, False), (1.0, False), (7.0, True)])
+def test_a_live_run_has_no_quantiles_or_those_in_memory(value: float | None, wrong: bool) -> None:
+    """Not any number."""
+    row = {"slot": 0, "peer": "legitimate", "quantile": 1.0}
+    reference = RunReference(SCENARIO, {}, {"slots": {(0, "legitimate"): row}})
+    table = pa.Table.from_pylist([{**row, "quantile": value}])
+    assert [*reference.wrong_rows("slots", table)] == (
+        ["slots (0, 'legitimate'): quantile is 7.0, not 1.0"] if wrong else []
+    )
+
+
+@pytest.mark.parametrize(
+    ("also", "said", "rows"),
+    [
+        ((), "", True),
+        ((), "legitimate broke the protocol", False),
+        ((ShortenMessage("sensor", 60),), "sensor broke the protocol", True),
+    ],
+)
+def test_a_number_that_nobody_could_read_is_in_no_row(also: tuple[Disturbance, ...], said: str, rows: bool) -> None:
+    """But who could not read another message may have read a wrong number before."""
+    run = SimulatedRun(Path(), said=said)
+    assert _falsified(run, (BreakMessage("recorder", 50), *also)) is rows
+
+
+@pytest.mark.parametrize(
+    ("faults", "count"),
+    [
+        ((), 0),
+        ((KILLED, ConfuseKeys("sensor", 50)), 1),
+        ((ConfuseKeys(EVERYBODY, 50),), 4),
+        ((LetStrangerIn("run", 50), ConfuseKeys("sensor", 50)), math.inf),
+    ],
+)
+def test_what_others_have_written_may_have_any_key(faults: tuple[Disturbance, ...], count: float) -> None:
+    """And of the run's own messages, those that were confused."""
+    assert _confused(SimulatedCase(1, SCENARIO, faults), faults) == count
+
+
+@pytest.mark.parametrize(("all_recorded", "missed"), [(True, True), (False, False)])
+def test_the_standard_error_of_trials_that_are_not_recorded_may_be_unknown(all_recorded: bool, missed: bool) -> None:
+    """While their block is not complete."""
+    in_memory, live = (
+        {"slots": 9, "events": [], "peers": {"legitimate": {"standard_errors": {"mean_trace_covariance": error}}}}
+        for error in (0.1, None)
+    )
+    broken = [*unlike_prefix({**live, "controller": {}}, in_memory, all_recorded=all_recorded)]
+    assert any("standard_errors.mean_trace_covariance is None" in miss for miss in broken) is missed
+    assert "the summary has controller, and in memory it has not" in broken
+
+
+@pytest.mark.parametrize(("decisions", "missed"), [(0, False), (5, False), (6, True)])
+def test_a_controller_may_end_before_it_has_told_of_its_last_decisions(decisions: int, missed: bool) -> None:
+    """But it has decided no more often than in memory."""
+    live, in_memory = (
+        {"slots": 9, "events": [], "controller": {"period": 2, "decisions": some}} for some in (decisions, 5)
+    )
+    broken = [*unlike_prefix(live, in_memory, all_recorded=True)]
+    assert broken == (["controller.decisions is 6, and in memory 5"] if missed else [])
+
+
+@pytest.mark.parametrize(("slots", "age"), [(9, " (the metrics are as of slot 3)"), (10, "")])
+def test_only_metrics_of_all_rows_of_a_run_that_was_cut_short_are_compared(
+    slots: int, age: str, tmp_path: Path
+) -> None:
+    """With those of the same slots in memory; a folder that has no scenario yet is not looked at either."""
+    case = SimulatedCase(1, SCENARIO, ())
+    assert [*_of_folder(case, SimulatedRun(tmp_path), tmp_path, done=False)] == []
+    write_resolved(tmp_path, SCENARIO)
+    assert [*_of_metrics(case, tmp_path, {"slots": slots, "ended": f"it failed{age}"})] == []
+
+
+def test_what_was_not_recomputed_is_not_verified() -> None:
+    """A run that is cut short at once has recomputed nothing."""
+    entry = {"recomputed_trials": 0, "verified": [], "own_word": []}
+    summary = {"mode": "live", "wall_seconds": 0.1, "misdelivered": {}, "verification": {"legitimate": entry}}
+    assert [*wrong_course(summary, verification_of(SCENARIO, ()), 1.0, 0)] == []
+
+
 @pytest.mark.parametrize(("metrics", "rows", "missed"), [(20, 10, True), (20, 20, False), (10, 0, False)])
 def test_metrics_are_of_rows_that_are_there(metrics: int, rows: int, missed: bool, tmp_path: Path) -> None:
     """But for the first ones, which are written before their rows count."""
@@ -337,6 +446,19 @@ _CASE = {
 }
 
 
+_KILL = ["kill", "legitimate", 300, None]
+
+
+def _after(change: Callable[[SimulatedRun], None]) -> Callable[..., list[str]]:
+    """The judge, once somebody has changed the results."""
+
+    def judge(case: SimulatedCase, run: SimulatedRun, *rest: Any) -> list[str]:
+        change(run)
+        return misses(case, run, *rest)
+
+    return judge
+
+
 def _without_log(run: SimulatedRun) -> None:
     (run.folder / "logs" / "sensor.log").unlink()
 
@@ -347,6 +469,27 @@ def _summary_with(**entries: Any) -> Callable[[SimulatedRun], None]:
         path.write_text(json.dumps({**json.loads(path.read_text()), **entries}))
 
     return change
+
+
+def _untold(run: SimulatedRun) -> None:
+    run.told.clear()
+
+
+def _without_theory(run: SimulatedRun) -> None:
+    peers = json.loads((run.folder / "summary.json").read_text())["peers"]
+    _summary_with(peers={**peers, "legitimate": {**peers["legitimate"], "theoretical_trace_covariance": 123.0}})(run)
+
+
+def _with_another_slot_count(run: SimulatedRun) -> None:
+    path = run.folder / "scenario.toml"
+    path.write_text(path.read_text().replace("slots = 20", "slots = 19"))
+
+
+def _on_its_word(run: SimulatedRun) -> None:
+    verification = json.loads((run.folder / "summary.json").read_text())["verification"]
+    entry = verification["legitimate"]
+    changed = {**entry, "verified": entry["own_word"], "own_word": entry["verified"]}
+    _summary_with(verification={"legitimate": changed})(run)
 
 
 def _with_decisions(run: SimulatedRun) -> None:
@@ -380,6 +523,46 @@ def _outage(process: str, until: int | None) -> dict[str, object]:
             "the outage of legitimate lasts 0.10 s after cut legitimate for 1.00 s after 100 events",
         ),
         (["kill", "legitimate", 380, None], _summary_with(slots=1), "slots were done 4.0 s before kill legitimate"),
+        (
+            ["stop and kill", "legitimate", 380, 0.1],
+            _summary_with(slots=1),
+            "slots were done 4.0 s before stop and kill",
+        ),
+        (["refuse a write to", "disk", 430, None], _summary_with(slots=1), "slots were done 4.0 s before refuse"),
+        (None, _summary_with(mode="exact"), "the mode of a live run is exact"),
+        (None, _summary_with(wall_seconds=-5.0), "wall_seconds is -5.0, and the run took"),
+        (
+            None,
+            _summary_with(misdelivered={"sensor": 5}),
+            "the summary has 5 messages of other keys, and 0 were confused",
+        ),
+        (None, _on_its_word, "own_word of legitimate is"),
+        (None, _untold, "the run tells no progress"),
+        (None, _with_another_slot_count, "scenario.toml has slots = 19, and the run 20"),
+        (_KILL, _summary_with(seed=99), "seed is 99, not"),
+        (_KILL, _summary_with(scenario="another"), "scenario is another, not Drawn"),
+        (_KILL, _summary_with(first_trial=7), "first_trial is 7, not"),
+        (_KILL, _without_theory, "theoretical_trace_covariance is 123.0"),
+        (
+            _KILL,
+            _summary_with(ended="the moon was full"),
+            "and its summary: the moon was full",
+        ),
+        (
+            ["interrupt", "launcher", 300, None],
+            _summary_with(ended="the moon"),
+            "was interrupted, and the summary says: the moon",
+        ),
+        (
+            ["ask for the status of", "run", 200, None],
+            _summary_with(outages=[_outage("legitimate", 4)]),
+            "an outage of legitimate at slot 1, and no fault caused one",
+        ),
+        (
+            ["cut", "legitimate", 100, 0.1],
+            _summary_with(outages=[{**_outage("legitimate", 4), "seconds": 1e6}]),
+            "an outage of 1000000.0 s in a run of",
+        ),
     ],
 )
 def test_what_results_must_say_and_do_not_is_a_miss(
@@ -389,9 +572,13 @@ def test_what_results_must_say_and_do_not_is_a_miss(
     case = read_case(json.dumps({**_CASE, "faults": [fault] if fault else []}))
     assert play(case).misses == ()
 
-    def changed(case: SimulatedCase, run: SimulatedRun, *rest: Any) -> list[str]:
-        change(run)
-        return misses(case, run, *rest)
-
-    monkeypatch.setattr(campaign, "misses", changed)
+    monkeypatch.setattr(campaign, "misses", _after(change))
     assert any(miss in broken for broken in play(case).misses)
+
+
+def test_a_write_that_is_shortened_excuses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rest is written: what else ends the run costs no rows that it has told of."""
+    case = read_case(json.dumps({**_CASE, "faults": [["shorten a write to", "disk", 60, None], _KILL]}))
+    assert play(case).misses == ()
+    monkeypatch.setattr(campaign, "misses", _after(_summary_with(slots=1)))
+    assert any("slots were done, and the summary has 1" in broken for broken in play(case).misses)

@@ -67,6 +67,14 @@ def test_a_run_ends_as_it_must(fault: Disturbance, status: int, said: str) -> No
     assert (run.status, said in run.said) == (status, True), run.said
 
 
+def test_a_host_that_is_cut_off_for_good_stays_so() -> None:
+    """Whatever else happens to it for a moment."""
+    run = played(
+        *(host_faults.UnplugHost("machine of host beta", RUNS + some, 0.01 * some or None) for some in (0, 5))
+    ).run
+    assert (run.status, "host beta" in run.said) == (3, True), run.said
+
+
 SHORT = Scenario({**SCENARIO.as_tables(), "longest_outage": 3.0})
 
 

@@ -42,8 +42,17 @@ from evedrop.wire.on_disk import summary_of_wire
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import REASONS, WireFate
 from tests.faults.wires import wrong_numbers, wrong_summary
-from tests.virtual.small_limits import FEW_KEYS, HUNG
+from tests.virtual.small_limits import FEW_KEYS, FULL, HUNG
 from tests.virtual.wire_commands import JOINED, MOVED, OPENED, REPLAY, REPLAY_FILE, VIEW, VIEW_FILE, wrong_recording
+from tests.virtual.wire_course import (
+    wrong_arrivals,
+    wrong_counts,
+    wrong_csv,
+    wrong_cuts,
+    wrong_order,
+    wrong_rates,
+    wrong_reasons,
+)
 from tests.virtual.wire_programs import Course, Message, WireProgram, gid_of, ros_key, ros_token, service, stream_of
 from tests.virtual.wire_tokens import wrong_tokens
 
@@ -135,16 +144,38 @@ class WireJudge:
         if run.status in {0, 1} and not self._disk and not self._hung:
             yield from self._of_summary(rows)
         if not (self._struck or self._hung):
+            yield from self._of_course(rows, flat)
             yield from course.doubts
             yield from self._of_operators()
             if JOINED not in self._case.further:
                 yield from wrong_tokens(self._plan, course, course.begun[0] + self._case.seconds)
         if not self._killed:
-            yield from self._of_readers(len(flat))
+            yield from self._of_readers(flat)
             if (REPLAY, 0) in [(name, status) for name, status, _ in course.read]:
                 # A start that was interrupted at once may not have come as far as the history.
                 latest = WireHistory.read(run.folder / JOURNAL_FOLDER).start
                 yield from wrong_recording(run.folder.parent / REPLAY_FILE, rows[latest])
+
+    def _of_course(self, rows: Mapping[int, list[Row]], flat: list[Row]) -> Iterator[str]:
+        """What must hold if nothing happens to the wire."""
+        plan, words = self._plan, [typed.split() for _, typed in self._case.operations]
+        changed = {link for verb, link, *_ in (each for each in words if len(each) > 1) if verb == "link"}
+        joined = JOINED in self._case.further
+        if OPENED in self._case.further or any(verb in {"partition", "heal"} for verb, *_ in words):
+            changed = {link.name for link in plan.links}  # its opener, or an operator, cuts them
+        yield from wrong_reasons(plan, flat, changed, joined=joined)
+        begun = WireHistory.read(self._run.folder / JOURNAL_FOLDER).began
+        yield from wrong_cuts(plan, rows[len(rows)], begun, changed)
+        for some in rows.values():
+            yield from wrong_rates(plan, some, changed)
+        if not joined and FULL not in self._case.further:
+            of_message = defaultdict[Message, list[Mapping[str, Any]]](list)
+            for row in flat:
+                if row["link"] is not None and row["key"] is not None:
+                    of_message[self._message(row)].append(row)
+            yield from wrong_arrivals(self._course, of_message)
+            for some in rows.values():
+                yield from wrong_order(plan, self._course, some)
 
     def _of_latest(self) -> Iterator[str]:
         """Commands tell of the latest start of the wire, even if that start failed."""
@@ -161,6 +192,7 @@ class WireJudge:
         if start != len(rows) and not any(isinstance(fault, KillProcess | InterruptProcess) for fault in self._struck):
             yield f"the summary is that of start {start} of {len(rows)}"
         yield from wrong_summary(run.folder, rows[start], start)
+        yield from wrong_counts(run.folder, rows[start], sampled="short counts" in self._case.further)
         yield from self._of_end()
         if VIEW in self._case.further and OPENED not in self._case.further:
             yield from wrong_recording(run.folder.parent / VIEW_FILE, rows[len(rows)])
@@ -356,14 +388,16 @@ class WireJudge:
             if status not in {0, UsageError.exit_status}:
                 yield f"{words!r} ends with status {status}"
 
-    def _of_readers(self, rows: int) -> Iterator[str]:
+    def _of_readers(self, rows: list[Row]) -> Iterator[str]:
         """Check the output of commands that read the folder afterwards."""
         for words, status, said in self._course.read:
             if status not in ({0, UsageError.exit_status} if words in {"links", REPLAY} else {0}):
                 yield f"{words} ends with status {status}: {said.strip()[-300:]}"
         told = "".join(said for words, _, said in self._course.read if words == "export")
-        if told and f": {rows:,} message" not in told and not self._disk:
-            yield f"the journal has {rows} rows, and {told.strip()}"
+        if told and f": {len(rows):,} message" not in told and not self._disk:
+            yield f"the journal has {len(rows)} rows, and {told.strip()}"
+        if told and not self._disk:
+            yield from wrong_csv(self._run.folder.parent / "rows.csv", rows)
 
 
 def _is_timeout(row: Row) -> bool:

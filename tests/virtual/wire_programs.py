@@ -49,12 +49,25 @@ class Message(NamedTuple):
     size: int
 
 
+class Content(NamedTuple):
+    """What a publication consists of."""
+
+    deletes: bool
+    payload: int
+    """Bytes."""
+    attachment: int
+
+
 @dataclass
 class Course:
     """What the programs of a wire saw."""
 
     sent: set[tuple[str, str, int]] = field(default_factory=set)
     """Kind, key and size of what was sent."""
+    contents: dict[tuple[str, int], Content] = field(default_factory=dict)
+    """Key and size of each publication → its content."""
+    arrived: list[tuple[float, Message, Content]] = field(default_factory=list)
+    """When each publication arrived, in virtual seconds, and what it consisted of."""
     got: Counter[Message] = field(default_factory=Counter)
     begun: list[float] = field(default_factory=list)
     """When each start of the wire began, in virtual seconds."""
@@ -187,7 +200,7 @@ class ProgramAtWork:
 
     def run(self, endpoint: str, users: Mapping[str, str] | None, epoch: float) -> int:
         """Work until its end; epoch: when the world began, in seconds since 1970."""
-        program = self._program
+        program, self._epoch = self._program, epoch
         world().sleep(program.after)
         self._session = session = connected(endpoint, users, next(iter(program.objects("peer")), None))
         for words in program.does:
@@ -213,7 +226,9 @@ class ProgramAtWork:
         how: dict[str, Any] = {"congestion_control": zenoh.CongestionControl.BLOCK, **details}
         if delete:
             attachment = bytes(size)
-        self._course.sent.add(("put", key, size if delete else size + len(attachment)))
+        whole = size if delete else size + len(attachment)
+        self._course.sent.add(("put", key, whole))
+        self._course.contents[key, whole] = Content(delete, 0 if delete else size, len(attachment))
         if attachment:
             how["attachment"] = attachment
         if delete:
@@ -292,8 +307,12 @@ class ProgramAtWork:
     def _hear(self, kind: str, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         if kind != "put" or not (key in self._own or key.rpartition("/")[0] in self._program.objects("many")):
-            size = len(sample.payload) + len(sample.attachment or b"")
-            self._course.got[Message(kind, self._side, key, size)] += 1
+            payload, attachment = len(sample.payload), len(sample.attachment or b"")
+            message = Message(kind, self._side, key, payload + attachment)
+            self._course.got[message] += 1
+            if kind == "put":
+                content = Content(sample.kind == zenoh.SampleKind.DELETE, payload, attachment)
+                self._course.arrived.append((world().time() - self._epoch, message, content))
 
     def _ask(self, key: str) -> None:
         querier = self._session.declare_querier(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,15 @@ import numpy as np
 from evedrop.results.crash_proof_tables import forget
 from evedrop.results.folder import replace_private
 from evedrop.score.summary import Summary
+from evedrop.system.world import world
 
 
 def write_summary(folder: Path, summary: Summary) -> None:
     """Write summary.json, which completes a results folder; infinite and undefined numbers as strings, which JSON lacks."""
-    replace_private(folder / "summary.json", summary_text(summary))
+    path = folder / "summary.json"
+    replace_private(path, summary_text(summary))
+    with suppress(OSError):  # who cannot sync its new name has written it all the same
+        world().disk.sync(path)  # or else a power cut could leave a complete run that seems cut short
     forget(folder)
 
 

@@ -223,7 +223,9 @@ def summary_of(
     metric or application failed is not `complete`: it ended with that failure.
     """
     tallies, detection, loop = run_tally.tallies, run_tally.detection, run_tally.loop
-    digests = {name: None if name in ending.accused else entry for name, entry in digests.items()}
+    # If the run was cut short, some processes were ahead of the others.
+    whole = tallies[LEGITIMATE].done == scenario.slots
+    digests = {name: entry if whole and name not in ending.accused else None for name, entry in digests.items()}
     expected = expectations_of(scenario)
     peers = {name: _peer(name, tally, expected[name], digests[name], ending.mode) for name, tally in tallies.items()}
     heavy = {name for name, peer in peers.items() if peer.infinite_variance}

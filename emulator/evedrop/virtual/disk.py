@@ -106,8 +106,14 @@ class VirtualDisk(Disk):
     def fail_next(self, fault: DiskFault, seconds: float | None = None) -> None:
         """Let the next operation fail; seconds: until there is room again, if the disk is full."""
         at = self.operations + 1
-        self.faults = lambda operation: fault if operation == at else None
-        self._scheduler.after_seconds(seconds, self.make_room)
+        faults = self.faults = lambda operation: fault if operation == at else None
+
+        def end() -> None:
+            if self.faults is faults:  # a disk that nobody has used meanwhile was full in vain
+                self.faults = lambda _: None
+            self.make_room()
+
+        self._scheduler.after_seconds(seconds, end)
 
     def make_room(self) -> None:
         """Let the disk be full no longer."""

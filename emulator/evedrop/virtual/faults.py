@@ -107,12 +107,13 @@ class StopAndKillProcess(_Kill):
 
 
 class _Signal(_EndProcess):
-    """A signal that ends a run if its launcher gets it."""
+    """A signal that ends a run if its launcher gets it, or its recorder."""
 
     @property
     def statuses(self) -> frozenset[int]:
-        """Those of any failure, and that of an interrupt."""
-        return super().statuses | {Interrupted.exit_status}
+        """Those of any failure, and that of an interrupt, if the run itself is told to end."""
+        told = self.target in (LAUNCHER, RECORDER)
+        return super().statuses | ({Interrupted.exit_status} if told else frozenset())
 
 
 @final
@@ -383,7 +384,7 @@ class ShortenWrite(DiskDisturbance):
     """Half of a write arrives, and the program is told so."""
 
     kind, share = "shorten a write to", 2
-    fault, harmless = DiskFault.SHORT, True  # the program writes the rest
+    fault, harmless, lacking = DiskFault.SHORT, True, False  # the program writes the rest
 
 
 @final

@@ -20,9 +20,11 @@ from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.protocol.keys import writer_of
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.crash_proof_tables import last_round
-from evedrop.results.reading import Results
+from evedrop.results.reading import METRICS_AS_OF, Results
+from evedrop.scenario.loading import load
 from evedrop.scenario.plugins import named_in
 from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
+from evedrop.score.scorekeeper import verification_of
 from evedrop.virtual.broken_messages import CONTRADICTIONS, BreakMessage
 from evedrop.virtual.cases import SimulatedCase
 from evedrop.virtual.disturbance import EVERYBODY, KILLED, ROUTERS, Disturbance, processes_of
@@ -32,21 +34,28 @@ from evedrop.virtual.faults import (
     CutConnection,
     DelayThread,
     DiskDisturbance,
+    FillDisk,
     FlapConnection,
     FreezeConnection,
     HangProcess,
+    HangUpProcess,
+    InterruptProcess,
     KillProcess,
+    RefuseWrite,
     ShortenMessage,
+    StopAndKillProcess,
     StopProcess,
+    TerminateProcess,
 )
 from evedrop.virtual.host_faults import FreezeSsh, LosePower
 from evedrop.virtual.host_parts import PROGRAM, SESSION, host_of, part_of
-from evedrop.virtual.metrics import slots_of_metrics
-from evedrop.virtual.outsiders import OperatorCommand
+from evedrop.virtual.metrics import slots_of_metrics, unlike_prefix, wrong_course
+from evedrop.virtual.outsiders import LetStrangerIn, OperatorCommand
 from evedrop.virtual.processes import FORK_SERVERS, LAUNCHER
-from evedrop.virtual.reference import RunReference, tables_of
+from evedrop.virtual.reference import RunReference, summary_until, tables_of
 from evedrop.virtual.results import lost_rows, wrong_outages, wrong_summary, wrong_tables
 from evedrop.virtual.run import SimulatedRun
+from evedrop.virtual.steered import broken_holds, wrong_scenario
 from evedrop.virtual.traffic import is_late, wrong_messages
 
 _HEEDED_SECONDS = 1.0
@@ -57,6 +66,10 @@ _FAULT_SECONDS, _BRIEF_SECONDS = 15.0, 6.0
 """That each fault may cost besides those that it lasts, and one of a second or less; none if no message is lost."""
 _SUSPENDED_SECONDS = 3.0
 """That the end of a run takes if a receiver is suspended."""
+_TELLS_SECONDS = 1.0
+"""Within which a run tells of its progress."""
+_AT_ONCE_SECONDS = 3.0
+"""Within which a run, and all its processes, end because one of them has."""
 _NOTICED_SECONDS = 0.1
 """Within which a connection that is cut is noticed."""
 _ANSWERED_SECONDS, _ANSWERED_SLOTS = 3.0, 5
@@ -148,6 +161,7 @@ def _of_status(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturban
             yield f"status {status}, although a program is wrong ({program}): {complaint}"
     elif status == good:
         yield from _of_ignored_signals(case, run, struck, fatal)
+        yield from _of_removed(run, struck)
     elif not fatal:
         yield f"status {status}, although nothing of this may end a run: {complaint}"
     elif not any(status in fault.statuses for fault in fatal):
@@ -255,6 +269,13 @@ def _of_ignored_signals(
                 yield f"the run went on to its end, {_HEEDED_SECONDS:.0f} s and more after {fault}"
 
 
+def _of_removed(run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
+    """A run that goes on without its folder cannot end well."""
+    for fault, at in struck.items():
+        if fault.destroys and any(message.key == "uplink" and message.at > at + _HEEDED_SECONDS for message in run.put):
+            yield f"the run ends with status {run.status}, although its results were removed at {at:.2f} s"
+
+
 def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
     """Whether the run ended as soon as it could: a wake-up that is lost, and a wait that is too long, cost nothing but time."""
     scenario = case.scenario
@@ -282,6 +303,19 @@ def _of_time(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance
     if took > most and not run.suspended:
         yield f"the run took {took:.1f} s, and not {most:.1f} s at most"
     yield from _of_hold(case, run, struck)
+    yield from _of_process_end(case, run, struck)
+
+
+def _of_process_end(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
+    """Whether a process that ends has ended the run at once, and all others, unless all slots were done."""
+    ends = KillProcess | InterruptProcess | TerminateProcess | HangUpProcess
+    is_over = any(message.said == "end" for message in run.put)  # then it may be waited for in vain
+    if len(struck) > 1 or case.hosts is not None or case.program is not None or is_over:
+        return
+    for fault, at in struck.items():
+        took = max(run.ended, run.seconds) - at
+        if isinstance(fault, ends) and not fault.survived(case.scenario.longest_outage) and took > _AT_ONCE_SECONDS:
+            yield f"the run goes on for {took:.1f} s after {fault}"
 
 
 def _of_hold(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Disturbance, float]) -> Iterator[str]:
@@ -357,9 +391,11 @@ def _of_operators(case: SimulatedCase, run: SimulatedRun, struck: Mapping[Distur
     if all(isinstance(fault, OperatorCommand) for fault in struck):
         most = _ANSWERED_SECONDS + _ANSWERED_SLOTS * case.scenario.pace
         most += 0.0 if case.program is None else case.program.seconds(case.scenario)  # a step waits for its states
-        for words, seconds in run.typed:
-            if seconds > most:
-                yield f"{words} is answered after {seconds:.1f} s, and not after {most:.1f} s at most"
+        for command in run.typed:
+            if (seconds := command.answered - command.begun) > most:
+                yield f"{command.words} is answered after {seconds:.1f} s, and not after {most:.1f} s at most"
+    if case.scenario.shards == 1:
+        yield from broken_holds(run.typed, run.put)
 
 
 def _progress(run: SimulatedRun) -> Iterator[tuple[float, int]]:
@@ -409,12 +445,14 @@ def _of_results(
             if done or has_rows or (whole and not lacking and any(slots for _, slots in _progress(run))):
                 yield f"the results cannot be read: {error}"
             continue
-        if whole and done:
-            yield from _lost_logs(case, folder)
+        if whole:
+            yield from _of_folder(case, run, folder, done)
         if falsified:  # rows may have a number that was noticed later, when its block was complete
             continue
         summary = results.summary
         yield from wrong_tables(tables, summary, expected, done)
+        if whole:
+            yield from _of_unsaved(run, struck, summary, expected)
         # A launcher may lack memory or threads when all results are written.
         starved = any(fault.lacking and not isinstance(fault, DiskDisturbance) for fault in struck)
         ended_at_once = starved or run.status in (None, KILLED, Interrupted.exit_status)
@@ -423,16 +461,67 @@ def _of_results(
         if lacking and not done:
             continue
         yield from wrong_summary(summary, expected, done)
+        yield from _of_words(case, run, struck, summary, whole and not done and not lacking)
+        if not done and expected.shards == 1:
+            yield from _of_metrics(case, folder, summary)
         # Rows are on the disk before the first process is told that the run is over.
         is_over = reference.shards == 1 and any(message.said == "end" for message in run.put)
         if is_over and summary["slots"] < reference.scenario.slots:
             yield f"all slots were done, and the summary has {summary['slots']}"
-        if whole:
-            yield from _of_unsaved(run, struck, summary, expected)
         # A recorder that is killed has no time to save what it told.
         killed = run.ends.get(RECORDER, (0.0, 0))[1] == KILLED or any(fault.ends_at_once(RECORDER) for fault in struck)
         if not killed:
             yield from _of_course(case, run, struck, summary, expected, whole)
+
+
+def _of_folder(case: SimulatedCase, run: SimulatedRun, folder: Path, done: bool) -> Iterator[str]:
+    """Whether the folder of a whole run has its logs if it ended well, and the right scenario."""
+    if done:
+        yield from _lost_logs(case, folder)
+    if case.program is None and (folder / "scenario.toml").exists():
+        yield from wrong_scenario(folder, case.scenario, run.typed)
+
+
+def _of_metrics(case: SimulatedCase, folder: Path, summary: Mapping[str, Any]) -> Iterator[str]:
+    """Whether the metrics of a run that was cut short are those of the same slots in memory, with the changes of operators."""
+    slots = int(summary["slots"])
+    if case.program is not None or slots != slots_of_metrics(summary):  # they are of fewer slots
+        return
+    scenario = load(folder)
+    if slots < scenario.slots and not any(named_in(scenario.as_tables())):
+        all_recorded = scenario.record_trials == scenario.trials
+        yield from unlike_prefix(summary, summary_until(scenario, slots), all_recorded=all_recorded)
+
+
+def _of_words(
+    case: SimulatedCase, run: SimulatedRun, struck: Iterable[Disturbance], summary: Mapping[str, Any], failed: bool
+) -> Iterator[str]:
+    """Whether the summary says how the run went; failed: whether it is of a whole run that ended early."""
+    faults = [*struck]
+    yield from wrong_course(summary, verification_of(case.scenario, ()), run.seconds, _confused(case, faults))
+    if (
+        not failed
+        or run.ends.get(RECORDER, (0.0, 0))[1] == KILLED
+        or any(fault.ends_at_once(RECORDER) for fault in faults)
+    ):
+        return
+    first = next(iter(str(summary["ended"]).splitlines()), "")
+    why, _, _ = first.partition(METRICS_AS_OF)
+    if run.status == Interrupted.exit_status and why != "interrupted":
+        yield f"the run was interrupted, and the summary says: {first}"
+    if run.status == RunError.exit_status and why not in run.said:
+        yield f"the run says {run.said.splitlines()[:1]}, and its summary: {first}"
+
+
+def _confused(case: SimulatedCase, faults: Iterable[Disturbance]) -> float:
+    """How many messages may have arrived as those of another key; any number if others than the run wrote some."""
+    names, count = len(processes_of(case.scenario)), 0.0
+    for fault in faults:
+        if isinstance(fault, ConfuseKeys):
+            count += case.scenario.shards * (names if fault.target == EVERYBODY else 1)
+        elif isinstance(fault, BreakMessage | LetStrangerIn | ShortenMessage):
+            return math.inf
+    return count
 
 
 def _lost_logs(case: SimulatedCase, folder: Path) -> Iterator[str]:
@@ -451,8 +540,10 @@ def _lost_logs(case: SimulatedCase, folder: Path) -> Iterator[str]:
 
 def _falsified(run: SimulatedRun, struck: Iterable[Disturbance]) -> bool:
     """Whether a run that has failed may have rows with a wrong number: it says so, unless something else ended it before."""
-    wrong = any(isinstance(fault, BreakMessage) and fault.target == RECORDER for fault in struck)
-    return wrong or any(text in run.said for text in CONTRADICTIONS)
+    broken = [fault for fault in struck if isinstance(fault, BreakMessage | ShortenMessage)]
+    wrong = any(isinstance(fault, BreakMessage) and fault.target == RECORDER for fault in broken)
+    unreadable = len(broken) == 1 and "broke the protocol" in run.said  # then no number was wrong
+    return (wrong and not unreadable) or any(text in run.said for text in CONTRADICTIONS)
 
 
 def _of_course(
@@ -467,6 +558,8 @@ def _of_course(
     told = max((done for _, done in _progress(run)), default=0)
     if summary["slots"] < told and whole:
         yield f"{told} slots were done, and the summary has {summary['slots']}"
+    if not (struck or told) and case.program is None and case.scenario.pace * case.scenario.slots > _TELLS_SECONDS:
+        yield "the run tells no progress"
     yield from _of_cuts(run, struck, summary, reference)
     yield from _of_lasting(struck, summary, reference)
     yield from _of_misled(run, struck, summary, reference)
@@ -475,7 +568,9 @@ def _of_course(
         if summary["slots"] < sent:
             yield f"the program has given states of {sent} slots, and the summary has {summary['slots']}"
     outages = [event for _, event in run.told if isinstance(event, ConnectionOutage)] if whole else []
-    yield from wrong_outages(summary, reference, frozenset((event.process, event.slot) for event in outages))
+    yield from wrong_outages(
+        summary, reference, frozenset((event.process, event.slot) for event in outages), run.seconds
+    )
     for entry in summary["outages"]:
         failing = _wrong_program(case) is not None and entry["process"] == SENSOR
         if not failing and not any(_explains(fault, entry["process"]) for fault in struck):
@@ -541,7 +636,8 @@ def _of_unsaved(
 ) -> Iterator[str]:
     """Whether a recorder that was killed had saved all rows and metrics but those of the last seconds."""
     fault = next(iter(struck), None)
-    if isinstance(fault, KillProcess) and len(struck) == 1 and reference.shards == 1:
+    stops = KillProcess | StopAndKillProcess | FillDisk | RefuseWrite
+    if isinstance(fault, stops) and len(struck) == 1 and reference.shards == 1:
         saved = struck[fault] - _UNSAVED_SECONDS
         early = max((done for at, done in _progress(run) if at < saved), default=0)
         for what, slots in (("summary", summary["slots"]), ("last metrics", slots_of_metrics(summary) or 0)):
@@ -579,6 +675,8 @@ def _explains(fault: Disturbance, process: str) -> bool:
     Routers, and the recorder, stand for all that were connected to them.
     """
     hubs = (*ROUTERS, RECORDER)
+    if isinstance(fault, OperatorCommand | DelayThread | DiskDisturbance):  # they cut off nobody
+        return False
     return (
         not fault.cuts_off
         or bool(host_of(fault.target))

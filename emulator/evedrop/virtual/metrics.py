@@ -15,6 +15,7 @@ from typing import Any
 import pyarrow as pa
 
 from evedrop.model.checks import MOST_SLOTS
+from evedrop.score.summary import Verification
 
 _ROUNDED = 1e-9
 """Relative difference of metrics that a live run adds up in another order."""
@@ -41,6 +42,44 @@ def unlike_memory(summary: Mapping[str, Any], wanted: Mapping[str, Any], shards:
             yield from _differences(name, summary.get(name), value)
     for name in summary.keys() - wanted.keys() - _OF_A_LIVE_RUN:
         yield f"the summary has {name}, and in memory it has not"
+
+
+def unlike_prefix(summary: Mapping[str, Any], wanted: Mapping[str, Any], *, all_recorded: bool) -> Iterator[str]:
+    """The entries of a run that was cut short that differ from those of the same slots in memory; wanted: these.
+
+    Its events may be those before the next slot, too, and a controller may end before it has told how long its last decisions
+    took. all_recorded: whether all trials are; of others, tr P of each is known at the end of a block only, as is its standard
+    error.
+    """
+    slots, controller = wanted["slots"], wanted.get("controller")
+    events = [event for event in summary["events"] if event["slot"] < slots or event in wanted["events"]]
+    if controller is not None:
+        counted = max(summary["controller"]["decisions"], _decisions(controller, slots, 1))
+        summary = {**summary, "controller": {**summary["controller"], "decisions": counted}}
+    for line in unlike_memory({**summary, "events": events}, wanted):
+        if all_recorded or ".standard_errors.mean_trace_covariance is None" not in line:
+            yield line
+
+
+def wrong_course(
+    summary: Mapping[str, Any], wanted: Mapping[str, Verification], seconds: float, confused: float
+) -> Iterator[str]:
+    """The entries that say how a live run went, and are not so; wanted: what is verified of each receiver.
+
+    seconds: that the run took; confused: how many messages arrived as those of another key.
+    """
+    if summary["mode"] != "live":
+        yield f"the mode of a live run is {summary['mode']}"
+    wall = summary["wall_seconds"]
+    if not 0.0 <= wall <= seconds:
+        yield f"wall_seconds is {wall}, and the run took {seconds:.1f} s"
+    if (dropped := sum(summary["misdelivered"].values())) > confused:
+        yield f"the summary has {dropped} messages of other keys, and {confused:.0f} were confused"
+    for name, entry in summary["verification"].items():
+        if entry["recomputed_trials"]:
+            for part in ("verified", "own_word"):
+                if [*entry[part]] != [*getattr(wanted[name], part)]:
+                    yield f"{part} of {name} is {entry[part]}"
 
 
 def _decisions(controller: Mapping[str, Any], slots: int, shards: int) -> int:

@@ -98,7 +98,7 @@ class HostConnection:
         """Let nothing through for some time, or for good, though it seems open."""
         self.orders.freeze()
         self.answers.freeze()
-        self.frozen_until = self._scheduler.later(seconds)
+        self.frozen_until = max(self.frozen_until, self._scheduler.later(seconds))
         self._scheduler.after_seconds(seconds, self._thaw)
 
     def _thaw(self) -> None:

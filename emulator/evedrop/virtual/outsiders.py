@@ -26,6 +26,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.system.world import world as here
 from evedrop.virtual.disturbance import Disturbance
 from evedrop.virtual.processes import LAUNCHER
+from evedrop.virtual.steered import Typed
 
 if TYPE_CHECKING:
     from evedrop.virtual.run import SimulatedWorld
@@ -60,9 +61,11 @@ class OperatorCommand(_Outsider):
     @staticmethod
     def _type(world: SimulatedWorld, *words: str) -> bool:
         """Carry out a command, such as `pause RUN`; returns whether the run did it, rather than to refuse."""
-        begun = here().monotonic()
+        typed, printed = Typed(" ".join(words), here().monotonic()), len(world.machine.current.printed)
+        world.typed.append(typed)
         status = world.machine.program([words[0], str(world.results_now), *words[1:]])
-        world.typed.append((" ".join(words), here().monotonic() - begun))
+        typed.answered, typed.status = here().monotonic(), status
+        typed.said = world.machine.current.printed[printed:]
         if status not in {0, UsageError.exit_status}:
             raise AssertionError(f"{' '.join(words)} ends with status {status}")
         return status == 0

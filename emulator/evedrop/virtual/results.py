@@ -6,6 +6,7 @@ Source: docs/results.md.
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
@@ -46,6 +47,9 @@ def wrong_summary(summary: Mapping[str, Any], reference: RunReference, done: boo
         in_bursts = sum(length * count for length, count in enumerate(link["bursts"] or (), start=1))
         if in_bursts > link["lost_by"].get("lost", 0):
             yield f"the bursts of {name} have {in_bursts} packets, and its losses are {link['lost_by']}"
+    for name in ("scenario", "seed", "first_trial"):
+        if summary[name] != reference.summary[name]:
+            yield f"{name} is {summary[name]}, not {reference.summary[name]}"
     if done:
         if summary["ended"] != "complete":
             yield f"the run ended well, and its summary says {summary['ended']}"
@@ -65,9 +69,15 @@ def _recorded(trials: int, of: int, shards: int) -> int:
 
 
 def wrong_outages(
-    summary: Mapping[str, Any], reference: RunReference, reconnected: frozenset[tuple[str, int]]
+    summary: Mapping[str, Any],
+    reference: RunReference,
+    reconnected: frozenset[tuple[str, int]],
+    seconds: float = math.inf,
 ) -> Iterator[str]:
-    """What is wrong with a summary's `outages`; reconnected: process and slot of those that the run told of."""
+    """What is wrong with a summary's `outages`; reconnected: process and slot of those that the run told of.
+
+    seconds: that the run took.
+    """
     complete, slots = summary["ended"] == "complete", int(reference.summary["slots"])
     listed = summary["outages"]
     for process, slot in sorted(reconnected - {(entry["process"], entry["slot"]) for entry in listed}):
@@ -75,8 +85,8 @@ def wrong_outages(
     for entry in listed:
         if complete and (entry["until"] is None or not entry["slot"] <= entry["until"] <= slots):
             yield f"an outage of {entry['process']} at slot {entry['slot']} until {entry['until']}, in a run that is complete"
-        if entry["seconds"] < 0.0:
-            yield f"an outage of {entry['seconds']} s"
+        if not 0.0 <= entry["seconds"] <= seconds:
+            yield f"an outage of {entry['seconds']} s in a run of {seconds:.1f} s"
         if (entry.get("shard") is None) != (reference.shards == 1):
             yield f"an outage of {entry['process']} in shard {entry.get('shard')} of {reference.shards}"
 

@@ -29,6 +29,7 @@ from evedrop.virtual.notes import PutMessage
 from evedrop.virtual.other_hosts import OtherHosts
 from evedrop.virtual.processes import ProcessOutput, Program, VirtualMachine, VirtualProcess
 from evedrop.virtual.scheduler import Occurrence, Stuck, VirtualScheduler
+from evedrop.virtual.steered import Typed
 from evedrop.virtual.world import VirtualWorld
 from evedrop.virtual.zenoh import VirtualZenoh
 
@@ -76,8 +77,8 @@ class SimulatedRun:
     """The hash of all events."""
     put: list[PutMessage] = field(default_factory=list)
     """The messages that all processes have put."""
-    typed: list[tuple[str, float]] = field(default_factory=list)
-    """The commands of operators, each with the virtual seconds until its answer."""
+    typed: list[Typed] = field(default_factory=list)
+    """The commands of operators."""
     misled: list[tuple[float, str, str]] = field(default_factory=list)
     """When a message of another key arrived as a command, at which process, and that key."""
     happened: list[Occurrence] = field(default_factory=list)
@@ -100,8 +101,8 @@ class SimulatedWorld:
         """How many slots its sensor may be ahead."""
         self.told: list[tuple[float, ProgressEvent]] = []
         """The events that its launcher got."""
-        self.typed: list[tuple[str, float]] = []
-        """The commands of operators, each with the virtual seconds until its answer."""
+        self.typed: list[Typed] = []
+        """The commands of operators."""
         self.places: Mapping[str, str] = {}
         """Router → where it listens, if that is at a port."""
         self.hosts: OtherHosts | None = None

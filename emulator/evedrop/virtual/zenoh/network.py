@@ -271,10 +271,14 @@ class VirtualZenoh:
 
     def cut(self, process: str, seconds: float | None) -> bool:
         """Cut the connections of a process, which cannot be made again, nor for the first time, for some time, or for good."""
-        self._cut[process] = self.scheduler.later(seconds)
+        self._keep_away(process, seconds)
         for connection in self._connections(process):
             connection.close("is cut")
         return True
+
+    def _keep_away(self, process: str, seconds: float | None) -> None:
+        """Let a process connect with nobody for some time, or for good, and for no less than was said before."""
+        self._cut[process] = max(self._cut.get(process, 0.0), self.scheduler.later(seconds))
 
     def freeze(self, process: str, seconds: float | None) -> bool:
         """Let nothing through the connections of a process for some time, or for good."""
@@ -282,7 +286,7 @@ class VirtualZenoh:
         for connection in connections:
             connection.freeze(seconds)
         if connections:
-            self._cut[process] = self.scheduler.later(seconds)
+            self._keep_away(process, seconds)
         return bool(connections)
 
     def clog(self, router: str) -> bool:
@@ -294,7 +298,7 @@ class VirtualZenoh:
 
     def unplug(self, host: str, seconds: float | None) -> None:
         """Let nothing through between the processes of a host and all others for some time, or for good."""
-        self._unplugged[host] = self.scheduler.later(seconds)
+        self._unplugged[host] = max(self._unplugged.get(host, 0.0), self.scheduler.later(seconds))
         for session in self._sessions:
             for end in session.ends if session.task.host == host else ():
                 if end.other.session.task.host != host:

@@ -258,6 +258,7 @@ class VirtualConnection:
         self.open = True
         self.held: list[Callable[[], object]] | None = None
         """Frames that have come as far as where nothing gets through; None where everything does."""
+        self._frozen_until = 0.0
         self._slow_until, self._factor = 0.0, 1.0
 
     def __str__(self) -> str:
@@ -294,6 +295,7 @@ class VirtualConnection:
         """
         if self.held is None:
             self.held = []
+        self._frozen_until = max(self._frozen_until, self._scheduler.later(seconds))
         self._scheduler.note(notes.FREEZES, self.ends[0].session.name, self.ends[1].session.name)
         lease = min(end.session.lease for end in self.ends)
         if noticed and (seconds is None or seconds >= lease):
@@ -302,6 +304,8 @@ class VirtualConnection:
             self._scheduler.after_seconds(seconds, self._thaw)
 
     def _thaw(self) -> None:
+        if self._scheduler.now < self._frozen_until:  # it was frozen again meanwhile
+            return
         held, self.held = self.held, None
         for arrive in held or ():
             arrive()
