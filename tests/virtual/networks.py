@@ -469,7 +469,7 @@ class SimulatedNetwork(Network):
 
     def heal(self, client: str) -> None:
         """Let it connect again."""
-        self.zenoh.cut(client, 0.0)
+        self.zenoh.heal(client)
 
 
 def play_simulated(seed: int, body: Callable[[Network], None]) -> None:

@@ -276,6 +276,10 @@ class VirtualZenoh:
             connection.close("is cut")
         return True
 
+    def heal(self, process: str) -> None:
+        """Let a process connect again."""
+        self._cut.pop(process, None)
+
     def _keep_away(self, process: str, seconds: float | None) -> None:
         """Let a process connect with nobody for some time, or for good, and for no less than was said before."""
         self._cut[process] = max(self._cut.get(process, 0.0), self.scheduler.later(seconds))
