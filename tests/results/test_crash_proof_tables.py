@@ -24,6 +24,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evedrop.cli.api.running import montecarlo
 from evedrop.errors import UsageError
 from evedrop.results import crash_proof_tables
 from evedrop.results.crash_proof_tables import goes_on, last_round, parquet_batches
@@ -244,7 +245,7 @@ def test_a_full_disk_ends_the_run_and_what_fitted_can_be_read(evedrop: Evedrop, 
 def test_a_killed_study_can_be_read(evedrop: Evedrop) -> None:
     """Kill -9 of Monte Carlo: the trials that were done, with statistics, digests and the recorded one."""
     live = evedrop.started("montecarlo", "eavesdroppers", "--trials", "100000", "--slots", "400", "--workers", "1")
-    wait_until((live.folder / UNFINISHED / "summary.json").exists, "metrics on disk")
+    wait_until(lambda: last_round(live.folder).slots > 0, "trials that count")
     kill_all(live)
     results = live.results
     trials = results.summary["trials"]
@@ -257,6 +258,27 @@ def test_a_killed_study_can_be_read(evedrop: Evedrop) -> None:
     assert results.slots.num_rows == results.trials.num_rows == 4 * 400
     assert results.digests.num_rows == 4 * 2 * trials
     assert f"{trials:,} trials" in evedrop("view", "run", "--table").out
+
+
+class _KilledError(Exception):
+    """A study is killed."""
+
+
+def test_a_study_that_is_killed_before_its_first_trials_count_has_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kill -9 between the metrics and the line that makes their rows count: no trials are claimed, and no slots."""
+
+    def kill(writer: ResultsWriter, at: str, metrics: Callable[[], Summary], _before: Callable[[], None]) -> None:
+        writer.write_metrics(metrics())
+        shutil.copytree(tmp_path / "out", tmp_path / "killed")
+        raise _KilledError
+
+    monkeypatch.setattr(ResultsWriter, "checkpoint", kill)
+    with pytest.raises(_KilledError):
+        montecarlo("eavesdroppers", trials=2 * 500, slots=20, workers=2, out=tmp_path / "out")
+    with pytest.raises(UsageError, match="nothing yet"):
+        Results.read(tmp_path / "killed")
 
 
 @pytest.mark.long

@@ -49,8 +49,12 @@ class ResultsWriter:
     `write_summary` then completes the folder.
     """
 
-    def __init__(self, folder: Path, scenario: Scenario, with_metrics: Callable[[], None] = lambda: None) -> None:
-        """with_metrics: called before metrics are written; their rows are on disk by then.
+    def __init__(
+        self, folder: Path, scenario: Scenario, with_metrics: Callable[[], None] = lambda: None, at: str = "slot 0"
+    ) -> None:
+        """with_metrics: called before metrics are written, when their rows are on disk; at: as for `checkpoint`.
+
+        at: empty for a study, whose folder has nothing to read before its first trials are done.
 
         Raises OSError if the folder cannot be written.
         """
@@ -76,7 +80,7 @@ class ResultsWriter:
         self._streams = {name: self._stream(name, 0) for name in self._kinds}
         self._outdated: list[TableStream] = []
         self._restarts = self._bytes = self._on_disk = self._slots = 0
-        self._at = "slot 0"
+        self._at = at
         self._broken = self._metrics_before = False
         self._round_due = self._metrics_due = world().monotonic() + _ROUND_SECONDS
         self._with_metrics = with_metrics

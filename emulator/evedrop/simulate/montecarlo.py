@@ -181,7 +181,7 @@ def simulate(scenario: Scenario, folder: Path, on_event: OnEvent, plan: Plan = P
         with contextlib.closing(HeldFolder(folder)) as held, disk_errors(folder):
             write_resolved(folder, scenario)
             with (
-                ResultsWriter(folder, scenario) as writer,
+                ResultsWriter(folder, scenario, at="") as writer,
                 contextlib.closing(crew.results(tasks, on_progress, stop.is_set, finished)) as results,
             ):
                 try:
