@@ -45,7 +45,7 @@ class EvedropError(Exception):
         return str(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """What a copy is made from, in another process too: not the constructor's arguments, of which the message is made."""
+        """How pickle copies an error: from its message, because its constructor's arguments are not kept."""
         return _copied, (type(self), self.args, self.__dict__)
 
 

@@ -7,6 +7,7 @@ import math
 import re
 import time
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -104,21 +105,35 @@ def test_a_wrong_model_is_told(tmp_path: Path, model: str, wrong: dict[str, Any]
     )
 
 
-def test_changes_and_cuts_are_part_of_the_distribution(tmp_path: Path) -> None:
-    """A link that changed half way, and was cut in between, agrees with its models of each time."""
-    plan = wire_plan(link=BURSTS)
-    other = {"loss": {"model": "bernoulli", "quality": 0.3}}
-    with WireJournal(tmp_path, plan) as journal:
+def judged(
+    folder: Path,
+    messages: int,
+    fate_of: Callable[[int, WireFate], WireFate],
+    link: dict[str, Any],
+    later: tuple[int, dict[str, Any]] | None = None,
+) -> WireLinkSummary:
+    """The summary of a link after so many messages.
+
+    fate_of: from a message's number and its fate by the models, its fate; link: its models; later: those from a message on.
+    """
+    plan = wire_plan(link=link)
+    with WireJournal(folder, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
         fates, key = key_fates(plan.links[0], "link/1", "put", 7), journal.words.key_code("link/1")
-        for n in range(4000):
-            if n == 2000:
-                journal.change("link", other, {("link/1", "put"): fates.change(other)})
-            fate = fates.next()[0]
-            if 1000 <= n < 1500:
-                fate = WireFate.CUT
-            journal.records.record(time.time(), n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
-    link = keeper.links()["link"]
+        for n in range(messages):
+            if later is not None and n == later[0]:
+                journal.change("link", later[1], {("link/1", "put"): fates.change(later[1])})
+            fate = fate_of(n, WireFate(fates.next()[0]))
+            journal.records.record(n / 10, n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
+    return keeper.links()["link"]
+
+
+def test_changes_and_cuts_are_part_of_the_distribution(tmp_path: Path) -> None:
+    """A link that changed half way, and was cut in between, agrees with its models of each time."""
+    other = {"loss": {"model": "bernoulli", "quality": 0.3}}
+    link = judged(
+        tmp_path, 4000, lambda n, fate: WireFate.CUT if 1000 <= n < 1500 else fate, BURSTS, later=(2000, other)
+    )
     assert link.expected_rate == pytest.approx((1500 * 0.2 / 0.22 + 2000 * 0.3) / 3500)
     assert link.within_bounds is True
     assert link.lost_by["cut"] == link.gap_messages == 500
@@ -150,37 +165,26 @@ def journal_time(n: int) -> float:
 
 def test_a_link_on_many_of_whose_messages_no_model_decides_is_judged_as_a_sample(tmp_path: Path) -> None:
     """The numbers of the others are too scattered to be kept: the model's rate, with bounds that are wide enough for a sample."""
-    plan, messages, quality = wire_plan(link={"loss": {"model": "bernoulli", "quality": 0.7}}), 12_000, 0.7
-    with WireJournal(tmp_path, plan) as journal:
-        keeper = WireScorekeeper(plan, journal)
-        fates, key = key_fates(plan.links[0], "link/1", "put", 7), journal.words.key_code("link/1")
-        for n in range(messages):
-            fate = fates.next()[0]
-            fate = WireFate.CUT if n % 4 else fate
-            journal.records.record(n / 10, n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
-    link, tried = keeper.links()["link"], messages // 4
+    messages, quality = 12_000, 0.7
+    loss = {"loss": {"model": "bernoulli", "quality": quality}}
+    link = judged(tmp_path, messages, lambda n, fate: WireFate.CUT if n % 4 else fate, loss)
     assert link.expected_rate == pytest.approx(quality)
     assert link.within_bounds is True
     assert link.bounds is not None
-    standard_deviation = math.sqrt(quality * (1.0 - quality) / tried)
+    standard_deviation = math.sqrt(quality * (1.0 - quality) / (messages // 4))
     assert link.bounds[1] - link.bounds[0] == pytest.approx(2 * 2.576 * standard_deviation, rel=0.03)
 
 
 def test_a_link_that_becomes_worse_and_overflows_at_once_agrees_with_its_models_of_each_time(tmp_path: Path) -> None:
     """However often the queue was full since: most of its good messages are those of before, and the model says so."""
-    plan = wire_plan(link={"loss": {"model": "bernoulli", "quality": 0.9}})
-    worse = {"loss": {"model": "bernoulli", "quality": 0.5}}
-    with WireJournal(tmp_path, plan) as journal:
-        keeper = WireScorekeeper(plan, journal)
-        fates, key = key_fates(plan.links[0], "link/1", "put", 7), journal.words.key_code("link/1")
-        for n in range(32_000):
-            if n == 10_000:
-                journal.change("link", worse, {("link/1", "put"): fates.change(worse)})
-            fate = fates.next()[0]
-            if n >= 10_000 and n % 10:
-                fate = WireFate.OVERFLOW
-            journal.records.record(n / 10, n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
-    link = keeper.links()["link"]
+    good, worse = ({"loss": {"model": "bernoulli", "quality": quality}} for quality in (0.9, 0.5))
+    link = judged(
+        tmp_path,
+        32_000,
+        lambda n, fate: WireFate.OVERFLOW if n >= 10_000 and n % 10 else fate,
+        good,
+        later=(10_000, worse),
+    )
     assert link.expected_rate == pytest.approx((10_000 * 0.9 + 2200 * 0.5) / 12_200, rel=1e-3)
     assert link.within_bounds is True
 

@@ -54,7 +54,7 @@ _DIGEST_WIDTH = 100
 def print_summary(summary: Summary, folder: str, replay: str | None = None, verbose: bool = False) -> None:
     """Print the closing report on standard output.
 
-    replay: the beginning of the command that shows one trial live; verbose: with what the report page says of verdicts, too.
+    replay: the beginning of the command that shows one trial live; verbose: also print the page's notes on verdicts.
     """
     console = terminal()
     if summary.ended != "complete":
@@ -83,7 +83,7 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None, verb
 
 
 def _print_details(console: ReportConsole, summary: Summary, replay: str | None) -> None:
-    """Print what the report page says besides: theory, leaks, directions, doubts, and the most surprising trial."""
+    """Print the other parts of the report page: theory, leaks, directions, doubts, and the most surprising trial."""
     for line in closing.details(summary):
         console.say(line)
     if summary.directions:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
@@ -314,8 +314,9 @@ def application_mistakes(scenario: Scenario) -> Iterator[str]:
         if scenario.plant is None or scenario.controller is None:
             yield f"{name}: is given without a [plant] and a [controller]; expected both, or no table [{name}]"
         else:
-            yield from _named_mistakes(name, APPLICATIONS[name], table, scenario.process, scenario.plant)
-            yield from _power_mistakes(name, APPLICATIONS[name], table, scenario.process, scenario.plant)
+            yield from _named_mistakes(
+                name, APPLICATIONS[name], table, _quantities_of(scenario.process, scenario.plant)
+            )
             if APPLICATIONS[name].powers and scenario.slot_seconds is None:
                 yield (
                     f"slot_seconds: is missing, and the energies of [{name}] need the duration of a slot; expected it, such as "
@@ -325,34 +326,35 @@ def application_mistakes(scenario: Scenario) -> Iterator[str]:
             yield f"eavesdroppers.{name}: is a name that the {name}'s metrics use; expected another"
 
 
+class _Quantities(NamedTuple):
+    """The states, inputs or disturbances of a scenario."""
+
+    entry: str
+    """Where the scenario names them."""
+    names: list[str]
+    units: list[str]
+    """As many as names, or none."""
+
+
+def _quantities_of(process: ProcessTable, plant: PlantTable) -> dict[Kind, _Quantities]:
+    return {
+        "states": _Quantities("process.states", process.states or [], process.units or []),
+        "inputs": _Quantities("plant.inputs", plant.inputs, plant.input_units or []),
+        "disturbances": _Quantities("plant.disturbances", plant.disturbances, plant.disturbance_units or []),
+    }
+
+
 def _named_mistakes(
-    name: str, application: type[Application], table: Table, process: ProcessTable, plant: PlantTable
+    name: str, application: type[Application], table: Table, quantities: Mapping[Kind, _Quantities]
 ) -> Iterator[str]:
-    names: dict[Kind, list[str]] = {
-        "states": process.states or [],
-        "inputs": plant.inputs,
-        "disturbances": plant.disturbances,
-    }
+    """Names of an application's table that the scenario does not have, and powers that it has in another unit."""
     for entry, kind in application.names.items():
-        given, there = getattr(table, entry), names[kind]
-        if given is not None and given not in there:
-            where = f"process.{kind}" if kind == "states" else f"plant.{kind}"
-            choice = f"expected one of {listed(there)}" if there else f"expected {where} = [{as_toml(given)}, …]"
+        given, (where, names, units) = getattr(table, entry), quantities[kind]
+        if given is not None and given not in names:
+            choice = f"expected one of {listed(names)}" if names else f"expected {where} = [{as_toml(given)}, …]"
             yield f"{name}.{entry}: is {as_toml(given)}, which is not among {where}; {choice}"
-
-
-def _power_mistakes(
-    name: str, application: type[Application], table: Table, process: ProcessTable, plant: PlantTable
-) -> Iterator[str]:
-    known: dict[Kind, tuple[list[str] | None, list[str] | None]] = {
-        "states": (process.states, process.units),
-        "inputs": (plant.inputs, plant.input_units),
-        "disturbances": (plant.disturbances, plant.disturbance_units),
-    }
-    for entry in application.powers:
-        given, (names, units) = getattr(table, entry), known[application.names[entry]]
-        unit = dict(zip(names or [], units or [], strict=False)).get(given, _POWER)
-        if unit != _POWER:
+        unit = dict(zip(names, units, strict=False)).get(given, _POWER)
+        if entry in application.powers and unit != _POWER:
             yield f"{name}.{entry}: is {as_toml(given)}, which is in {unit}; expected a power in {_POWER}"
 
 

@@ -143,7 +143,7 @@ def _model_mistakes(
     problem: Problem,
     stated: Any,
 ) -> Iterator[str]:
-    """stated: the slots, or how many lags, of which the model must state probabilities."""
+    """stated: the slots, or the number of lags, for which the model must give probabilities."""
     if models.foreign(spec["model"]):
         parameters = {name: value for name, value in spec.items() if name != "model"}
         made = checks(models[spec["model"]], parameters)

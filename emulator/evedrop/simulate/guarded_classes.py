@@ -9,18 +9,13 @@ Source: docs/your-own/rules.md, mistakes.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
 from typing import Any, final
 
 import numpy as np
 
-from evedrop.model.delays import DELAY_MODELS
-from evedrop.model.links import LOSS_MODELS, single_specs
-from evedrop.model.links.loss_model import Fate
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Encoder, Scheme
-from evedrop.model.slot.link import Fates, LinkSchedule
 from evedrop.model.streams import Batch
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.conformance.checked import (
@@ -33,7 +28,7 @@ from evedrop.scenario.conformance.checked import (
     scheme_in_words,
 )
 from evedrop.scenario.conformance.problems import Problem, expect_actions
-from evedrop.scenario.conformance.rules import Broken, expect_array, expect_finite
+from evedrop.scenario.conformance.rules import expect_array, expect_finite
 from evedrop.scenario.dry_run import foreign
 from evedrop.scenario.tables import Scenario
 
@@ -53,19 +48,10 @@ class Guard:
             self._classes[name] = eavesdropper_in_words(name, table.strategy, table.parameters)
             if is_foreign(table.strategy, table.parameters):
                 self._watched.add(name)
-        self._links = {receiver: list(_models_of(scenario.schedule(receiver))) for receiver in scenario.receivers}
 
     def asking(self, receiver: str, slots: range) -> contextlib.AbstractContextManager[None]:
         """Turn an error in the block into one that names the receiver's class, the slots and the trials."""
-        return self._named(self._classes[receiver], slots)
-
-    def asking_link(self, receiver: str, slots: range) -> contextlib.AbstractContextManager[None]:
-        """Like `asking`, for the models of a receiver's link."""
-        models = f" ({', '.join(self._links[receiver])})" if self._links[receiver] else ""
-        return self._named(f"{receiver}'s link{models}", slots)
-
-    def _named(self, subject: str, slots: range) -> contextlib.AbstractContextManager[None]:
-        return asking(subject, slots, self._batch) if self._active else contextlib.nullcontext()
+        return asking(self._classes[receiver], slots, self._batch) if self._active else contextlib.nullcontext()
 
     def encoder(self, encoder: Encoder) -> Encoder:
         """The encoder; if its class is not built in, one that checks all its packets."""
@@ -98,25 +84,5 @@ class Guard:
                 expect_array(f"slot {k}: act()", action, np.uint8, (self._batch.trials,), _EACH)
                 expect_actions(range(k, k + 1), action[None], gamma[None], self._problem)
 
-    def fates(self, receiver: str, slots: range, fates: Fates) -> None:
-        """Raise RunError unless these are valid fates of the packets of some slots on a receiver's link."""
-        if not self._links[receiver]:
-            return
-        shape = (len(slots), self._batch.trials)
-        with self.asking_link(receiver, slots):
-            expect_array("fates()", fates.codes, np.uint8, shape, "slots, R trials")
-            if fates.codes.size and int(fates.codes.max()) > max(Fate):
-                raise Broken(f"fates(): one is {int(fates.codes.max())}; expected Fate.DELIVERED or Fate.LOST")
-
 
 _EACH = "one for each of the R trials"
-
-
-def _models_of(schedule: LinkSchedule) -> Iterator[str]:
-    """The names of a link's models that are not built in, at first and after changes."""
-    for settings in (schedule.settings, *(change.settings or {} for change in schedule.changes)):
-        loss, delay = settings.get("loss"), settings.get("delay")
-        losses = [spec["model"] for spec in single_specs(loss)] if loss else []
-        yield from filter(LOSS_MODELS.foreign, losses)
-        if delay and DELAY_MODELS.foreign(delay["model"]):
-            yield delay["model"]

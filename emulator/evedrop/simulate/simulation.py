@@ -28,6 +28,7 @@ from evedrop.model.slot.link_core import LinkCore
 from evedrop.model.streams import OWN, Batch, Lineage
 from evedrop.model.theory.covariances import misled_covariances
 from evedrop.names import LEGITIMATE
+from evedrop.scenario.conformance.checked import CheckedLink
 from evedrop.scenario.plugins import look_in
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
@@ -124,6 +125,7 @@ class Simulation:
             name: LinkCore(schedule, name, self._keys.link(name, schedule), self._batch)
             for name, schedule in schedules.items()
         }
+        checked_links = [CheckedLink(name, link, schedules[name], self._batch) for name, link in links.items()]
         play = {
             Mode.EXACT: self._exact,
             Mode.ERROR_COORDINATES: self._error_coordinates,
@@ -136,10 +138,8 @@ class Simulation:
         for block, end in pairwise(bounds):
             for first in range(block, end, length):
                 chunk = range(first, min(first + length, end))
-                for name, link in links.items():
-                    with self._guard.asking_link(name, chunk):
-                        link.plan(chunk)
-                    self._guard.fates(name, chunk, link.fates)
+                for link in checked_links:
+                    link.plan(chunk)
                 yield play(chunk, links)
 
     def _exact(self) -> Callable[[range, Mapping[str, LinkCore]], Chunk]:

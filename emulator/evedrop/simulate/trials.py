@@ -6,7 +6,7 @@ on the distribution of the work.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import final
@@ -119,13 +119,16 @@ def _split(first: int, end: int, workers: int, side_by_side: int) -> Iterator[tu
         yield from pairwise(min(first - BLOCK_TRIALS * (-blocks * i // count), end) for i in range(count + 1))
 
 
-def carry_out(task: TrialsTask, on_progress: OnProgress, stopped: Stopped) -> BatchResult:
-    """Simulate a task. `on_progress` gets the trial-slots done since its last call; the simulation ends early once `stopped`."""
+def carry_out(task: TrialsTask, on_progress: OnProgress, stopped: Stopped, stops: Collection[int] = ()) -> BatchResult:
+    """Simulate a task. `on_progress` gets the trial-slots done since its last call; the simulation ends early once `stopped`.
+
+    stops: slots before which `stopped` is asked in any case.
+    """
     scenario = Scenario.read(task.scenario)
     names, slots = scenario.receivers, scenario.slots
     trials = range(task.start, task.stop)
     recorded = max(0, min(scenario.first_trial + scenario.record_trials, task.stop) - task.start)
-    simulation = Simulation(scenario, trials, task.mode)
+    simulation = Simulation(scenario, trials, task.mode, stops=stops)
     process = scenario.process.process
     scale = float(np.trace(process.Q)) or float(np.trace(process.initial_covariance)) or 1.0  # where there is no noise
     expected = theoretical_traces_of(scenario)

@@ -276,10 +276,9 @@ def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:
     own = next((table for table in tables.values() if table["strategy"] == strategy), None)
     if own is not None and "reads_as" not in own:
         return _alone(own)
-    donor = next((table for table in tables.values() if "link" in table), None)
-    if donor is None:
-        donor = scenario.legitimate.model_dump(mode="json", exclude_none=True)
-    link = donor["link"]
+    legitimate = scenario.legitimate.model_dump(mode="json", exclude_none=True)
+    donor = tables.get(_link_owner(scenario, strategy), legitimate)
+    link = donor.get("link", {})  # none if it pools links: its own table has them
     kind = STRATEGIES[strategy]
     made: Tables = {"strategy": strategy, "window": donor["window"], **(own or {})}
     if kind.pools_links:
@@ -298,13 +297,18 @@ def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:
 def _wire_links(scenario: Scenario, matches: Sequence[Match]) -> dict[str, str]:
     """Receiver → its link of the scenario's wire: an adversary has that of the receiver whose link it has."""
     assert scenario.wire is not None  # noqa: S101 - the caller knows
-    links, names = scenario.wire.links, dict.fromkeys([LEGITIMATE], LEGITIMATE)
+    links, owners = scenario.wire.links, dict.fromkeys([LEGITIMATE], LEGITIMATE)
     for match in matches:
         if match.strategy is not None and not STRATEGIES[match.strategy].pools_links:
-            own = (name for name, table in scenario.eavesdroppers.items() if table.strategy == match.strategy)
-            any_ = (name for name, table in scenario.eavesdroppers.items() if table.link is not None)
-            names[match.receiver] = next(own, None) or next(any_, LEGITIMATE)
-    return {receiver: links[name] for receiver, name in names.items() if name in links}
+            owners[match.receiver] = _link_owner(scenario, match.strategy)
+    return {receiver: links[owner] for receiver, owner in owners.items() if owner in links}
+
+
+def _link_owner(scenario: Scenario, strategy: str) -> str:
+    """The receiver whose link an adversary has: the first of its strategy, else the first eavesdropper with a link."""
+    own = (name for name, table in scenario.eavesdroppers.items() if table.strategy == strategy)
+    any_ = (name for name, table in scenario.eavesdroppers.items() if table.link is not None)
+    return next(own, None) or next(any_, LEGITIMATE)
 
 
 def _alone(table: Tables) -> Tables:

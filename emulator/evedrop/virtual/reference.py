@@ -10,10 +10,8 @@ import math
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import pyarrow as pa
 
@@ -25,9 +23,9 @@ from evedrop.results.reading import Results
 from evedrop.results.summary_file import summary_text
 from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import RunOutcome
-from evedrop.simulate import trials
 from evedrop.simulate.montecarlo import Merger, Plan, simulate
 from evedrop.simulate.simulation import Mode, Simulation
+from evedrop.simulate.trials import TrialsTask, carry_out
 
 KEYS: Mapping[str, tuple[str, ...]] = {
     "slots": ("slot", "peer"),
@@ -151,14 +149,13 @@ def in_memory(scenario: Scenario, folder: Path) -> RunReference:
 def summary_until(scenario: Scenario, slots: int) -> Mapping[str, Any]:
     """The summary in memory of a run that was cut short after some slots."""
     first, done = scenario.first_trial, 0
-    task = trials.TrialsTask(scenario.model_dump(mode="json"), first, first + scenario.trials, Mode.EXACT)
+    task = TrialsTask(scenario.model_dump(mode="json"), first, first + scenario.trials, Mode.EXACT)
 
     def count(more: int) -> None:
         nonlocal done
         done += more
 
-    with patch.object(trials, "Simulation", partial(Simulation, stops=(slots,))):
-        result = trials.carry_out(task, count, lambda: done >= slots * scenario.trials)
+    result = carry_out(task, count, lambda: done >= slots * scenario.trials, stops=(slots,))
     summary = Merger.of(scenario, Mode.EXACT, [result]).summary(RunOutcome(0.0, f"slot {slots}"))
     cut_short: dict[str, Any] = json.loads(summary_text(summary))
     return cut_short

@@ -44,11 +44,11 @@ class Typed:
 def broken_holds(typed: Sequence[Typed], put: Sequence[PutMessage]) -> Iterator[str]:
     """Slots that a run sends although it is held, as far as no other command was under way; steps of another length."""
     before: Typed | None = None
-    for command in sorted(typed, key=lambda one: one.begun):
-        others = [one for one in typed if one is not command]
-        alone = not any(one.begun <= command.answered and one.answered >= command.begun for one in others)
+    for command in sorted(typed, key=lambda each: each.begun):
+        others = [other for other in typed if other is not command]
+        alone = not any(other.begun <= command.answered and other.answered >= command.begun for other in others)
         if alone and command.held is not None:
-            until = min((one.begun for one in others if one.begun > command.answered), default=math.inf)
+            until = min((other.begun for other in others if other.begun > command.answered), default=math.inf)
             late = [
                 message
                 for message in put

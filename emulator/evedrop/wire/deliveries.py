@@ -70,8 +70,8 @@ class KeyDeliveries:
         means = [min(mean, count) for mean, count in zip(means, counts, strict=True)]  # the products are rounded
         self.mean = sum_in_order(means)
         if self.sampled:  # each message counted by chance so far; but how many of a range count is known
-            known = zip(means, counts, shares, strict=True)
-            self.variance -= sum_in_order((1.0 - share) * mean * mean / count for mean, count, share in known)
+            parts_of_means = zip(means, counts, shares, strict=True)
+            self.variance -= sum_in_order((1.0 - share) * mean * mean / count for mean, count, share in parts_of_means)
             self.variance = self.variance if self.variance > _ROUNDED * self.mean else 0.0
 
     @property

@@ -124,7 +124,7 @@ def run_wire(
 
 
 def _earlier(journal: WireJournal) -> Iterator[str]:
-    """What a wire says of earlier starts in its folder."""
+    """Lines about the earlier starts in the wire's folder."""
     if journal.recovered:
         yield (
             f"an earlier start was killed or had a full disk: {counted(journal.recovered, 'message')} of it could be recovered, "

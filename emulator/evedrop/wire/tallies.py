@@ -29,7 +29,7 @@ for _fate in WireFate:
 
 
 class NumberRange(NamedTuple):
-    """Consecutive numbers of messages, of which some count."""
+    """A range of message numbers; not every message in it has to count."""
 
     start: int
     stop: int

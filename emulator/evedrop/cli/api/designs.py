@@ -46,7 +46,7 @@ def measuring_command(given: str | Path | Scenario, changes: Mapping[str, Any], 
         keywords = {key.replace(".", "__"): value for key, value in given_changes.items()}
         if all(word.isidentifier() for word in keywords) and dotted(keywords) == given_changes:
             words += [f"{word}={value!r}" for word, value in keywords.items()]
-        else:  # a name such as much-better is no part of a keyword
+        else:  # a keyword cannot contain a name such as much-better
             words.append(f"**{given_changes!r}")
         return f"{'sweep' if constant else 'montecarlo'}({', '.join(words)})"
     words = [

@@ -53,6 +53,7 @@ from evedrop.model.slot.link import COUNTED_BURSTS, Account, Accountant, Change,
 from evedrop.model.slot.link_core import Arrivals, Late, LinkCore
 from evedrop.model.slot.records import PacketSlots
 from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE, RECORDER, ROUTER
+from evedrop.scenario.conformance.checked import CheckedLink
 from evedrop.system.threads import Queue
 from evedrop.system.world import world
 
@@ -72,6 +73,7 @@ class Downlink:
         """waited: whether deliveries are sent at once; in lock-step, waking up others would take most of the time."""
         keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, schedule)}
         self.core = LinkCore(schedule, name, keys, brief.batch)
+        self._checked = CheckedLink(name, self.core, schedule, brief.batch)
         self._schedule = schedule
         self._accountant = Accountant(schedule.window, brief.trials)
         self._put = put
@@ -81,6 +83,10 @@ class Downlink:
         self._leak = brief.part.leaks.get(name)
         self._waited, self._most = waited, brief.flow.message
         self._held: list[PacketSlots] = []
+
+    def plan(self, slots: range) -> None:
+        """Decide the fates of the packets of the next batch."""
+        self._checked.plan(slots)
 
     def account(self, slots: range) -> Account:
         """The fates of the packets of the next slots, which belong to the current batch."""
@@ -276,7 +282,7 @@ class RouterLoop:
         self._slots = range(first, min(first + self._brief.flow.batch, self._brief.slots))
         if self._slots:
             for downlink in self._downlinks.values():
-                downlink.core.plan(self._slots)
+                downlink.plan(self._slots)
         return self._slots
 
     def _take(self) -> None:

@@ -13,14 +13,21 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any, final
 
+import numpy as np
+
 from evedrop.errors import ClassFailed
+from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.links import LOSS_MODELS, single_specs
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Receiver, Reception
 from evedrop.model.registry import CLASS_ERRORS, place_of
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme
+from evedrop.model.slot.link import LinkSchedule
+from evedrop.model.slot.link_core import LinkCore
 from evedrop.model.streams import Batch
 from evedrop.scenario.conformance.problems import (
     Problem,
@@ -31,7 +38,13 @@ from evedrop.scenario.conformance.problems import (
     expect_packets,
     slots_text,
 )
-from evedrop.scenario.conformance.rules import Broken, changes_in_place, is_about_read_only, read_only
+from evedrop.scenario.conformance.rules import (
+    Broken,
+    changes_in_place,
+    expect_array,
+    is_about_read_only,
+    read_only,
+)
 
 
 def failed(subject: str, slots: range, batch: Batch, how: str) -> ClassFailed:
@@ -97,6 +110,38 @@ class CheckedEncoder(Encoder):
         """Pass the acknowledgements on to the encoder."""
         with self._asking(range(k, k + 1)):
             self._encoder.acknowledged(k, read_only(acknowledged))
+
+
+@final
+class CheckedLink:
+    """Plans a link. Raises ClassFailed for any error, wrong fate or wrong delay of a model that is not built in."""
+
+    def __init__(self, receiver: str, core: LinkCore, schedule: LinkSchedule, batch: Batch) -> None:
+        self._core, self._batch = core, batch
+        self._models = list(_foreign_models_of(schedule))
+        self._what = f"{receiver}'s link ({', '.join(self._models)})"
+
+    def plan(self, slots: range) -> None:
+        """Decide the fates of the packets of the next slots."""
+        if not self._models:
+            self._core.plan(slots)
+            return
+        with asking(self._what, slots, self._batch):
+            self._core.plan(slots)
+            codes = self._core.fates.codes
+            expect_array("fates()", codes, np.uint8, (len(slots), self._batch.trials), "slots, R trials")
+            if codes.size and int(codes.max()) > max(Fate):
+                raise Broken(f"fates(): one is {int(codes.max())}; expected Fate.DELIVERED or Fate.LOST")
+
+
+def _foreign_models_of(schedule: LinkSchedule) -> Iterator[str]:
+    """The names of a link's models that are not built in, at first and after changes."""
+    for settings in (schedule.settings, *(change.settings or {} for change in schedule.changes)):
+        loss, delay = settings.get("loss"), settings.get("delay")
+        losses = [spec["model"] for spec in single_specs(loss)] if loss else []
+        yield from filter(LOSS_MODELS.foreign, losses)
+        if delay and DELAY_MODELS.foreign(delay["model"]):
+            yield delay["model"]
 
 
 @final
