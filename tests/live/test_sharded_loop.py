@@ -135,7 +135,8 @@ def test_a_loop_that_is_cut_short_is_made_one(evedrop: Evedrop, name: str) -> No
     assert f"shard 2 (trials 2 to 4): {name} was ended by signal 9" in done.err
     live.nothing_left()
     assert not (live.folder / "shards").exists()
-    assert set(live.results.slots["trials"].to_pylist()) <= {2, 3, 5}
+    counts = set(live.results.slots["trials"].to_pylist())
+    assert counts <= {2, 3, 5}
     assert live.results.inputs is not None
     recorded = set(live.results.inputs["trial"].to_pylist())
     assert recorded == set(range(RECORDED))
@@ -143,7 +144,8 @@ def test_a_loop_that_is_cut_short_is_made_one(evedrop: Evedrop, name: str) -> No
     summary = live.results.summary
     assert summary["controller"]["digest"] is None
     assert summary["controller"]["decisions"] > 0
-    assert summary["household"]["bought_energy"] > 0.0
+    assert summary["household"]["net_difference"] >= 0.0
+    assert (summary["household"]["bought_energy"] is None) is (counts != {5})  # an energy is of as many slots in every trial
 
 
 @pytest.mark.long

@@ -132,6 +132,13 @@ class CallbackSubscription:
             self._receive(payload)
 
 
+FULL_SECONDS = 2.5
+"""For which a message waits for a reader that takes none; then Zenoh closes the reader's connection.
+
+Meanwhile Zenoh may send nothing to all others, who would take this process for gone if it lasted as long as their lease.
+"""
+
+
 @final
 class Publisher:
     """A publisher for one exact key. Messages put without a connection are lost, and sent again in a later round."""
@@ -153,11 +160,14 @@ class Publisher:
         publisher, session = self._publisher, self._session
         if publisher is None or session is None:
             return
+        begun = world().monotonic()
         try:
             publisher.put(self._head + payload)
         except zenoh.ZError:
             if not session.is_closed():
                 raise
+        if world().monotonic() - begun > 0.8 * FULL_SECONDS:
+            world().sleep(_CLOSING_SECONDS)  # Zenoh cannot close the connection while another message waits
 
     @property
     def matched(self) -> bool:
@@ -243,6 +253,7 @@ _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
 _ANSWER_SECONDS = 1.0
 _RENEW_SECONDS = 1.0  # between sessions that are closed because they confuse keys
 _POLL_SECONDS = 0.02
+_CLOSING_SECONDS = 0.2
 _LINGER_SECONDS = 10.0  # longer than a router needs to find out that a connection is lost
 
 One = TypeVar("One", bound=Declared)

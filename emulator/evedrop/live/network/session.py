@@ -27,6 +27,7 @@ from evedrop.live.network.connecting import (
     open_session,
 )
 from evedrop.live.network.connection import (
+    FULL_SECONDS,
     CallbackSubscription,
     Connection,
     ConnectionWatchdog,
@@ -79,8 +80,7 @@ _LOGGED = f"{LOGGED},zenoh_transport::unicast::establishment::open=off"  # the p
 
 def _transport(identity: Identity | None, largest: int, packet: int, listens: bool = False) -> ZenohConfig:
     """The limits of a connection; largest, packet: bytes of the run's largest message and of a packet's numbers."""
-    # A full queue waits a minute, not five seconds, before it drops a reader: the window bounds the messages under way.
-    wait = {"block": {"wait_before_close": 60_000_000}}
+    wait = {"block": {"wait_before_close": int(FULL_SECONDS * 1e6)}}
     link: ZenohConfig = {
         "tx": {
             "lease": int(_LEASE_SECONDS * 1000),
