@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -36,6 +37,7 @@ BATCH_BYTES = 16 * 2**20
 _GROUP_ROWS = 65_536
 _ROUNDS = "rounds"
 _SUMMARY = "summary.json"
+_STREAM_FILE = re.compile(r"[a-z]+-[0-9]+\.arrows")
 _CHECKED_AT_ONCE = 2**20
 _LOCK_ATTEMPTS = 50
 _LOCKED_SECONDS = 0.002  # in which a reader that looks whether a run goes on holds the lock
@@ -174,7 +176,9 @@ class TableRound:
         entry = json.loads(line)
         tables, checks = {}, {}
         for name, (file, rows, *check) in entry["tables"].items():
-            tables[str(name)] = (Path(str(file)).name, int(rows))
+            if not _STREAM_FILE.fullmatch(file):
+                raise ValueError(f"{file!r} is no file of a table")
+            tables[str(name)] = (file, int(rows))
             if check:  # an older version wrote none
                 size, checksum = check
                 checks[str(name)] = (int(size), int(checksum))
@@ -190,6 +194,11 @@ class TableRound:
             elif of_file.get(size) != checksum:
                 return False
         return True
+
+
+def stream_file(name: str, number: int) -> str:
+    """The file of a table's stream; a stream that replaces another has the next number."""
+    return f"{name}-{number}.arrows"
 
 
 def _checksums_of(folder: Path, rounds: Sequence[TableRound]) -> dict[str, Mapping[int, int] | None]:

@@ -21,7 +21,15 @@ from evedrop.model.digest import DigestLog, Digests
 from evedrop.model.process import Floats
 from evedrop.model.receiver import ACTIONS, MISLED, NOTHING, TYPES, Action, Codes, Flags, packed_flags
 from evedrop.names import CONTROLLER
-from evedrop.results.crash_proof_tables import BATCH_BYTES, TableStream, Unfinished, finish, keep, write_metrics
+from evedrop.results.crash_proof_tables import (
+    BATCH_BYTES,
+    TableStream,
+    Unfinished,
+    finish,
+    keep,
+    stream_file,
+    write_metrics,
+)
 from evedrop.results.folder import UNFINISHED, HeldFolder
 from evedrop.results.resolved_scenario import TakenStates
 from evedrop.results.summary_file import summary_text
@@ -88,7 +96,7 @@ class ResultsWriter:
 
     def _stream(self, name: str, number: int) -> TableStream:
         schema, names = self._kinds[name]
-        return TableStream(self._held.now / UNFINISHED / f"{name}-{number}.arrows", schema, names)
+        return TableStream(self._held.now / UNFINISHED / stream_file(name, number), schema, names)
 
     def __enter__(self) -> Self:
         return self

@@ -463,8 +463,7 @@ def _of_results(
         yield from wrong_summary(summary, expected, done)
         verification = verification_of(expected.scenario)
         yield from wrong_course(summary, verification, run.seconds, _confused(case, struck))
-        if whole and not done and not lacking:
-            yield from _of_words(run, struck, summary)
+        yield from _of_words(run, struck, summary, whole and not done)
         if not done and expected.shards == 1:
             yield from _of_metrics(case, folder, summary)
         # Rows are on the disk before the first process is told that the run is over.
@@ -496,9 +495,12 @@ def _of_metrics(case: SimulatedCase, folder: Path, summary: Mapping[str, Any]) -
         yield from unlike_prefix(summary, summary_until(scenario, slots), all_recorded=all_recorded)
 
 
-def _of_words(run: SimulatedRun, struck: Iterable[Disturbance], summary: Mapping[str, Any]) -> Iterator[str]:
-    """Whether the summary of a whole run that ended early says why."""
-    if run.ends.get(RECORDER, (0.0, 0))[1] == KILLED or any(fault.ends_at_once(RECORDER) for fault in struck):
+def _of_words(
+    run: SimulatedRun, struck: Iterable[Disturbance], summary: Mapping[str, Any], failed: bool
+) -> Iterator[str]:
+    """Whether the summary says why a run ended early; failed: whether it is of a whole run that did."""
+    killed = run.ends.get(RECORDER, (0.0, 0))[1] == KILLED or any(fault.ends_at_once(RECORDER) for fault in struck)
+    if killed or not failed:
         return
     first = next(iter(str(summary["ended"]).splitlines()), "")
     why, _, _ = first.partition(METRICS_AS_OF)
