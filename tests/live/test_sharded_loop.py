@@ -145,9 +145,8 @@ def test_a_loop_that_is_cut_short_is_made_one(evedrop: Evedrop, name: str) -> No
     assert summary["controller"]["digest"] is None
     assert summary["controller"]["decisions"] > 0
     assert summary["household"]["net_difference"] >= 0.0
-    assert (summary["household"]["bought_energy"] is None) is (
-        counts != {5}
-    )  # an energy is of as many slots in every trial
+    # An energy is of as many slots in every trial.
+    assert (summary["household"]["bought_energy"] is None) is (counts != {5})
 
 
 @pytest.mark.long
