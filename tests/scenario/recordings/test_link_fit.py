@@ -235,6 +235,32 @@ def test_few_bursts_tell_nothing_of_the_fit(tmp_path: Path) -> None:
     assert fit(save(tmp_path, outcomes)).goodness == "too few bursts (2) to tell how well it fits"
 
 
+def test_bursts_and_gaps_of_one_length_tell_nothing_of_the_fit(tmp_path: Path) -> None:
+    """There are enough of them, and a test needs two lengths; a mean length of one is one slot."""
+    fitted = fit(save(tmp_path, np.tile(np.array([1, 0], np.uint8), 100)))
+    assert fitted.goodness == "the lengths of bursts and gaps differ too little to tell how well it fits"
+    assert link_fit.headline(fitted, "outcomes", "slot").endswith("99 bursts, 1 slot on average")
+
+
+def test_the_goodness_of_fit_names_what_was_judged(tmp_path: Path) -> None:
+    """Bursts of one slot leave nothing to test; the gaps between them do."""
+    outcomes, rng = np.ones(4000, np.uint8), np.random.default_rng(4)
+    outcomes[np.cumsum(1 + rng.geometric(0.2, 600))] = 0
+    fitted = fit(save(tmp_path, outcomes))
+    assert fitted.bursts.p_value is None
+    assert fitted.goodness.startswith("gaps last as long as the model predicts (chi-square, p = ")
+
+
+def test_a_link_that_is_mostly_bad_is_found() -> None:
+    """Long good regimes are rare: the fit is no worse than the model that has produced the recording."""
+    loss = {"model": "gilbert-elliott", "p": 0.05, "r": 0.0006, "good": 0.0, "bad": 0.35}
+    outcomes = recorded(loss, 20_000, 0)
+    actual = log_likelihood(outcomes, TwoStates(0.05, 0.0006, 1e-9, 0.35))
+    fitted = link_fit.fit_outcomes("walk", outcomes, np.empty(0))
+    assert fitted.chosen.name == "gilbert-elliott"
+    assert fitted.chosen.log_likelihood > actual
+
+
 @pytest.mark.parametrize(
     ("name", "delays", "spec", "bound"),
     [

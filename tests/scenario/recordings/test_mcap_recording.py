@@ -243,6 +243,9 @@ def test_the_command_prints_links_for_both(evedrop: Evedrop) -> None:
     assert wire["delay"]["mean"] == pytest.approx(0.03, abs=0.001)
     assert wire["duplicate"] == pytest.approx(0.01, abs=0.001)
     assert "# for a scenario with slots of 0.1 s:" in text
+    assert " messages on average\n" in text[text.index("taken: ") :]
+    longer = evedrop("links", "fit", "tuesday.mcap", "--slot", "1").out
+    assert "# for a scenario with slots of 1 s, each with one message:" in longer
     link = tomllib.loads(text.splitlines()[-1])["link"]
     assert link["delay"]["mean"] == pytest.approx(0.3, abs=0.01)
     assert (link["loss"], link["duplicate"]) == (wire["loss"], wire["duplicate"])

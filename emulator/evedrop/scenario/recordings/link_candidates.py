@@ -223,7 +223,7 @@ def gilbert_elliott(outcomes: Outcomes) -> Candidate:
 
 
 def _starts(outcomes: Outcomes) -> list[TwoStates]:
-    """Starting points: Gilbert's own solution, softened, and regimes of tens, hundreds and thousands of slots."""
+    """Starting points: Gilbert's own solution, softened, and rare bad or good regimes of tens to thousands of slots."""
     loss = 1.0 - float(outcomes.mean())
     own = gilbert(outcomes).spec
     mild, harsh = 0.5 * loss, min(0.95, 0.5 + 0.5 * loss)
@@ -234,6 +234,7 @@ def _starts(outcomes: Outcomes) -> list[TwoStates]:
     for slots in (20.0, 200.0, 2000.0):
         if slots * 4 < len(outcomes):
             starts.append(TwoStates(0.5 / slots, 1.0 / slots, 0.3 * loss, min(0.95, 2.5 * loss)))
+            starts.append(TwoStates(1.0 / slots, 0.5 / slots, 0.1 * loss, min(0.95, 1.3 * loss)))
     return [
         TwoStates(*(float(np.clip(value, 1e-4, 0.999)) for value in vars(two_states).values())) for two_states in starts
     ]

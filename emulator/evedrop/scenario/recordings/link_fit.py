@@ -24,7 +24,7 @@ from evedrop.scenario.recordings.link_candidates import (
     wilson,
 )
 from evedrop.scenario.recordings.link_recording import DELAY, LinkRecording, Outcomes
-from evedrop.scenario.recordings.run_lengths import RunLengthDistribution, RunLengths, lengths_of, p_value
+from evedrop.scenario.recordings.run_lengths import FEWEST_RUNS, RunLengthDistribution, RunLengths, lengths_of, p_value
 
 FEWEST = 100
 """The fewest outcomes from which a model can be estimated."""
@@ -71,18 +71,21 @@ class Fit:
     @property
     def goodness(self) -> str:
         """How well the chosen model explains the lengths of bursts and gaps, in a sentence."""
-        told = {"bursts": self.bursts.p_value, "gaps": self.gaps.p_value}
-        judged = {name: value for name, value in told.items() if value is not None}
+        both = {"bursts": self.bursts, "gaps": self.gaps}
+        judged = {name: runs.p_value for name, runs in both.items() if runs.p_value is not None}
         shown = " and ".join(f"{value:.2g} for {name}" for name, value in judged.items())
         if not judged:
-            return f"too few bursts ({self.bursts.count}) to tell how well it fits"
+            few = self.bursts.count < FEWEST_RUNS
+            why = f"too few bursts ({self.bursts.count})" if few else "the lengths of bursts and gaps differ too little"
+            return f"{why} to tell how well it fits"
+        names = " and ".join(judged)
         # Each of two tests has half the level: together they reject a correct model in one of a hundred recordings.
         if min(judged.values()) < _LEVEL / 2.0:
             return (
-                f"it does NOT explain how long bursts and gaps last (chi-square, p = {shown}): the link has habits that none "
+                f"it does NOT explain how long {names} last (chi-square, p = {shown}): the link has habits that none "
                 'of these models has; use the recording itself, model = "trace"'
             )
-        return f"bursts and gaps last as long as the model predicts (chi-square, p = {shown})"
+        return f"{names} last as long as the model predicts (chi-square, p = {shown})"
 
     def as_dict(self) -> dict[str, Any]:
         """The fit as JSON values."""
@@ -177,21 +180,26 @@ def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> RunLengths:
 
 def lines(fitted: Fit) -> list[str]:
     """The fit as printed lines."""
-    return [headline(fitted, "outcomes", "slots"), *model_lines(fitted), fitted.toml]
+    return [headline(fitted, "outcomes", "slot"), *model_lines(fitted, "slot"), fitted.toml]
 
 
 def headline(fitted: Fit, packets: str, unit: str) -> str:
-    """How much was recorded and lost; packets, unit: what is counted, and what bursts are measured in."""
+    """How much was recorded and lost; packets, unit: what is counted, and what bursts are measured in, such as "slot"."""
     fraction = 100.0 * fitted.lost / fitted.count
-    mean = "none of them ended" if fitted.bursts.mean is None else f"{fitted.bursts.mean:.4g} {unit} on average"
-    counted = f"{fitted.count} {packets}, {fitted.lost} lost ({fraction:.4g} %)"
-    return f"{fitted.trace}: {counted}, {fitted.bursts.count} bursts, {mean}"
+    mean = "none of them ended" if fitted.bursts.mean is None else _average(fitted.bursts.mean, unit)
+    lost = f"{fitted.count} {packets}, {fitted.lost} lost ({fraction:.4g} %)"
+    return f"{fitted.trace}: {lost}, {fitted.bursts.count} burst{'' if fitted.bursts.count == 1 else 's'}, {mean}"
 
 
-def model_lines(fitted: Fit) -> list[str]:
-    """The candidates, the models that were taken, and how well they fit, as printed lines."""
+def _average(length: float, unit: str) -> str:
+    shown = f"{length:.4g}"
+    return f"{shown} {unit if shown == '1' else f'{unit}s'} on average"
+
+
+def model_lines(fitted: Fit, unit: str) -> list[str]:
+    """The candidates, the models that were taken, and how well they fit, as printed lines; unit: as for `headline`."""
     told = _table(fitted.candidates, fitted.chosen, fitted.count)
-    told.append(f"taken: {fitted.chosen.name}, by BIC; its bursts last {fitted.bursts.fitted:.4g} slots on average")
+    told.append(f"taken: {fitted.chosen.name}, by BIC; its bursts last {_average(fitted.bursts.fitted, unit)}")
     told.append(f"fit: {fitted.goodness}")
     if fitted.chosen_delay is not None:
         told.append(f"{fitted.delays} delays")

@@ -96,15 +96,16 @@ def fit_messages(recording: MessageRecording, slot: float | None = None) -> Mess
 def message_lines(fitted: MessageFit) -> list[str]:
     """The fit as printed lines."""
     fit = fitted.fit
-    told = [headline(fit, "messages", "messages")]
+    told = [headline(fit, "messages", "message")]
     told += [f"  {sentence}" for sentence in (*_counted(fitted), *fitted.recording.notes)]
-    told += [*model_lines(fit), "# for a wire file:", fitted.wire_toml]
+    told += [*model_lines(fit, "message"), "# for a wire file:", fitted.wire_toml]
     link = fitted.scenario_link
     if link is None:
         return [*told, "# a scenario needs the length of a slot: give --slot SECONDS"]
     if fit.chosen_delay is None:
         return [*told, "# for a scenario in which a message is a slot:", f"link = {toml_of(link)}"]
-    return [*told, f"# for a scenario with slots of {fitted.slot:.4g} s:", f"link = {toml_of(link)}"]
+    each = "" if fitted.slot == fitted.recording.series.seconds else ", each with one message"
+    return [*told, f"# for a scenario with slots of {fitted.slot:.4g} s{each}:", f"link = {toml_of(link)}"]
 
 
 def _counted(fitted: MessageFit) -> list[str]:
@@ -123,7 +124,7 @@ def _counted(fitted: MessageFit) -> list[str]:
         )
     if series.outages:
         told.append(
-            f"{len(series.outages)} silences, the longest of {max(series.outages):.4g} s, were longer than --outage: "
+            f"silences longer than --outage: {len(series.outages)}, the longest of {max(series.outages):.4g} s; "
             "not counted as losses; in a wire file they are an [[event]] with cut"
         )
     if series.parts > 1:

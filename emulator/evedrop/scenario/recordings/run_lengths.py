@@ -16,7 +16,7 @@ from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 
-_BINS, _LEAST_EXPECTED, _FEWEST = 20, 5.0, 30
+_BINS, _LEAST_EXPECTED, FEWEST_RUNS = 20, 5.0, 30
 
 
 def lengths_of(within: Flags) -> NDArray[np.intp]:
@@ -76,7 +76,7 @@ def p_value(lengths: NDArray[np.intp], distribution: RunLengthDistribution, para
 
     parameters: the number of parameters of the distribution that were estimated from the recording.
     """
-    if len(lengths) < _FEWEST:
+    if len(lengths) < FEWEST_RUNS:
         return None
     longer = distribution.longer(int(lengths.max()) + 1)
     least = max(_LEAST_EXPECTED, len(lengths) / _BINS)

@@ -332,7 +332,7 @@ def _loop_line(controller: ControllerSummary) -> str:
 
 def sweep_doubts(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """A line about the means of a sweep that rare events carry, if there are some; rows: as for `sweep_table`."""
-    count = sum((row["rare_fraction"] or 0.0) > RARE_FRACTION for row in rows)
+    count = sum(row["trials"] > 1 and (row["rare_fraction"] or 0.0) > RARE_FRACTION for row in rows)
     if count:
         are, have = ("are", "have") if count > 1 else ("is", "has")
         yield (

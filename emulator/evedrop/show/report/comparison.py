@@ -188,7 +188,7 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
     rare = [
         f"{name} up to {fraction_text(fraction)}" for name, fraction in fractions.items() if fraction > RARE_FRACTION
     ]
-    if rare:
+    if rare and comparison.trials > 1:
         yield (
             f"{rare_events_words(comparison.trials)} carry a part of expected errors, whose means and standard errors are then "
             f"probably too small: {', '.join(rare)}"
