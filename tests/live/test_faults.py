@@ -310,6 +310,22 @@ class Stillness:
 
 
 @pytest.mark.thorough
+def test_a_receiver_that_stops_reading_for_some_seconds_costs_no_other_a_connection(evedrop: Evedrop) -> None:
+    """Its queue at the router is full, and its lease expires; nobody else is cut off, and the run goes on when it is back."""
+    live = evedrop.live("eavesdroppers", "--slots", "3000", "--trials", "300", "--set", "expect=[]")
+    live.running()
+    live.kill("smart", signal.SIGSTOP)
+    wait_until(
+        lambda: not evedrop("status", str(live.folder), "--json").summary["processes"]["smart"],
+        "the loss of its connection",
+    )
+    live.kill("smart", signal.SIGCONT)
+    done = live.end()
+    assert done.status == 0, done.err
+    assert {outage["process"] for outage in live.results.summary["outages"]} == {"smart"}
+
+
+@pytest.mark.thorough
 @pytest.mark.parametrize(("name", "trials"), [("naive", 1), ("naive", 200), ("router", 1)])
 def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop, name: str, trials: int) -> None:
     """When its connection is lost and does not come back for as long as the scenario waits, it is named, not its victims.

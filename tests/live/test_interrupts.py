@@ -283,3 +283,25 @@ def test_a_signal_waits_until_a_process_of_a_run_heeds_it(evedrop: Evedrop, numb
     assert done.err.startswith("evedrop: recorder was interrupted by a signal")
     assert "Traceback" not in done.err
     live.nothing_left()
+
+
+IN_THE_REPORT = """
+import argparse, os, signal, sys
+from pathlib import Path
+from evedrop.cli import options, report
+from evedrop.errors import RunError
+from evedrop.system.signals import heed_signals
+heed_signals()
+report.print_results = lambda *_: os.kill(os.getpid(), signal.SIGINT)
+failure = RunError("smart stopped responding") if sys.argv[1] == "3" else None
+options.print_so_far(Path("run"), argparse.Namespace(json=False, verbose=False), int(sys.argv[1]), failure)
+"""
+"""A report during which a signal comes."""
+
+
+@pytest.mark.parametrize(("status", "said"), [(0, ""), (1, ""), (3, "evedrop: smart stopped responding\n")])
+def test_a_signal_while_the_report_is_printed_does_not_change_how_the_run_has_ended(status: int, said: str) -> None:
+    """The status is that of the run, and a failure is said."""
+    command = [sys.executable, "-c", IN_THE_REPORT, str(status)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=LIMIT)
+    assert (done.returncode, done.stderr) == (status, said)

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evedrop.cli.command import flag, option, together
-from evedrop.errors import UsageError
-from evedrop.system.output import warn
+from evedrop.errors import EvedropError, UsageError
+from evedrop.system.output import say, warn
+from evedrop.system.signals import leave_after
 
 if TYPE_CHECKING:
     from evedrop.scenario.tables import Scenario
@@ -117,11 +118,18 @@ def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenari
     return scenario
 
 
-def print_so_far(folder: Path, options: argparse.Namespace) -> None:
-    """Print the closing report of a run, if it has results, and write its page; options: those of `output`."""
+def print_so_far(folder: Path, options: argparse.Namespace, status: int, failure: EvedropError | None = None) -> None:
+    """Print the closing report of a run, if it has results, and write its page; options: those of `output`.
+
+    status, failure: how the run has ended, which a signal that comes meanwhile does not change.
+    """
     from evedrop.cli.report import print_results, report_page
 
-    with contextlib.suppress(UsageError):
+    def tell() -> None:
+        if failure is not None:
+            say(failure.illustrated, "evedrop:")
+
+    with leave_after(tell, status), contextlib.suppress(UsageError):
         print_results(folder, options.json, options.verbose)
         sys.stdout.flush()  # the words first: the page takes a tenth of a second
         report_page(folder, options.json)

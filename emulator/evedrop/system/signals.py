@@ -126,12 +126,12 @@ def raise_on_signals() -> AbstractContextManager[None]:
     return _handled(interrupt)
 
 
-def leave_after(act: Callable[[], object]) -> AbstractContextManager[None]:
+def leave_after(act: Callable[[], object], status: int = INTERRUPTED) -> AbstractContextManager[None]:
     """Make Ctrl-C, SIGTERM and SIGHUP call `act` and exit at once while the block runs."""
 
     def interrupt() -> None:
         act()
-        os._exit(INTERRUPTED)
+        os._exit(status)
 
     return _handled(interrupt)
 

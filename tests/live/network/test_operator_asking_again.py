@@ -64,7 +64,8 @@ def test_a_request_that_may_be_repeated_is_asked_again(tmp_path: Path, capsys: p
 @pytest.mark.parametrize(
     ("words", "unanswered", "message"),
     [
-        (["step", "4"], 2, "it ended before it answered"),  # steps are counted: a second request would be another step
+        # Steps are counted: a second request would be another step.
+        (["step", "4"], 2, "its recorder or router is away, and may still do this"),
         (["pause"], 1, "no run is going on"),
     ],
 )

@@ -79,10 +79,10 @@ def _run(options: argparse.Namespace) -> FinishedRun:
                     paused=options.paused,
                     hosts=hosts,
                 )
-            except (RunError, Interrupted):
-                print_so_far(line.moved or folder, options)
+            except (RunError, Interrupted) as error:
+                print_so_far(line.moved or folder, options, error.exit_status, error)
                 raise
-        print_so_far(ended.folder, options)
+        print_so_far(ended.folder, options, ended.status)
     return ended
 
 

@@ -168,8 +168,13 @@ def _answer(run: Path, control: Control, request: OperatorRequest, subject: str,
         raise UsageError(
             f"{subject}: no answer from the run in {run} in {patience:g} s; it may still do this: look at its logs, or end it"
         )
+    if answer is None and control in read_controls(run):  # which raises UsageError when the run is over
+        raise UsageError(
+            f"{subject}: no answer from the run in {run}; its recorder or router is away, and may still do this: look at its "
+            "status"
+        )
     if answer is None:
-        raise no_run(run, "it ended before it answered, or its router did, which is then restarted")
+        raise no_run(run, "it ended before it answered")
     if answer.refused:
         told = f"{subject}: {counted(len(answer.refused), 'mistake')}, nothing was changed"
         raise UsageError("\n".join([told, *(f"  {line}" for line in answer.refused)]))

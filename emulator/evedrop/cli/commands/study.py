@@ -48,10 +48,10 @@ def montecarlo(options: argparse.Namespace) -> int:
         with ProgressLine(scenario.trials * scenario.slots, "trial-slots", options.json) as line:
             try:
                 status = simulate(scenario, folder, line.on_event, plan, resume=options.resume)
-            except Interrupted:
-                print_so_far(line.moved or folder, options)
+            except Interrupted as error:
+                print_so_far(line.moved or folder, options, error.exit_status, error)
                 raise
-        print_so_far(line.moved or folder, options)
+        print_so_far(line.moved or folder, options, status)
     return status
 
 
