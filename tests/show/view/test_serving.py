@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import threading
 import urllib.request
@@ -13,6 +14,7 @@ import pytest
 from evedrop.errors import UsageError
 from evedrop.show.view.serving import Followed, RerunPage, Served
 from evedrop.show.view.viewer import end, executable, spawn
+from evedrop.system.lacks import lack_of
 from evedrop.system.ports import free_port
 from tests.conftest import LIMIT, wait_until
 
@@ -142,6 +144,21 @@ def test_a_command_without_a_page_is_refused(content: bytes, why: str, tmp_path:
         RerunPage(tmp_path / "rerun")
     with pytest.raises(UsageError, match="No such file"):
         RerunPage(tmp_path / "other")
+
+
+def test_too_little_memory_for_the_page_is_not_taken_for_another_version(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The machine lacks something, and no other version would help."""
+
+    def without_memory(*_: object, **_also: object) -> None:
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    (tmp_path / "rerun").write_bytes(PAGE + SCRIPT + MODULE)
+    monkeypatch.setattr("evedrop.show.view.serving.mmap.mmap", without_memory)
+    with pytest.raises(OSError, match="Cannot allocate memory") as raised:
+        RerunPage(tmp_path / "rerun")
+    assert lack_of(raised.value) is not None
 
 
 def test_a_replaced_command_changes_no_page(tmp_path: Path) -> None:

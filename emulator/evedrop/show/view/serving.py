@@ -32,6 +32,7 @@ from typing import IO, final
 from evedrop.errors import UsageError
 from evedrop.show.view.bounded_http import BoundedServer, QuietHandler
 from evedrop.show.view.live_files import LiveFiles
+from evedrop.system.lacks import lack_of
 from evedrop.system.ports import other_user
 
 _POLL_SECONDS = 0.05  # between two checks of whether the file has grown
@@ -195,7 +196,7 @@ class RerunPage:
     """
 
     def __init__(self, command: Path) -> None:
-        """command: the file of Rerun's command. Raises UsageError if it cannot be read, or contains no such page."""
+        """command: the file of Rerun's command. Raises UsageError if it has no page, OSError if memory is lacking."""
         try:
             self._file = os.open(command, os.O_RDONLY | os.O_CLOEXEC)
             weakref.finalize(self, os.close, self._file)  # when no browser is being served any more
@@ -205,6 +206,8 @@ class RerunPage:
                 self.program = _program(content)
             self.html = b"".join(self.pieces(page)).decode()
         except (OSError, EOFError, ValueError) as error:
+            if lack_of(error) is not None:
+                raise
             raise UsageError(
                 f"the page of the view cannot be read from {command} ({error}); install a version of rerun-sdk that Evedrop is "
                 "tested with (tools/constraints/project.txt), or choose the native view or no view"
