@@ -129,7 +129,8 @@ def tried_damages(simulated: SimulatedWorld, folder: Path, tables: Tables, seed:
 
     tables: those of its file; its sides are elsewhere now, where its programs do not find them.
     """
-    if not (folder / JOURNAL_FOLDER / _HISTORY).is_file():
+    history = folder / JOURNAL_FOLDER / _HISTORY
+    if not history.is_file():
         return
     copy, file, scheduler = folder.parent / "damaged", folder.parent / "damaged.toml", simulated.scheduler
     sides = {name: {"listen": _ELSEWHERE[name]} for name in tables["side"]}
@@ -139,13 +140,15 @@ def tried_damages(simulated: SimulatedWorld, folder: Path, tables: Tables, seed:
     numbered = any(numbers.null_count < len(numbers) for numbers in parts)
     for name in random.Random(seed).sample([*DAMAGES], _EACH):  # noqa: S311 - to be repeated, not to be secret
         damage = DAMAGES[name]
+        if not history.is_file():  # somebody has moved it away meanwhile
+            return
         if name == "files without keys" and not numbered:
             continue
         shutil.copytree(folder, copy)
         process = simulated.machine.begin("reader", partial(_start, damage, copy, file))
         scheduler.run(scheduler.now + _SECONDS, lambda process=process: not process.task.alive)  # type: ignore[misc]
         status, said = process.task.status, process.printed
-        if damage.named is None and status not in {0, 1}:
+        if damage.named is None and (status not in {0, 1} or "Traceback" in said):
             yield f"{name}: status {status}: {said.strip()[-300:]}"
         if damage.named is not None and (status != UsageError.exit_status or damage.named not in said):
             yield f"{name}: status {status}, and the message does not say {damage.named!r}: {said.strip()[-300:]}"
