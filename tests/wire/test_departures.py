@@ -266,6 +266,16 @@ def test_where_a_program_was_is_forgotten_in_any_order_of_events() -> None:
         assert at.departures._links == {}
 
 
+def test_a_program_has_its_address_when_all_events_of_its_link_come_first() -> None:
+    """Those of its connection come by another thread, which may be slow."""
+    at = Sides()
+    at.connect_link("a1")
+    at.departures._linked("robot", cast("Any", SimpleNamespace(kind=DELETE, link=SimpleNamespace(zid="a1"))))
+    at._changed(PUT, "a1")
+    at.leave("a1", MANY, 0)
+    assert "the program a1 (client, tls/10.0.0.2:5)" in at.lines[0]
+
+
 def test_nobody_is_named_when_the_wire_ends() -> None:
     """It ends all connections itself."""
     at = Sides()

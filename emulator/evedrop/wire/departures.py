@@ -168,7 +168,6 @@ class Departures:
         self._backlogs, self._waiting_for, self._clock = backlogs, waiting_for, clock
         self._lines = FewLines(tell, "programs that lost their connection")
         self._links: dict[tuple[str, str], str] = {}  # side and program → from where it is connected
-        self._here: set[tuple[str, str]] = set()
         self._gone: dict[tuple[str, str], _Gone] = {}
         self._lock = world().lock()
         self._ended = False
@@ -194,7 +193,7 @@ class Departures:
             if event.kind == zenoh.SampleKind.PUT:
                 user = "" if link.auth_identifier is None else f", as {link.auth_identifier}"
                 self._links[program] = f", {link.dst}{user}"
-            elif program not in self._here:  # the events of its connection, which come by another thread, were faster
+            elif program in self._gone:  # the events of its connection, which come by another thread, were faster
                 self._links.pop(program, None)
 
     def _changed(self, side: str, event: zenoh.TransportEvent) -> None:
@@ -208,7 +207,6 @@ class Departures:
 
     def _connected(self, program: tuple[str, str]) -> None:
         with self._lock:
-            self._here.add(program)
             gone = self._gone.pop(program, None)
         if gone is None:
             return
@@ -222,7 +220,6 @@ class Departures:
         side, zid = program
         backlogs = self._backlogs[side]
         with self._lock:
-            self._here.discard(program)
             name = f"the program {zid} ({mode}{self._links.pop(program, '')})"
             gone = _Gone(name, side, self._clock.monotonic(), self._waiting_for(side), len(backlogs))
             self._gone.pop(program, None)
