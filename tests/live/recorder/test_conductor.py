@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from evedrop.errors import Interrupted, RunError
-from evedrop.live.protocol.commands import Abandon, Start
+from evedrop.live.protocol.commands import Abandon, ProcessStatus, ReportStatus, Start
 from evedrop.live.protocol.notices import EndReport, Progress
 from evedrop.live.recorder.conductor import Conductor, Stop
 from evedrop.names import RECORDER
@@ -33,6 +33,8 @@ class Told(Network):
         self.absent = absent
         self.sent: list[tuple[str, bytes, float]] = []
         self.opened = False
+        self.waits: dict[str, tuple[str, ...]] = {}
+        """Process that answers requests → the keys on which it says that it waits."""
 
     def watch(self, name: str, changed: Callable[[bool], None]) -> None:
         """Everybody is there but those that are not."""
@@ -41,8 +43,15 @@ class Told(Network):
             changed(True)
 
     def publisher(self, key: str) -> Callable[[bytes], None]:
-        """Whatever is sent is noted."""
-        return lambda payload: self.sent.append((key.rpartition("/")[2], payload, self.clock.now - 1000.0))
+        """Whatever is sent is noted, and requests for a status are answered."""
+        name = key.rpartition("/")[2]
+
+        def put(payload: bytes) -> None:
+            self.sent.append((name, payload, self.clock.now - 1000.0))
+            if payload == ReportStatus().pack() and name in self.waits:
+                self.reads[self.keys.telemetry(name)](ProcessStatus(0, self.waits[name]).pack())
+
+        return put
 
     def ready(self) -> None:
         """The run can begin."""
@@ -87,8 +96,30 @@ def test_who_does_not_appear_is_named_after_the_patience(unread: tuple[str, ...]
         conducted(network).assemble()
     assert str(raised.value) == message
     assert raised.value.missing == (unread or ("sensor", "smart"))
-    assert 30.0 < network.clock.now - 1000.0 < 30.2
+    assert 30.0 < network.clock.now - 1000.0 < (30.2 if unread else 31.5)
     assert not network.opened
+
+
+@pytest.mark.parametrize(
+    ("waits", "named"),
+    [
+        ({"legitimate": ("evedrop/r/estimate",)}, ("smart",)),
+        ({"legitimate": ("evedrop/r/estimate",), "smart": ()}, ("smart",)),
+        ({"legitimate": ("evedrop/r/estimate",), "smart": ("evedrop/r/telemetry/smart",)}, ("legitimate", "smart")),
+        ({}, ("legitimate", "smart")),
+    ],
+)
+def test_a_process_that_says_that_it_waits_is_not_named(
+    waits: dict[str, tuple[str, ...]], named: tuple[str, ...]
+) -> None:
+    """Of missing processes that have opened their sessions, one that hangs does not answer, or waits for nobody."""
+    network = Told("legitimate", "smart")
+    network.waits = waits
+    with pytest.raises(RunError) as raised:
+        conducted(network).assemble()
+    assert raised.value.missing == named
+    assert [name for name, message, _ in network.sent if message == ReportStatus().pack()] == ["legitimate", "smart"]
+    assert network.clock.now - 1000.0 < 31.5
 
 
 def test_a_signal_ends_the_waiting_for_processes() -> None:

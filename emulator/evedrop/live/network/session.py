@@ -301,7 +301,9 @@ class Session:
         recorder is present, this process waits on: the recorder reports the missing processes.
         """
         waited, before = 0.0, world().monotonic()
+        self._answer_requests()
         while unread := self._unread():
+            self.status.waits = (unread[0],)
             missing = dict.fromkeys(reader_of(key) for key in unread)
             now = world().monotonic()
             if RECORDER not in missing and self._process != RECORDER:
@@ -316,13 +318,22 @@ class Session:
                     f"within {self.patience:.0f} s, and nobody reads {', '.join(unread)}; start them, or look at their logs",
                 )
             world().sleep(_POLL_SECONDS)
-        self.appear()
+        self.status.waits = ()
+        self._show()
 
     def appear(self) -> None:
-        """Show that this process is present."""
+        """Show that this process is present, without waiting for others."""
+        self._answer_requests()
+        self._show()
+
+    def _answer_requests(self) -> None:
+        """Answer the recorder's requests for the status from now on."""
+        if self._reporting is not None:
+            self.status.answer(self._reporting)
+
+    def _show(self) -> None:
         publisher = self._reporting
         if publisher is not None:
-            self.status.answer(publisher)
             self.end_without_recorder(lambda: publisher.matched, self.patience)
         if self._replays:
             world().thread(self._send_again, name="sends-again").start()

@@ -165,7 +165,7 @@ class ProcessStatus(StructMessage, frozen=True):
     slot: Slot = field(name="k")
     """The slot that it is at."""
     waits: Annotated[tuple[str, ...], Meta(max_length=4096)]
-    """The keys on which it waits for a message; empty if it does not wait."""
+    """The keys on which it waits for a message, or a key of its own for whose reader it waits; empty if it does not wait."""
 
 
 def is_process_status(message: Reader) -> bool:

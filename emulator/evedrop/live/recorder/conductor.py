@@ -13,7 +13,15 @@ from evedrop.live.network.connection import Question
 from evedrop.live.network.process_session import Mailbox
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.commands import Abandon, ControlCommand, EndRun, Start
+from evedrop.live.protocol.commands import (
+    Abandon,
+    ControlCommand,
+    EndRun,
+    ProcessStatus,
+    ReportStatus,
+    Start,
+    is_process_status,
+)
 from evedrop.live.protocol.notices import EndReport, Progress
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS
@@ -26,6 +34,7 @@ _POLL_SECONDS = 0.05  # how soon a signal is noticed
 _LOST_TOGETHER_SECONDS = 1.0  # in which a router's processes are missed that are lost with it
 _END_SECONDS = 0.5  # how often a process that is still present is told that the run is over
 _RETURN_SECONDS = 3.0  # within which a process may return that was told to end and vanished without confirming it
+_ANSWER_SECONDS = 1.0  # for missing processes to say what they wait for
 _ROUTERS_SECONDS = 5.0  # for a router to confirm
 
 
@@ -115,9 +124,7 @@ class Conductor:
         while self.missing:
             self._stop.check()
             if world().monotonic() > deadline:
-                # Do not name processes that wait for another one themselves.
-                names = [name for name in self.missing if not self._reaches(name)]
-                names = names or self.missing
+                names = [name for name in self.missing if not self._reaches(name)] or self._without_excuse()
                 do = "start it, or look at its log" if len(names) == 1 else "start them, or look at their logs"
                 failure = RunError(f"{', '.join(names)} did not appear within {self._session.patience:.0f} s; {do}")
                 failure.missing = tuple(names)
@@ -125,6 +132,21 @@ class Conductor:
             self._next()
         self._session.ready()
         self._router = self._session.router_id
+
+    def _without_excuse(self) -> list[str]:
+        """The missing processes that do not say that they wait for another one themselves; all if each of them says so."""
+        names, excused = self.missing, set[str]()
+        for name in names:
+            self.send_to(name, ReportStatus())
+        deadline = world().monotonic() + _ANSWER_SECONDS
+        while not excused.issuperset(names) and world().monotonic() < deadline:
+            message = self._next()
+            if message is not None:
+                source, payload = message
+                answer = Reader(self.keys[source], payload)
+                if is_process_status(answer) and answer.read(ProcessStatus).waits:
+                    excused.add(source)
+        return [name for name in names if name not in excused] or names
 
     def start(self) -> None:
         """Tell the sensor to begin."""
