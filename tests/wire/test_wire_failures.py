@@ -38,7 +38,7 @@ def test_a_failed_expectation_is_told_apart_from_the_rest(tmp_path: Path) -> Non
 def test_a_wire_over_which_messages_no_longer_cross_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A fault of Evedrop is told when it shows, and once more at the end, with the status of a failed run."""
+    """The wire says so at once, and again at its end, which has the status of a failed run."""
     monkeypatch.setattr(PublicationRelay, "_take_all", lambda *_: 1 / 0)
     said: list[str] = []
     why = r"messages from the side robot no longer cross \(ZeroDivisionError.*the side base no longer cross"

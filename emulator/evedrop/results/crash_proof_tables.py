@@ -37,7 +37,6 @@ BATCH_BYTES = 16 * 2**20
 _GROUP_ROWS = 65_536
 _ROUNDS = "rounds"
 _SUMMARY = "summary.json"
-_STREAM_FILE = re.compile(r"[a-z]+-[0-9]+\.arrows")
 _CHECKED_AT_ONCE = 2**20
 _LOCK_ATTEMPTS = 50
 _LOCKED_SECONDS = 0.002  # in which a reader that looks whether a run goes on holds the lock
@@ -177,7 +176,7 @@ class TableRound:
         tables, checks = {}, {}
         for name, (file, rows, *check) in entry["tables"].items():
             if not _STREAM_FILE.fullmatch(file):
-                raise ValueError(f"{file!r} is no file of a table")
+                raise ValueError(f"{file!r} is not the name of a stream")
             tables[str(name)] = (file, int(rows))
             if check:  # an older version wrote none
                 size, checksum = check
@@ -194,6 +193,9 @@ class TableRound:
             elif of_file.get(size) != checksum:
                 return False
         return True
+
+
+_STREAM_FILE = re.compile(r"[a-z]+-[0-9]+\.arrows")
 
 
 def stream_file(name: str, number: int) -> str:

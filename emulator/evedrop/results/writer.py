@@ -60,9 +60,9 @@ class ResultsWriter:
     def __init__(
         self, folder: Path, scenario: Scenario, with_metrics: Callable[[], None] = lambda: None, at: str = "slot 0"
     ) -> None:
-        """with_metrics: called before metrics are written, when their rows are on disk; at: as for `checkpoint`.
+        """with_metrics: called before metrics are written, when their rows are on disk.
 
-        at: empty for a study, whose folder has nothing to read before its first trials are done.
+        at: as for `checkpoint`; empty for a study, whose folder has nothing to read before its first trials are done.
 
         Raises OSError if the folder cannot be written.
         """
