@@ -195,14 +195,18 @@ def test_a_trial_that_never_is_synchronised_is_found_as_nothing(tmp_path: Path) 
     assert (expectation["held"], expectation["value"], expectation["wanted"]) == (False, None, "by slot 3")
     assert Judged(**expectation).sentence == "expected legitimate synchronised by slot 3: FAILED, found none"
     ranged = {"metric": "smart.used_fraction", "slots": [3, 9], "below": 1}
+    whole = {"metric": "smart.used_fraction", "below": 1}
     secret = {"secrecy": "relative", "against": "smart"}
-    scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged, secret]})
+    scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged, whole, secret]})
     short = {name: Tally(9, 1) for name in scenario.receivers}
     open_ = SecrecySummary(Claim.UNDECIDED, Claim.UNDECIDED, True, 1, True, "mean", "")
     peers = dict.fromkeys(scenario.receivers, PeerSummary({"used_fraction": 0.5}, None, False, None))
     judged = Evidence(scenario, peers, {}, short, {"smart": open_}).judged("evedrop run x")
-    assert [judgement.held for judgement in judged] == [None] * 3
-    assert [judgement.value for judgement in judged[:2]] == [None] * 2
+    assert [judgement.held for judgement in judged] == [None] * 4
+    assert [judgement.value for judgement in judged[:3]] == [None, None, 0.5]
+    assert judged[2].sentence == (
+        "expected smart.used_fraction below 1: FAILED, the run was cut short, found 0.5"
+    )
     assert not any("replay" in judgement.as_dict() for judgement in judged)
 
 

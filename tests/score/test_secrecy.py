@@ -19,7 +19,7 @@ from evedrop.scenario.loading import load
 from evedrop.scenario.theory import Expectation, expectations_of
 from evedrop.score.rare_events import rare_events_of
 from evedrop.score.scorekeeper import verdicts
-from evedrop.score.secrecy import Claim, rejected, secrecy
+from evedrop.score.secrecy import Claim, SignTest, _missing, rejected, secrecy, sign_of_mean
 from evedrop.score.summary import SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
 from tests.score.test_verdict_calibration import tally_of
@@ -112,6 +112,17 @@ def test_holm_rejects_step_by_step(p_values: list[float], numbers: list[int]) ->
     assert rejected(dict(enumerate(p_values))) == numbers
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e-200, 1e200])
+def test_the_sign_of_a_mean_does_not_depend_on_the_scale(scale: float) -> None:
+    """Squares of large numbers overflow, and those of small ones vanish."""
+    samples = np.array([-1.0] * 99 + [1e5])
+    expected = sign_of_mean(samples)
+    assert 0.1 < expected.above < 0.9
+    found = sign_of_mean(scale * samples)
+    assert (found.above, found.below) == pytest.approx((expected.above, expected.below))
+    assert sign_of_mean(np.full(9, scale)) == SignTest(0.0, 1.0)
+
+
 def test_an_unclear_window_leaves_the_verdict_open() -> None:
     """A window whose difference may be either way is neither held nor failed."""
     levels = np.full(WINDOWS, 0.002)
@@ -156,6 +167,13 @@ def test_without_a_closed_form_an_event_that_no_trial_met_may_still_be_there(tri
         assert (
             f": too few trials lose the first packet of {name}, of 2,000 enough would;" in verdict.sentence
         ) != enough
+
+
+def test_the_number_of_trials_that_is_asked_for_is_enough() -> None:
+    """20 losses of the first packet are expected in it, and not in one trial less."""
+    unknown = Expectation(STABLE, distribution_of(LinkSchedule({"loss": good(0.81)})), None)
+    assert "of 106 enough would" in _missing("eve", tally(around(1.0, trials=105)), unknown)
+    assert "enough would" not in _missing("eve", tally(around(1.0, trials=106)), unknown)
 
 
 @pytest.mark.parametrize(

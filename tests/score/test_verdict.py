@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -137,6 +139,17 @@ def test_errors_of_rounding_are_equal() -> None:
     assert (known.ratio, known.larger) == (np.inf, True)
 
 
+def test_logarithms_do_not_decide_against_the_ratio_of_the_means() -> None:
+    """An estimator that is right but in a few bursts, which make up its whole mean error; and the same of an eavesdropper."""
+    draw = np.random.default_rng(4)
+    bursts, always = np.zeros(4096), draw.lognormal(size=4096)
+    bursts[3000:3100] = 1000.0
+    for ours, theirs, ratio in ((bursts, always, 0.03), (always, bursts, 30.0)):
+        values = AfterStart.of_batches(batches(ours), batches(theirs), noise=1.0)
+        assert values.larger is None
+        assert values.ratio == pytest.approx(ratio, rel=0.2)
+
+
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.99])
 def test_equal_errors_are_rarely_called_different(memory: float) -> None:
     """Two receivers with the same distribution of errors, correlated over up to a hundred slots: a few times in a hundred."""
@@ -203,6 +216,9 @@ def test_the_eavesdropper_that_knows_most_decides() -> None:
         assert (verdict.outcome, verdict.eavesdropper) == (outcome, name)
         assert verdict.sentence.startswith(f"{outcome.glyph} {outcome.value}: ")
     assert verdict_of([]) is None
+    further = verdict_of([near, compared("slow", 900.0, None)])
+    assert further is not None
+    assert "the estimator is 1 off, slow 30: 900 ×" in further.sentence  # undecided, and not the best
 
 
 @pytest.mark.parametrize(
@@ -223,6 +239,16 @@ def test_every_outcome_has_its_sentence(ratio: float, larger: bool | None, denie
         verdict_on(compared("eve", ratio, larger, denied=denied)).sentence.removesuffix(" the squared error")
         == sentence
     )
+
+
+def test_a_single_trial_does_not_show_what_theory_denies() -> None:
+    """It may lack the rare events that make up most of the legitimate error."""
+    after_start = AfterStart(4.0, None, True, (1.0, 2.0), in_one_trial=True)
+    assert Compared("eve", after_start).outcome is SecrecyOutcome.RELATIVE
+    verdict = verdict_on(Compared("eve", after_start, denied=True))
+    assert verdict.sentence.startswith("✗ not secret: by theory, eve knows as much as the estimator in the long run; here ")
+    several = replace(after_start, in_one_trial=False)
+    assert Compared("eve", several, denied=True).outcome is SecrecyOutcome.RELATIVE
 
 
 def test_a_distance_counts_the_first_states_of_one_unit() -> None:

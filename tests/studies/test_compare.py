@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from evedrop.errors import UsageError
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.closed_forms import encrypted_fraction
-from evedrop.results.comparison import Comparison, SimulatedError, Theory, read_comparison
+from evedrop.results.comparison import Cell, Comparison, SimulatedError, Theory, read_comparison
 from evedrop.results.summary_file import plain
 from evedrop.scenario.loading import load
 from evedrop.score.summary import RareEvents
@@ -535,3 +536,11 @@ def test_workers_change_nothing(everything: Everything, tmp_path: Path) -> None:
     for scheme in some["schemes"]:
         for adversary in some["adversaries"]:
             assert alone.cell(scheme, adversary) == everything[0].cell(scheme, adversary)
+
+
+@pytest.mark.parametrize(("ours", "theirs", "ratio"), [(0.0, 0.0, 1.0), (0.0, 2.0, math.inf), (4.0, 2.0, 0.5)])
+def test_medians_that_are_both_0_are_equal(ours: float, theirs: float, ratio: float) -> None:
+    """The ratio of medians is that of equal errors then, as the verdict says."""
+    errors: list[Any] = [SimpleNamespace(infinite_variance=True, quantiles={"0.5": median}) for median in (ours, theirs)]
+    anything: Any = SimpleNamespace()
+    assert Cell(anything, errors[0], errors[1], anything).ratio == ratio

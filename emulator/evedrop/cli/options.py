@@ -35,7 +35,7 @@ entries = together(
     option("--secret", "FILE", "a secret that is not derived from the seed", type=Path),
 )
 """`--set`, and an option for each of the entries that are changed most often."""
-verbose = flag("--verbose", "also print the report page's notes on verdicts")
+verbose = flag("--verbose", "also print further notes or tables of the report page")
 as_json = flag("--json", "print JSON")
 output = together(
     option("--out", "DIR", "results folder, new or empty", type=Path),

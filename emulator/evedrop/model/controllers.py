@@ -71,7 +71,7 @@ class Assignment:
 
 
 class Controller(Parametrised, ABC):
-    """A control strategy. Each file of this folder defines one, registered by its name in a scenario.
+    """A control strategy.
 
     `parameters` are the entries of the scenario's `[controller]` for this strategy, each with an example.
     """

@@ -30,8 +30,7 @@ def length_mistakes(given: Mapping[str, Any], *names: str) -> list[tuple[str, st
 class DelayModel(Parametrised, ABC):
     """Decides delays from random numbers, for all trials at once, slot by slot.
 
-    Each file of this folder defines one model, whose name in a scenario is the file's name. `parameters` are the entries
-    that the scenario gives it, each with an example; lengths of time are in slots.
+    `parameters` are the entries that the scenario gives it, each with an example; lengths of time are in slots.
     """
 
     optional: ClassVar[frozenset[str]] = frozenset()

@@ -142,7 +142,7 @@ class Cell:
         if not (first.infinite_variance or second.infinite_variance):
             return math.inf if self.secrecy.ratio is None else self.secrecy.ratio
         legitimate, other = (each.quantiles["0.5"] for each in (first, second))
-        return other / legitimate if legitimate else math.inf
+        return other / legitimate if legitimate else math.inf if other else 1.0
 
     @property
     def ratio_error(self) -> float | None:

@@ -71,7 +71,8 @@ class AfterStart:
             return cls(ratio, None, None, distances, TOO_SHORT, in_one_trial=True)
         logarithms = np.log(np.clip(over[:, 0], floor, _LARGEST)) - np.log(np.clip(under[:, 0], floor, _LARGEST))
         low, high = _limits(logarithms)
-        larger = True if low > 0.0 else False if high < math.log(AS_MUCH) else None
+        # Means of logarithms decide only what the ratio of the means says as well: a few large errors may make up all of a mean.
+        larger = True if low > 0.0 and ratio > 1.0 else False if high < math.log(AS_MUCH) and ratio <= AS_MUCH else None
         interval = (math.exp(low), math.exp(high)) if math.isfinite(ratio) and high < FARTHEST else None
         if interval is not None and not interval[0] <= ratio <= interval[1]:
             interval = None

@@ -71,7 +71,12 @@ class Evidence:
             "synchronised": self._synchronised,
         }
         value, held = judge[expect.kind](expect)
-        return Judged(expect.text, held, value, expect.wanted, replay if held is False else None)
+        why = None if held is not None or self._complete else "the run was cut short"
+        return Judged(expect.text, held, value, expect.wanted, replay if held is False else None, why)
+
+    @property
+    def _complete(self) -> bool:
+        return all(tally.done == tally.slots for tally in self.tallies.values())
 
     def _metric(self, expect: ExpectTable) -> tuple[float | None, bool | None]:
         name = str(expect.metric)
@@ -86,7 +91,8 @@ class Evidence:
             value = None if summary is None else APPLICATIONS[application].metric(summary, path)
         else:
             value = self._of_link(*link) if link is not None else self._of_receiver(expect, *name.split("."))
-        return value, None if value is None else expect.holds(value)
+        decided = self._complete or expect.slots is not None
+        return value, expect.holds(value) if value is not None and decided else None
 
     def _of_link(self, receiver: str, path: tuple[str, ...]) -> float | None:
         """A metric of a link's account, or of its losses by reason: 0 for a reason that did not occur."""
@@ -129,15 +135,14 @@ class Evidence:
             return None, None
         shown = str(entry.relative if relative else entry.perfect)
         value = _RUN.get(shown, f"the run has {shown}")
-        complete = all(tally.done == tally.slots for tally in self.tallies.values())
         if not relative:
             promised = entry.perfect_by_theory
         elif isinstance(entry, SecrecySummary):
             promised = entry.relative_by_theory
         else:
-            return value, shown == Claim.HELD.value if complete else None
+            return value, shown == Claim.HELD.value if self._complete else None
         held = promised is True and shown == Claim.HELD.value
-        return f"{_THEORY[promised]}, {value}", held if complete else None
+        return f"{_THEORY[promised]}, {value}", held if self._complete else None
 
     def _synchronised(self, expect: ExpectTable) -> tuple[JudgedValue, bool | None]:
         """The slot by which it was synchronised in all trials; undecided if the run was cut short before `by`."""

@@ -60,14 +60,17 @@ def sign_of_mean(samples: Floats) -> SignTest:
 
     Source: docs/mathematics/verdicts.md, verdicts.
     """
+    scale = float(np.max(np.abs(samples), initial=0.0))
+    if 0.0 < scale < math.inf:
+        samples = samples / scale  # the tests do not depend on it, and squares of large numbers overflow
     tests = student_test(samples, 0.0), skewed_test(samples, 0.0)
     possible = [test for test in tests if test is not None]
     if possible:
         return SignTest(max(test.above for test in possible), max(test.below for test in possible))
     mean = float(np.mean(samples))
-    if len(samples) < 2 or mean == 0.0 or not math.isfinite(mean):
+    if len(samples) < 2 or mean == 0.0 or not math.isfinite(mean) or (samples != samples[0]).any():
         return _NOTHING
-    return SignTest(0.0, 1.0) if mean > 0.0 else SignTest(1.0, 0.0)  # all equal
+    return SignTest(0.0, 1.0) if mean > 0.0 else SignTest(1.0, 0.0)
 
 
 def sign_of_median(samples: Floats) -> SignTest:
@@ -451,7 +454,8 @@ def _missing(name: str, tally: Tally, theory: Expectation) -> str:
     """What the trials lack for a verdict that they would otherwise support, as the end of a sentence."""
     if not theory.known:
         if 0.0 < theory.first_loss * tally.trials < RARE:
-            return f": too few trials lose the first packet of {name}, of {count_text(RARE / theory.first_loss)} enough would"
+            enough = count_text(math.ceil(RARE / theory.first_loss))
+            return f": too few trials lose the first packet of {name}, of {enough} enough would"
         ever = math.isnan(theory.first_loss) and theory.process.spectral_radius >= 1.0
         more = ", however many trials there are" if ever else ""
         return f": losses that no trial met could change this, and no theory bounds the error of {name} in them{more}"

@@ -95,11 +95,17 @@ class Compared:
     """Whether medians decide, because a variance is infinite: distances and the ratio are of means, which then say nothing."""
 
     @property
+    def larger(self) -> bool | None:
+        """As in `AfterStart`; a single trial does not show what theory denies, because it may lack rare events."""
+        shown = self.after_start.larger
+        return None if shown and self.denied and self.after_start.in_one_trial else shown
+
+    @property
     def outcome(self) -> SecrecyOutcome:
         """What it shows."""
-        if math.isnan(self.after_start.ratio) or self.after_start.larger is None:
+        if math.isnan(self.after_start.ratio) or self.larger is None:
             return SecrecyOutcome.BROKEN if self.denied else SecrecyOutcome.OPEN
-        if self.after_start.larger:
+        if self.larger:
             return SecrecyOutcome.PERFECT if self.grows else SecrecyOutcome.RELATIVE
         return SecrecyOutcome.BROKEN
 
@@ -133,7 +139,7 @@ def verdict_on(compared: Compared, unit: str = "", *, best: bool = False) -> Ver
         SecrecyOutcome.PERFECT: f"{numbers}, and growing",
         SecrecyOutcome.RELATIVE: numbers,
     }[outcome]
-    if outcome is SecrecyOutcome.BROKEN and values.larger is None:  # only theory says so
+    if outcome is SecrecyOutcome.BROKEN and compared.larger is None:  # only theory says so
         reason = f"by theory, {name} knows as much as the estimator in the long run; here {numbers}"
     return Verdict(outcome, reason, name, times)
 
@@ -144,7 +150,8 @@ def verdict_of(compared: Iterable[Compared], unit: str = "") -> Verdict | None:
     if not several:
         return None
     decisive = min(several, key=lambda each: (_ORDER.index(each.outcome), _sortable(each.after_start.ratio)))
-    return verdict_on(decisive, unit, best=len(several) > 1)
+    least = min(_sortable(each.after_start.ratio) for each in several)
+    return verdict_on(decisive, unit, best=len(several) > 1 and _sortable(decisive.after_start.ratio) == least)
 
 
 def verdict_so_far(

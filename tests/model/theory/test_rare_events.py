@@ -177,3 +177,12 @@ def test_streaks_are_unknown_where_they_cannot_be_computed(monkeypatch: pytest.M
     assert streaks(PLANE, MISLED, 5) is None
     assert streaks(PLANE, MISLED, 4) is not None
     assert streaks(PLANE, SMART, 5) is not None
+
+
+@pytest.mark.parametrize("trials", [1, 3, 100])
+def test_what_happens_in_every_trial_is_not_rare(trials: int) -> None:
+    """However few trials there are: a receiver without packets has the same streak in each of them."""
+    carried = streaks(PLANE, NOBODY, 30)
+    assert carried is not None
+    assert carried.fraction(trials) == 0.0
+    assert carried.trials_for(0.1) == 1.0

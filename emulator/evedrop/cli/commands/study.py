@@ -212,7 +212,7 @@ _ROUNDING = 1e-12  # a standard error that is smaller, over the mean, is roundin
     page="learning",
 )
 def learned(options: argparse.Namespace) -> int:
-    """Show what eavesdroppers that learn the process know, slot by slot."""
+    """Show what eavesdroppers that learn the process know after 8, 16, 32 … slots."""
     from evedrop.results.summary_file import plain
     from evedrop.studies.learning_curve import learning_curve
 

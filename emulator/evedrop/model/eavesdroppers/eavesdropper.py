@@ -42,8 +42,7 @@ class Knowledge:
 class Eavesdropper(Parametrised, Receiver):
     """A strategy: how an eavesdropper reads packets.
 
-    Each file of this folder defines one strategy. `parameters` are the entries that a scenario must give it, each with an
-    example; `Knowledge.parameters` has the values given.
+    `parameters` are the entries that a scenario must give it, each with an example; `Knowledge.parameters` has the values given.
     """
 
     pools_links: ClassVar[bool] = False

@@ -161,8 +161,7 @@ class NoInnovations(Shared):
 class Scheme(Parametrised, ABC):
     """One way to fill packets. The keys of `secret_streams` are the secret; everything else about a scheme is public.
 
-    Each file of this folder defines one scheme, whose name in a scenario is the file's name with - for _. `parameters` are
-    the entries in the scenario's `[encoding]`, each with an example; they are the constructor's arguments.
+    `parameters` are the entries in the scenario's `[encoding]`, each with an example; they are the constructor's arguments.
 
     Source: docs/schemes.md.
     """

@@ -51,18 +51,25 @@ class Streaks:
         """The fraction of the expectation in slots that fewer than RARE streaks of all trials are expected to reach, 0 … 1."""
         if self.total == 0.0:
             return 0.0
-        met = float(self.carried[self.number * trials >= RARE].sum()) / self.total
+        met = float(self.carried[self._numbers * trials >= RARE].sum()) / self.total
         return 1.0 - met if met < 1.0 - REST else 0.0
 
     def trials_for(self, fraction: float) -> float:
         """The number of trials for which this fraction is left in such slots; inf beyond double precision. fraction > 1e-9."""
         if self.total == 0.0:
             return 1.0
-        order = np.argsort(-self.number, axis=None, kind="stable")
+        order = np.argsort(-self._numbers, axis=None, kind="stable")
         met = np.cumsum(self.carried.reshape(-1)[order])
         last = int(np.searchsorted(met, (1.0 - fraction) * self.total))
-        number = float(self.number.reshape(-1)[order[min(last, len(order) - 1)]])
+        number = float(self._numbers.reshape(-1)[order[min(last, len(order) - 1)]])
         return max(1.0, float(np.ceil(RARE / number))) if number > 0.0 else math.inf
+
+    @property
+    def _numbers(self) -> Floats:
+        """`number`, with inf where a streak that began in slot 0 certainly lasts so long: every trial has it."""
+        numbers = self.number.copy()
+        numbers[2, numbers[2] >= 1.0 - REST] = math.inf
+        return numbers
 
 
 @np.errstate(over="ignore", invalid="ignore")
