@@ -122,6 +122,43 @@ def test_the_reader_is_the_textbook_filter(process: Process, encrypted: list[int
         np.testing.assert_allclose(belief.P.transpose(2, 0, 1), P, atol=1e-10)
 
 
+CHAIN = np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.1], [0.0, 0.0, 0.97]])
+"""A vehicle that only its acceleration moves at random."""
+BESIDE = np.array([[1.0, 0.0, 0.1, 0.3], [0.0, 1.0, 0.2 * 1.1, 0.6 * 1.1], [0.0, 0.0, 0.9, 0.0], [0.0, 0.0, 0.0, 0.95]])
+"""Two positions that are moved by the same combination of two other states, but for rounding."""
+
+
+@pytest.mark.parametrize(
+    ("A", "noise", "encrypted"),
+    [
+        (CHAIN, [0.0, 0.0, 1.0], [0]),
+        (CHAIN, [0.0, 0.0, 1.0], [1]),
+        (CHAIN, [0.0, 0.0, 1.0], [2]),
+        (BESIDE, [0.0, 0.0, 1.0, 1.0], [2, 3]),
+    ],
+)
+def test_an_unencrypted_state_that_follows_from_others_takes_nothing_away(
+    A: Floats, noise: list[float], encrypted: list[int]
+) -> None:
+    """Receiver and theory know what a Kalman filter in pseudo-inverses knows, where Q is singular, and the error is as large."""
+    n, slots, trials = len(A), 40, 300
+    process = Process(A, np.diag(noise), np.eye(n), singular_noise=True)
+    clear, P, traces = np.eye(n)[[i for i in range(n) if i not in encrypted]], np.eye(n), []
+    for k in range(slots):
+        P = A @ P @ A.T + np.diag(noise) if k else P
+        P = P - P @ clear.T @ np.linalg.pinv(clear @ P @ clear.T, rcond=1e-12) @ clear @ P
+        P = (P + P.T) / 2.0
+        traces.append(float(np.trace(P)))
+    batch, hidden = Batch(slots, trials), np.isin(np.arange(n), encrypted)
+    np.testing.assert_allclose(ClearStatesForm(process, hidden, 1.0, 1.0, slots).traces, traces, rtol=1e-5, atol=1e-12)
+    errors = []
+    followed = beliefs(reader_of(process, batch), scheme(process, encrypted, 1.0), np.ones((slots, trials)), batch)
+    for wanted, (x, _, belief) in zip(traces, followed, strict=True):
+        np.testing.assert_allclose(np.trace(belief.P), wanted, rtol=1e-5, atol=1e-12)
+        errors.append(((belief.x_hat - x) ** 2).sum(axis=0))
+    assert np.mean(errors) == pytest.approx(np.mean(traces), rel=0.2)
+
+
 def test_the_reader_says_what_it_did() -> None:
     """The state where all is unencrypted or without a header; nothing used where all is encrypted; a betrayed state is known."""
     batch = Batch(3, 4)

@@ -12,8 +12,16 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats, product
 from evedrop.model.receiver import Action, Belief, Flags, Reception
-from evedrop.model.reference_code import NEGLIGIBLE, ReferenceReceiver, initial_factor, squares, triangular_solutions
+from evedrop.model.reference_code import (
+    NEGLIGIBLE,
+    ROUNDING_OF_REFERENCES,
+    ReferenceReceiver,
+    initial_factor,
+    squares,
+    triangular_solutions,
+)
 from evedrop.model.schemes.partial_encryption import UNENCRYPTED_INNOVATION
+from evedrop.model.staircase import is_singular
 from evedrop.model.streams import Batch
 
 
@@ -62,6 +70,10 @@ class ClearStates(PacketReader):
         "reads a header that says which states are encrypted, and there is none: it is the same as naive here",
     )
 
+    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
+        super().__init__(knowledge, batch)
+        self._singular = is_singular(knowledge.process)
+
     def prior(self, first: int = 0) -> Belief:
         """With a factor of the state's covariance."""
         X = initial_factor(self.process, max(0, first - 1))
@@ -82,7 +94,10 @@ class ClearStates(PacketReader):
         for mask in np.unique(header[state]).tolist():
             some = np.flatnonzero(state & (header == mask))
             hidden = np.array([bool(mask >> i & 1) for i in range(self.process.n)])
-            x_hat[:, some], X[:, :, some] = _read(x_hat[:, some], X[:, :, some], hidden, heard.z[:, some])
+            before, z = X[:, :, some], heard.z[:, some]
+            if self._singular:
+                before = _with_rounding(before, hidden, np.abs(x_hat[:, some]) + np.abs(z))
+            x_hat[:, some], X[:, :, some] = _read(x_hat[:, some], before, hidden, z)
             read = Action.DISCARDED if hidden.all() else Action.INNOVATION if hidden.any() else Action.STATE
             action[some] = np.uint8(read)
         return Belief(x_hat, squares(X), action, (X,))
@@ -100,8 +115,18 @@ class ClearStates(PacketReader):
         return self.process.predict(belief.x_hat), factors.transpose(1, 2, 0).copy()
 
 
+def _with_rounding(X: Floats, hidden: Flags, sizes: Floats) -> Floats:
+    """A factor (n, 2n, R) that also has the rounding of the unencrypted states; X: (n, n, R), sizes: of the numbers, (n, R).
+
+    Without it, an unencrypted state that is known already, or that follows from others, would have a pivot that is 0 or mere
+    rounding, and its column would take what is not known of the encrypted states.
+    """
+    rounding = ROUNDING_OF_REFERENCES * np.where(hidden[:, None], 0.0, sizes)
+    return np.concatenate([X, rounding[:, None, :] * np.eye(len(hidden))[:, :, None]], axis=1)
+
+
 def _read(x_hat: Floats, X: Floats, hidden: Flags, z: Floats) -> tuple[Floats, Floats]:
-    """x̂ (n, R) and the factor (n, n, R) once the unencrypted states have been read from z (n, R)."""
+    """x̂ (n, R) and the factor (n, n, R) once the unencrypted states have been read from z (n, R); X: (n, m, R), m ≥ n."""
     order = np.argsort(hidden, kind="stable")
     clear = int((~hidden).sum())
     L = kernels.triangular_factors(X[order].transpose(2, 0, 1).copy())
@@ -109,7 +134,7 @@ def _read(x_hat: Floats, X: Floats, hidden: Flags, z: Floats) -> tuple[Floats, F
     gain = (
         product(L[:, clear:, :clear].copy(), white.T[:, :, None].copy())[:, :, 0].T if 0 < clear < len(order) else 0.0
     )
-    after, rest = np.empty_like(x_hat), np.zeros_like(X)
+    after, rest = np.empty_like(x_hat), np.zeros((len(order), *x_hat.shape))
     after[order[:clear]] = z[order[:clear]]
     after[order[clear:]] = x_hat[order[clear:]] + gain
     rest[order[clear:], : len(order) - clear] = L[:, clear:, clear:].transpose(1, 2, 0)

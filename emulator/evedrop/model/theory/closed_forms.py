@@ -23,7 +23,9 @@ from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.process import MARGINAL, Floats, Process, invariant_hull
 from evedrop.model.receiver import Flags
+from evedrop.model.reference_code import ROUNDING_OF_REFERENCES
 from evedrop.model.schedule import NoiseDistribution, StateProbability, in_slot, mean_of
+from evedrop.model.staircase import is_singular
 from evedrop.model.theory.covariances import (
     LARGEST_OPERATOR,
     NOBODY,
@@ -531,7 +533,7 @@ class TakesNoise(ClosedForm):
 
 _LARGEST = 1e150  # whose square is a double
 _LONGEST = 2_000  # slots in which a bounded error settles, or its limit is unknown
-_SETTLED = 1e-12  # relative change in a slot
+_SETTLED, _ROUNDED = 1e-12, 1e-6  # relative change in a slot, and where rounding is added to the unencrypted states
 _RANK = 1e-9  # relative: a smaller singular value is taken for 0
 
 
@@ -574,7 +576,10 @@ class ClearStatesForm(ClosedForm):
         if self.growing.shape[1]:
             return math.inf
         last, before = self._followed(_LONGEST)[[-1, -2]]
-        return float(last) if abs(last - before) <= _SETTLED * last else math.nan
+        settled = _SETTLED * last
+        if self._rounding is not None:  # below this, rounding adds up
+            settled = _ROUNDED * last + _SETTLED**2 * np.trace(self.process.initial_covariance)
+        return float(last) if abs(last - before) <= settled else math.nan
 
     @cached_property
     def growing(self) -> Floats:
@@ -615,10 +620,20 @@ class ClearStatesForm(ClosedForm):
             X = after
         return traces
 
+    @cached_property
+    def _rounding(self) -> Floats | None:
+        """That of the unencrypted states, as the receiver has it for singular Q, (n, n); else None."""
+        if not is_singular(self.process):
+            return None
+        deviations = np.sqrt(np.diag(self.process.initial_covariance))
+        return np.diag(ROUNDING_OF_REFERENCES * np.where(self.hidden, 0.0, deviations))
+
     def _read(self, X: Floats) -> Floats:
         """A factor of the covariance once the unencrypted states have been read, (n, n), from one of it before, (n, m)."""
         order = np.argsort(self.hidden, kind="stable")
         clear = int((~self.hidden).sum())
+        if self._rounding is not None:
+            X = np.concatenate([X, self._rounding], axis=1)
         L = kernels.triangular_factors(X[order][None].copy())[0]
         L[:clear] = 0.0
         L[:, :clear] = 0.0
