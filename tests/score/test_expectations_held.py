@@ -204,9 +204,7 @@ def test_a_trial_that_never_is_synchronised_is_found_as_nothing(tmp_path: Path) 
     judged = Evidence(scenario, peers, {}, short, {"smart": open_}).judged("evedrop run x")
     assert [judgement.held for judgement in judged] == [None] * 4
     assert [judgement.value for judgement in judged[:3]] == [None, None, 0.5]
-    assert judged[2].sentence == (
-        "expected smart.used_fraction below 1: FAILED, the run was cut short, found 0.5"
-    )
+    assert judged[2].sentence == ("expected smart.used_fraction below 1: FAILED, the run was cut short, found 0.5")
     assert not any("replay" in judgement.as_dict() for judgement in judged)
 
 

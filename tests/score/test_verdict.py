@@ -246,7 +246,9 @@ def test_a_single_trial_does_not_show_what_theory_denies() -> None:
     after_start = AfterStart(4.0, None, True, (1.0, 2.0), in_one_trial=True)
     assert Compared("eve", after_start).outcome is SecrecyOutcome.RELATIVE
     verdict = verdict_on(Compared("eve", after_start, denied=True))
-    assert verdict.sentence.startswith("✗ not secret: by theory, eve knows as much as the estimator in the long run; here ")
+    assert verdict.sentence.startswith(
+        "✗ not secret: by theory, eve knows as much as the estimator in the long run; here "
+    )
     several = replace(after_start, in_one_trial=False)
     assert Compared("eve", several, denied=True).outcome is SecrecyOutcome.RELATIVE
 

@@ -541,6 +541,8 @@ def test_workers_change_nothing(everything: Everything, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("ours", "theirs", "ratio"), [(0.0, 0.0, 1.0), (0.0, 2.0, math.inf), (4.0, 2.0, 0.5)])
 def test_medians_that_are_both_0_are_equal(ours: float, theirs: float, ratio: float) -> None:
     """The ratio of medians is that of equal errors then, as the verdict says."""
-    errors: list[Any] = [SimpleNamespace(infinite_variance=True, quantiles={"0.5": median}) for median in (ours, theirs)]
+    errors: list[Any] = [
+        SimpleNamespace(infinite_variance=True, quantiles={"0.5": median}) for median in (ours, theirs)
+    ]
     anything: Any = SimpleNamespace()
     assert Cell(anything, errors[0], errors[1], anything).ratio == ratio

@@ -487,3 +487,22 @@ def test_the_fixture_is_one_of_the_plugin(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
     assert "a test has either evedrop_wire or evedrop_simulated_wire" in done.stdout
     assert "1 passed, 1 error" in done.stdout
+
+
+def test_an_attachment_may_be_text(evedrop_simulated_wire: Opener) -> None:
+    """As on a real session."""
+    radio = evedrop_simulated_wire(**WIRE)
+    heard: list[tuple[str, str]] = []
+    with zenoh.open(radio.config("base")) as base, zenoh.open(radio.config("robot")) as robot:
+        base.declare_subscriber(
+            "place",
+            lambda sample: heard.append(
+                (sample.payload.to_string(), (sample.attachment or zenoh.ZBytes()).to_string())
+            ),
+        )
+        radio.clock.sleep(1.0)
+        for n in range(20):
+            robot.put("place", str(n), attachment="frame 1")
+        radio.clock.sleep(1.0)
+    assert heard
+    assert {attachment for _, attachment in heard} == {"frame 1"}

@@ -84,11 +84,11 @@ def test_a_message_waits_for_those_before_it(tmp_path: Path) -> None:
     assert [decision[3] for decision in sent] == [True, True, False, True, True, False]
 
 
-@pytest.mark.parametrize(("rate", "sent_at"), [(2000.0, 101.0), (500.0, 102.2), (10_000.0, 101.0), (0.0, 100.0)])
+@pytest.mark.parametrize(("rate", "sent_at"), [(2000.0, 101.0), (500.0, 102.2), (10_000.0, 101.0), (0.0, 101.0)])
 def test_what_waits_at_a_change_of_the_rate_passes_at_the_new_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate: float, sent_at: float
 ) -> None:
-    """Its bytes fill the queue until then, and no later message overtakes it; without a rate, there is no queue."""
+    """Its bytes fill the queue until then, and no later message overtakes it; without a rate, the queue is never full."""
     now = [100.0]
     monkeypatch.setattr(world(), "monotonic", lambda: now[0])
     plan = both_ways({**PERFECT, "rate": 1000.0, "queue": 1000}, largest=1000)
@@ -98,11 +98,11 @@ def test_what_waits_at_a_change_of_the_rate_passes_at_the_new_one(
         assert decide(now[0], 1000)[:3] == (0, 0, 1.0)
         state.change({**PERFECT, "rate": rate, "queue": 1000})
         assert decide(now[0], 100)[1] == (WireFate.OVERFLOW if rate else 0)
-        room_at = 100.0 + 100 / rate if rate else 100.0
+        room_at = 100.0 + 100 / rate if rate else 100.1
         assert decide(room_at - 0.01, 100)[1] == (WireFate.OVERFLOW if rate else 0)
         fate, delay = decide(room_at + 0.001, 100)[1:3]
         assert fate == 0
-        assert delay == pytest.approx(max(0.0, sent_at - room_at - 0.001) if rate else 0.0, abs=1e-9)
+        assert delay == pytest.approx(max(0.0, sent_at - room_at - 0.001), abs=1e-9)
 
 
 def test_a_higher_rate_holds_at_once_for_keys_of_which_none_waits(
@@ -173,7 +173,7 @@ def test_other_settings_hold_from_the_next_message_on(tmp_path: Path) -> None:
         state.change(slower)
         assert [scan(0.0, 10), pose(0.0, 10)] == [(3, 0, 2.0, False), (0, 0, 3.0, False)]
         state.change(SLOW)
-        assert scan(0.0, 10) == (4, 0, 0.25, True)
+        assert scan(0.0, 10) == (4, 0, 1.25, True)  # the message before waits on
         messages = [
             [change.at for change in journal.history.changes_of("robot-base", key, "put")] for key in ("scan", "pose")
         ]

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
 from evedrop.wire.file import wire_of
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.tables import WireExpectTable
+from evedrop.wire.tables import WireExpectTable, WireFile, changed_settings
 from tests.builders import mistakes_of
 
 
@@ -100,3 +101,17 @@ def test_malformed_names_of_links_are_the_tables_matter() -> None:
         'expect.0.metric: is ".heard", but there is no link '
     )
     assert mistakes_of(expecting, link="")[0].startswith('expect.0.link: is "", but there is no link ')
+
+
+def test_a_rate_that_was_added_can_be_taken_away() -> None:
+    """With the queue that came with it, although the change does not name it."""
+    first = {"loss": {"model": "bernoulli", "quality": 0.9}}
+    added = changed_settings(first, {"rate": 1000.0}, first)
+    assert added == {"rate": 1000.0, "queue": 256_000.0}
+    assert changed_settings({**first, **added}, {"rate": None}, first)["rate"] == 0.0
+
+
+def test_a_query_waits_for_some_time() -> None:
+    """Without any, replies would be lost at random."""
+    with pytest.raises(ValidationError, match="query_seconds"):
+        WireFile.model_validate({"query_seconds": 0.0})

@@ -8,6 +8,8 @@ import os
 import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from unittest.mock import patch
 
 import pyarrow as pa
@@ -21,7 +23,7 @@ from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_reading import journal_tables
 from evedrop.wire.journal_records import JournalRecords
 from evedrop.wire.records import Kind, WireFate
-from evedrop.wire.run import continuation, run_wire
+from evedrop.wire.run import _earlier, continuation, run_wire
 from tests.conftest import Evedrop, Live, wait_until
 from tests.wire.wire_at_work import program
 from tests.wire.wire_links import key_fates
@@ -77,10 +79,18 @@ def test_a_first_start_and_one_without_messages_continue_nothing(tmp_path: Path)
     for lines in (first, second):
         assert run_wire(wire_plan(), tmp_path / "out", seconds=0.01, say=lines.append) == 0
     assert [line for line in first if "continues" in line] == []
-    assert "start 2 continues start 1, which numbered no message" in second
+    assert "start 2 continues start 1, which numbered no message of these links" in second
     assert continuation(3, {("up", "a", "query"): 7}).startswith(
         "start 3 continues start 2: query 8 of a on the link up is next;"
     )
+
+
+def test_a_start_with_other_links_continues_only_those_that_are_still_there() -> None:
+    """The most messages were on a link that the file no longer has."""
+    counts = {("gone", "scan", "put"): 50, ("scan", "scan", "put"): 8}
+    journal: Any = SimpleNamespace(recovered=0, history=SimpleNamespace(start=2), counts=counts)
+    (line,) = _earlier(journal, wire_plan())
+    assert line.startswith("start 2 continues start 1: message 9 of scan on the link scan is next; for")
 
 
 def test_records_of_a_wire_that_ended_on_a_full_disk_are_not_said_to_be_of_a_killed_one(tmp_path: Path) -> None:

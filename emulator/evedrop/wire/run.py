@@ -89,7 +89,7 @@ def run_wire(
                     say(line)
 
                 _begin_results(out, plan)
-                for line in _earlier(journal):
+                for line in _earlier(journal, plan):
                     say(line)
                 relay = WireRelay(plan, journal, sides, warn, happened)
                 # Before anything crosses: it applies what is in force at first.
@@ -123,7 +123,7 @@ def run_wire(
     return status
 
 
-def _earlier(journal: WireJournal) -> Iterator[str]:
+def _earlier(journal: WireJournal, plan: WirePlan) -> Iterator[str]:
     """Lines about the earlier starts in the wire's folder."""
     if journal.recovered:
         yield (
@@ -131,13 +131,15 @@ def _earlier(journal: WireJournal) -> Iterator[str]:
             "and the numbers go on"
         )
     if journal.history.start > 1:
-        yield continuation(journal.history.start, journal.counts)
+        links = {link.name for link in plan.links}
+        counts = {numbered: n for numbered, n in journal.counts.items() if numbered[0] in links}
+        yield continuation(journal.history.start, counts)
 
 
 def continuation(start: int, counts: Mapping[Numbered, int]) -> str:
     """The sentence about a start in the folder of an earlier one. counts: the number of each stream's next message, from 0."""
     if not counts:
-        return f"start {start} continues start {start - 1}, which numbered no message"
+        return f"start {start} continues start {start - 1}, which numbered no message of these links"
     (link, key, kind), number = max(counts.items(), key=lambda item: item[1])
     others = f", and likewise for {len(counts) - 1:,} more" if len(counts) > 1 else ""
     noun = "message" if kind == PUT else kind

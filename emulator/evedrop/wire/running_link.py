@@ -361,6 +361,8 @@ class RunningLink:
                     if wait is None:
                         return at, _OVERFLOW, 0.0, False
                     delay += wait
+                elif stream in self._queued:  # messages of a rate before wait on
+                    delay += self._queued[stream].delay(0.0, now)
             if size > largest:
                 return at, _TOO_LARGE, 0.0, False
             if self.looped:

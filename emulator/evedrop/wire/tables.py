@@ -506,7 +506,7 @@ class WireFile(Table):
     expect: Annotated[list[WireExpectTable], Field(default_factory=list)]
     lossless: Annotated[KeyExpressions, Field(default_factory=list)]
     largest: Annotated[Size, Field(ge=1, examples=["64 MB"])] = 2**30
-    query_seconds: Annotated[Seconds, Field(examples=["10 s"])] = 10.0
+    query_seconds: Annotated[Seconds, Field(gt=0.0, examples=["10 s"])] = 10.0
     held_messages: Annotated[int, Field(strict=True, ge=1, le=10_000_000, examples=[100_000])] = 100_000
     held_bytes: Annotated[Size, Field(ge=1, examples=["1 GB"])] = 2**30
 
@@ -523,7 +523,10 @@ def changed_settings(
     settings: the present ones; first: those at the start. What a change needs and the link did not have at the start is part of
     the result, so that it can be added to the settings at any time.
     """
-    entries = {name: value for name, value in settings.items() if not (name == "loss" and "quality" in changes)}
+    replaced = {"loss"} if "quality" in changes else set()
+    if "rate" in changes and changes["rate"] is None:
+        replaced.add("queue")
+    entries = {name: value for name, value in settings.items() if name not in replaced}
     made = WireSettingsTable.model_validate({**entries, **changes}).wire_settings()
     names = ["loss" if name == "quality" else name for name in changes]
     needed = [_NEEDS[name] for name in names if name in _NEEDS]

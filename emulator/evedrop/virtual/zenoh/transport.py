@@ -48,11 +48,11 @@ class VirtualSample(NamedTuple):
 PLAIN = VirtualSample()
 
 
-def details_of(attachment: bytes | zenoh.ZBytes | None = None, **given: Any) -> VirtualSample:
+def details_of(attachment: bytes | str | zenoh.ZBytes | None = None, **given: Any) -> VirtualSample:
     """What a message carries: what is given, but for None; the rest as it is by default."""
     details = {name: value for name, value in given.items() if value is not None and name in VirtualSample._fields}
     if attachment is not None:
-        details["attachment"] = zenoh.ZBytes(attachment) if isinstance(attachment, bytes) else attachment
+        details["attachment"] = attachment if isinstance(attachment, zenoh.ZBytes) else zenoh.ZBytes(attachment)
     return VirtualSample(**details) if details else PLAIN
 
 
