@@ -11,7 +11,7 @@ import pytest
 
 from tests.virtual.simulated import played
 
-HASH = "c0148981776ad138"
+HASH = "926f259662fbcee4"
 """Of the seeds 1 to 30."""
 _PLAY = """
 from evedrop.results.reading import Results
@@ -23,7 +23,7 @@ print(campaign.play(1002, program).misses, played(1104)[2])
 
 
 @pytest.mark.parametrize(
-    ("seeds", "expected"), [(3, "b034bdae253c04ce"), pytest.param(30, HASH, marks=pytest.mark.campaign)]
+    ("seeds", "expected"), [(3, "0a56e525dde26eb1"), pytest.param(30, HASH, marks=pytest.mark.campaign)]
 )
 def test_seeds_give_the_same_events_on_every_machine(seeds: int, expected: str) -> None:
     """To the byte, with every version of Python. A change of the programs may change a hash: then it is written here again."""

@@ -61,6 +61,12 @@ def listen(config: zenoh.Config, count: int) -> list[int]:
         return [int(sample.payload.to_string()) for sample in islice(places, count)]
 
 
+QUERIES: dict[str, Any] = {
+    "side": ["robot", "base"],
+    "link": [{"from": "robot", "to": "base"}, {"from": "base", "to": "robot"}],
+}
+
+
 def drives(radio: SimulatedWire, seconds: float, **entries: Any) -> int:
     """Let a robot drive, and wait for it, and for the journal."""
     count = radio.start(drive, radio.config("robot"), seconds, radio.clock, **entries).result()
@@ -506,3 +512,40 @@ def test_an_attachment_may_be_text(evedrop_simulated_wire: Opener) -> None:
         radio.clock.sleep(1.0)
     assert heard
     assert {attachment for _, attachment in heard} == {"frame 1"}
+
+
+def test_a_question_has_its_answers_once_nobody_holds_it(evedrop_simulated_wire: Opener) -> None:
+    """As on a real session: at once, and with the parameters of the selector; also within `with`."""
+    radio = evedrop_simulated_wire(**QUERIES)
+    with zenoh.open(radio.config("base")) as base, zenoh.open(radio.config("robot")) as robot:
+        base.declare_queryable("pose", lambda query: query.reply("pose", f"here {query.parameters}"))
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                query.reply("map", str(query.selector))
+
+        base.declare_queryable("map", answer)
+        radio.clock.sleep(1.0)
+        began = radio.clock.time()
+        answers = [
+            [reply.ok.payload.to_string() for reply in robot.get(asked) if reply.ok is not None]
+            for asked in ("pose", "pose?x=1", "map?y=2")
+        ]
+        assert radio.clock.time() - began < 1.0
+    assert answers == [["here "], ["here x=1"], ["map?y=2"]]
+
+
+@pytest.mark.parametrize("declared", ["subscriber", "publisher", "queryable", "querier"])
+def test_what_is_no_key_expression_is_refused_at_once(evedrop_simulated_wire: Opener, declared: str) -> None:
+    """By the session that is asked, and not somewhere in the wire."""
+    radio = evedrop_simulated_wire(**QUERIES)
+    with zenoh.open(radio.config("base")) as base:
+        handlers = {"subscriber": [print], "queryable": [print]}.get(declared, [])
+        for act in (
+            lambda: getattr(base, f"declare_{declared}")("x#y", *handlers),
+            lambda: base.put("x#y", "1"),
+            lambda: base.get("x#y"),
+            lambda: base.liveliness().declare_token("x#y"),
+        ):
+            with pytest.raises(zenoh.ZError):
+                act()

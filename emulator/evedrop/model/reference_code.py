@@ -18,7 +18,7 @@ from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.process import Floats, Process, StateFactors, product
 from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception
 from evedrop.model.schedule import state_factors
-from evedrop.model.staircase import is_nonsingular, is_singular
+from evedrop.model.staircase import ROUNDING_OF_PACKETS, is_nonsingular, is_singular
 from evedrop.model.theory.horizon import TOLERANCE, UNIT_ROUNDOFF
 
 
@@ -204,8 +204,6 @@ def initial_factor(process: Process, first: int) -> Floats:
 
 Slots = NDArray[np.int64]
 
-ROUNDING_OF_REFERENCES = 2.0**-44
-"""The standard deviation of the rounding of a packet with a reference, relative to the numbers that it is computed from."""
 NEGLIGIBLE = 1e-75
 """Of the noise: the square of such a standard deviation is lost in rounding, and its own square in underflow."""
 
@@ -364,7 +362,7 @@ class ReferenceReceiver(Receiver):
         if self._singular:
             # A direction without noise is known up to the rounding of x, r and z.
             size = np.abs(x) + np.abs(r) + np.abs(z) + self._code.standard_deviation(k)[:, None]
-            top = np.concatenate([top, ROUNDING_OF_REFERENCES * size[:, None, :] * np.eye(n)[:, :, None]], axis=1)
+            top = np.concatenate([top, ROUNDING_OF_PACKETS * size[:, None, :] * np.eye(n)[:, :, None]], axis=1)
             R = np.concatenate([R, 0.0 * noise], axis=1)
         joint = np.concatenate([np.concatenate([noise, top], axis=1), np.concatenate([0.0 * noise, R], axis=1)])
         joint = np.where(np.abs(joint) < self._negligible, 0.0, joint)

@@ -158,6 +158,10 @@ def checked_slots(slots: int) -> list[int]:
     )
 
 
+ROUNDING_OF_PACKETS = 2.0**-44
+"""The standard deviation of the rounding of a packet where Q is singular, relative to the numbers that it is computed from."""
+
+
 def is_singular(process: Process) -> bool:
     """Whether Q has a direction without variance, and is allowed to."""
     return process.singular_noise and bool(np.any(np.diag(process.noise_factor) == 0.0))

@@ -14,14 +14,13 @@ from evedrop.model.process import Floats, product
 from evedrop.model.receiver import Action, Belief, Flags, Reception
 from evedrop.model.reference_code import (
     NEGLIGIBLE,
-    ROUNDING_OF_REFERENCES,
     ReferenceReceiver,
     initial_factor,
     squares,
     triangular_solutions,
 )
 from evedrop.model.schemes.partial_encryption import UNENCRYPTED_INNOVATION
-from evedrop.model.staircase import is_singular
+from evedrop.model.staircase import ROUNDING_OF_PACKETS, is_singular
 from evedrop.model.streams import Batch
 
 
@@ -121,7 +120,7 @@ def _with_rounding(X: Floats, hidden: Flags, sizes: Floats) -> Floats:
     Without it, an unencrypted state that is known already, or that follows from others, would have a pivot that is 0 or mere
     rounding, and its column would take what is not known of the encrypted states.
     """
-    rounding = ROUNDING_OF_REFERENCES * np.where(hidden[:, None], 0.0, sizes)
+    rounding = ROUNDING_OF_PACKETS * np.where(hidden[:, None], 0.0, sizes)
     return np.concatenate([X, rounding[:, None, :] * np.eye(len(hidden))[:, :, None]], axis=1)
 
 

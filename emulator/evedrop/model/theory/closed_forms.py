@@ -23,9 +23,8 @@ from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.process import MARGINAL, Floats, Process, invariant_hull
 from evedrop.model.receiver import Flags
-from evedrop.model.reference_code import ROUNDING_OF_REFERENCES
 from evedrop.model.schedule import NoiseDistribution, StateProbability, in_slot, mean_of
-from evedrop.model.staircase import is_singular
+from evedrop.model.staircase import ROUNDING_OF_PACKETS, is_singular
 from evedrop.model.theory.covariances import (
     LARGEST_OPERATOR,
     NOBODY,
@@ -626,7 +625,7 @@ class ClearStatesForm(ClosedForm):
         if not is_singular(self.process):
             return None
         deviations = np.sqrt(np.diag(self.process.initial_covariance))
-        return np.diag(ROUNDING_OF_REFERENCES * np.where(self.hidden, 0.0, deviations))
+        return np.diag(ROUNDING_OF_PACKETS * np.where(self.hidden, 0.0, deviations))
 
     def _read(self, X: Floats) -> Floats:
         """A factor of the covariance once the unencrypted states have been read, (n, n), from one of it before, (n, m)."""

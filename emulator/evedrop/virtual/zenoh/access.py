@@ -30,6 +30,13 @@ class Peer(NamedTuple):
 
 
 @lru_cache(maxsize=1 << 16)
+def expression_of(key: str | zenoh.KeyExpr) -> str:
+    """A key expression as a text. Raises ZError if it is none."""
+    zenoh.KeyExpr(str(key))
+    return str(key)
+
+
+@lru_cache(maxsize=1 << 16)
 def intersects(expression: str, other: str) -> bool:
     """Whether two key expressions have a key in common."""
     return expression == other or bool(

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from types import TracebackType
 from typing import Any, Protocol, Self, final
 
@@ -169,7 +170,8 @@ def taker_of(session: AnySession, handler: FifoChannel | RingChannel | Callable[
 
     def call() -> None:
         for item in items_of(channel):
-            attempt(session, lambda item=item: function(item))  # type: ignore[misc]
+            attempt(session, partial(function, item))
+            del item  # a question that nobody holds has all its answers
         attempt(session, function.end)
 
     session.scheduler.thread("calls back", call, session.task).start()

@@ -13,7 +13,7 @@ from typing import final
 
 import zenoh
 
-from evedrop.virtual.zenoh.access import intersects
+from evedrop.virtual.zenoh.access import expression_of, intersects
 from evedrop.virtual.zenoh.handlers import Callback, Taker, VirtualDeclaration, taker_of
 from evedrop.virtual.zenoh.questions import QUERY_SECONDS, VirtualQuestions
 from evedrop.virtual.zenoh.transport import End, TransportFrame, VirtualReply, VirtualSample
@@ -68,6 +68,7 @@ class Liveliness:
     def declare_token(self, key: str) -> VirtualToken:
         """Show a token. Raises ZError if the session is closed."""
         self._session.expect_open()
+        key = expression_of(key)
         self.shown[key] += 1
         if self.shown[key] == 1:
             self._tell(None, key, there=True)
@@ -86,7 +87,7 @@ class Liveliness:
     ) -> VirtualWatch:
         """Watch tokens; history: also those that are there already. Raises ZError if the session is closed."""
         self._session.expect_open()
-        watch = VirtualWatch(self, key, taker_of(self._session, handler))
+        watch = VirtualWatch(self, expression_of(key), taker_of(self._session, handler))
         for token in self.known(key) if history else ():
             watch.taker.put(_token_sample(token, there=True))
         self.watching.append(watch)

@@ -9,7 +9,8 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any, final
+from types import TracebackType
+from typing import Any, Self, final
 
 import zenoh
 
@@ -33,16 +34,32 @@ _NO_LIMIT = sys.maxsize
 
 @final
 class VirtualQuery:
-    """A question, as the process that answers it gets it."""
-
-    parameters = ""
+    """A question, as the process that answers it gets it. Once nobody holds it, there is no further answer."""
 
     def __init__(self, questions: VirtualQuestions, frame: TransportFrame, number: int) -> None:
         self._questions, self.key_expr, self._number = questions, frame.key, number
         self.payload = zenoh.ZBytes(frame.payload) if frame.payload else None
         self.encoding = frame.details.encoding
         self.attachment, self.source_info = frame.details.attachment, frame.details.source_info
+        self.parameters = zenoh.Parameters(frame.details.parameters)
         self._open = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.drop()
+
+    def __del__(self) -> None:
+        if self._open:  # not at once: whoever let it go may be in the middle of something
+            self._questions.session.scheduler.after_seconds(0.0, self.drop)
+
+    @property
+    def selector(self) -> zenoh.Selector:
+        """Key expression and parameters."""
+        return zenoh.Selector(self.key_expr, self.parameters)
 
     @staticmethod
     def accepts_replies() -> zenoh.ReplyKeyExpr:
@@ -103,14 +120,15 @@ class VirtualQuerier(VirtualDeclaration):
         handler: Callback,
         *,
         payload: zenoh.ZBytes | None = None,
-        parameters: str = "",
+        parameters: str | zenoh.Parameters = "",
         encoding: zenoh.Encoding | None = None,
         attachment: zenoh.ZBytes | None = None,
         source_info: zenoh.SourceInfo | None = None,
     ) -> None:
         """Ask; the handler gets the answers, and is told when there are no more. Raises ZError if the session is closed."""
-        del parameters
-        details = details_of(encoding=encoding, attachment=attachment, source_info=source_info)
+        details = details_of(
+            encoding=encoding, attachment=attachment, source_info=source_info, parameters=str(parameters) or None
+        )
         frame = TransportFrame("query", self._key, bytes_of(payload), 0, details)
         self._questions.ask(frame, self._timeout, handler, remote=True, latest=self._latest)
 

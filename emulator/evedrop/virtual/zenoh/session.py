@@ -15,7 +15,7 @@ import zenoh
 
 from evedrop.virtual import notes
 from evedrop.virtual.scheduler import VirtualQueue, VirtualScheduler, VirtualTask
-from evedrop.virtual.zenoh.access import Access, intersects, section
+from evedrop.virtual.zenoh.access import Access, expression_of, intersects, section
 from evedrop.virtual.zenoh.certificates import shown_by
 from evedrop.virtual.zenoh.handlers import (
     Callback,
@@ -243,7 +243,7 @@ class VirtualSession:
         if not (isinstance(handler, FifoChannel | RingChannel) or callable(handler)):
             raise TypeError(f"{handler!r} is not simulated; expected a function, or a FifoChannel or RingChannel")
         remote = allowed_origin == zenoh.Locality.REMOTE
-        subscriber = VirtualSubscriber(self, str(key), taker_of(self, handler), remote)
+        subscriber = VirtualSubscriber(self, expression_of(key), taker_of(self, handler), remote)
         self._subscribers.append(subscriber)
         self.declare("declare_subscriber", subscriber.key)
         return subscriber
@@ -262,13 +262,13 @@ class VirtualSession:
     ) -> VirtualPublisher:
         """Publish on a key; how: as for `put`. Raises ZError if the session is closed."""
         self.expect_open()
-        return VirtualPublisher(self, str(key), {**how, "congestion_control": congestion_control})
+        return VirtualPublisher(self, expression_of(key), {**how, "congestion_control": congestion_control})
 
     def declare_queryable(
         self, key: str | zenoh.KeyExpr, handler: Callable[[VirtualQuery], object], **_: object
     ) -> VirtualQueryable:
         """Answer questions at a key expression. Raises ZError if the session is closed."""
-        return self.questions.declare_queryable(str(key), handler)
+        return self.questions.declare_queryable(expression_of(key), handler)
 
     def declare_querier(
         self,
@@ -280,7 +280,9 @@ class VirtualSession:
     ) -> VirtualQuerier:
         """Ask others at a key expression. Raises ZError if the session is closed."""
         self.expect_open()
-        return VirtualQuerier(self.questions, str(key), timeout, consolidation != zenoh.ConsolidationMode.NONE)
+        return VirtualQuerier(
+            self.questions, expression_of(key), timeout, consolidation != zenoh.ConsolidationMode.NONE
+        )
 
     def put(
         self,
@@ -294,7 +296,7 @@ class VirtualSession:
         self.expect_open()
         self.task.allocate()
         message = bytes_of(payload)
-        self.scheduler.note(notes.PUT, notes.key_within(str(key)), len(message), notes.said_in(message))
+        self.scheduler.note(notes.PUT, notes.key_within(expression_of(key)), len(message), notes.said_in(message))
         frame = TransportFrame("put", str(key), message, self.scheduler.events, details_of(**details))
         self._pass_on(None, frame, remote=allowed_destination == zenoh.Locality.REMOTE)
         self.scheduler.interruptible()
@@ -307,7 +309,11 @@ class VirtualSession:
         self, key: str, handler: Callback | None = None, *, payload: bytes = b"", timeout: float = QUERY_SECONDS
     ) -> Iterator[VirtualReply] | None:
         """Ask a question, and return the latest answer of each key, unless a handler gets them. Raises ZError if closed."""
-        return self.questions.ask(TransportFrame("query", key, payload), timeout, handler, latest=True)
+        selected, _, parameters = str(key).partition("?")
+        frame = TransportFrame(
+            "query", expression_of(selected), bytes_of(payload), details=details_of(parameters=parameters or None)
+        )
+        return self.questions.ask(frame, timeout, handler, latest=True)
 
     def has_reader(self, key: str, *, remote: bool = False) -> bool:
         """Whether somebody reads a key; remote: somebody else. Raises ZError if the session is closed."""

@@ -38,6 +38,8 @@ class VirtualSample(NamedTuple):
     priority: zenoh.Priority = zenoh.Priority.DATA
     congestion_control: zenoh.CongestionControl = zenoh.CongestionControl.BLOCK
     express: bool = False
+    parameters: str = ""
+    """Of a question."""
 
     @property
     def waits(self) -> bool:
