@@ -71,8 +71,8 @@ def test_the_limits_of_a_file() -> None:
     assert loading.MOST_BYTES == 256 * 2**20
     assert loading.MOST_VALUES == 1_000_000
     assert (
-        "a file has at most 256 MiB and a million values in lists, tables and lists are at most "
-        f"{table._DEEPEST} deep, whole numbers have at most {table._LARGEST_BITS} bits"
+        "a file has at most 256 MiB, and a million values in lists; nesting is at most "
+        f"{table._DEEPEST} deep; whole numbers have at most {table._LARGEST_BITS} bits"
     ) in page("scenario.md")
 
 
