@@ -129,16 +129,16 @@ BESIDE = np.array([[1.0, 0.0, 0.1, 0.3], [0.0, 1.0, 0.2 * 1.1, 0.6 * 1.1], [0.0,
 
 
 @pytest.mark.parametrize(
-    ("A", "noise", "encrypted"),
+    ("A", "noise", "encrypted", "limit"),
     [
-        (CHAIN, [0.0, 0.0, 1.0], [0]),
-        (CHAIN, [0.0, 0.0, 1.0], [1]),
-        (CHAIN, [0.0, 0.0, 1.0], [2]),
-        (BESIDE, [0.0, 0.0, 1.0, 1.0], [2, 3]),
+        (CHAIN, [0.0, 0.0, 1.0], [0], math.inf),
+        (CHAIN, [0.0, 0.0, 1.0], [1], 0.0),
+        (CHAIN, [0.0, 0.0, 1.0], [2], 1.0),
+        (BESIDE, [0.0, 0.0, 1.0, 1.0], [2, 3], 6.5),
     ],
 )
 def test_an_unencrypted_state_that_follows_from_others_takes_nothing_away(
-    A: Floats, noise: list[float], encrypted: list[int]
+    A: Floats, noise: list[float], encrypted: list[int], limit: float
 ) -> None:
     """Receiver and theory know what a Kalman filter in pseudo-inverses knows, where Q is singular, and the error is as large."""
     n, slots, trials = len(A), 40, 300
@@ -150,7 +150,9 @@ def test_an_unencrypted_state_that_follows_from_others_takes_nothing_away(
         P = (P + P.T) / 2.0
         traces.append(float(np.trace(P)))
     batch, hidden = Batch(slots, trials), np.isin(np.arange(n), encrypted)
-    np.testing.assert_allclose(ClearStatesForm(process, hidden, 1.0, 1.0, slots).traces, traces, rtol=1e-5, atol=1e-12)
+    theory = ClearStatesForm(process, hidden, 1.0, 1.0, slots)
+    np.testing.assert_allclose(theory.traces, traces, rtol=1e-5, atol=1e-12)
+    assert theory.limit == pytest.approx(limit, rel=1e-3, abs=1e-12)
     errors = []
     followed = beliefs(reader_of(process, batch), scheme(process, encrypted, 1.0), np.ones((slots, trials)), batch)
     for wanted, (x, _, belief) in zip(traces, followed, strict=True):
