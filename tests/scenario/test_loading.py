@@ -195,6 +195,30 @@ def test_an_unbounded_estimator_is_a_warning(key: str, value: float) -> None:
     assert warnings_of(load("numerical")) == []
 
 
+@pytest.mark.parametrize(
+    ("encoding", "growth", "attack"),
+    [
+        ({"scheme": "quantised-schedule", "threshold": 3, "bits": 1, "standard_deviations": 4}, 1.3, None),
+        ({"scheme": "scheduled", "threshold": 3}, 1.6, "forge"),
+    ],
+)
+def test_an_estimator_that_its_scheme_leaves_unbounded_is_a_warning(
+    encoding: dict[str, Any], growth: float, attack: str | None
+) -> None:
+    """Though its link is good enough for the states themselves."""
+    listener = {"strategy": "reference", "link": {"quality": 0.5}}
+    process = {"A": [[growth]], "Q": [[1.0]], "initial_covariance": [[1.0]]}
+    acknowledgements = {"link": {"quality": 0.9}, **({} if attack is None else {"attack": attack})}
+    changes = {"process": process, "acknowledgements": acknowledgements, "eavesdroppers": {"listener": listener}}
+    changes |= {"expect": [], "slots": 40, "legitimate.link.quality": 0.8}
+    (warning,) = warnings_of(load("acknowledged", {**changes, "encoding": encoding}))
+    assert "grows without bound: with link quality 0.8" in warning
+    assert f"the scheme {encoding['scheme']} brings it the state too rarely or too roughly" in warning
+    assert (
+        warnings_of(load("acknowledged", {**changes, "encoding": encoding, "process": process | {"A": [[0.9]]}})) == []
+    )
+
+
 def test_large_results_are_a_warning() -> None:
     """A run that will write more than a gigabyte says so first."""
     scenario = load("eavesdroppers", {"trials": 100_000, "record_trials": 100_000})

@@ -40,6 +40,13 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"plant__output_matrix": [[0.0, 0.0]]},
         "plant.output_matrix",
     ),
+    "the same twice, exactly": (
+        {
+            "plant__output_matrix": [[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]],
+            "plant__measurement_noise": [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.01]],
+        },
+        "plant.measurement_noise",
+    ),
     "an unstable mode unseen": (
         {
             "process__A": [[1.2, 0.0], [0.0, 0.5]],
@@ -89,6 +96,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
             "slots": 44,
         },
         "slots",
+    ),
+    "nothing moves": (
+        {**NO_PLANT, "process__Q": [[0.0, 0.0], [0.0, 0.0]]},
+        "process.Q",
     ),
     "too long": (
         {**NO_PLANT, "process__A": [[2.0, 0.0], [1.5, 0.5]], "process__Q": [[1.0, 1.0], [1.0, 1.0]], "slots": 100},

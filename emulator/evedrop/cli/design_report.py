@@ -101,13 +101,14 @@ def _answer(design: Design) -> str | None:
             ("", "") if design.minimum is None else (" that keeps the wanted trace", "ask for a larger trace, or ")
         )
         return f"no μ_d{which} keeps the error of every eavesdropper above the legitimate one: {also}improve the legitimate link"
-    perfect = [name for name, ratio in choice.ratios.items() if math.isinf(ratio) and choice.trace > 0.0]
+    traces = design.traces_at(choice.mu_d)
+    perfect = [name for name in choice.ratios if math.isinf(traces[name])]
     closest = min(choice.ratios, key=lambda name: choice.ratios[name])
     gives = [f"perfect secrecy against {', '.join(perfect)}"] if perfect else []
-    if closest not in perfect and choice.trace > 0.0:
+    if choice.trace == 0.0:
+        gives.append("the legitimate error is 0")
+    elif closest not in perfect:
         gives.append(f"the error of {closest}, the closest, is {choice.ratios[closest]:.3g} × the legitimate one")
-    if not gives:
-        gives = ["the legitimate error is 0"]
     cost = f"costs {choice.cost:.3g} × the error of sending every state"
     return f"choose μ_d = {_rounded_down(choice.mu_d)}: {', and '.join(gives)}; {cost}"
 

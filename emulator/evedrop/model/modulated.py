@@ -30,6 +30,7 @@ from evedrop.model.theory.covariances import (
     misled_covariances,
     radius,
     theoretical_covariances,
+    unbounded,
     without_cancellation,
 )
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
@@ -240,13 +241,13 @@ class _Slot:
 
 
 def limit_of(process: Process, link: LinkDistribution, outcomes_at: OutcomesAt) -> float:
-    """Trace of lim E P_k for the link in its last state; inf if it has no limit, NaN if it is too large to compute."""
+    """Trace of lim E P_k for the link in its last state; inf if it is unbounded, NaN if theory does not know it."""
     chain = link.last
     if len(chain.stationary) * process.n**2 > LARGEST_OPERATOR:
         return float("nan")
     states = limit_states(process, chain, outcomes_at)
-    if states is None:
-        return float("inf")
+    if not np.isfinite(states).all():
+        return float(states[0, 0, 0])
     arrived = link.segments[-1].arrived
     for lag in range(link.window - 1, -1, -1):
         there = Chain(
@@ -257,24 +258,25 @@ def limit_of(process: Process, link: LinkDistribution, outcomes_at: OutcomesAt) 
 
 
 def limit_trace(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> float:
-    """Trace of lim E P_k; inf if it has no limit: the operator on (E(s)) does not contract, or misled errors grow."""
-    states = limit_states(process, chain, outcomes_at)
-    return float("inf") if states is None else float(np.trace(states.sum(axis=0)))
+    """Trace of lim E P_k; `unbounded` if the operator on (E(s)) does not contract, or misled errors grow."""
+    return float(np.trace(limit_states(process, chain, outcomes_at).sum(axis=0)))
 
 
-def limit_states(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> Floats | None:
-    """Lim E_k(s), (states, n, n); None if there is none."""
+def limit_states(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> Floats:
+    """Lim E_k(s), (states, n, n); `unbounded` if there is none."""
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
     n, states = process.n, len(chain.stationary)
     misled = any(outcome.misled > 0.0 for outcome in outcomes)
     if misled and radius(process) >= 1.0:
-        return None
+        return np.repeat(unbounded(process, 1.0)[None], states, axis=0)
     if not misled and all(outcome.predicted + outcome.leaked + outcome.initial == 0.0 for outcome in outcomes):
         return np.zeros((states, n, n))
     kept = np.repeat([outcome.propagated for outcome in outcomes], n * n)
     operator = kept[:, None] * np.kron(chain.transitions.T, np.kron(process.A, process.A))
-    if np.max(np.abs(np.linalg.eigvals(operator))) >= 1.0 - 1e-12:
-        return None
+    largest = float(np.max(np.abs(np.linalg.eigvals(operator))))
+    if largest >= 1.0 - 1e-12:
+        starts = any(outcome.initial > 0.0 for outcome in outcomes)
+        return np.repeat(unbounded(process, largest / radius(process) ** 2, starts)[None], states, axis=0)
     source = _limit_sources(process, chain, outcomes).reshape(-1)
     return np.linalg.solve(np.eye(len(operator)) - operator, source).reshape(states, n, n)
 

@@ -447,6 +447,10 @@ def _application_objections(scenario: Scenario) -> list[str]:
 
 def horizon_mistakes(process: Process, slots: int) -> list[str]:
     """A mistake if float64 cannot follow the process for that many slots (docs/mathematics/numerics.md, horizon)."""
+    if not process.Q.any():
+        return [
+            "process.Q: is 0, and a process without noise is not supported; expected noise in at least one direction"
+        ]
     last = horizon(process, slots)
     if last is None:
         return []

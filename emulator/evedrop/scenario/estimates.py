@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from evedrop.model.acknowledgements import rates_of
+from evedrop.model.links.chain import Chain
 from evedrop.model.local_filter import settled
 from evedrop.model.theory.covariances import stability_bound
 from evedrop.names import LEGITIMATE
@@ -28,26 +29,16 @@ def warnings_of(scenario: Scenario, several: bool = False) -> list[str]:
     Source: docs/mathematics/secrecy.md, secrecy and design (stability bound).
     """
     warnings = []
-    process, mu_d = scenario.process.process, scenario.encoding.mu_d
     expectation = expectations_of(scenario)[LEGITIMATE]
     alike = None if expectation.link is None else expectation.link.alike
     mu = 0.0 if alike is None else float(alike.quality[0])
-    bound = stability_bound(process, mu)
-    if alike is None:
-        if math.isinf(expectation.limit):
-            warnings.append(
-                f"the legitimate estimator's expected error grows without bound: with spectral radius "
-                f"{process.spectral_radius:.6g} and state_probability {mu_d:g} the losses of its link last too long"
-            )
-    elif expectation.has_limit and not mu_d > bound and process.spectral_radius >= 1.0 and mu < 1.0:
-        needed = f"{bound:.6g}" if math.isfinite(bound) else "∞"
+    lost_reference = _reference_warnings(scenario, mu)
+    explained = lost_reference and scenario.encoding.mu_d > stability_bound(scenario.process.process, mu)
+    if math.isinf(expectation.limit) and not explained:
         warnings.append(
-            f"the legitimate estimator's expected error grows without bound: state_probability is {mu_d:g}, and with "
-            f"link quality {mu:g} and spectral radius {process.spectral_radius:.6g} it must exceed {needed}"
-            + ("; no state_probability can, the link must be better" if bound >= 1.0 else "")
+            f"the legitimate estimator's expected error grows without bound: {_why_unbounded(scenario, alike)}"
         )
-    warnings += _reference_warnings(scenario, mu)
-    warnings += [*_filter_warnings(scenario), *scenario.make_scheme().warnings()]
+    warnings += [*lost_reference, *_filter_warnings(scenario), *scenario.make_scheme().warnings()]
     warnings += _recording_warnings(scenario) if several or scenario.trials > 1 else []
     size = written_bytes(scenario)
     if size > _LARGE_BYTES:
@@ -58,6 +49,25 @@ def warnings_of(scenario: Scenario, several: bool = False) -> list[str]:
         if scenario.made_with.get(module, source) != source:
             warnings.append(f"the {module} is not the one these results were made with; its digests may differ")
     return warnings
+
+
+def _why_unbounded(scenario: Scenario, alike: Chain | None) -> str:
+    """Why the legitimate error grows without bound. alike: the losses of its link if they are independent and stay the same."""
+    rho, mu_d = scenario.process.process.spectral_radius, scenario.encoding.mu_d
+    if alike is None:
+        return f"with spectral radius {rho:.6g} and state_probability {mu_d:g} the losses of its link last too long"
+    mu = float(alike.quality[0])
+    bound = stability_bound(scenario.process.process, mu)
+    if mu_d > bound:
+        return (
+            f"with link quality {mu:g} and spectral radius {rho:.6g} the scheme {scenario.encoding.scheme} brings it the state "
+            "too rarely or too roughly"
+        )
+    needed = f"{bound:.6g}" if math.isfinite(bound) else "∞"
+    return (
+        f"state_probability is {mu_d:g}, and with link quality {mu:g} and spectral radius {rho:.6g} it must exceed {needed}"
+        + ("; no state_probability can, the link must be better" if bound >= 1.0 else "")
+    )
 
 
 def _reference_warnings(scenario: Scenario, mu: float) -> list[str]:

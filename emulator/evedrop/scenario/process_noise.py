@@ -161,16 +161,24 @@ def _why_unsettled(process: ProcessTable, plant: PlantTable) -> Iterator[str]:
 
 
 def _unsettled(A: Floats, plant: Plant, least: float) -> str | None:
-    """The reason why a filter has no steady state: a mode of A that no measurement shows or no noise moves; None if unknown.
+    """The reason why a filter has no steady state; None if unknown.
 
+    It is a measurement that follows from others without noise, or a mode of A that no measurement shows or no noise moves.
     least: the smallest singular value that is not rounding.
     """
-    C, n = plant.output_matrix, len(A)
-    assert C is not None  # noqa: S101 - the caller knows
+    C, V, n = plant.output_matrix, plant.measurement_noise, len(A)
+    assert C is not None and V is not None  # noqa: S101, PT018 - the caller knows
     if plant.noise.shape != A.shape:
         return None  # reported elsewhere
     if not C.any():
         return "plant.output_matrix: is 0, so that the measurements show nothing; expected a row for each measurement"
+    deviations = np.sqrt(np.where(np.diag(V) > 0.0, np.diag(V), 1.0))
+    weighed = np.hstack([np.stack([_scaled(row) for row in C]), V / np.outer(deviations, deviations)])
+    if int(np.linalg.matrix_rank(weighed, tol=least)) < len(C):
+        return (
+            "plant.measurement_noise: gives no noise to measurements that follow exactly from the others, and the filter cannot "
+            f"weigh them; expected noise in each of the {len(C)}, or fewer measurements"
+        )
     for value in sorted(np.linalg.eigvals(A), key=abs, reverse=True):
         size = f"an eigenvalue of A of modulus {abs(value):.6g}"
         shifted = _scaled(A - value * np.eye(n))

@@ -7,9 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from evedrop.model import modulated
+from evedrop.model.links.chain import Chain
 from evedrop.model.process import Process
-from evedrop.model.theory.closed_forms import ClearStatesForm
-from evedrop.model.theory.covariances import NOBODY, Outcomes, growth, radius, stability_bound, theoretical_covariances
+from evedrop.model.schedule import NoiseDistribution
+from evedrop.model.theory.closed_forms import ClearStatesForm, SensorChain, TakesNoise, reference_limit
+from evedrop.model.theory.covariances import (
+    NOBODY,
+    Outcomes,
+    growth,
+    limit_trace,
+    radius,
+    stability_bound,
+    theoretical_covariances,
+    theoretical_traces,
+)
 
 TURNED, _ = np.linalg.qr(np.random.default_rng(3).standard_normal((4, 4)))
 MIXED = Process(TURNED @ np.diag([1.3, 1.1, 1.0, 0.6]) @ TURNED.T, np.eye(4), np.eye(4))
@@ -94,3 +106,56 @@ def test_what_is_not_observed_grows() -> None:
     exact, lossy = (ClearStatesForm(process, hidden, 1.0, received, 10).growth for received in (1.0, 0.8))
     assert [exact.along(v) for v in np.eye(3)] == [True, False, False]
     assert [lossy.along(v) for v in np.eye(3)] == [True, None, False]
+
+
+STILL = Process(np.diag([1.0, 0.5]), np.diag([0.0, 0.25]), np.eye(2), singular_noise=True)
+"""Its first state is constant."""
+DRIVEN = replace(STILL, A=np.array([[1.0, 1.0], [0.0, 0.5]]))
+"""Its first state is moved by the second."""
+GROWING = replace(STILL, A=np.diag([1.25, 0.5]))
+MISLED = Outcomes.eavesdropper(0.5, 0.5, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("outcomes", [NOBODY, MISLED])
+def test_the_error_in_a_constant_state_without_noise_has_no_known_limit(outcomes: Outcomes) -> None:
+    """It stays bounded, however long, and depends on the start; a moved or growing state's error has no bound."""
+    late = theoretical_covariances(STILL, outcomes, 3000)[:, 0, 0]
+    assert late[-1] == pytest.approx(late[500], rel=1e-9)
+    assert late[-1] > 0.0
+    assert np.isnan(limit_trace(STILL, outcomes))
+    assert growth(STILL, outcomes).along(np.array([1.0, 0.0])) is None
+    assert growth(STILL, outcomes).along(np.array([0.0, 1.0])) is False
+    for process in (DRIVEN, GROWING):
+        traces = theoretical_traces(process, outcomes, 1000)
+        assert traces[-1] > 1.5 * traces[500]
+        assert limit_trace(process, outcomes) == np.inf
+        assert growth(process, outcomes).along(np.array([1.0, 0.0])) is True
+
+
+def test_every_theory_of_a_limit_knows_states_without_noise() -> None:
+    """Closed forms, and links in bursts; a packet that is the state ends the error, however it began."""
+    bursts = Chain(np.array([[0.9, 0.1], [0.2, 0.8]]), np.array([2 / 3, 1 / 3]), np.array([0.9, 0.1]))
+    distribution = NoiseDistribution(np.eye(2))
+    chain = SensorChain(np.array([1.0]), np.array([[0.0]]), np.array([[1.0]]))
+    for process, unknown in ((STILL, np.nan), (DRIVEN, np.inf), (GROWING, np.inf)):
+        limits = [
+            modulated.limit_trace(process, bursts, lambda mu: Outcomes.eavesdropper(mu, 0.5, 1.0, 1.0)),
+            modulated.limit_trace(process, bursts, lambda _: NOBODY),
+            TakesNoise(process, distribution, 0.5, 0.5, (1.0, 1.0), 50).limit,
+            np.trace(chain.limit(process)),
+            reference_limit(process, 0.5, (0.5, 0.5)),
+            ClearStatesForm(process, np.array([True, False]), 1.0, 1.0, 50).limit if process is not DRIVEN else unknown,
+        ]
+        expected = [unknown] * 5 + [1.0 if process is STILL else unknown]
+        np.testing.assert_allclose(limits, expected)
+    assert np.isfinite(modulated.limit_trace(STILL, bursts, lambda mu: Outcomes.eavesdropper(mu, 0.5, 1.0, 0.0)))
+    assert limit_trace(STILL, Outcomes.plain(0.5)) < np.inf
+
+
+def test_a_growing_state_without_noise_that_is_known_at_the_start_stays_known() -> None:
+    """Behind a lossless link, slot 0 tells the state; only its loss would let the error grow."""
+    heard = Outcomes.eavesdropper(1.0, 0.2, 1.0, 0.0)
+    assert theoretical_covariances(GROWING, heard, 500)[-1, 0, 0] == 0.0
+    assert np.isnan(limit_trace(GROWING, heard))
+    assert growth(GROWING, heard).along(np.array([1.0, 0.0])) is None
+    assert limit_trace(GROWING, replace(heard, initial=0.1)) == np.inf

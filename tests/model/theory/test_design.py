@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
@@ -88,14 +88,21 @@ def test_optima_are_no_worse_than_any_other_choice() -> None:
 qualities = st.floats(0.3, 1.0)
 
 
+def bound_of(growth: float, mu: float) -> float:
+    """Where the legitimate error begins to be bounded, for ρ = growth; everywhere over a lossless link."""
+    return 0.0 if mu == 1.0 else (1.0 - growth**-2) / mu
+
+
 @given(st.floats(1.0, 1.3), st.floats(-0.5, 0.5), qualities, qualities, st.floats(0.02, 0.98))
+@example(1.2, 0.1, 1.0, 0.8, 0.5)
+@example(1.2, 0.1, 1.0, 0.8, 0.05)
 @settings(deadline=None, max_examples=examples(40))
 def test_relative_secrecy_is_the_sign_of_the_difference(
     growth: float, coupling: float, mu: float, mu_e: float, at: float
 ) -> None:
     """A μ_d lies in an interval of relative secrecy exactly when J is bounded and J < J_e there."""
     process = Process(np.array([[growth, coupling], [0.0, 0.9]]), np.diag([1.0, 0.5]), np.eye(2))
-    low = stability_bound(process, mu)
+    low = bound_of(growth, mu)
     intervals = relative_secrecy(process, mu, smart(mu_e))
     if low >= 1.0:
         assert intervals == ()
@@ -111,13 +118,15 @@ def test_relative_secrecy_is_the_sign_of_the_difference(
 
 
 @given(st.floats(1.0, 1.3), qualities, qualities)
+@example(1.2, 1.0, 0.8)
+@example(1.2, 1.0, 1.0)
 @settings(deadline=None, max_examples=examples(30))
 def test_perfect_secrecy_is_where_one_is_bounded_and_the_other_not(growth: float, mu: float, mu_e: float) -> None:
     """Just inside the interval J is finite and J_e infinite; beyond its upper end J_e is finite."""
     process = Process(np.diag([growth, 0.7]), np.eye(2), np.eye(2))
     interval = perfect_secrecy(process, mu, smart(mu_e))
     if interval is None:
-        assert mu_e >= mu or stability_bound(process, mu) >= 1.0 or growth < 1.0 + 1e-6
+        assert mu_e >= mu or bound_of(growth, mu) >= 1.0 or growth < 1.0 + 1e-6
         return
     low, high = interval
     middle = 0.5 * (low + high)
@@ -180,15 +189,34 @@ def test_trace_that_cannot_be_kept_is_refused() -> None:
 
 
 def test_lossless_link() -> None:
-    """With μ = 1 nothing costs: J ≡ 0, μ_d_min is the stability bound, everybody else is kept out relatively."""
+    """With μ = 1 nothing costs: J ≡ 0 for every μ_d, and everybody else is kept out relatively, for small μ_d perfectly."""
     result = design(UNSTABLE, 1.0, 0.6, [smart(0.9), NAIVE], slots=80, max_trace=1e-6)
     assert result.trace == result.plain_trace == 0.0
     assert result.cost == 1.0
-    assert result.minimum == result.bound == pytest.approx(0.480785, abs=1e-6)
+    assert result.minimum == result.bound == 0.0
+    assert J(UNSTABLE, 1.0, 0.01) == 0.0
     against = result.eavesdroppers["smart"]
-    (interval,) = against.relative
-    assert interval == pytest.approx((result.bound, 1.0))
+    assert against.relative == ((0.0, 1.0),)
+    assert against.perfect == (0.0, against.bound)
+    assert against.bound == pytest.approx(0.534206, abs=1e-6)
     assert against.best_ratio is None
+
+
+@pytest.mark.parametrize("others", [[], [NAIVE]])
+def test_the_choice_over_a_lossless_link_is_perfect_where_that_is_possible(others: list[Adversary]) -> None:
+    """It costs nothing: the largest μ_d at which every eavesdropper's error is unbounded; of a stable process, any."""
+    chosen = design(UNSTABLE, 1.0, 0.6, [smart(0.9), *others], slots=80).suggestion
+    assert chosen is not None
+    assert chosen.mu_d == pytest.approx(0.534206, abs=1e-6)
+    assert math.isinf(limit_trace(UNSTABLE, smart(0.9).outcomes(chosen.mu_d)))
+    assert (chosen.trace, chosen.cost) == (0.0, 1.0)
+    stable = design(Process(np.array([[0.7]]), np.eye(1), np.eye(1)), 1.0, 0.6, [smart(0.9)], slots=80).suggestion
+    assert stable is not None
+    assert stable.mu_d == 1.0
+    within = design(UNSTABLE, 1.0, 0.6, [smart(0.9)], slots=80, max_trace=1.0).suggestion
+    assert within is not None
+    (interval,) = within.intervals
+    assert interval == pytest.approx((0.0, 0.534206), abs=1e-6)
 
 
 def test_deaf_eavesdropper() -> None:

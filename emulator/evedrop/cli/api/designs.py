@@ -121,7 +121,8 @@ def _adversaries(made: Scenario, measured: str) -> tuple[float, list[Adversary],
 
     measured: the command that measures what cannot be designed.
     """
-    from evedrop.model.theory.ratio import Adversary  # a run does not need it
+    from evedrop.model.theory.covariances import limit_trace  # a run does not need these
+    from evedrop.model.theory.ratio import Adversary
 
     quality = {}
     for name in made.receivers:
@@ -138,10 +139,11 @@ def _adversaries(made: Scenario, measured: str) -> tuple[float, list[Adversary],
     adversaries, left_out = [], {}
     for name, table in made.eavesdroppers.items():
         outcomes_at = STRATEGIES[table.strategy].outcomes(table.parameters, 0.5)
-        if outcomes_at is None:
+        adversary = outcomes_at and Adversary.with_outcomes(name, quality[name], outcomes_at(1.0))
+        if adversary is None or math.isnan(limit_trace(made.process.process, adversary.outcomes(0.5))):
             left_out[name] = table.strategy
         else:
-            adversaries.append(Adversary.with_outcomes(name, quality[name], outcomes_at(1.0)))
+            adversaries.append(adversary)
     return quality[LEGITIMATE], adversaries, left_out
 
 

@@ -30,6 +30,7 @@ from evedrop.model.theory.covariances import (
     NOBODY,
     Growth,
     Outcomes,
+    driven_part,
     has_infinite_variance,
     limit,
     limit_trace,
@@ -37,6 +38,7 @@ from evedrop.model.theory.covariances import (
     radius,
     state_covariances,
     traces_of_slots,
+    unbounded,
     unstable_part,
 )
 
@@ -58,7 +60,7 @@ class ClosedForm(ABC):
     @property
     @abstractmethod
     def limit(self) -> float:
-        """Trace of the limit; inf if it is unbounded, NaN if it is too large to compute."""
+        """Trace of the limit; inf if it is unbounded, NaN if theory does not know it, or it is too large to compute."""
 
     @property
     @abstractmethod
@@ -125,7 +127,7 @@ class QuantisationError:
         return self._of(state_covariances(process, slots))
 
     def limit(self, process: Process) -> Floats:
-        """The limit of R_k, (n, n); its diagonal is inf unless A forgets."""
+        """The limit of R_k, (n, n); its diagonal is inf, or NaN as in `unbounded`, unless A forgets."""
         return self._of(limit(process, NOBODY))
 
     def _of(self, sigma: Floats) -> Floats:
@@ -191,7 +193,7 @@ def reference_covariances(
 
 
 def reference_limit(process: Process, received: float, acknowledged: tuple[float, float], plain: float = 0.0) -> float:
-    """Trace of the limit of `reference_covariances` with L = A; inf if it is unbounded, NaN if it is too large to compute.
+    """Trace of the limit of `reference_covariances` with L = A; inf or NaN as in `unbounded`, NaN if it is too large to compute.
 
     Source: docs/mathematics/schemes.md, acknowledged references; docs/mathematics/attacks.md, flipped acknowledgements.
     """
@@ -199,8 +201,9 @@ def reference_limit(process: Process, received: float, acknowledged: tuple[float
     if unheard == 0.0:
         return limit_trace(process, Outcomes.plain(received))
     carried = np.array([[1.0 - received, received * (1.0 - plain)], [unheard, 1.0 - unheard - plain * heard]])
-    if np.abs(np.linalg.eigvals(carried)).max() * radius(process) ** 2 >= 1.0 - 1e-12:
-        return float("inf")
+    kept = float(np.abs(np.linalg.eigvals(carried)).max())
+    if kept * radius(process) ** 2 >= 1.0 - 1e-12:
+        return float(np.trace(unbounded(process, kept)))
     n = process.n
     if 2 * n * n > LARGEST_OPERATOR:
         return float("nan")
@@ -250,17 +253,18 @@ class SensorChain:
         return covariances
 
     def limit(self, process: Process, quantisation: QuantisationError | None = None) -> Floats:
-        """Limit of E P_k, (n, n), or its mean over a period if slots repeat; all inf if it is unbounded.
+        """Limit of E P_k, (n, n), or its mean over a period if slots repeat; `unbounded` if there is none.
 
         quantisation: the error that a reset leaves, if it is not 0.
         """
         states, n = len(self.start), process.n
         # The spectral radius of a Kronecker product is the product of its factors'.
-        if np.max(np.abs(np.linalg.eigvals(self.carried))) * radius(process) ** 2 >= 1.0 - 1e-12:
-            return np.full((n, n), np.inf)
+        kept = float(np.max(np.abs(np.linalg.eigvals(self.carried))))
+        if kept * radius(process) ** 2 >= 1.0 - 1e-12:
+            return unbounded(process, kept)
         left = np.zeros((n, n)) if quantisation is None else quantisation.limit(process)
         if not np.isfinite(left).all():
-            return np.full((n, n), np.inf)
+            return np.full((n, n), np.trace(left))
         operator = np.kron(self.carried.T, np.kron(process.A, process.A))
         stationary = self.stationary
         noise = np.kron(self.carried.T @ stationary, process.Q.reshape(-1)) + np.kron(
@@ -446,7 +450,7 @@ class ChainForm(ClosedForm):
 
     @cached_property
     def limit(self) -> float:
-        """Trace of the limit; inf if it is unbounded, NaN if it is too large to compute."""
+        """Trace of the limit; inf if it is unbounded, NaN if theory does not know it, or it is too large to compute."""
         if len(self.chain.start) * self.process.n**2 > LARGEST_OPERATOR:
             return float("nan")
         return float(np.trace(self.chain.limit(self.process, self.quantisation)))
@@ -504,12 +508,12 @@ class TakesNoise(ClosedForm):
 
     @property
     def limit_covariance(self) -> Floats:
-        """The limit of E P_k with the mean of μ_d, (n, n); all inf for ρ ≥ 1, if noise is ever used."""
+        """The limit of E P_k with the mean of μ_d, (n, n); `unbounded` for ρ ≥ 1, if noise is ever used."""
         outcomes, N = self.outcomes, self.distribution.covariance
         if outcomes.misled == 0.0:
             return limit(self.process, outcomes)
         if radius(self.process) >= 1.0:
-            return np.full_like(self.process.Q, math.inf)
+            return unbounded(self.process, 1.0)
         sigma = limit(self.process, NOBODY)
         source = outcomes.predicted * self.process.Q + outcomes.misled * (sigma + (sigma if N is None else N))
         return lyapunov(replace(self.process, Q=source), outcomes.propagated)
@@ -591,15 +595,23 @@ class ClearStatesForm(ClosedForm):
             growing = unstable_part(A, invariant_hull(A, axes[:, self.hidden], _RANK), 1.0 + MARGINAL)
         else:
             unseen = _orthogonal_to(invariant_hull(A.T, axes[:, ~self.hidden], _RANK))
-            growing = unstable_part(A, unseen, 1.0 - MARGINAL if self.mu_d == 1.0 else 1.0 + MARGINAL)
+            driven = self.mu_d == 1.0 and self._noise_reaches_all
+            growing = unstable_part(A, unseen, 1.0 - MARGINAL if driven else 1.0 + MARGINAL)
         return np.linalg.qr(units[:, None] * growing)[0]
 
     @property
     def growth(self) -> Growth:
         """Where the error grows: exactly in `growing`, or perhaps also elsewhere, but only where the state itself grows."""
-        if self.mu_d == 1.0 and not self.bound:
+        if self.mu_d == 1.0 and not self.bound and self._noise_reaches_all:
             return Growth(self.growing, self.growing)
         return Growth(self.growing, unstable_part(self.process.A, np.eye(self.process.n), 1.0 - MARGINAL))
+
+    @cached_property
+    def _noise_reaches_all(self) -> bool:
+        """Whether process noise moves every mode that does not decay."""
+        least = 1.0 - MARGINAL
+        every = unstable_part(self.process.A, np.eye(self.process.n), least)
+        return bool(driven_part(self.process, least).shape[1] == every.shape[1])
 
     def _followed(self, slots: int) -> Floats:
         traces = np.full(slots, np.inf)

@@ -15,7 +15,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from evedrop.model.process import MARGINAL, Floats, Process, eigenvalues, modulus_in
+from evedrop.model.process import MARGINAL, Floats, Process, eigenvalues, invariant_hull, modulus_in
 from evedrop.model.streams import BlockByBlock
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
 
@@ -287,7 +287,7 @@ def radius(process: Process) -> float:
 
 
 def stability_bound(process: Process, mu: float) -> float:
-    """(1 − ρ⁻²)/μ: a receiver behind a link of quality μ that is never misled has a bounded error iff μ_d exceeds it.
+    """(1 − ρ⁻²)/μ: a receiver that uses only states, behind a link of quality μ, has a bounded error iff μ_d exceeds it.
 
     0 for ρ = 1: any μ_d > 0 exceeds it. 1 or more: no μ_d ≤ 1 does. inf for μ = 0 and ρ ≥ 1.
 
@@ -299,16 +299,38 @@ def stability_bound(process: Process, mu: float) -> float:
     return (rho - 1.0) * (rho + 1.0) / rho**2 / mu if mu > 0.0 else math.inf
 
 
+def legitimate_bound(process: Process, mu: float) -> float:
+    """The legitimate error is bounded for every larger μ_d: `stability_bound`, or 0 for a lossless link, μ = 1.
+
+    Every packet that a legitimate estimator receives leaves it without an error, so with μ = 1 it never has one.
+
+    Source: docs/mathematics/model.md, limits.
+    """
+    return 0.0 if mu == 1.0 else stability_bound(process, mu)
+
+
 def lyapunov(process: Process, kept: float) -> Floats:
-    """S = kept · A S Aᵀ + Q, (n, n): S(q) of the paper with kept = 1 − q. All inf where kept · ρ² ≥ 1: unbounded.
+    """S = kept · A S Aᵀ + Q, (n, n): S(q) of the paper with kept = 1 − q. `unbounded` where kept · ρ² ≥ 1.
 
     Source: Theorem IV.3.
     """
     return _stationary(process, kept, process.Q)
 
 
+def unbounded(process: Process, kept: float, starts: bool = True) -> Floats:
+    """What E = kept · A E Aᵀ + … tends to where kept · ρ² ≥ 1, (n, n): all inf, or all NaN where theory does not know it.
+
+    It stays bounded where process noise that is singular reaches no mode with kept · |λ|² ≥ 1, and none grows by itself.
+
+    starts: whether E is not 0 in slot 0, so that a mode without noise grows from there if kept · |λ|² > 1.
+    """
+    least = 1.0 / math.sqrt(kept)
+    grows = not process.singular_noise or (starts and radius(process) > least + MARGINAL)
+    return np.full_like(process.Q, np.inf if grows or driven_part(process, least - MARGINAL).shape[1] else np.nan)
+
+
 def limit(process: Process, outcomes: Outcomes) -> Floats:
-    """Limit of E P_k, (n, n), all inf if it is unbounded: p_d S(1 − kept) for a receiver that is never misled.
+    """Limit of E P_k, (n, n), `unbounded` if there is none: p_d S(1 − kept) for a receiver that is never misled.
 
     Source: Theorem IV.3, Corollaries V.3 and V.4, Lemma V.6; docs/mathematics/model.md, limits;
     docs/mathematics/eavesdroppers.md, genie.
@@ -318,15 +340,15 @@ def limit(process: Process, outcomes: Outcomes) -> Floats:
         source = source + outcomes.leaked * remaining_limit(process)
     if outcomes.misled:
         if radius(process) >= 1.0:
-            return np.full_like(process.Q, np.inf)
+            return unbounded(process, 1.0)
         source = source + 2.0 * outcomes.misled * (process.A @ lyapunov(process, 1.0) @ process.A.T)
     elif outcomes.predicted + outcomes.leaked + outcomes.initial == 0.0:
         return np.zeros_like(process.Q)
-    return _stationary(process, outcomes.propagated, source)
+    return _stationary(process, outcomes.propagated, source, outcomes.initial > 0.0)
 
 
 def limit_trace(process: Process, outcomes: Outcomes) -> float:
-    """Limit of tr E P_k, inf if it is unbounded: J(μ_d) of the legitimate estimator, J_e(μ_d) of an eavesdropper.
+    """Limit of tr E P_k: J(μ_d) of the legitimate estimator, J_e(μ_d) of an eavesdropper. inf or NaN as in `unbounded`.
 
     Source: docs/mathematics/model.md, limits.
     """
@@ -357,10 +379,10 @@ def has_infinite_variance(process: Process, outcomes: Outcomes) -> bool:
     return tail_index(process, outcomes) <= 2.0
 
 
-def _stationary(process: Process, kept: float, source: Floats) -> Floats:
-    S: Floats = np.full_like(source, np.inf)
+def _stationary(process: Process, kept: float, source: Floats, starts: bool = True) -> Floats:
     if kept * radius(process) ** 2 >= 1.0 - _ROUNDING:
-        return S
+        return unbounded(process, kept, starts)
+    S: Floats = np.full_like(source, np.inf)
     # Near the bound the equation may be singular to rounding, or nearly; finiteness and definiteness decide.
     with suppress(np.linalg.LinAlgError):
         S = _fixed_point(math.sqrt(kept) * process.A, source)
@@ -438,6 +460,7 @@ def _unbounded_from_overflow(covariances: Floats) -> Floats:
 
 
 _TOUCHES = 1e-9  # relative: less is rounding
+_REACHED = 1e-9  # relative: a smaller singular value is taken for 0
 
 
 class Growth(NamedTuple):
@@ -470,23 +493,38 @@ def unstable_part(A: Floats, within: Floats, least: float) -> Floats:
     return within @ Z[:, :count]
 
 
+def driven_part(process: Process, least: float) -> Floats:
+    """As `unstable_part` of the whole space, of the modes that process noise reaches: of all unless Q is singular."""
+    axes = np.eye(process.n)
+    if process.singular_noise:
+        # In units of the states' own deviations at the start, so that ranks do not depend on the units that the user chose.
+        units = np.sqrt(np.diag(process.initial_covariance))
+        reached = invariant_hull(process.A * units / units[:, None], process.Q / np.outer(units, units), _REACHED)
+        axes = np.linalg.qr(units[:, None] * reached)[0]
+    return unstable_part(process.A, axes, least)
+
+
 def growth(process: Process, outcomes: Outcomes) -> Growth:
     """Where the expected error of a receiver with these outcomes in every slot grows.
 
+    Where noise does not reach all modes that do not decay, only those grow for certain that grow by themselves.
+
     Source: docs/mathematics/verdicts.md, verdicts by direction.
     """
-    basis = unstable_part(process.A, np.eye(process.n), _least(outcomes))
-    return Growth(basis, basis)
-
-
-def _least(outcomes: Outcomes) -> float:
-    """The least modulus of an eigenvalue of A in whose eigenspace the error grows."""
+    noise = bool(outcomes.misled + outcomes.predicted + outcomes.leaked)
     if outcomes.misled:
-        return 1.0 - MARGINAL
-    noise = outcomes.predicted + outcomes.leaked
-    if outcomes.propagated == 0.0 or noise + outcomes.initial == 0.0:
-        return math.inf
-    return 1.0 / math.sqrt(outcomes.propagated) + (-MARGINAL if noise else MARGINAL)
+        marginal = 1.0
+    elif outcomes.propagated == 0.0 or not (noise or outcomes.initial):
+        marginal = math.inf
+    else:
+        marginal = 1.0 / math.sqrt(outcomes.propagated)
+    by_itself, within = (
+        unstable_part(process.A, np.eye(process.n), marginal + margin)
+        for margin in (MARGINAL, -MARGINAL if noise else MARGINAL)
+    )
+    reached = driven_part(process, marginal - MARGINAL).shape[1] == within.shape[1]
+    certain = by_itself if outcomes.misled or outcomes.initial else within[:, :0]
+    return Growth(within if reached else certain, within)
 
 
 def _touches(basis: Floats, v: Floats) -> bool:

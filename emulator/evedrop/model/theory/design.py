@@ -16,7 +16,7 @@ import numpy as np
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
 from evedrop.model.receiver import Flags
-from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bound, theoretical_traces
+from evedrop.model.theory.covariances import Outcomes, legitimate_bound, limit_trace, theoretical_traces
 from evedrop.model.theory.json_values import json_value
 from evedrop.model.theory.ratio import (
     ATTAINED,
@@ -85,7 +85,7 @@ class Design:
     mu_d: float
     """The scenario's own μ_d."""
     bound: float
-    """(1 − ρ⁻²)/μ: the legitimate error is bounded iff μ_d lies above it."""
+    """(1 − ρ⁻²)/μ, or 0 for μ = 1: the legitimate error is bounded iff μ_d lies above it."""
     admissible: Interval | None
     """(lo, 1], the μ_d of a bounded legitimate error; None if there are none."""
     minimum: float | None
@@ -172,7 +172,7 @@ def design(
 
     Source: docs/mathematics/secrecy.md, design.
     """
-    bound = stability_bound(process, mu)
+    bound = legitimate_bound(process, mu)
     own = Outcomes.legitimate(mu, mu_d)
     ours = theoretical_traces(process, own, slots)
     trace = limit_trace(process, own)
@@ -221,7 +221,7 @@ def perfect_secrecy(process: Process, mu: float, adversary: Adversary) -> Interv
 
     Source: Theorem V.9, Corollaries V.3 and V.4.
     """
-    low = stability_bound(process, mu)
+    low = legitimate_bound(process, mu)
     high = min(1.0, adversary_bound(process, adversary))
     return (low, high) if low < high else None
 
@@ -233,7 +233,7 @@ def relative_secrecy(process: Process, mu: float, adversary: Adversary) -> tuple
     """
     from scipy.optimize import brentq  # noqa: PLC0415 - slow to import
 
-    low = stability_bound(process, mu)
+    low = legitimate_bound(process, mu)
     if low >= 1.0:
         return ()
 
@@ -258,13 +258,13 @@ def relative_secrecy(process: Process, mu: float, adversary: Adversary) -> tuple
 def least_state_probability(process: Process, mu: float, max_trace: float) -> float:
     """μ_d_min, the root of J = Ω: the error stays below Ω, in the limit, for every larger μ_d. Ω is `max_trace`.
 
-    It is the stability bound for a lossless link. Raises UsageError if not even μ_d = 1 keeps Ω.
+    It is 0 for a lossless link. Raises UsageError if not even μ_d = 1 keeps Ω.
 
     Source: docs/mathematics/secrecy.md, design; Lemma VI.1 (J falls).
     """
     from scipy.optimize import brentq  # noqa: PLC0415 - slow to import
 
-    low = stability_bound(process, mu)
+    low = legitimate_bound(process, mu)
     best = limit_trace(process, Outcomes.plain(mu))
     if not low < 1.0 or not best < max_trace:
         least = f"{best:.6g}" if low < 1.0 and math.isfinite(best) else "unbounded"
@@ -302,7 +302,7 @@ def best_ratio(process: Process, mu: float, adversary: Adversary) -> float | Non
 def _argmax(process: Process, mu: float, adversary: Adversary, gain: Callable[[float, float], float]) -> float | None:
     from scipy.optimize import minimize_scalar  # noqa: PLC0415 - slow to import
 
-    low = stability_bound(process, mu)
+    low = legitimate_bound(process, mu)
     if low >= 1.0 or adversary_bound(process, adversary) > low + _EQUAL:
         return None
 

@@ -17,8 +17,11 @@ import numpy as np
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
-from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bound
+from evedrop.model.theory.covariances import Outcomes, legitimate_bound, limit_trace, stability_bound
 from evedrop.model.theory.json_values import JsonFields
+
+Intervals = tuple[tuple[float, float], ...]
+"""(lo, hi) of each interval of μ_d, in ascending order."""
 
 ATTAINED = 1e-5
 """A maximum nearer than this to the open end of the interval, relative to its length, is not a maximum."""
@@ -100,7 +103,7 @@ class Choice(JsonFields):
 
     min_ratio: float
     """The ratio asked for."""
-    intervals: tuple[tuple[float, float], ...]
+    intervals: Intervals
     """(lo, hi) of all such μ_d, in ascending order; the ends belong to them, except for those at which an error is unbounded."""
     mu_d: float
     trace: float
@@ -127,7 +130,7 @@ def largest_ratio(
 
     above: only μ_d larger than this are considered.
     """
-    low = max(stability_bound(process, mu), above or 0.0)
+    low = max(legitimate_bound(process, mu), above or 0.0)
     if low >= 1.0:
         return None
     ratio = _least_ratio(process, mu, adversaries)
@@ -157,20 +160,32 @@ def cheapest(
 
     Source: docs/mathematics/secrecy.md, design; Lemma VI.1 (J falls).
     """
-    low = stability_bound(process, mu)
+    low = legitimate_bound(process, mu)
     if low >= 1.0:
         raise UsageError(
             f"no μ_d gives {min_ratio:g}×: none is admissible, because the legitimate error is unbounded even if every packet is "
             "the state; improve the legitimate link"
         )
     intervals = large_enough(process, mu, adversaries, min_ratio)
-    kept = tuple((max(a, minimum or 0.0), b) for a, b in intervals if minimum is None or b > minimum)
+    kept = _above(minimum, intervals)
     if not kept:
         raise UsageError(_impossible(process, mu, adversaries, min_ratio, intervals, minimum, max_trace))
-    mu_d = kept[-1][1]
+    return _choice(process, mu, adversaries, min_ratio, kept)
+
+
+def _above(minimum: float | None, intervals: Intervals) -> Intervals:
+    """What lies above the minimum, if there is one."""
+    return tuple((max(a, minimum or 0.0), b) for a, b in intervals if minimum is None or b > minimum)
+
+
+def _choice(
+    process: Process, mu: float, adversaries: Sequence[Adversary], min_ratio: float, intervals: Intervals
+) -> Choice:
+    """The largest μ_d of the intervals, where the legitimate error is least."""
+    mu_d = intervals[-1][1]
     return Choice(
         min_ratio=min_ratio,
-        intervals=kept,
+        intervals=intervals,
         mu_d=mu_d,
         trace=limit_trace(process, Outcomes.legitimate(mu, mu_d)),
         cost=cost_of(process, mu, mu_d),
@@ -186,7 +201,8 @@ def suggestion(
 ) -> Choice | None:
     """The cheapest μ_d with at least 90 % of the largest J_e / J that is possible against every eavesdropper.
 
-    If that is unbounded, so is the ratio at this μ_d. minimum: as for `cheapest`. None if there is no eavesdropper, or the
+    If that is unbounded, so is the ratio at this μ_d. With a lossless link the legitimate error is 0 whatever μ_d: the choice is
+    the largest μ_d of perfect secrecy, if there is one. minimum: as for `cheapest`. None if there is no eavesdropper, or the
     error of one is never larger than the legitimate one.
 
     Source: docs/mathematics/secrecy.md, design.
@@ -194,18 +210,27 @@ def suggestion(
     most = largest_ratio(process, mu, adversaries, minimum) if adversaries else None
     if most is None or most.ratio <= 1.0 + _ROUNDING:
         return None
+    if mu == 1.0 and (perfect := _above(minimum, _perfect(process, adversaries))):
+        return _choice(process, mu, adversaries, math.inf, perfect)
     return cheapest(process, mu, adversaries, max(1.0, _NEARLY * most.ratio), minimum)
 
 
-def large_enough(
-    process: Process, mu: float, adversaries: Sequence[Adversary], min_ratio: float
-) -> tuple[tuple[float, float], ...]:
+def _perfect(process: Process, adversaries: Sequence[Adversary]) -> Intervals:
+    """The intervals of μ_d at which the error of every eavesdropper is unbounded."""
+
+    def unbounded(mu_d: float) -> float:
+        return min(limit_trace(process, adversary.outcomes(mu_d)) for adversary in adversaries)
+
+    return _where(lambda mu_d: math.isinf(unbounded(mu_d)), _points(process, 0.0, adversaries, unbounded), 0.0)
+
+
+def large_enough(process: Process, mu: float, adversaries: Sequence[Adversary], min_ratio: float) -> Intervals:
     """The intervals of admissible μ_d with J_e / J ≥ min_ratio against every eavesdropper, in ascending order.
 
     The ratio need not be monotone. It is computed at many points between its poles, and at its local extrema; where two
     neighbouring points differ, the end is found by bisection.
     """
-    low = stability_bound(process, mu)
+    low = legitimate_bound(process, mu)
     if low >= 1.0:
         return ()
     ratio = _least_ratio(process, mu, adversaries)
@@ -213,7 +238,11 @@ def large_enough(
     def holds(mu_d: float) -> bool:
         return ratio(mu_d) >= min_ratio * (1.0 - _ROUNDING)
 
-    points = _points(process, low, adversaries, ratio)
+    return _where(holds, _points(process, low, adversaries, ratio), low)
+
+
+def _where(holds: Callable[[float], bool], points: Sequence[float], low: float) -> Intervals:
+    """The intervals of (low, 1] in which something holds; it changes at most once between two neighbouring points."""
     intervals: list[tuple[float, float]] = []
     begin = low if holds(points[0]) else None
     for a, b in pairwise(points):
