@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import multiprocessing
 import os
 import queue
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -13,7 +16,7 @@ import threading
 import time
 import tomllib
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, NoReturn
@@ -380,6 +383,12 @@ def test_a_program_that_spins_is_stopped(evedrop_simulated_wire: Opener, monkeyp
         flooding.result()
 
 
+def run_a_coroutine() -> None:
+    """Wait for one that takes no time."""
+    with closing(asyncio.sleep(0)) as coroutine:
+        asyncio.run(coroutine)
+
+
 @pytest.mark.parametrize(
     ("wait", "named"),
     [
@@ -389,6 +398,11 @@ def test_a_program_that_spins_is_stopped(evedrop_simulated_wire: Opener, monkeyp
         (lambda: threading.Thread(target=print).start(), "threading.Thread.start"),
         (lambda: subprocess.run(["true"], check=True), "subprocess.Popen"),
         (lambda: os.system("true"), "os.system"),  # noqa: S605 - refused
+        (lambda: os.fork(), "os.fork"),  # noqa: PLW0108 - the function of that moment
+        (lambda: os.posix_spawn("/bin/true", ["true"], {}), "os.posix_spawn"),
+        (lambda: multiprocessing.get_context("spawn").Process(target=print).start(), "a process of multiprocessing"),
+        (lambda: select.select([], [], [], 0.1), "select.select"),
+        (run_a_coroutine, "asyncio.run"),
         (lambda: wire(**WIRE).__enter__(), "subprocess.Popen"),
     ],
 )
@@ -417,6 +431,24 @@ def test_what_the_wire_itself_needs_is_not_refused(tmp_path: Path) -> None:
     with SimulatedWires(command) as wires:
         wires.open(**WIRE, out=tmp_path / "wire")
     assert done == [0]
+
+
+def test_a_side_with_users_is_for_them(evedrop_simulated_wire: Opener) -> None:
+    """A configuration has the first user's name and password, or another's; without one, nobody connects."""
+    users = {"ada": "first", "bob": "second"}
+    radio = evedrop_simulated_wire(**{**WIRE, "side": {"robot": {"users": users}, "base": {}}})
+    for config, user in ((radio.config("robot"), "ada"), (radio.config("robot", "bob"), "bob")):
+        assert json.loads(config.get_json("transport/auth/usrpwd/user")) == user
+        assert json.loads(config.get_json("transport/auth/usrpwd/password")) == users[user]
+        assert radio.start(drive, config, 1.0, clock=radio.clock).result() == 10
+    with pytest.raises(UsageError, match="side \"robot\" has no user 'eve'; expected ada or bob"):
+        radio.config("robot", "eve")
+    with pytest.raises(UsageError, match="has no user 'ada'; expected none"):
+        radio.config("base", "ada")
+    stranger = radio.config("base")
+    stranger.insert_json5("connect/endpoints", json.dumps([radio.endpoint("robot")]))
+    with pytest.raises(zenoh.ZError):
+        radio.start(zenoh.open, stranger).result()
 
 
 def test_the_real_zenoh_does_not_find_a_simulated_wire(evedrop_simulated_wire: Opener) -> None:

@@ -8,8 +8,11 @@ Source: docs/maintainers/simulated-world.md, tests of wires.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import multiprocessing.process
 import os
+import select
 import subprocess
 import sys
 import threading
@@ -38,6 +41,11 @@ _REAL: tuple[tuple[Any, str, str], ...] = (
     (threading.Condition, "wait", "a wait of threading or queue"),
     (subprocess.Popen, "__init__", "subprocess.Popen"),
     (os, "system", "os.system"),
+    (os, "posix_spawn", "os.posix_spawn"),
+    (os, "fork", "os.fork"),
+    (multiprocessing.process.BaseProcess, "start", "a process of multiprocessing"),
+    (select, "select", "select.select"),
+    (asyncio, "run", "asyncio.run"),
 )
 """What takes real time: place, name, and how users know it."""
 _MOST_TURNS = 100_000

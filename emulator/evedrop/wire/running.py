@@ -208,13 +208,23 @@ class RunningWire:
         """The Zenoh endpoint of a side, such as tcp/127.0.0.1:41999. Raises UsageError if it does not listen."""
         return self._endpoints_of(side)[0]
 
-    def config(self, side: str) -> zenoh.Config:
-        """A configuration for `zenoh.open`: a client of a side, which finds no other program without the wire."""
-        settings = {
+    def config(self, side: str, user: str | None = None) -> zenoh.Config:
+        """A configuration for `zenoh.open`: a client of a side, which finds no other program without the wire.
+
+        user: who connects, with the password of the wire's file; by default the first of the side's users, if it has any.
+        Raises UsageError if the side does not listen, or has no such user.
+        """
+        users = self.plan.sides[side].users if side in self.plan.sides else None
+        if user is not None and user not in (users or {}):
+            raise UsageError(f'side "{side}" has no user {user!r}; expected {listed([*users]) if users else "none"}')
+        settings: dict[str, Any] = {
             "mode": "client",
             "connect": {"endpoints": list(self._endpoints_of(side))},
             "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         }
+        if users:
+            name = next(iter(users)) if user is None else user
+            settings["transport"] = {"auth": {"usrpwd": {"user": name, "password": users[name]}}}
         return zenoh.Config.from_json5(json.dumps(settings))
 
     def partition(self, side: str, other: str) -> None:

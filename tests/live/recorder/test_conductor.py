@@ -149,6 +149,22 @@ def test_a_signal_is_waited_for_as_long_as_is_said() -> None:
             assert clock.now == pytest.approx(1002.0, abs=0.1)
 
 
+def test_time_without_the_router_counts_for_nobody() -> None:
+    """Nobody could be seen; those lost with it connect from its return on, those lost before have as much time as then."""
+    network = Told()
+    conductor = conducted(network)
+    conductor.assemble()
+    for seconds, name in ((0.0, "smart"), (10.0, "router"), (0.5, "sensor")):
+        network.clock.now += seconds
+        network.watches[name](False)
+        conductor.next_message()
+    assert conductor.lost == {"smart": 1000.0, "router": 1010.0, "sensor": 1010.5}
+    network.clock.now += 4.5
+    network.watches["router"](True)
+    conductor.next_message()
+    assert conductor.lost == {"smart": 1005.0, "sensor": 1015.0}
+
+
 def test_processes_that_come_and_go_are_noted() -> None:
     """The first moment of a loss counts; reports are passed on with the names of their senders."""
     network = Told()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Collection, Iterator
+from typing import Any, NoReturn
 
 import pytest
 
+from evedrop.errors import RunError
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again, ControlCommand
@@ -52,6 +53,10 @@ class Conducted:
     def lose(self, *names: str) -> None:
         """These vanish."""
         self.lost |= dict.fromkeys(names, self.clock.monotonic())
+
+    def fail_cut_off(self, names: Collection[str], patience: float) -> NoReturn:
+        """As the conductor of a run."""
+        raise RunError(f"{', '.join(names)} cut off for {patience:g} s")
 
     def wait_longer(self, seconds: float) -> None:
         """Give those that are lost more time."""
@@ -174,6 +179,25 @@ def test_time_in_which_the_recorder_did_not_run_does_not_count() -> None:
     clock.now += 3600.0
     recovery.poll(10)
     assert clock.now - conducted.lost["smart"] == pytest.approx(1.0)
+
+
+def test_nobody_is_judged_while_the_router_is_missing() -> None:
+    """Those lost before it may be back without being seen; it is judged itself, after its own time."""
+    conducted, clock = Conducted(), clock_at_start()
+    recovery = recovery_of(conducted, clock, 30.0)
+    recovery.poll(10)
+
+    def wait(seconds: int) -> None:
+        for _ in range(seconds):
+            clock.now += 1.0
+            recovery.poll(10)
+
+    conducted.lose("smart")
+    wait(20)
+    conducted.lose("router", "sensor")
+    with pytest.raises(RunError, match=r"^router cut off for 30 s$"):
+        wait(100)
+    assert clock.now == conducted.lost["router"] + 31.0
 
 
 @pytest.mark.parametrize("awaits_belief", [False, True])

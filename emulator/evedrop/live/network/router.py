@@ -233,9 +233,7 @@ class RouterLoop:
         # A message to the router's own uplink wakes the thread that waits there: only the conductor ends a router.
         knock = session.publisher(session.keys.uplink)
         waiting = [] if self._ack_link is None else [self._ack_link.sent]
-        self._commands = Commands(
-            session, tuple(self._schedules), lambda: knock(barrier(brief.slots)), waiting, brief.flow.longest_outage
-        )
+        self._commands = Commands(session, tuple(self._schedules), lambda: knock(barrier(brief.slots)), waiting)
         self._stale = False
         """Whether to ignore packets until the resend begins."""
         self._begin(0, 0)
@@ -406,6 +404,9 @@ class ReplayRequested(Exception):
     """The conductor asks for packets again: the message that the router waits for may have been lost."""
 
 
+_ROUND_SECONDS = 2.0  # for which a round that the sensor has announced waits for the conductor's command
+
+
 @final
 class Commands:
     """Reads the session's commands on a thread of its own.
@@ -420,14 +421,9 @@ class Commands:
         receivers: Collection[str],
         knock: Callable[[], None],
         waiting: Iterable[Queue[bytes | None]],
-        patience: float,
     ) -> None:
-        """receivers: those that a command may name.
-
-        patience: how many seconds to wait for the conductor's command for a round that the sensor has announced.
-        """
+        """receivers: those that a command may name."""
         self._session, self._receivers, self._knock, self._waiting = session, receivers, knock, tuple(waiting)
-        self._patience = patience
         self._orders: Queue[tuple[int, ControlCommand] | None] = world().queue()
         self._changed = world().condition()
         self._asked = Again(0, 0)
@@ -487,11 +483,12 @@ class Commands:
     def resend_of(self, number: int) -> Again | None:
         """Wait for the conductor's command for this round; None if the conductor has asked for a later one.
 
-        Also None if it has ended the run meanwhile, or if no such command arrives within the patience.
+        Also None if it has ended the run meanwhile, or if no such command arrives within some seconds.
         """
         with self._changed:
-            # Sensor and router are told at the same time: if the command does not arrive, the round does not exist.
-            if not self._changed.wait_for(lambda: self.over() or self._asked.round >= number, self._patience):
+            # Sensor and router are told at the same time: if the command does not arrive, the round does not exist, or another
+            # one will follow.
+            if not self._changed.wait_for(lambda: self.over() or self._asked.round >= number, _ROUND_SECONDS):
                 return None
             if self._ended or self._asked.round > number:
                 return None

@@ -279,9 +279,11 @@ class Conductor:
             self.lost = {name: at + seconds for name, at in self.lost.items()}
 
     def _restart_time_of_others(self, at: float) -> None:
-        """A router that was lost at some time is back: those that were lost with it can connect from now on only."""
+        """A router that was lost at some time is back: nobody could be seen, and those lost with it can connect only now."""
         now = world().monotonic()
-        self.lost = {name: now if lost > at - _LOST_TOGETHER_SECONDS else lost for name, lost in self.lost.items()}
+        self.lost = {
+            name: now if lost > at - _LOST_TOGETHER_SECONDS else lost + now - at for name, lost in self.lost.items()
+        }
 
     def _note(self, name: str, there: bool) -> None:
         self.present[name] = there

@@ -226,14 +226,11 @@ class Recovery:
         self._returned = None
         for name in self._conductor.missing:
             self._missing.setdefault(name, (done, min(self._joined, self._conductor.lost.get(name, now))))
-        gone = [
-            name
-            for name in self._conductor.missing
-            if now - self._conductor.lost.get(name, now) > self._flow.longest_outage
-        ]
+        missing = self._conductor.missing
+        # Without the router no other process can be seen: it may be back.
+        judged = next(([name] for name in (RELAY, ROUTER) if name in missing), missing)
+        gone = [name for name in judged if now - self._conductor.lost.get(name, now) > self._flow.longest_outage]
         if gone:
-            # Without the router no other process can be seen.
-            gone = next(([name] for name in (RELAY, ROUTER) if name in gone), gone)
             self.give_up(done)
             self._conductor.fail_cut_off(gone, self._flow.longest_outage)
 
