@@ -163,6 +163,13 @@ def test_time_without_the_router_counts_for_nobody() -> None:
     network.watches["router"](True)
     conductor.next_message()
     assert conductor.lost == {"smart": 1005.0, "sensor": 1015.0}
+    network.watches["router"](False)
+    conductor.next_message()
+    conductor.wait_longer(60.0)  # the recorder itself was suspended
+    conductor.lost |= {"smart": 1010.0}
+    network.watches["router"](True)
+    conductor.next_message()
+    assert conductor.lost == {"smart": 1010.0, "sensor": 1015.0}
 
 
 def test_processes_that_come_and_go_are_noted() -> None:

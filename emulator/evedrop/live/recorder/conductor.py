@@ -281,8 +281,9 @@ class Conductor:
     def _restart_time_of_others(self, at: float) -> None:
         """A router that was lost at some time is back: nobody could be seen, and those lost with it can connect only now."""
         now = world().monotonic()
+        unseen = max(0.0, now - at)  # `wait_longer` may have put it off
         self.lost = {
-            name: now if lost > at - _LOST_TOGETHER_SECONDS else lost + now - at for name, lost in self.lost.items()
+            name: now if lost > at - _LOST_TOGETHER_SECONDS else lost + unseen for name, lost in self.lost.items()
         }
 
     def _note(self, name: str, there: bool) -> None:
