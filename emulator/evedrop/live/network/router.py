@@ -26,9 +26,10 @@ from typing import final
 
 import numpy as np
 
-from evedrop.errors import EvedropError, MalformedMessage
+from evedrop.errors import EvedropError, MalformedMessage, RunError
 from evedrop.live.network.access import Grant, access_control, at_relay, at_router, grants, until_all_left, users_file
 from evedrop.live.network.connecting import connected
+from evedrop.live.network.launcher_pipe import launcher_is_gone
 from evedrop.live.network.process_session import GapDetector, Pending
 from evedrop.live.network.session import ATTEMPT, Session, client_config, router_config
 from evedrop.live.protocol.brief import AnyBrief, Brief, RelayPart, RouterPart, RoutingPart
@@ -539,7 +540,8 @@ def relay(brief: Brief[RelayPart]) -> None:
     part = brief.part
     table = at_relay(brief.run, grants(brief.run, tuple(part.receivers), part.controller, relayed=True), part.zid)
     # Connect as a client first, which reports errors; Zenoh links routers in the background and reports none.
-    with connected(brief, client_config(brief), float(brief.patience)):
+    meanwhile = _end_with_launcher if brief.ends_with_stdin else lambda: None
+    with connected(brief, client_config(brief), float(brief.patience), meanwhile):
         pass
     with _opened(brief, table) as session:
         present = session.presence(grant.process for grant in table if grant.token is not None and grant.zid is None)
@@ -549,6 +551,12 @@ def relay(brief: Brief[RelayPart]) -> None:
         session.ready()
         session.wait_for(EndRun)
         until_all_left(present)
+
+
+def _end_with_launcher() -> None:
+    """End at once if the launcher is gone, as a session does once there is one."""
+    if launcher_is_gone():
+        world().process.exit(RunError.exit_status)
 
 
 def _linked(brief: AnyBrief, listening: ZenohConfig) -> ZenohConfig:
