@@ -24,6 +24,7 @@ from evedrop.results.reading import METRICS_AS_OF, Results
 from evedrop.scenario.loading import load
 from evedrop.scenario.plugins import named_in
 from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
+from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import verification_of
 from evedrop.virtual.broken_messages import CONTRADICTIONS, BreakMessage
 from evedrop.virtual.cases import SimulatedCase
@@ -491,8 +492,11 @@ def _of_metrics(case: SimulatedCase, folder: Path, summary: Mapping[str, Any]) -
         return
     scenario = load(folder)
     if slots < scenario.slots and not any(named_in(scenario.as_tables())):
+        # A change that an operator made when the last slot was done is in none of them, and theory had not heard of it.
+        given, tables = len(case.scenario.event), scenario.model_dump(mode="json", exclude_none=True)
+        tables["event"] = [event for i, event in enumerate(tables["event"]) if i < given or event["at"] < slots]
         all_recorded = scenario.record_trials == scenario.trials
-        yield from unlike_prefix(summary, summary_until(scenario, slots), all_recorded=all_recorded)
+        yield from unlike_prefix(summary, summary_until(Scenario(tables), slots), all_recorded=all_recorded)
 
 
 def _of_words(

@@ -30,9 +30,11 @@ def error_floor(noise: float, trials: int) -> float:
 
 def mean_band(means: Floats, standard_errors: Floats, trials: Floats | int) -> tuple[Floats, Floats]:
     """The ends of the 95 % intervals of means over trials: Student's, of logarithms, so they stay above 0 if the means do."""
-    from scipy.special import stdtrit  # noqa: PLC0415 - a run without a view needs none
+    reach: Floats | float = math.nan  # a single trial has no standard error
+    if np.max(trials) > 1:
+        from scipy.special import stdtrit  # noqa: PLC0415 - a tenth of the memory of a process that draws one trial
 
-    reach = stdtrit(np.maximum(trials, 2) - 1, 0.975)  # a single trial has no standard error
+        reach = np.asarray(stdtrit(np.maximum(trials, 2) - 1, 0.975))
     with np.errstate(all="ignore"):
         factor = np.where(means == 0.0, 1.0, np.exp(reach * standard_errors / means))
         return means / factor, means * factor
