@@ -492,11 +492,13 @@ def _of_metrics(case: SimulatedCase, folder: Path, summary: Mapping[str, Any]) -
         return
     scenario = load(folder)
     if slots < scenario.slots and not any(named_in(scenario.as_tables())):
-        # A change that an operator made when the last slot was done is in none of them, and theory had not heard of it.
+        until = {**summary_until(scenario, slots)}
         given, tables = len(case.scenario.event), scenario.model_dump(mode="json", exclude_none=True)
         tables["event"] = [event for i, event in enumerate(tables["event"]) if i < given or event["at"] < slots]
-        all_recorded = scenario.record_trials == scenario.trials
-        yield from unlike_prefix(summary, summary_until(Scenario(tables), slots), all_recorded=all_recorded)
+        if len(tables["event"]) < len(scenario.event):
+            # An operator changed a link when the last slot was done: theory had not heard of it in any slot.
+            until["peers"] = summary_until(Scenario(tables), slots)["peers"]
+        yield from unlike_prefix(summary, until, all_recorded=scenario.record_trials == scenario.trials)
 
 
 def _of_words(
