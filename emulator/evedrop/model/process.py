@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from random import Random
 from typing import final
 
 import numpy as np
@@ -51,7 +52,9 @@ def eigenvalues(A: Floats) -> NDArray[np.complex128]:
     Those that lie no further apart than a change of the last bits of A moves them count as one.
     """
     values = np.linalg.eigvals(A).astype(np.complex128)
-    signs, moved = np.random.default_rng(0).choice((-_LAST_BITS, _LAST_BITS), (4, *A.shape)), np.zeros(len(A))
+    # Not by numpy.random, which takes 2 MB of every process.
+    numbers = np.frombuffer(Random(0).randbytes(4 * A.size), np.uint8).reshape(4, *A.shape)  # noqa: S311 - no secret
+    signs, moved = np.where(numbers < 128, -_LAST_BITS, _LAST_BITS), np.zeros(len(A))
     for changed in np.linalg.eigvals(A * (1.0 + signs)):
         moved = np.maximum(moved, np.abs(values[:, None] - changed).min(axis=1))
     alike = np.abs(values[:, None] - values) <= 4.0 * (moved[:, None] + moved)

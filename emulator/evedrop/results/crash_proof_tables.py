@@ -34,7 +34,7 @@ from evedrop.system.world import world
 
 BATCH_BYTES = 16 * 2**20
 """The largest record batch and row group of a Parquet file, unless a single row is larger."""
-_GROUP_ROWS = 65_536
+_GROUP_ROWS = 32_768
 _ROUNDS = "rounds"
 _SUMMARY = "summary.json"
 _CHECKED_AT_ONCE = 2**20

@@ -55,7 +55,7 @@ class ByName(dict[str, T]):
 
 
 _MOST_BYTES = 2**28
-_PIECE_ROWS = 8192
+_PIECE_ROWS = 4096
 _ROWS_WORTH_THREADS = 100_000
 
 

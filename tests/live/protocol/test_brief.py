@@ -154,6 +154,7 @@ def without(name: str) -> dict[str, Any]:
         {**PLAIN, "flow": {"window": 8}},
         {**PLAIN, "flow": {"window": 8, "batch": 2, "more": 1}},
         {**PLAIN, "model": []},
+        *({**PLAIN, entry: chunk} for entry in ("run", "process") for chunk in ("", "/nowhere", "a//b", "a*", "a#")),
         without("slots"),
         without("model"),
         without("role"),

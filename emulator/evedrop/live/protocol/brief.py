@@ -53,6 +53,8 @@ from evedrop.system.world import world
 Positive = Annotated[int, Meta(ge=1, le=2**62)]
 Window = Annotated[int, Meta(ge=0, le=MOST_SLOTS)]
 Trials = Annotated[int, Meta(ge=1, le=1_000_000)]
+Chunk = Annotated[str, Meta(pattern=r"\A[^/*$?#]{1,250}\Z")]
+"""A name that is a part of Zenoh's keys."""
 Key = Annotated[str, Meta(pattern=rf"\A[0-9a-fA-F]{{{2 * KEY_BYTES}}}\Z")]
 """The key of a stream, in hexadecimal."""
 Outage = tuple[Slot, Slot, bool]
@@ -125,7 +127,7 @@ class RouterPart:
     """The router's part: all links, and the credentials of all users."""
 
     role: ClassVar[str] = "router"
-    links: Mapping[str, LinkSchedule]
+    links: Mapping[Chunk, LinkSchedule]
     """Receiver → the schedule of its link."""
     pace: NotNegative
     """Seconds per slot; 0: as fast as possible."""
@@ -168,7 +170,7 @@ class RelayPart:
     role: ClassVar[str] = "relay"
     users: Mapping[str, str] = field(repr=False)
     """User of its site → password."""
-    receivers: Sequence[str]
+    receivers: Sequence[Chunk]
     listen: str
     """The endpoint where it listens."""
     zid: str
@@ -217,7 +219,7 @@ class SensorPart:
     """`scheme`, its name, and its parameters."""
     pace: NotNegative
     """As the router's."""
-    receivers: Sequence[str]
+    receivers: Sequence[Chunk]
     holds: Sequence[Slot]
     """Slots before which it holds."""
     history: Window
@@ -547,8 +549,8 @@ P = TypeVar("P", bound=Part)
 class Brief(Generic[P_co]):
     """Everything one process may know."""
 
-    run: str
-    process: str
+    run: Chunk
+    process: Chunk
     role: str
     router: str
     """Zenoh endpoint, such as unixsock-stream/PATH or tls/127.0.0.1:17460."""
