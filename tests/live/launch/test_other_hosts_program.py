@@ -167,6 +167,6 @@ def test_a_brief_is_written_only_into_the_folder_of_the_run(name: str, tmp_path:
     """The launcher's name of a process is not a path."""
     order = StartProcess(7, {**ORDER.brief, "process": name}, {})
     (tmp_path / "private").mkdir()
-    with pytest.raises(ValueError, match="is not the name of a process"):
+    with pytest.raises(ValueError, match=r"matching regex .* at `\$\.process`"):
         HostProcesses(tmp_path / "private", unable, len).obey(order)
     assert [path.name for path in tmp_path.rglob("*")] == ["private"]

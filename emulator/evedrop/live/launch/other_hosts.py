@@ -518,8 +518,6 @@ class HostProcesses:
 
     def _begin(self, order: StartProcess) -> None:
         number, brief = order.number, with_files_in(brief_from(order.brief), self._private)
-        if Path(brief.process).name != brief.process:
-            raise ValueError(f"{brief.process} is not the name of a process")
         environment = {**own_environment(), **order.environment}
         if "TMPDIR" in order.environment:
             environment["TMPDIR"] = str(self._private)
