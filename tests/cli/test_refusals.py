@@ -91,6 +91,7 @@ REFUSED = {
         view done --slot 3
         view done --table --size 300x300
         view done --picture done.png --fps 5
+        view done --picture done.png --csv done.csv
         view done --table --serve nonsense
         """,
     "diff": """

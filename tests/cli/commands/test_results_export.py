@@ -44,6 +44,21 @@ def test_the_picture_and_the_tables_of_any_study(study: str, evedrop: Evedrop) -
             assert picture.width == 1050
 
 
+def test_what_a_picture_shows_is_called_what_it_is(evedrop: Evedrop) -> None:
+    """Covariances are no squared errors; a title in letters that the font lacks is no reason for a warning."""
+    named = ("--set", "title=机器人")
+    for study, shown, not_shown in (
+        ("run", "squared error", "covariance"),
+        ("without states", "trace of the actual covariance", "squared error"),
+    ):
+        assert evedrop(*STUDIES[study], "--out", study, *named).status in {0, 1}
+        done = evedrop("export", study, "out.svg", "--panel", "errors")
+        assert (done.status, done.err) == (0, "")
+        drawn = (evedrop.folder / "out.svg").read_text()
+        assert shown in drawn
+        assert not_shown not in drawn
+
+
 @pytest.mark.thorough
 def test_a_panel_is_drawn_alone(evedrop: Evedrop) -> None:
     """The errors of a run are lower than the whole picture, and as wide; other studies have no such panel."""

@@ -152,6 +152,8 @@ def _check_names(options: argparse.Namespace) -> None:
         ("slot", picture or video, "a picture; give --picture, too"),
         ("time", picture or video, "a picture; give --picture, too"),
         ("fps", video, "a video; give --video, too"),
+        ("csv", options.table, "a table; give --table, too"),
+        ("latex", options.table, "a table; give --table, too"),
         ("serve", not (picture or video or options.table), "a view on the screen; leave it out"),
     ):
         if getattr(options, name) is not None and not fits:

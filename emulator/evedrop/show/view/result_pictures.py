@@ -97,11 +97,13 @@ def run_figure(
         for name, axes in zip(names, places, strict=True):
             if name == "errors":
                 floor = error_floor(recorded_noise(results.folder), pc.max(rows["trials"]).as_py())
-                y_label = f"squared error{without_mathematics(squared_unit(recorded_units(results.folder)))}"
+                what = "trace of the actual covariance" if _without_states(rows) else "squared error"
+                y_label = f"{what}{without_mathematics(squared_unit(recorded_units(results.folder)))}"
                 if results.summary.get("filter") is not None:
                     y_label += "\nto the sensor's estimate"
                 rare = recorded_rare_errors(results.folder, last + 1, pc.max(rows["trials"]).as_py())
-                _errors(axes, rows, inks, slots, floor, y_label, rare)
+                _errors(axes, rows, inks, slots, floor, what, rare)
+                axes.set_ylabel(y_label)
             elif recorded_trial is not None:
                 (recorded_trial.lanes if name == "lanes" else recorded_trial.plane)(axes)
             height = heights[names.index(name)]
@@ -112,19 +114,24 @@ def run_figure(
     return figure
 
 
+def _without_states(rows: pa.Table) -> bool:
+    """Whether slots have no errors, only covariances."""
+    return bool(np.isnan(rows["mean_squared_error"].to_numpy()).all())
+
+
 def _errors(
     axes: Axes,
     rows: pa.Table,
     inks: Mapping[str, str],
     slots: range | None,
     floor: float,
-    y_label: str,
+    what: str,
     rare: Mapping[str, Floats],
 ) -> None:
     """The mean squared error of each slot, theory dashed, and a band of two standard errors of its logarithm.
 
-    inks: of each receiver; floor: values below it are drawn at it; rare: receiver → what rare events carry of its expected error
-    in each slot of the run. There is no band where they carry more than it covers.
+    inks: of each receiver; floor: values below it are drawn at it; what: is drawn, in words; rare: receiver → what rare events
+    carry of its expected error in each slot of the run. There is no band where they carry more than it covers.
     """
     many, gaps, curves = False, False, dict[str, tuple[dict[str, Any], Floats, Floats]]()
     for name in inks:
@@ -156,8 +163,7 @@ def _errors(
         axes.set_yscale("log")
         axes.set_ylim(axis.low, axis.high)
     axes.set_xlabel("slot")
-    axes.set_ylabel(y_label)
-    title = "squared error" + (", mean ± 2 standard errors" if many else "") + "; dashed: theory"
+    title = what + (", mean ± 2 standard errors" if many else "") + "; dashed: theory"
     title += "; no band: rare events" if gaps else ""
     words = "" if axis is None else axis.words
     axes.set_title(title + (words if len(title + words) < _LETTERS else words.replace("; ", ";\n")))

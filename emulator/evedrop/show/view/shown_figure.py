@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from io import BytesIO
 from typing import Any, final
 
@@ -24,7 +25,9 @@ class ShownFigure(Figure):
 
     def savefig(self, *arguments: Any, **options: Any) -> None:
         """Write the figure to a file, as `Figure` does: PDF, SVG or PNG by the ending of its name."""
-        with mpl.rc_context(self._style):  # labels of ticks are made only now, and fonts looked up
+        # Labels of ticks are made only now, and fonts looked up; a letter that they lack is a box.
+        with mpl.rc_context(self._style), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Glyph")
             super().savefig(*arguments, **options)
 
     def _repr_png_(self) -> bytes:
