@@ -74,7 +74,7 @@ def _too_soon(scenario: Scenario, put: list[PutMessage]) -> Iterator[str]:
     """The first slot that the sensor sends before it is due: a hold puts off all later slots for as long as it lasts."""
     begun: float | None = None
     held: dict[int, float] = {}
-    longer, goes_on = 0.0, set[int]()
+    longer, goes_on, told = 0.0, set[int](), set[int]()
     for message in put:
         command, _, slot = message.said.partition(" ")
         if message.key == f"control/{SENSOR}" and command == "start" and begun is None:
@@ -84,6 +84,10 @@ def _too_soon(scenario: Scenario, put: list[PutMessage]) -> Iterator[str]:
             longer += max(0.0, message.at - held.get(int(slot), message.at) - _HOLDS_SECONDS)
         elif message.key == "uplink" and command == "hold":
             held.setdefault(int(slot), message.at)
+        elif message.key == f"telemetry/{SENSOR}" and message.said.isdecimal() and int(message.said) in held:
+            if int(message.said) not in told | goes_on:  # the barrier: before it, the sensor may have been suspended
+                told.add(int(message.said))
+                held[int(message.said)] = message.at
         elif message.key == "uplink" and begun is not None:
             for first in message.slots[:1]:
                 due = begun + first * scenario.pace + longer
