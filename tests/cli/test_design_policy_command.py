@@ -72,8 +72,10 @@ def test_json(evedrop: Evedrop, scenario: str) -> None:
 
 def test_for_people(evedrop: Evedrop, scenario: str) -> None:
     """Two tables for each eavesdropper, ∞ for unbounded, and a line for what was left out, with the reason."""
-    done = evedrop("design", scenario, "--policy", "--states", "6", "--price", "0", "1e-2")
+    done = evedrop("design", scenario, "--policy", "--states", "6", "--price", "0", "1e-2", "--csv", "a.csv")
     assert (done.status, done.err) == (0, "")
+    files = [evedrop.folder / f"a{number}.csv" for number in ("", "-2", "-3", "-4")]
+    assert [file.read_text().splitlines()[-1].partition(",")[0] for file in files] == ["near", "near", "far", "far"]
     for words in (
         "legitimate link quality μ = 0.9",
         "against near, the scheme with its threshold:",

@@ -92,6 +92,7 @@ REFUSED = {
         view done --table --size 300x300
         view done --picture done.png --fps 5
         view done --picture done.png --csv done.csv
+        view done --verbose
         view done --table --serve nonsense
         """,
     "diff": """

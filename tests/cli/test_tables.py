@@ -130,6 +130,26 @@ def test_numbers_are_at_full_precision(evedrop: Evedrop) -> None:
         assert float(row["mean error standard error"]) == exact["mean_squared_error_standard_error"]
 
 
+def test_a_table_of_one_of_several_eavesdroppers_names_it(evedrop: Evedrop) -> None:
+    """The terminal has the name above the table; a file has nothing above it."""
+    smart = '{strategy = "smart", link = {quality = 0.85}}'
+    both = f"eavesdroppers={{near = {smart}, far = {smart}}}"
+    design = ("design", "numerical", "--schedule", "3", "--max-trace", "0.004", "--set", both)
+    assert evedrop(*design, "--csv", "a.csv").status == 0
+    tables = [list(csv.DictReader((evedrop.folder / name).read_text().splitlines())) for name in ("a.csv", "a-2.csv")]
+    assert [[row["against"] for row in table] for table in tables] == [["near"] * 3, ["far"] * 3]
+
+
+def test_errors_by_direction_are_in_the_file_with_and_without_details(evedrop: Evedrop) -> None:
+    """The terminal shows them with --verbose only."""
+    study = shlex.split("montecarlo partial-encryption --trials 2 --slots 40 --set expect=[]")
+    for verbose in ([], ["--verbose"]):
+        assert evedrop(*study, *verbose, "--out", f"run{len(verbose)}", "--csv", f"a{len(verbose)}.csv").status == 0
+    (short, whole) = ((evedrop.folder / f"a{verbose}-2.csv").read_text(encoding="utf-8") for verbose in (0, 1))
+    assert short == whole
+    assert short.startswith("receiver,direction,")
+
+
 def by_hand() -> TextTable:
     """A table with everything that may be in one."""
     table = TextTable.headed(["receiver"], ["mean |x − x̂|²", "μ_d", "z"], ["words"], "The title")
@@ -141,7 +161,7 @@ def by_hand() -> TextTable:
 def test_csv_is_as_written_by_hand() -> None:
     """The whole text."""
     assert csv_text(by_hand()) == (
-        "receiver,mean |x − x̂|²,mean |x − x̂|² standard error,mean |x − x̂|² unit,μ_d,z,words\n"
+        "receiver,mean |x − x̂|²,mean |x − x̂|² standard error,mean |x − x̂|² note,μ_d,z,words\n"
         "a_b & c,0.0123456789,0.0004,*,inf,,\n"
         "a_b & c,2.5e-07,,,0.1,-1.25,50 % {x}\n"
     )

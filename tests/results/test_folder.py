@@ -193,6 +193,20 @@ def check_as_nobody(evedrop: Evedrop, live: Live) -> None:
     assert lines[1:] == ["Permission denied"] * len(places)
 
 
+@pytest.mark.parametrize(
+    ("scenario", "name"),
+    [
+        ("vehicle", "vehicle"),
+        ("folder/robot.toml", "robot"),
+        ("folder/robot.v2.toml", "robot.v2"),
+        ("robot.v2-sweep", "robot.v2-sweep"),
+    ],
+)
+def test_a_default_folder_has_the_whole_name_of_its_scenario(scenario: str, name: str) -> None:
+    """What follows another dot belongs to it."""
+    assert default_folder(scenario).name.rpartition("-")[0].rpartition("-")[0] == name
+
+
 def test_the_command_that_shares_a_run_shares_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Others can reach a run in its default folder after the command of docs/results.md."""
     monkeypatch.chdir(tmp_path)

@@ -180,9 +180,9 @@ def _print_policies(design: PolicyDesign, console: ReportConsole) -> None:
     )
     for name, front in design.fronts.items():
         console.say(f"\nagainst {name}, the scheme with its threshold:")
-        console.show(_thresholds(front))
+        _show_against(name, _thresholds(front), console)
         console.say(f"the best policy if the sensor also knew how long ago {name} heard a packet, which it does not:")
-        console.show(_policies(front, design.states))
+        _show_against(name, _policies(front, design.states), console)
         if front.never:
             for price in sorted({price for _, price in front.never}):
                 weights = ", ".join(f"{weight:g}" for weight, never_price in front.never if never_price == price)
@@ -192,6 +192,11 @@ def _print_policies(design: PolicyDesign, console: ReportConsole) -> None:
             console.say(f"left out: {front.dominated} {policies} that another one dominates")
     if design.left_out:
         console.say(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
+
+
+def _show_against(eavesdropper: str, table: TextTable, console: ReportConsole) -> None:
+    """Show a table below a line that names the eavesdropper; a file of the table names it itself."""
+    console.show(table.under("against", eavesdropper), table)
 
 
 def _thresholds(front: Front) -> TextTable:
@@ -236,7 +241,7 @@ def _print_schedules(design: ScheduleDesign, console: ReportConsole) -> None:
             f"against {name}: the sum is {schedule.best.value:.6g} with this schedule, "
             f"and {schedule.constant.value:.6g} with the best constant μ_d, {schedule.constant.mu_d[1]:.6g}"
         )
-        console.show(_slots(schedule.best))
+        _show_against(name, _slots(schedule.best), console)
         on_grid = (
             "the best schedule of the grid"
             if schedule.exact

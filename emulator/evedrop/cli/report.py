@@ -68,26 +68,29 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None, verb
             console.say(f"  {line}", _STYLES.get(outcome, ""))
     for line in closing.remarks(summary):
         console.say(line)
-    doubts = list(closing.doubts(summary))
+    directions = closing.directions_table(summary.directions) if summary.directions else None
     if verbose:
-        _print_details(console, summary, replay)
-    elif doubts:
-        console.say(f"{len(doubts)} of the means above {_UNCERTAIN[len(doubts) > 1]}; --verbose says why", _WARNING)
+        _print_details(console, summary, directions, replay)
+    else:
+        if directions is not None:
+            console.take(directions)
+        if number := len(closing.doubtful(summary)):
+            console.say(f"{number} of the means above {_UNCERTAIN[number > 1]}; --verbose says why", _WARNING)
     for line in closing.application_lines(summary):
         console.say(line)
     for expectation in summary.expectations:
         console.say(expectation.sentence)
         if expectation.replay is not None:
             console.command(f"    see it again: {expectation.replay}")
-    console.say(f"results: {folder}; to look at them: {closing.looking(folder, summary.mode)}")
+    console.say(f"results: {folder}; to look at them: {closing.looking(folder, summary)}")
 
 
-def _print_details(console: ReportConsole, summary: Summary, replay: str | None) -> None:
+def _print_details(console: ReportConsole, summary: Summary, directions: TextTable | None, replay: str | None) -> None:
     """Print the other parts of the report page: theory, leaks, directions, doubts, and the most surprising trial."""
     for line in closing.details(summary):
         console.say(line)
-    if summary.directions:
-        console.show(closing.directions_table(summary.directions), tight=True)
+    if directions is not None:
+        console.show(directions, tight=True)
     for line in closing.doubts(summary):
         console.say(line, _WARNING)
     surprise = closing.surprise(summary)

@@ -114,6 +114,8 @@ class Pareto(DelayModel):
 
     parameters = MappingProxyType({"least": 0.5, "shape": 2.0})
     lengths = ("least",)
+    shapes: ClassVar[tuple[float, float]] = (0.1, 1000.0)
+    """The least and the largest shape."""
 
     def __init__(self, least: float, shape: float) -> None:
         self._least, self._shape = float(least), float(shape)
@@ -121,7 +123,7 @@ class Pareto(DelayModel):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A length, and a positive shape."""
-        return length_mistakes(given, "least") + number_mistakes(given, "shape", 0.1, 1000.0)
+        return length_mistakes(given, "least") + number_mistakes(given, "shape", *cls.shapes)
 
     def delays(self, first: int, numbers: Floats) -> Floats:  # noqa: ARG002 - every slot alike
         """Each from a uniform number in [0, 1)."""

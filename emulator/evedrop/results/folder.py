@@ -31,7 +31,7 @@ UNFINISHED = "unfinished"
 
 def default_folder(scenario: str | Path) -> Path:
     """The default name of a results folder: `runs/<scenario>-<time>` in the current folder."""
-    stem = Path(scenario).stem if Path(scenario).suffix else Path(scenario).name
+    stem = Path(scenario).name.removesuffix(".toml")
     return Path("runs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 

@@ -6,6 +6,7 @@ import json
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -360,6 +361,10 @@ def test_the_report_says_where_rare_events_carry_the_error(capsys: pytest.Captur
     assert message in report_of(few, capsys)
     print_summary(few, "folder")
     assert "1 of the means above is uncertain; --verbose says why" in capsys.readouterr().out
+    quantiles = dict.fromkeys(("0.05", "0.5", "0.95"), 1.0)
+    twice = replace(few.peers["legitimate"], infinite_variance=True, error_quantiles=quantiles)
+    print_summary(replace(few, peers={**few.peers, "legitimate": twice}), "folder")
+    assert "1 of the means above is uncertain" in capsys.readouterr().out, "two doubts about one mean"
     assert many.peers["legitimate"].rare_events is not None
     assert many.peers["legitimate"].rare_events.fraction < RARE_FRACTION
     for summary in (many, single):

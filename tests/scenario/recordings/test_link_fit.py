@@ -23,7 +23,8 @@ from evedrop.model.links.loss_model import Fate
 from evedrop.model.process import Floats
 from evedrop.scenario.loading import load
 from evedrop.scenario.recordings import link_candidates, link_fit
-from evedrop.scenario.recordings.link_candidates import delay_candidates, wilson
+from evedrop.scenario.recordings.delay_candidates import delay_candidates
+from evedrop.scenario.recordings.link_candidates import wilson
 from evedrop.scenario.recordings.link_fit import fit
 from evedrop.scenario.recordings.link_recording import Outcomes
 from evedrop.scenario.recordings.run_lengths import RunLengthDistribution, lengths_of, p_value
@@ -296,6 +297,49 @@ def test_no_delay_is_proposed_that_a_link_cannot_have(delays: Floats) -> None:
         assert not DELAY_MODELS[spec.pop("model")].mistakes(spec)
 
 
+@pytest.mark.parametrize(
+    ("model", "truth"),
+    [
+        ("normal", {"mean": 3.3, "standard_deviation": 0.9}),
+        ("normal", {"mean": 1.1, "standard_deviation": 1.2}),
+        ("normal", {"mean": 40.0, "standard_deviation": 7.0}),
+        ("pareto", {"least": 2.6, "shape": 3.0}),
+        ("pareto", {"least": 0.4, "shape": 1.2}),
+    ],
+)
+def test_whole_delays_count_slots(model: str, truth: dict[str, float]) -> None:
+    """A link delays by 2.7 slots what arrives two slots late: 95 % of the intervals hold the truth; of 200, 86 % by chance."""
+    held = dict.fromkeys(truth, 0)
+    means = dict.fromkeys(truth, 0.0)
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        numbers = rng.standard_normal((400, 1)) if model == "normal" else rng.random((400, 1))
+        delays = np.floor(DELAY_MODELS[model](**truth).delays(0, numbers)[:, 0])
+        fitted = min(delay_candidates(delays), key=lambda candidate: candidate.bic(len(delays)))
+        if fitted.name != model:  # the other one explains a few of the recordings as well
+            continue
+        for name, value in truth.items():
+            means[name] += fitted.exact[name] / 200
+            low, high = fitted.intervals.get(name, (value, value))
+            held[name] += low <= value <= high
+    assert min(held.values()) > 0.86 * 200
+    assert means == pytest.approx(truth, rel=0.05)
+
+
+@pytest.mark.parametrize("delays", [[3.0, 4.0] * 50, [0.0] * 99 + [1.0], [2.0] * 50 + [90.0], [0.0, 10.0] * 9])
+def test_few_different_whole_delays_have_models_that_a_link_can_have(delays: list[float]) -> None:
+    """Each model gives the observed delays about their fractions."""
+    values, counts = np.unique(delays, return_counts=True)
+    for candidate in delay_candidates(np.array(delays)):
+        spec = dict(candidate.spec)
+        model = DELAY_MODELS[spec.pop("model")]
+        assert not model.mistakes(spec)
+        assert math.isfinite(candidate.log_likelihood)
+        if len(values) == 2 and values[1] == values[0] + 1.0:
+            arrived = model(**spec).arrived(int(values[0]))
+            assert arrived == pytest.approx(counts[0] / counts.sum(), abs=0.02)
+
+
 def test_intervals_from_few_delays_are_as_wide_as_they_must_be() -> None:
     """Of 2000 recordings of ten delays, 95 % of the intervals hold the truth; by chance, 92.9 % in one of 100 000 tests."""
     held = {"mean": 0, "standard_deviation": 0}
@@ -319,7 +363,7 @@ def test_delays_that_are_cut_at_zero_are_found_again() -> None:
     assert min(held.values()) > 85
 
 
-@pytest.mark.parametrize("late", [[1.0], [3e-3, 4e-3], (10.0 * np.random.default_rng(1).pareto(1.1, 100)).tolist()])
+@pytest.mark.parametrize("late", [[1.5], [3e-3, 4e-3], (10.0 * np.random.default_rng(1).pareto(1.1, 100)).tolist()])
 def test_delays_that_are_nearly_all_zero_have_no_mean_below_zero(late: list[float]) -> None:
     """Which no link may have: then half of them are 0, and the others as large as these."""
     (normal,) = delay_candidates(np.array([0.0] * 900 + late))

@@ -1,3 +1,4 @@
+import os
 import re
 import shutil
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from evedrop import load_results, montecarlo, run
+from evedrop.cli.commands.view import _recording
 from evedrop.cli.main import status_of
 from evedrop.errors import UsageError
 from evedrop.results.reading import Results
@@ -178,6 +180,24 @@ def test_a_folder_that_cannot_be_written_is_told(study: Path, tmp_path: Path) ->
     """In one line, with what to do."""
     with pytest.raises(UsageError, match=r"cannot be written \(No such file or directory\); make the folder writable"):
         replay(study, tmp_path / "missing" / "run.rrd")
+
+
+def test_a_finished_run_in_a_folder_that_may_only_be_read_is_shown(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a recording elsewhere; one in a writable folder stays there, and is the one that is shown again."""
+    run = tmp_path / "run"
+    shutil.copytree(study, run, ignore=shutil.ignore_patterns("*.rrd"))
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert _recording(run, tmp_path, finished=True) == tmp_path / "recording.rrd"
+    assert not (run / "recording.rrd").exists()
+    monkeypatch.undo()
+    assert _recording(run, tmp_path, finished=False) == tmp_path / "recording.rrd"
+    assert not (run / "recording.rrd").exists()
+    kept = _recording(run, tmp_path, finished=True)
+    written = kept.stat().st_mtime_ns
+    assert kept == run / "recording.rrd" == _recording(run, tmp_path, finished=True)
+    assert kept.stat().st_mtime_ns == written
 
 
 def one_action(table: pa.Table) -> pa.Table:

@@ -112,7 +112,7 @@ _FIGURES = together(
 
 @command((_FIGURES,), section="study", example="figures paper/", page="papers")
 def figures(options: argparse.Namespace) -> int:
-    """Draw the figures of the paper, and a table of its numbers and ours."""
+    """Draw the figures of kennedy2022, and a table of its numbers and ours."""
     from evedrop.studies.papers.kennedy2022 import Size
     from evedrop.studies.papers.kennedy2022 import figures as draw
 

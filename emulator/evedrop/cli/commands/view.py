@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 import tempfile
 import time
@@ -82,7 +83,7 @@ _SHOWN = together(
     option(
         "--fps",
         "F",
-        "frames per second of a video; default 15",
+        "frames per second of a video; default 15, fewer for a video of less than ten seconds and for a wire",
         type=number_type(1, _MOST_RATE, f"a number of frames per second from 1 to {_MOST_RATE}"),
     ),
     option("--size", "WxH", "in pixels; default 1600x950 for a picture, 880x660 for a video", type=_size),
@@ -124,13 +125,7 @@ def view(options: argparse.Namespace) -> int:
         # Chosen first: a recording that is then made of a run in progress has these slots, and perhaps more.
         slots: Sequence[int] = () if options.video is None else _slots_of(options)
         slot = _chosen_slot(options.run) if options.picture is not None and options.slot is None else options.slot
-        recording = options.run / "recording.rrd"
-        if results is not None or not recording.is_file():
-            from evedrop.show.view.scene_slots import replay
-        if results is not None:  # a run in progress, or a killed one, has no complete recording
-            recording = replay(options.run, Path(temporary) / "recording.rrd")
-        elif not recording.is_file():
-            recording = replay(options.run)
+        recording = _recording(options.run, Path(temporary), finished=results is None)
         if options.video is not None:
             return _film(recording, options, slots)
         if options.picture is None:
@@ -143,6 +138,16 @@ def view(options: argparse.Namespace) -> int:
     return 0
 
 
+def _recording(run: Path, temporary: Path, *, finished: bool) -> Path:
+    """The recording of a run. One that is made first is kept beside the results if the run is finished."""
+    recording = run / "recording.rrd"
+    if finished and recording.is_file():
+        return recording
+    from evedrop.show.view.scene_slots import replay
+
+    return replay(run, recording if finished and os.access(run, os.W_OK) else temporary / recording.name)
+
+
 def _check_names(options: argparse.Namespace) -> None:
     """Raise UsageError for a picture or a video that cannot be made, or an option of one, before anything is drawn."""
     picture, video = options.picture is not None, options.video is not None
@@ -152,11 +157,12 @@ def _check_names(options: argparse.Namespace) -> None:
         ("slot", picture or video, "a picture; give --picture, too"),
         ("time", picture or video, "a picture; give --picture, too"),
         ("fps", video, "a video; give --video, too"),
+        ("verbose", options.table, "a table; give --table, too"),
         ("csv", options.table, "a table; give --table, too"),
         ("latex", options.table, "a table; give --table, too"),
         ("serve", not (picture or video or options.table), "a view on the screen; leave it out"),
     ):
-        if getattr(options, name) is not None and not fits:
+        if getattr(options, name) not in {None, False} and not fits:
             raise UsageError(f"--{name} is for {what}")
     if options.picture is not None:
         from evedrop.show.view.picture import check_picture_name

@@ -1,4 +1,4 @@
-"""The models that may have produced a link's recording, each with its most likely parameters.
+"""The loss models that may have produced a link's recording, each with its most likely parameters.
 
 Source: docs/mathematics/links.md, estimating a link.
 """
@@ -12,15 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.model.delays import Pareto
-from evedrop.model.process import Floats
 from evedrop.scenario.recordings.link_recording import Outcomes
 from evedrop.scenario.recordings.two_states import TwoStates, most_likely
 
-_NEWTON = 20  # steps of Newton's method, which doubles the digits in each of the last ones
 Interval = tuple[float, float]
 _NORMAL = 1.959963984540054  # for 95 %
-_TAIL = 0.025
 
 
 @dataclass(frozen=True)
@@ -93,95 +89,6 @@ def _rounded(parameter: str, value: float) -> float:
     if parameter != "quality" or not 0.0 < loss < 0.1:
         return rounded(value)
     return round(value, 3 - math.floor(math.log10(loss)))
-
-
-def delay_candidates(delays: Floats) -> list[Candidate]:
-    """Models for delays in slots, (packets,): constant if all are equal, else normal, or Pareto if a link may have its shape."""
-    count, least = len(delays), float(delays.min())
-    if least == float(delays.max()):
-        return [Candidate("constant", {"model": "constant", "value": least}, 0.0, 1)]
-    candidates = [_normal(delays)]
-    logs = float(np.log(delays / least).sum()) if least > 0.0 else math.inf
-    shape = count / logs
-    if not Pareto.mistakes({"shape": shape}):
-        likelihood = count * (math.log(shape) - math.log(least)) - (shape + 1.0) * logs
-        candidates.append(
-            Candidate(
-                "pareto",
-                {"model": "pareto", "least": least, "shape": shape},
-                likelihood,
-                2,
-                {"shape": normal_interval(shape, shape / math.sqrt(count))},
-            )
-        )
-    return candidates
-
-
-def _normal(delays: Floats) -> Candidate:
-    """The most likely normal model, whose delays are 0 where the normal number is not above 0."""
-    from scipy.special import chdtri, stdtrit  # noqa: PLC0415 - 0.2 s that only this needs
-
-    count, mean, standard_deviation = len(delays), float(delays.mean()), float(delays.std())
-    likelihood = -0.5 * count * (math.log(2.0 * math.pi * standard_deviation * standard_deviation) + 1.0)
-    # Exact for a sample of any size: Student's for the mean, that of chi-square for the standard deviation.
-    reach = float(stdtrit(count - 1, 1.0 - _TAIL)) * standard_deviation / math.sqrt(count - 1)
-    least, most = (standard_deviation * math.sqrt(count / float(chdtri(count - 1, p))) for p in (_TAIL, 1.0 - _TAIL))
-    intervals = [(mean - reach, mean + reach), (least, most)]
-    above = delays[delays > 0.0]
-    if len(above) < count:
-        scaled, zeros = above / standard_deviation, count - len(above)
-        (place, scale), covariance, likelihood = _cut_at_zero(scaled, zeros, mean / standard_deviation)
-        likelihood -= len(above) * math.log(standard_deviation)
-        mean, standard_deviation = place / scale * standard_deviation, standard_deviation / scale
-        to_both = standard_deviation * np.array([[1.0, -place / scale], [0.0, -1.0 / scale]])
-        errors = np.sqrt(np.diag(to_both @ covariance @ to_both.T)).tolist()
-        intervals = [normal_interval(*pair) for pair in zip((mean, standard_deviation), errors, strict=True)]
-    names = ("mean", "standard_deviation")
-    return Candidate(
-        "normal",
-        {"model": "normal", "mean": mean, "standard_deviation": standard_deviation},
-        likelihood,
-        2,
-        {name: (max(0.0, low), high) for name, (low, high) in zip(names, intervals, strict=True)},
-    )
-
-
-def _cut_at_zero(above: Floats, zeros: int, place: float) -> tuple[Floats, Floats, float]:
-    """The most likely mean / sd, at least 0, and 1 / sd of normal numbers of which some are not above 0; the others are these.
-
-    zeros: how many are not above 0; place: a guess of mean / sd, where the sd is about 1. By Newton's method, with steps that
-    are halved until the log-likelihood grows, which is concave. Returns also the covariance of both, and the log-likelihood.
-
-    Source: Olsen (1978).
-    """
-    from scipy.special import log_ndtr  # noqa: PLC0415 - 0.2 s that only this needs
-
-    count, half = len(above), 0.5 * math.log(2.0 * math.pi)
-
-    def likelihood(at: Floats) -> float:
-        if at[1] <= 0.0:
-            return -math.inf
-        away = at[1] * above - at[0]
-        return float(zeros * log_ndtr(-at[0]) + count * (math.log(at[1]) - half) - 0.5 * (away * away).sum())
-
-    def derivatives(at: Floats) -> tuple[Floats, Floats]:
-        away = at[1] * above - at[0]
-        hazard = math.exp(-0.5 * at[0] * at[0] - half - float(log_ndtr(-at[0])))
-        slope = np.array([away.sum() - zeros * hazard, count / at[1] - (above * away).sum()])
-        mixed, own = -float(above.sum()), count / (at[1] * at[1]) + float((above * above).sum())
-        return slope, np.array([[count + zeros * hazard * (hazard - at[0]), mixed], [mixed, own]])
-
-    at = np.array([place, 1.0])
-    for _ in range(_NEWTON):
-        slope, bend = derivatives(at)
-        step = np.linalg.solve(bend, slope)
-        while likelihood(at + step) < likelihood(at):
-            step *= 0.5
-        at = at + step
-    if at[0] < 0.0:  # the model has no mean below 0
-        at = np.array([0.0, math.sqrt(count / float((above * above).sum()))])
-    covariance = np.asarray(np.linalg.inv(derivatives(at)[1]), np.float64)
-    return at, covariance, likelihood(at)
 
 
 def bernoulli(outcomes: Outcomes) -> Candidate:

@@ -15,14 +15,8 @@ import numpy as np
 from evedrop.errors import TraceError
 from evedrop.model.checks import toml_of
 from evedrop.model.process import Floats
-from evedrop.scenario.recordings.link_candidates import (
-    Candidate,
-    bernoulli,
-    delay_candidates,
-    gilbert,
-    gilbert_elliott,
-    wilson,
-)
+from evedrop.scenario.recordings.delay_candidates import delay_candidates
+from evedrop.scenario.recordings.link_candidates import Candidate, bernoulli, gilbert, gilbert_elliott, wilson
 from evedrop.scenario.recordings.link_recording import DELAY, LinkRecording, Outcomes
 from evedrop.scenario.recordings.run_lengths import FEWEST_RUNS, RunLengthDistribution, RunLengths, lengths_of, p_value
 

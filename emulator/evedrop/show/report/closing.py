@@ -54,12 +54,10 @@ def heading(summary: Summary) -> str:
     return title
 
 
-def looking(folder: str, mode: str) -> str:
-    """The command that shows the results in a folder: their view, or their table in a mode without a recorded trial.
-
-    mode: as in the summary.
-    """
-    return f"evedrop view {shlex.quote(folder)}{'' if mode in {'live', 'exact'} else ' --table'}"
+def looking(folder: str, summary: Summary) -> str:
+    """The command that shows the results in a folder: their view, or their table if they have no slot of a recorded trial."""
+    recorded = summary.mode in {"live", "exact"} and summary.slots_per_second > 0.0
+    return f"evedrop view {shlex.quote(folder)}{'' if recorded else ' --table'}"
 
 
 def outcome(summary: Summary) -> tuple[str, bool | None]:
@@ -226,14 +224,25 @@ def details(summary: Summary) -> Iterator[str]:
             yield f"{name}: packets that hide the state revealed {verdict.leak.text} of its path"
 
 
-def doubts(summary: Summary) -> Iterator[str]:
-    """A line for each receiver whose mean error is meaningless or too uncertain."""
+def doubts(summary: Summary) -> list[str]:
+    """The lines that say why mean errors are meaningless or too uncertain."""
+    return [line for _, line in _doubts(summary)]
+
+
+def doubtful(summary: Summary) -> set[str]:
+    """The receivers that `doubts` is about."""
+    return {name for name, _ in _doubts(summary)}
+
+
+def _doubts(summary: Summary) -> Iterator[tuple[str, str]]:
+    """Receivers whose mean error is meaningless or too uncertain, with the reason in a line."""
     for name, peer in summary.peers.items():
         if peer.infinite_variance and peer.error_quantiles and summary.trials > 1:
             low, middle, high = (f"{value:.3g}" for value in peer.error_quantiles.values())
             yield (
+                name,
                 f"{name}: its error has infinite variance, so the mean over trials says nothing; "
-                f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
+                f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten",
             )
     yield from _rare_lines(summary)
 
@@ -283,18 +292,19 @@ def _link_lines(links: Mapping[str, LinkSummary]) -> Iterator[str]:
             )
 
 
-def _rare_lines(summary: Summary) -> Iterator[str]:
-    """A line for each receiver whose expected error is carried by events that too few of the trials contain."""
+def _rare_lines(summary: Summary) -> Iterator[tuple[str, str]]:
+    """Receivers whose expected error is carried by events that too few of the trials contain, with a line each."""
     for name, peer in summary.peers.items():
         rare = peer.rare_events
         if rare is not None and rare.fraction > RARE_FRACTION and summary.trials > 1:
             split = peer.rare_estimate is not None
             enough = f"{count_text(rare.trials)} trials" if math.isfinite(rare.trials) else "no number of trials"
             yield (
+                name,
                 f"{name}: {fraction_text(rare.fraction)} of its expected error is carried by "
                 f"{rare_events_words(summary.trials)}, so its mean over the trials is uncertain, probably too small"
                 f"{'' if split else ', and has no z'}; {enough} would leave {fraction_text(RARE_FRACTION)}"
-                + ("" if split else "; montecarlo --rare estimates it by splitting")
+                + ("" if split else "; montecarlo --rare estimates it by splitting"),
             )
 
 

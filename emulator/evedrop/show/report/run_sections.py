@@ -448,7 +448,7 @@ def _repeat(of: RunSource) -> Iterator[Markup]:
         command = repeating(Path(SCENARIO), trials, summary.mode)
         if any(peer.rare_estimate is not None for peer in summary.peers.values()):
             command += " --rare"
-        yield made("code", f"{command} --out again\n{closing.looking('again', summary.mode)}")
+        yield made("code", f"{command} --out again\n{closing.looking('again', summary)}")
     else:
         yield made("paragraph", f"The run cannot be repeated: its folder has no {SCENARIO} that can be read.")
     versions = of.tables.get("made_with", {})

@@ -65,6 +65,11 @@ class TextTable:
         """Add a row."""
         self.rows.append(cells)
 
+    def under(self, heading: str, word: str) -> TextTable:
+        """The same table with a first column of this heading that has the word in every row."""
+        columns, rows = [TextColumn(heading, number=False), *self.columns], [(word, *row) for row in self.rows]
+        return replace(self, columns=columns, rows=rows)
+
 
 _SMALL, _LARGE, _DUST = 1e-3, 1e5, 1e-12
 _FAR = 4.0
@@ -109,13 +114,13 @@ def far(table: TextTable) -> set[tuple[int, int]]:
     }
 
 
-ERROR, UNIT = "standard error", "unit"
+ERROR, NOTE = "standard error", "note"
 """What the heading of a column says after that of its numbers."""
 _EMPTY = {"–", ""}
 
 
 def csv_text(table: TextTable) -> str:
-    """The table as CSV: numbers as Python writes them, and their standard errors and units in columns of their own.
+    """The table as CSV: numbers as Python writes them; their standard errors and what follows them have their own columns.
 
     A cell without a value is empty; a first cell that repeats the one above it is written out.
     """
@@ -130,7 +135,7 @@ def csv_text(table: TextTable) -> str:
             heads.append(f"{heading} {ERROR}")
             written.append(["" if number.error is None else repr(float(number.error)) for number in numbers])
         if any(number.after for number in numbers):
-            heads.append(f"{heading} {UNIT}")
+            heads.append(f"{heading} {NOTE}")
             written.append([number.after.strip() for number in numbers])
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
