@@ -56,7 +56,7 @@ def _normal(delays: Floats) -> Candidate:
 
     count, mean, standard_deviation = len(delays), float(delays.mean()), float(delays.std())
     likelihood = -0.5 * count * (math.log(2.0 * math.pi * standard_deviation * standard_deviation) + 1.0)
-    # Exact for a sample of any size: Student's for the mean, that of chi-square for the standard scale.
+    # Exact for a sample of any size: Student's for the mean, that of chi-square for the standard deviation.
     reach = float(stdtrit(count - 1, 1.0 - _TAIL)) * standard_deviation / math.sqrt(count - 1)
     least, most = (standard_deviation * math.sqrt(count / float(chdtri(count - 1, p))) for p in (_TAIL, 1.0 - _TAIL))
     intervals = [(mean - reach, mean + reach), (least, most)]
