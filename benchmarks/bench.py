@@ -10,6 +10,7 @@ reach what they must.
 
 from __future__ import annotations
 
+import argparse
 import os
 import signal
 import subprocess
@@ -92,4 +93,6 @@ def main(quick: bool, families: Sequence[Family] = FAMILIES) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main("--quick" in sys.argv))
+    parser = argparse.ArgumentParser(description="All benchmarks, one after the other.")
+    parser.add_argument("--quick", action="store_true", help="small, to see that each of them runs")
+    sys.exit(main(parser.parse_args().quick))

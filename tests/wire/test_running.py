@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 from evedrop.cli.pytest_plugin import _opening
-from evedrop.errors import EvedropError, RunError, UsageError
+from evedrop.errors import EvedropError, RunError, ScenarioError, UsageError
 from evedrop.live.network.operator import Answer
 from evedrop.wire import running
 from evedrop.wire.file import wire_of
-from evedrop.wire.running import RunningWire
+from evedrop.wire.running import RunningWire, wire
 from evedrop.wire.tables import seconds_of
 
 PLAN = wire_of(
@@ -46,6 +46,16 @@ def test_a_file_that_cannot_be_written_keeps_the_wire_from_beginning(
     with pytest.raises(UsageError, match=r"cannot write the wire's file \(No space left on device\); set TMPDIR"):
         RunningWire(PLAN, tmp_path).__enter__()
     assert [folder.exists() for folder in folders] == [False]
+
+
+def test_a_wire_that_is_refused_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is wrong with it."""
+    monkeypatch.chdir(tmp_path)
+    link = [{"from": "robot", "to": "base", "quality": 0.5}]
+    for wrong in ({"seconds": "long"}, {"seconds": -1.0}, {"sides": 3}):
+        with pytest.raises((UsageError, ScenarioError)):
+            wire(side=["robot", "base"], link=link, **wrong)
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from evedrop.model.controllers import Assignment, Controller
 from evedrop.model.integrity.monitor import MonitorPlan
 from evedrop.model.metrics import error_column
 from evedrop.model.metrics.standard_error import standard_error
-from evedrop.model.metrics.text import estimate
+from evedrop.model.metrics.text import estimate, percent_estimate
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
 from evedrop.model.registry import Registry
@@ -364,6 +364,11 @@ class Application(ABC):
     def text(cls, summary: Summary, path: Sequence[str], how: str = ".4g") -> str:
         """A metric by its path, as above, with its standard error: 0.0123 ± 0.0004; how: its format without one."""
         return estimate(cls.metric(summary, path), cls.standard_error(summary, path), how)
+
+    @classmethod
+    def percent(cls, summary: Summary, name: str) -> str:
+        """A metric of the run that is a fraction, in per cent, with its standard error: 12.3 ± 0.4 %."""
+        return percent_estimate(cls.metric(summary, [name]), cls.standard_error(summary, [name]), ".3g")
 
     @classmethod
     def sweep_columns(cls, summary: Summary, receiver: str) -> dict[str, float | None]:

@@ -72,7 +72,8 @@ def wire(
     Raises ScenarioError with every mistake of the wire. The `with` statement raises UsageError or RunError if the wire cannot
     begin, and ExpectationFailed if one of its `[[expect]]` failed, or programs could speak past it.
     """
-    return RunningWire(*described_wire(source, out, entries), seconds)
+    limit = seconds_of(str(seconds), "seconds")  # refused before there is a folder
+    return RunningWire(*described_wire(source, out, entries), limit)
 
 
 def described_wire(

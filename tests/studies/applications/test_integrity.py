@@ -215,16 +215,16 @@ def test_the_closing_report_has_its_lines() -> None:
         "watermark_fraction": 0.5, "standard_errors": {"mean_delay": 0.5},
     }  # fmt: skip
     assert Integrity.lines(entries) == [
-        "false alarms in 0.01 of the trials, by theory at most 0.05",
-        "the attack is detected in 1 of the other trials, after 12.0 ± 0.5 slots; h/D is 11.5",
-        "the watermark costs 0.36 a slot before the attack, by theory 0.35 (z 1.5); it is on in 0.5 of all slots",
+        "false alarms in 1 % of the trials, by theory at most 5 %",
+        "the attack is detected in 100 % of the other trials, after 12.0 ± 0.5 slots; h/D is 11.5",
+        "the watermark costs 0.36 a slot before the attack, by theory 0.35 (z 1.5); it is on in 50 % of all slots",
     ]
     bare = {**dict.fromkeys(entries), "false_alarm_fraction": 0.0, "detected_fraction": 0.0, "watermark_cost": 0.1}
     bare |= {"standard_errors": {}, "watermark_fraction": 1.0}
     assert Integrity.lines(bare) == [
-        "false alarms in 0 of the trials",
-        "the attack is detected in 0 of the other trials",
-        "the watermark costs 0.1 a slot before the attack; it is on in 1 of all slots",
+        "false alarms in 0 % of the trials",
+        "the attack is detected in 0 % of the other trials",
+        "the watermark costs 0.1 a slot before the attack; it is on in 100 % of all slots",
     ]
     assert len(Integrity.lines({**bare, "watermark_fraction": 0.0})) == 2
 

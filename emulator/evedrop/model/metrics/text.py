@@ -106,6 +106,12 @@ def estimate(value: float | None, error: float | None, how: str = ".4g") -> Show
     return ShownNumber(_estimate(value, error, how), value, error)
 
 
+def percent_estimate(fraction: float | None, error: float | None, how: str = ".2g") -> ShownNumber:
+    """A fraction in per cent, as `estimate` has it: 12.3 ± 0.4 %."""
+    scaled = (None if each is None else 100.0 * each for each in (fraction, error))
+    return estimate(*scaled, how) + " %"
+
+
 def _estimate(value: float | None, error: float | None, how: str) -> str:
     if value is None or not error or not math.isfinite(value) or math.isnan(error) or error <= _ROUNDING * abs(value):
         return number_text(value, how)

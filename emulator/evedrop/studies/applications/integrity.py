@@ -28,6 +28,7 @@ from evedrop.model.integrity.policies import WatermarkPolicy
 from evedrop.model.integrity.theory import WatermarkTheory, loop_of
 from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.metrics.standard_error import z_of
+from evedrop.model.metrics.text import percent_estimate
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, product
 from evedrop.model.slot.records import SensorSlots
@@ -371,12 +372,10 @@ class Integrity(Application):
         if summary["false_alarm_fraction"] is None:
             return []
         bound = summary["false_alarm_bound"]
-        alarms = f"false alarms in {cls.text(summary, ('false_alarm_fraction',), '.3g')} of the trials"
-        lines = [alarms if bound is None else f"{alarms}, by theory at most {bound:.3g}"]
+        alarms = f"false alarms in {cls.percent(summary, 'false_alarm_fraction')} of the trials"
+        lines = [alarms if bound is None else f"{alarms}, by theory at most {percent_estimate(bound, None, '.3g')}"]
         if summary["detected_fraction"] is not None:
-            sentence = (
-                f"the attack is detected in {cls.text(summary, ('detected_fraction',), '.3g')} of the other trials"
-            )
+            sentence = f"the attack is detected in {cls.percent(summary, 'detected_fraction')} of the other trials"
             if summary["mean_delay"] is not None:
                 sentence += f", after {cls.text(summary, ('mean_delay',), '.3g')} slots"
             if summary["expected_delay"] is not None:
@@ -387,7 +386,7 @@ class Integrity(Application):
             expected, z = summary["expected_watermark_cost"], summary["watermark_cost_z"]
             if expected is not None:
                 alarms += f", by theory {expected:.3g}" + ("" if z is None else f" (z {z:.1f})")
-            lines.append(f"{alarms}; it is on in {cls.text(summary, ('watermark_fraction',), '.3g')} of all slots")
+            lines.append(f"{alarms}; it is on in {cls.percent(summary, 'watermark_fraction')} of all slots")
         return lines
 
     @classmethod

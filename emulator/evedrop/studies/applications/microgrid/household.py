@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from evedrop.model.controllers import Assignment, Controller, held
-from evedrop.model.metrics.text import estimate
+from evedrop.model.metrics.text import percent_estimate
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Flags
@@ -393,7 +393,7 @@ class Household(Application):
         fractions = [summary[f"{name}_difference"] for name in ("net", "total", "summed")]
         if None not in fractions:
             errors = [cls.standard_error(summary, (f"{name}_difference",)) for name in ("net", "total", "summed")]
-            net, total, summed = (_per_cent(*pair) for pair in zip(fractions, errors, strict=True))
+            net, total, summed = (percent_estimate(*pair) for pair in zip(fractions, errors, strict=True))
             lines.append(
                 f"grid power differs from that controller's by {net} in net energy, {total} in total, "
                 f"{summed} summed slot by slot"
@@ -516,10 +516,6 @@ def _store(loop: ControlledPlant, name: str, state: int, foot: Spot) -> DrawnLev
 def _house(table: Table) -> HouseholdTable:
     assert isinstance(table, HouseholdTable)  # noqa: S101 - the hook gives each application its own table
     return table
-
-
-def _per_cent(fraction: float, error: float | None) -> str:
-    return estimate(100.0 * fraction, None if error is None else 100.0 * error, ".2g") + " %"
 
 
 def _kwh(summary: Summary, way: str) -> str:
