@@ -108,8 +108,8 @@ def estimate(value: float | None, error: float | None, how: str = ".4g") -> Show
 
 def percent_estimate(fraction: float | None, error: float | None, how: str = ".2g") -> ShownNumber:
     """A fraction in per cent, as `estimate` has it: 12.3 ± 0.4 %."""
-    scaled = (None if each is None else 100.0 * each for each in (fraction, error))
-    return estimate(*scaled, how) + " %"
+    value, scatter = (None if each is None else 100.0 * each for each in (fraction, error))
+    return estimate(value, scatter, how) + " %"
 
 
 def _estimate(value: float | None, error: float | None, how: str) -> str:
