@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from typing import TYPE_CHECKING, final
 
 from evedrop.errors import RunError, UsageError
@@ -118,7 +119,9 @@ class ReadMetrics(Disturbance):
         metrics = RunMetrics(world.scenario, world.results, lambda _: None)
         for _, event in told:
             metrics.on_event(event)
-        values = {sample.name: sample.value for family in metrics.collect() for sample in family.samples}
+        with closing(metrics):
+            samples = [sample for family in metrics.collect() for sample in family.samples]
+        values = {sample.name: sample.value for sample in samples}
         slots, planned = values["evedrop_slots_total"], values["evedrop_slots_planned"]
         if not 0 <= slots <= planned == world.scenario.slots:
             raise AssertionError(f"the metrics say {slots} of {planned} slots")

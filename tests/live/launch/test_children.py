@@ -300,6 +300,19 @@ def test_a_process_starts_again_only_when_its_router_listens(bench: Bench) -> No
     assert bench.starter.begun[begun:] == ["router", "eve"]
 
 
+def test_an_act_is_confirmed_to_nobody_after_the_run(bench: Bench) -> None:
+    """A process's end may be reported only when the recorder's pipe is closed."""
+    bench.children.start(bench.briefs["eve"])
+    bench.tells()
+    pipe = BytesIO()
+    bench.children._processes["recorder"] = Ended(7, None, pipe)
+    request = ProcessRequest(do=ProcessAction.STOP, process="eve", first=0, number=1)
+    bench.children.act(request)
+    assert pipe.getvalue() == b"1\n"
+    pipe.close()
+    bench.children.act(request)
+
+
 def test_a_request_that_waits_does_not_speak_for_its_recorder(bench: Bench) -> None:
     """A recorder that falls silent is noticed, also while a process waits to be started again."""
     bench.starter.pipes = {"router": BytesIO()}

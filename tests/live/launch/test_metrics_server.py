@@ -15,7 +15,6 @@ from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import (
     ConnectionOutage,
-    FolderMoved,
     Held,
     ProgressEvent,
     RunProgress,
@@ -139,12 +138,15 @@ def test_a_run_that_is_paused_is_held(tmp_path: Path) -> None:
 
 
 def test_metrics_are_those_of_the_folder_and_alarms_of_the_watermark(tmp_path: Path) -> None:
-    """A folder that has been renamed is found again."""
-    montecarlo("replay-attack", trials=10, out=tmp_path / "after")
-    metrics = RunMetrics(load("replay-attack"), tmp_path / "before", silent)
-    with metrics_served(ANY_PORT, metrics) as page:
+    """A folder may be renamed while the run goes on: without it, counters would fall."""
+    before, after = tmp_path / "before", tmp_path / "after"
+    metrics = RunMetrics(load("replay-attack"), before, silent)
+    before.mkdir()
+    with contextlib.closing(metrics), metrics_served(ANY_PORT, metrics) as page:
         assert ("evedrop_mean_squared_error", "legitimate") not in scraped(page)
-        metrics.on_event(FolderMoved(str(tmp_path / "after")))
+        metrics.on_event(Started())
+        before.rename(after)
+        montecarlo("replay-attack", trials=10, out=after)
         result = scraped(page)
     summary = Results.read(tmp_path / "after").summary
     assert result["evedrop_mean_squared_error", "legitimate"] == summary["peers"]["legitimate"]["mean_squared_error"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import signal
 import subprocess
 from io import BytesIO
@@ -60,6 +62,24 @@ def test_processes_are_asked_before_they_are_killed() -> None:
     assert stays.signals == [signal.SIGCONT, signal.SIGTERM, SHOW_STACKS, signal.SIGKILL]
     assert gone.signals == [signal.SIGCONT]
     assert all(process.stdin.closed for process in (willing, stays, gone))
+
+
+class DeadPipe(BytesIO):
+    """A pipe to a process that has died, with something in its buffer."""
+
+    def close(self) -> None:
+        """Write that again, in vain."""
+        super().close()
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+
+def test_what_a_dead_process_was_not_told_is_no_error() -> None:
+    """All others are ended, and the run's own error is shown."""
+    dead, other = Stubborn(status=3), Stubborn()
+    dead.stdin = DeadPipe()
+    end_all([dead, other])
+    assert dead.stdin.closed
+    assert other.stdin.closed
 
 
 def test_a_process_that_cannot_be_killed_is_waited_for_with_a_limit() -> None:

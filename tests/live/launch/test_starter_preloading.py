@@ -8,6 +8,7 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from pathlib import Path
 from tempfile import mkdtemp
@@ -15,6 +16,7 @@ from tempfile import mkdtemp
 import pytest
 
 from evedrop import preloaded
+from evedrop.live.launch import starter
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import loopback_endpoints
 from evedrop.live.launch.starter import (
@@ -141,6 +143,25 @@ def test_in_a_block_all_runs_have_the_same_servers(
     monkeypatch.undo()
     with process_starter() as after:
         assert after is before
+
+
+def test_a_run_in_another_thread_has_servers_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of a run end with it; in a block, all threads have the same."""
+    monkeypatch.setattr(starter, "_preloaded", [])
+
+    def in_a_thread() -> Starter:
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(starter_of_a_run).result(LIMIT)
+
+    def starter_of_a_run() -> Starter:
+        with process_starter() as found:
+            return found
+
+    with process_starter() as own:
+        assert starter_of_a_run() is own
+        assert in_a_thread() is not own
+    with preloaded() as shared:
+        assert in_a_thread() is starter_of_a_run() is shared
 
 
 @pytest.mark.thorough

@@ -22,12 +22,13 @@ from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol import codec as wire
-from evedrop.live.protocol import telemetry
+from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import Brief, Flow, RouterPart
-from evedrop.live.protocol.commands import EndRun
+from evedrop.live.protocol.commands import EndRun, Go, LinkChange
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.packets import read_delivery
 from evedrop.model.process import Floats
+from evedrop.model.slot.link import Change
 from tests.conftest import LIMIT
 from tests.live.in_memory import Stage
 from tests.live.network.bench import Bench, small_network
@@ -214,10 +215,22 @@ def test_a_part_of_a_slot_is_waited_for_in_real_time(bench: Callable[..., Bench]
     """With half a slot of delay and a tenth of a second a slot, a delivery is 50 ms later than that of a link without."""
     delayed = {"quality": 1.0, "delay": {"model": "constant", "value": 0.5}}
     eve = {"strategy": "naive", "link": {"quality": 1.0}}
-    stage = bench(slots=3, pace=0.1, legitimate={"link": delayed}, eavesdroppers={"eve": eve})
+    stage = bench(slots=6, pace=0.1, legitimate={"link": delayed}, eavesdroppers={"eve": eve})
     for k in range(3):
         began = time.monotonic()
         stage.put("sensor", stage.keys.uplink, packet(k, stage.packet(k)))
         stage.downlinks["eve"].hear()
         stage.downlinks["legitimate"].hear()
         assert time.monotonic() - began >= 0.05
+    stage.put("sensor", stage.keys.uplink, packets.barrier(3))
+    for name in ("eve", "legitimate"):
+        assert packets.is_barrier(wire.Reader(*stage.downlinks[name].hear()))
+    lossless = {"model": "bernoulli", "quality": 1.0}
+    change = LinkChange("eve", (Change(3, {"loss": lossless, "delay": delayed["delay"]}),))
+    for command in (change, Go(3)):
+        stage.put("recorder", stage.keys.control("router"), command.pack())
+    for k in range(3, 6):
+        began = time.monotonic()
+        stage.put("sensor", stage.keys.uplink, packet(k, stage.packet(k)))
+        stage.downlinks["eve"].hear()
+        assert time.monotonic() - began >= 0.05, "a link that an operator gives a delay"

@@ -35,3 +35,12 @@ def test_more_keys_than_a_run_has_and_slots_beyond_it_are_refused() -> None:
         read_process_status(Reader(KEY, many.pack()), 10)
     with pytest.raises(MalformedMessage):
         read_process_status(Reader(KEY, ProcessStatus(11, ()).pack()), 10)
+
+
+@pytest.mark.parametrize("key", ["x", "", "evedrop/r1", "evedrop/r1/" + 600 * "x", "evedrop/r1/control/a\nb"])
+def test_what_is_no_key_of_a_run_is_refused(key: str) -> None:
+    """An eavesdropper is not trusted, and a failure names the keys that processes wait on: its sender is named."""
+    told = ProcessStatus(7, ("evedrop/r1/downlink/eve", key)).pack()
+    with pytest.raises(MalformedMessage, match="keys of a run") as refused:
+        read_process_status(Reader(KEY, told), 10)
+    assert refused.value.at_fault == ("eve",)

@@ -97,7 +97,7 @@ def _metrics(options: argparse.Namespace, scenario: Scenario, folder: Path, line
 
     address = MetricsAddress.of(options.metrics)
     metrics = RunMetrics(scenario, folder, line.on_event)
-    with metrics_served(address, metrics) as page:
+    with contextlib.closing(metrics), metrics_served(address, metrics) as page:
         if not options.json:
             line.console.print(f"metrics are served at {page}", soft_wrap=True)
         if address.warning is not None:

@@ -102,7 +102,7 @@ class Children:
         self._restarts = 0
         self._briefs: dict[str, AnyBrief] = {}
         self._killed: set[int] = set()
-        """Ids of processes whose end is not a failure: those killed by the scenario, and routers that were restarted."""
+        """Ids of processes whose end is not a failure: those killed by the scenario."""
 
     def __enter__(self) -> Children:
         return self
@@ -184,7 +184,6 @@ class Children:
         if ended.process not in {ROUTER, RELAY} or not signalled or self._restarts == ROUTER_RESTARTS:
             return False
         self._restarts += 1
-        self._killed.add(self._processes[ended.process].pid)
         self.start(self._briefs[ended.process], again=True)
         return True
 
@@ -216,7 +215,7 @@ class Children:
     def _confirm(self, request: ProcessRequest) -> None:
         recorder = self._processes[RECORDER].stdin
         if recorder is not None:
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, ValueError):  # it has ended, or the run has
                 recorder.write(b"%d\n" % request.number)
                 recorder.flush()
 

@@ -8,12 +8,12 @@ Source: docs/export.md, metrics of a live run.
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import re
 import socket
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -22,11 +22,11 @@ from msgspec import structs
 
 from evedrop.errors import UsageError
 from evedrop.model.metrics import estimated_metrics
+from evedrop.results.folder import HeldFolder
 from evedrop.results.reading import Results
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.progress_events import (
     ConnectionOutage,
-    FolderMoved,
     Held,
     OnEvent,
     ProgressEvent,
@@ -89,6 +89,8 @@ class RunMetrics:
     def __init__(self, scenario: Scenario, folder: Path, on_event: OnEvent) -> None:
         """folder: of the results; on_event: gets all events after this object."""
         self._scenario, self._folder, self._on_event = scenario, folder, on_event
+        self._held_folder: HeldFolder | None = None
+        """The folder once it is there; it may be renamed while the run goes on."""
         self._lock = world().lock()
         self._progress = RunProgress(0, 0.0, "slots/s", {})
         self._running = self._held = False
@@ -100,6 +102,8 @@ class RunMetrics:
             match event:
                 case Started():
                     self._running = True
+                    with contextlib.suppress(OSError):
+                        self._held_folder = self._held_folder or HeldFolder(self._folder)
                 case Held():
                     self._held = True
                     self._progress = structs.replace(self._progress, done=event.before, rate=0.0)
@@ -107,9 +111,21 @@ class RunMetrics:
                     self._progress, self._held = event, False
                 case ConnectionOutage():
                     self._losses[event.process] += 1
-                case FolderMoved():
-                    self._folder = Path(event.folder)
         self._on_event(event)
+
+    def close(self) -> None:
+        """Let the folder go."""
+        with self._lock:
+            if self._held_folder is not None:
+                self._held_folder.close()
+            self._held_folder = None
+
+    def _place(self) -> Path:
+        """Where the folder is now."""
+        with contextlib.suppress(OSError):
+            if self._held_folder is not None:
+                return self._held_folder.now
+        return self._folder
 
     def describe(self) -> list[Any]:
         """Nothing: the metrics are made at each scrape."""
@@ -120,7 +136,7 @@ class RunMetrics:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily  # noqa: PLC0415 - an optional extra
 
         with self._lock:
-            progress, losses, folder = self._progress, Counter(self._losses), self._folder
+            progress, losses, folder = self._progress, Counter(self._losses), self._place()
             running, held = self._running, self._held
         yield GaugeMetricFamily("evedrop_running", "Whether all processes have appeared.", float(running))
         yield GaugeMetricFamily("evedrop_held", "Whether the operator holds the run.", float(held))
@@ -175,7 +191,7 @@ def _summary(folder: Path) -> Mapping[str, Any]:
         return {}
 
 
-@contextmanager
+@contextlib.contextmanager
 def metrics_served(address: MetricsAddress, metrics: RunMetrics, patience: float = _REQUEST_SECONDS) -> Iterator[str]:
     """Serve metrics while the block runs; gives the address of their page.
 

@@ -20,6 +20,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from queue import Empty
 from typing import IO, Protocol, final
@@ -153,7 +154,8 @@ def end_all(processes: Collection[StartedProcess]) -> None:
         kill(*wait_for(hanging, _STACKS_SECONDS))
     for process in processes:
         if process.stdin is not None:
-            process.stdin.close()
+            with contextlib.suppress(OSError):  # what could not be written to one that is dead is written again
+                process.stdin.close()
 
 
 _REPORT_SECONDS = 5.0
@@ -375,6 +377,8 @@ class PreloadedStarter:
 
 _preloaded: list[PreloadedStarter] = []
 """What is kept for the `preloaded` blocks that this process is in."""
+_OF_RUN: ContextVar[PreloadedStarter | None] = ContextVar("of_run", default=None)
+"""What is kept for the run that this thread is in: its servers end with it, and no other thread may use them."""
 
 
 @contextmanager
@@ -385,12 +389,20 @@ def process_starter(stop: ThreadEvent | None = None) -> Iterator[Starter]:
     imports are not made in advance, so that one run starts as early as it can.
     """
     with ExitStack() as stack:
-        usable = bool(_preloaded) and _preloaded[-1].usable
-        starter = _preloaded[-1] if usable else stack.enter_context(_waiting_servers(OF_OTHERS, OF_RECORDERS))
+        starter: Starter | None = next(filter(_is_usable, (_OF_RUN.get(), *reversed(_preloaded))), None)
+        if starter is None:
+            starter = stack.enter_context(_waiting_servers(OF_OTHERS, OF_RECORDERS))
+            if isinstance(starter, PreloadedStarter):
+                stack.callback(_OF_RUN.reset, _OF_RUN.set(starter))
         yield starter.until(stop) if stop is not None and isinstance(starter, PreloadedStarter) else starter
 
 
-def preloaded() -> AbstractContextManager[Starter]:
+def _is_usable(starter: PreloadedStarter | None) -> bool:
+    return starter is not None and starter.usable
+
+
+@contextmanager
+def preloaded() -> Iterator[Starter]:
     """Make the imports of live runs once for all runs in the block, which then start and end faster.
 
     Two more processes wait meanwhile. Raises OSError if they cannot be started.
@@ -398,7 +410,15 @@ def preloaded() -> AbstractContextManager[Starter]:
     >>> with preloaded():                                                               # doctest: +SKIP
     ...     found = [run("eavesdroppers", slots=1000, seed=seed) for seed in range(10)]
     """
-    return _waiting_servers(OF_OTHERS, (*OF_RECORDERS, *OF_SUMMARIES))
+    with _waiting_servers(OF_OTHERS, (*OF_RECORDERS, *OF_SUMMARIES)) as starter:
+        if not isinstance(starter, PreloadedStarter):
+            yield starter
+            return
+        _preloaded.append(starter)
+        try:
+            yield starter
+        finally:
+            _preloaded.remove(starter)
 
 
 def preloaded_without_recorder() -> AbstractContextManager[Starter]:
@@ -408,17 +428,12 @@ def preloaded_without_recorder() -> AbstractContextManager[Starter]:
 
 @contextmanager
 def _waiting_servers(*modules: Sequence[str]) -> Iterator[Starter]:
-    """Fork servers that import these modules, for all runs in the block. Raises OSError."""
+    """Fork servers that import these modules, where there can be any. Raises OSError."""
     if not world().forks:
         yield start_process
         return
     with fork_servers(*modules) as servers:
-        starter = PreloadedStarter(servers)
-        _preloaded.append(starter)
-        try:
-            yield starter
-        finally:
-            _preloaded.remove(starter)
+        yield PreloadedStarter(servers)
 
 
 def _inherited() -> dict[str, str]:

@@ -131,7 +131,7 @@ class Downlink:
         if packets.truth is not None and k == self._leak:
             arrivals = arrivals._replace(truth=dict(enumerate(packets.truth)))
         rests = bool(self._rests) or self.core.fates.rests is not None
-        seconds = self._rest(k, arrivals.gamma[0], arrivals.late.get(0, ())) if rests else 0.0
+        seconds = self._rest(k, arrivals.gamma[0], arrivals.late.get(0, ())) if rests and self._pace else 0.0
         self._put(delivery(slots, arrivals), seconds)
 
     def _rest(self, k: int, gamma: Flags, late: tuple[Late, ...]) -> float:
@@ -218,17 +218,12 @@ class RouterLoop:
         self._put_journal = session.publisher(session.keys.journal)
         delayed_sender = DelayedSender() if brief.part.pace else None
 
-        def publisher(name: str, schedule: LinkSchedule) -> Callable[[bytes, float], None]:
+        def publisher(name: str) -> Callable[[bytes, float], None]:
             put = session.publisher(session.keys.downlink(name))
-            delays = any(
-                "delay" in (settings or {}) for settings in (schedule.settings, *(c.settings for c in schedule.changes))
-            )
-            return (
-                (lambda payload, _: put(payload)) if delayed_sender is None or not delays else delayed_sender.round(put)
-            )
+            return (lambda payload, _: put(payload)) if delayed_sender is None else delayed_sender.round(put)
 
         self._schedules = dict(brief.part.links)
-        self._publishers = {name: publisher(name, schedule) for name, schedule in self._schedules.items()}
+        self._publishers = {name: publisher(name) for name in self._schedules}
         acknowledgements = brief.part.acknowledgements
         self._ack_link = AckLink(brief, session, acknowledgements) if acknowledgements is not None else None
         # A message to the router's own uplink wakes the thread that waits there: only the conductor ends a router.
@@ -512,14 +507,25 @@ class DelayedSender:
 
     def round(self, put: Put) -> Callable[[bytes, float], None]:
         """A publisher that sends each message the given seconds later, but never before the previous message."""
-        last = 0.0
+        last, waiting = 0.0, 0
+
+        def put_due(payload: bytes) -> None:
+            nonlocal waiting
+            put(payload)
+            with self._changed:
+                waiting -= 1
 
         def send(payload: bytes, seconds: float) -> None:
-            nonlocal last
-            last = max(last, world().monotonic() + seconds)
+            nonlocal last, waiting
             with self._changed:
-                heapq.heappush(self._due, (last, next(self._numbers), put, payload))
-                self._changed.notify()
+                at_once = not seconds and not waiting
+                if not at_once:
+                    last = max(last, world().monotonic() + seconds)
+                    waiting += 1
+                    heapq.heappush(self._due, (last, next(self._numbers), put_due, payload))
+                    self._changed.notify()
+            if at_once:
+                put(payload)
 
         return send
 

@@ -23,6 +23,9 @@ from evedrop.system.fields import Slot
 from evedrop.system.threads import Queue
 from evedrop.system.world import world
 
+_KEY_LENGTH = 600
+"""The most characters of a key: the names of a run and of a process have at most 250."""
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -176,7 +179,11 @@ def is_process_status(message: Reader) -> bool:
 def read_process_status(message: Reader, slots: int) -> ProcessStatus:
     """Decode a process's status; slots: of the run."""
     message.integer("k", 0, slots)
-    return message.read(ProcessStatus)
+    status = message.read(ProcessStatus)
+    for key in status.waits:  # a failure quotes them
+        if key.count("/") < 2 or len(key) > _KEY_LENGTH or not key.isprintable():
+            raise message.malformed(f"waits has {shown(key)}", "keys of a run")
+    return status
 
 
 @final

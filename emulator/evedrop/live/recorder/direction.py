@@ -101,6 +101,8 @@ class Direction:
         done, at = self._joiner.done, self._steering.at
         self._recovery.poll(done)
         held = at is not None and done >= at
+        if held:
+            self._run.progress.start(done)
         # Slots are joined without the controller's reports, until the sensor waits for them.
         flow = self._brief.flow
         owed = self._run.score.all_joined or done - self._joiner.settled >= flow.window - flow.batch
