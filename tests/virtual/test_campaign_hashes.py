@@ -11,7 +11,7 @@ import pytest
 
 from tests.virtual.simulated import played
 
-HASH = "926f259662fbcee4"
+HASH = "03fcf3c605f11670"
 """Of the seeds 1 to 30."""
 _PLAY = """
 from evedrop.results.reading import Results

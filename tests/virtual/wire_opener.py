@@ -14,6 +14,7 @@ from evedrop.errors import EvedropError, UsageError
 from evedrop.system.output import say
 from evedrop.system.world import world
 from evedrop.virtual.processes import ChildProcess, VirtualMachine
+from evedrop.wire.journal_place import JOURNAL_FOLDER
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.running import ExpectationFailed, RunningWire, described_wire
 from tests.virtual.wire_programs import Course
@@ -46,6 +47,8 @@ def open_from_python(
     finally:
         for process in course.processes[-1:]:
             process.printed = "".join(running._errors)
+    if not (folder / JOURNAL_FOLDER).is_dir():  # somebody has moved it away meanwhile
+        return 0
     heard = running.summary()["heard"]
     rows = running.rows().num_rows
     if heard > rows or (folder / "summary.json").exists() != (running.typed_summary().state == "ended"):

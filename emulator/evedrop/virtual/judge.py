@@ -23,7 +23,7 @@ from evedrop.results.crash_proof_tables import last_round
 from evedrop.results.reading import METRICS_AS_OF, Results
 from evedrop.scenario.loading import load
 from evedrop.scenario.plugins import named_in
-from evedrop.scenario.progress_events import ConnectionOutage, RunProgress
+from evedrop.scenario.progress_events import ConnectionOutage, RunProgress, Started
 from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import verification_of
 from evedrop.virtual.broken_messages import CONTRADICTIONS, BreakMessage
@@ -93,6 +93,16 @@ _GOES_ON = ("control.json", "control.json.new", "unfinished")
 """What the folder of a run that goes on has, and that of a run that has ended has not."""
 
 
+def _hung_at_start(run: SimulatedRun, struck: Mapping[Disturbance, float]) -> set[str]:
+    """The processes that hang for good while they start: none of their threads notices that the launcher was killed."""
+    began = min((at for at, event in run.told if isinstance(event, Started)), default=math.inf)
+    return {
+        fault.target
+        for fault, at in struck.items()
+        if isinstance(fault, HangProcess) and fault.seconds is None and at < began
+    }
+
+
 def misses(
     case: SimulatedCase,
     run: SimulatedRun,
@@ -114,6 +124,7 @@ def misses(
         if isinstance(fault, StopProcess) and fault.seconds is None
         if at >= min(killed, cut.get(host_of(fault.target), math.inf))
     }
+    unheard |= _hung_at_start(run, struck) if killed < math.inf else set()
     for_good = [fault for fault in struck if fault.seconds is None]
     stopped = {(part_of(fault.target), host_of(fault.target)) for fault in for_good if isinstance(fault, StopProcess)}
     frozen = {host_of(fault.target) for fault in for_good if isinstance(fault, FreezeSsh)}
