@@ -40,7 +40,6 @@ as_json = flag("--json", "print JSON")
 output = together(
     option("--out", "DIR", "results folder, new or empty", type=Path),
     flag("--json", "print only the summary, as JSON, on standard output"),
-    verbose,
 )
 tables = together(
     option("--csv", "FILE", "also write the table as CSV, at full precision", type=Path),

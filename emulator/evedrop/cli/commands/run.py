@@ -10,7 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.cli.command import command, option
-from evedrop.cli.options import entries, hold, loaded, output, over_wire, paused, print_so_far, scenario, tables
+from evedrop.cli.options import (
+    entries,
+    hold,
+    loaded,
+    output,
+    over_wire,
+    paused,
+    print_so_far,
+    scenario,
+    tables,
+    verbose,
+)
 from evedrop.errors import Interrupted, RunError, UsageError
 
 if TYPE_CHECKING:
@@ -25,6 +36,7 @@ if TYPE_CHECKING:
 _LIVE = (
     entries,
     output,
+    verbose,
     option("--view", help_text="default auto", choices=("auto", "native", "web", "off"), default="auto"),
     option("--listen", "ENDPOINT", "the router's endpoint, such as tls/127.0.0.1:PORT; by default no port"),
     option("--relay", "ENDPOINT", "the second router's endpoint, if the scenario has two"),

@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING
 
 from evedrop.cli.command import command, flag, option, together
 from evedrop.cli.in_memory import MEMORY, check_resuming, crew, default_trials, keeping, plan_of, resuming, studied
-from evedrop.cli.options import as_json, changes_of, entries, loaded, output, over_wire, print_so_far, scenario, tables
+from evedrop.cli.options import (
+    as_json,
+    changes_of,
+    entries,
+    loaded,
+    output,
+    over_wire,
+    print_so_far,
+    scenario,
+    tables,
+    verbose,
+)
 from evedrop.counting import counted
 from evedrop.errors import Interrupted, UsageError
 from evedrop.model.metrics.text import ShownNumber, finite_text, number_text
@@ -29,7 +40,7 @@ _RARE = flag(
 
 
 @command(
-    (scenario, over_wire, *MEMORY, _RARE, tables),
+    (scenario, over_wire, *MEMORY, verbose, _RARE, tables),
     section="run",
     example="montecarlo vehicle --trials 200",
     page="montecarlo",
@@ -112,7 +123,7 @@ _COMPARES = together(
 
 
 @command(
-    (scenario, entries, output, _COMPARES, crew, resuming, tables),
+    (scenario, entries, output, verbose, _COMPARES, crew, resuming, tables),
     section="study",
     example="compare vehicle --trials 100",
     page="compare",
