@@ -152,6 +152,20 @@ def test_an_output_in_latin_1_ends_no_run(name: str, inputs: Path, tmp_path: Pat
     assert (evedrop.folder / "out" / "report.html").read_text(encoding="utf-8").endswith("</html>\n")
 
 
+def test_what_a_class_prints_is_not_among_the_json(evedrop: Evedrop) -> None:
+    """It goes to standard error."""
+    (evedrop.folder / "chatty.py").write_text(
+        "from evedrop.extend import Bernoulli\n\n\nclass Chatty(Bernoulli):\n    def __init__(self, **given):\n"
+        "        print('I am made')\n        super().__init__(**given)\n"
+    )
+    words = ("montecarlo", "eavesdroppers", "--trials", "2", "--slots", "9", "--set", "expect=[]")
+    link = 'legitimate.link={loss={model="chatty:Chatty", quality=0.8}}'
+    done = evedrop.process(*words, "--set", link, "--json")
+    assert done.status == 0
+    assert "I am made" in done.err
+    assert json.loads(done.out)["trials"] == 2
+
+
 def test_json_in_any_encoding_has_the_same_content(tmp_path: Path) -> None:
     """Characters that the encoding lacks are escaped, as JSON escapes them."""
     value = {"μ_d": ["ü", "😀", 0.5]}

@@ -54,7 +54,7 @@ EXCEPTIONS = {
     "peers/sensor.py wait self._mailbox.get": PROCESS,
 }
 """File, function and call → why it needs no limit."""
-CONTEXT = {"TAKEN", "_NO_MODULES", "_OF_COMMAND", "_OF_RUN"}
+CONTEXT = {"TAKEN", "_NO_MODULES", "_OF_COMMAND", "_OF_JSON", "_OF_RUN"}
 """Variables of a context, whose `get` does not wait."""
 
 

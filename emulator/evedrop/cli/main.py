@@ -7,6 +7,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -19,7 +20,7 @@ from evedrop.cli.words import words_of_commands
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.system.files import shown
 from evedrop.system.lacks import lack_of, refuse_scipy_without_room, report_refusal
-from evedrop.system.output import say, standard_streams, warn
+from evedrop.system.output import json_alone, say, standard_streams, warn
 
 if TYPE_CHECKING:
     from evedrop.cli.command import Command
@@ -78,7 +79,8 @@ def _status_of_command(given: list[str], parser: Parser | None) -> int:
     described: Command = options.described
     try:
         _check_names(options)
-        with written_tables(options), words_of_commands():
+        alone = json_alone() if getattr(options, "json", False) else nullcontext()
+        with alone, written_tables(options), words_of_commands():
             status = command(options)
         if status == 0:
             print_next_step(described, options)

@@ -15,6 +15,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator
+from contextvars import ContextVar
 from typing import Any, TextIO, cast, final
 
 _SPELLED = "evedrop.spelled"
@@ -162,12 +163,28 @@ def is_warning(line: str) -> bool:
     return line.startswith(f"evedrop: {_WARNING}")
 
 
+_OF_JSON: ContextVar[TextIO | None] = ContextVar("of_json", default=None)
+"""Where JSON is printed, while all else that is printed goes to standard error."""
+
+
+@contextlib.contextmanager
+def json_alone() -> Iterator[None]:
+    """Let standard output have JSON alone during the block: what a class of the user's prints goes to standard error."""
+    token = _OF_JSON.set(sys.stdout)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _OF_JSON.reset(token)
+
+
 def print_json(value: object) -> None:
     """Print a value as one line of JSON, whose content does not depend on the encoding of standard output."""
-    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    out = _OF_JSON.get() or sys.stdout
+    encoding = getattr(out, "encoding", None) or "utf-8"
     text = json.dumps(value, ensure_ascii=codecs.lookup(encoding).name != "utf-8")
     text = _STEERING.sub(lambda match: f"\\u{ord(match[0]):04x}", text)  # which JSON would leave as they are
-    sys.stdout.write(f"{text}\n")
+    out.write(f"{text}\n")
 
 
 def _descriptor(stream: io.TextIOWrapper) -> int | None:
