@@ -146,6 +146,9 @@ MISTAKES: dict[str, Callable[[Tables], str]] = {
     ),
     "certificates without encryption": _put("side", ROBOT, "tls", value={"certificate": "a", "key": "b"}),
     "a user with a colon": _put("side", ROBOT, "users", value={"a:b": "c"}),
+    "a user with a line break": _put("side", ROBOT, "users", value={"a\nb": "c"}),
+    "a user with a space": _put("side", ROBOT, "users", value={" a": "c"}),
+    "a link without keys": _put("link", 0, "keys", value=[]),
     "an event without a time": _add("event", {"note": "when?"}, "at"),
     "an event with two times": _add("event", {"at": 1, "from": 2, "note": "when?"}, "at"),
     "an event that only ends": _add("event", {"at": 1, "to": 2, "note": "when?"}, "to"),
@@ -163,6 +166,11 @@ MISTAKES: dict[str, Callable[[Tables], str]] = {
     "an expectation of nothing": _add("expect", {}, "metric"),
     "an expectation of an unknown metric": _add("expect", {"metric": "l0.speed", "above": 0.5}, "metric"),
     "an expectation without a bound": _add("expect", {"metric": "l0.delivery"}, "below"),
+    "an expectation that nothing meets": _add("expect", {"metric": "l0.delivery", "below": 0.0}, "below"),
+    "an expectation beyond everything": _add("expect", {"metric": "l0.delivery", "above": 1.0}, "above"),
+    "an expectation whose bounds are exchanged": _add(
+        "expect", {"metric": "l0.delivery", "above": 0.6, "below": 0.5}, "above"
+    ),
     "an expectation without a quantile": _add("expect", {"metric": "l0.latency", "below": 1}, "quantile"),
     "an expectation with a pointless quantile": _add(
         "expect", {"metric": "l0.delivery", "below": 1, "quantile": 0.5}, "quantile"

@@ -90,6 +90,8 @@ def _use(running: RunningWire, plan: WirePlan, seconds: float, course: Course) -
             course.doubts.append(f"side {name} is at {running.endpoint(name)}")
         if side.listen:
             running.config(name)
+            _refused(lambda name=name: running.config(name, "nobody"), "has no user", course)  # type: ignore[misc]
+    _refused(running.__enter__, "runs already", course)
     for step in steps:
         world().sleep(seconds / len(steps))
         if not running.is_running:
