@@ -75,7 +75,8 @@ class ScenarioError(UsageError):
         self._all = mistakes
         more = len(mistakes) - MOST_MISTAKES
         self._excerpts = [*excerpts[:MOST_MISTAKES], ""] if more > 0 else excerpts
-        short = [line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}…" for line in mistakes[:MOST_MISTAKES]]
+        whole = (line.replace("\n", r"\n") for line in mistakes[:MOST_MISTAKES])  # also with a name of two lines
+        short = [line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}…" for line in whole]
         self.mistakes = short if more <= 0 else [*short, f"and {more} more"]
         told = f"{source}: {counted(len(mistakes), 'mistake')}, nothing was started"
         super().__init__("\n".join([told, *(f"  {line}" for line in self.mistakes)]))

@@ -221,3 +221,13 @@ def test_a_message_has_as_many_mistakes_as_can_be_read() -> None:
     illustrated = caught.value.illustrated.split("\n")
     assert len(illustrated) == 1 + 3 * MOST_MISTAKES + 1
     assert illustrated[-1] == "  and 50 more"
+
+
+def test_a_mistake_is_a_line_whatever_a_name_has() -> None:
+    """The excerpt of the file follows it."""
+    with pytest.raises(ScenarioError) as caught:
+        parse(BASE + '\n[eavesdroppers."a\\nb"]\nstrategy = "naive"\n', "lines.toml")
+    first, *lines = str(caught.value).split("\n")
+    assert first == f"lines.toml: {len(lines)} mistake{'s' * (len(lines) > 1)}, nothing was started"
+    assert any(r"a\nb" in line for line in lines)
+    assert "     |" in caught.value.illustrated
