@@ -89,6 +89,7 @@ REFUSED = {
         view done --picture a.png --times 1:2
         view done --panel scene
         view done --slot 3
+        view done --slot 0
         view done --table --size 300x300
         view done --picture done.png --fps 5
         view done --picture done.png --csv done.csv

@@ -162,7 +162,8 @@ def _check_names(options: argparse.Namespace) -> None:
         ("latex", options.table, "a table; give --table, too"),
         ("serve", not (picture or video or options.table), "a view on the screen; leave it out"),
     ):
-        if getattr(options, name) not in {None, False} and not fits:
+        given = getattr(options, name)
+        if given is not None and given is not False and not fits:
             raise UsageError(f"--{name} is for {what}")
     if options.picture is not None:
         from evedrop.show.view.picture import check_picture_name
