@@ -6,13 +6,18 @@ import re
 import shlex
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from xml.etree import ElementTree as ET
 
 import pytest
 
+from evedrop.cli.simulated import program
+from evedrop.errors import Interrupted
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import Scenario, load
 from evedrop.scenarios import shipped
+from evedrop.virtual import campaign
+from evedrop.virtual.campaign import play_case
 from evedrop.virtual.cases import case_with
 from tests.conftest import Evedrop
 
@@ -80,6 +85,24 @@ def test_seeds_disturb_a_scenario_in_different_ways() -> None:
     assert {bool(case.faults) for case in cases} == {True, False}
     assert case_with(scenario, 5) == cases[4]
     assert all(case.scenario is scenario for case in cases)
+
+
+def test_a_play_ends_in_its_midst(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Ctrl-C wants it: at once, and nothing is left."""
+    case = case_with(load(str(shipped()["eavesdroppers"]), {"slots": 60}), 1)
+    checks = count()
+
+    def check() -> None:
+        if next(checks) == 200:
+            raise Interrupted
+
+    with TemporaryDirectory() as folder:  # whose path is short enough for sockets
+        monkeypatch.setattr(campaign, "_MEMORY", Path(folder))
+        with pytest.raises(Interrupted):
+            play_case(case, program, check=check)
+        assert next(checks) == 201
+        assert not [*Path(folder).iterdir()]
+        assert not play_case(case, program).misses
 
 
 def test_a_long_run_is_not_cut_into_many_messages() -> None:

@@ -93,10 +93,13 @@ def play_seeds(
     with stop_on_signals() as stop:
         reference = in_memory(scenario, folder)
 
-        def play(case: SimulatedCase, reference: RunReference | None = None) -> PlayedCase:
+        def heed() -> None:
             if stop.is_set():
                 raise Interrupted.with_results(folder)
-            return play_case(case, program, keep=reference is None, reference=reference)
+
+        def play(case: SimulatedCase, reference: RunReference | None = None) -> PlayedCase:
+            heed()
+            return play_case(case, program, keep=reference is None, reference=reference, check=heed)
 
         started = time.monotonic()
         for seed in range(simulation.first, simulation.first + simulation.seeds):
@@ -111,8 +114,7 @@ def play_seeds(
         if not failed:
             return PlayedSeeds(told)
         story = _story(failed[0], play)
-        if stop.is_set():
-            raise Interrupted.with_results(folder)
+        heed()
     return PlayedSeeds(told, _reasons(failed[0], place, changes), story)
 
 

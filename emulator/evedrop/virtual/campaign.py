@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -53,9 +53,16 @@ def play(seed: int, program: Program, keep: bool = False) -> PlayedCase:
 
 
 def play_case(
-    case: SimulatedCase, program: Program, keep: bool = False, reference: RunReference | None = None
+    case: SimulatedCase,
+    program: Program,
+    keep: bool = False,
+    reference: RunReference | None = None,
+    check: Callable[[], object] = lambda: None,
 ) -> PlayedCase:
-    """Play a case; reference: the same trials in memory, if they have been computed."""
+    """Play a case; reference: the same trials in memory, if they have been computed.
+
+    check: called again and again meanwhile; what it raises ends the play.
+    """
     with _folder() as folder:
         if reference is None:
             reference = in_memory(case.scenario, folder / "memory")
@@ -63,6 +70,7 @@ def play_case(
         machine.mkdir()
         struck: dict[Disturbance, float] = {}
         world = SimulatedWorld(case.seed, program, machine, keep)
+        world.scheduler.check = check
         temporary = world.disk.root / "temporary"
         temporary.mkdir(0o700)
         for fault in case.faults:

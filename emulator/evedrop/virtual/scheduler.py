@@ -193,6 +193,8 @@ class VirtualScheduler:
         self._number = 1000
         self.current: VirtualThread | None = None
         self.tasks: list[VirtualTask] = []
+        self.check: Callable[[], object] = lambda: None
+        """Called before each thread goes on; what it raises ends the world."""
         self.on_stop: Callable[[VirtualTask], object] = lambda _: None
         """What else happens when a process is suspended."""
         self.watchers: list[Callable[[str, str, tuple[object, ...]], object]] = []
@@ -392,6 +394,7 @@ class VirtualScheduler:
     def run(self, until: float, done: Callable[[], bool]) -> None:
         """Let everything happen until `done`. Raises Stuck if that is not before this moment, or cannot be any more."""
         while not done():
+            self.check()
             while self._plans and self.events >= self._plans[0][0]:
                 heapq.heappop(self._plans)[2]()
             if self._ready:
