@@ -166,3 +166,14 @@ def test_what_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
         with monkeypatch.context() as patch:
             patch.setattr(module, name, most)
             assert modulated_streaks(PLANE, link, at, 9, total) is None
+
+
+def test_a_packet_that_is_delayed_into_a_later_slot_is_lost() -> None:
+    """Without a window: the streaks are those behind a link that loses it, and carry all of the error."""
+    lossy = Chain(BURSTS.transitions, BURSTS.stationary, 0.6 * BURSTS.quality)
+    at = AT["suspicious"](0.4)
+    delayed = found_in(LinkDistribution((Segment(0, BURSTS, 1.0, np.array([0.6])),)), at, 40)
+    lost = found_in(LinkDistribution.steady(lossy), at, 40)
+    np.testing.assert_allclose(delayed.number, lost.number, rtol=1e-12)
+    np.testing.assert_allclose(delayed.carried, lost.carried, rtol=1e-12)
+    assert delayed.carried.sum() == pytest.approx(delayed.total, rel=2e-9)

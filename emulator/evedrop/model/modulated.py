@@ -448,7 +448,8 @@ def _slot_distributions_of(
         stationary[some, :states] = segment.chain.stationary
         if not segment.continues:
             transitions[some][:1, :, :states] = segment.chain.stationary
-        quality[some, :states] = segment.quality(range(some.start, max(some.start, some.stop)))
+        # Without a window, a packet that is delayed into a later slot is lost.
+        quality[some, :states] = segment.arrived[0] * segment.quality(range(some.start, max(some.start, some.stop)))
     odds = SlotOdds.of(outcomes_at).at(quality)
     if slots_at is not None:
         for k in range(slots):
