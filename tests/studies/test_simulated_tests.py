@@ -12,13 +12,16 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from evedrop.cli.simulated import program
-from evedrop.errors import Interrupted
+from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import Scenario, load
 from evedrop.scenarios import shipped
+from evedrop.studies import simulated_tests
+from evedrop.studies.simulated_tests import check_simulated
 from evedrop.virtual import campaign
-from evedrop.virtual.campaign import play_case
-from evedrop.virtual.cases import case_with
+from evedrop.virtual.campaign import PlayedCase, play_case
+from evedrop.virtual.cases import SimulatedCase, case_with
+from evedrop.virtual.shrinking import Shrunk
 from tests.conftest import Evedrop
 
 BEGINNING = """\
@@ -109,6 +112,31 @@ def test_a_long_run_is_not_cut_into_many_messages() -> None:
     """Its sensor may be far ahead, or the run would take minutes."""
     scenario = Scenario({**load(str(shipped()["eavesdroppers"]), {}).as_tables(), "slots": 10_000})
     assert min(case_with(scenario, seed).ahead for seed in range(1, 50)) >= 250
+
+
+@pytest.mark.parametrize(("slots", "pace"), [(7000, 1.0), (39, 60.0), (10_000, 0.5)])
+def test_the_pace_that_is_advised_is_not_refused(slots: int, pace: float) -> None:
+    """It has two digits, and is rounded down."""
+    scenario = load(str(shipped()["eavesdroppers"]), {"slots": slots, "pace": pace})
+    with pytest.raises(UsageError, match="give --set pace=") as refused:
+        check_simulated(scenario)
+    advised = re.search(r"--set pace=([0-9.e-]+),", str(refused.value))
+    assert advised is not None
+    check_simulated(load(str(shipped()["eavesdroppers"]), {"slots": slots, "pace": float(advised[1])}))
+
+
+def test_a_story_that_cannot_be_told_again_leaves_its_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A class that does something else each time may fail when the smallest run is played to be shown."""
+    case = case_with(load(str(shipped()["eavesdroppers"]), {"slots": 60}), 1)
+    failed = play_case(case, program)
+    monkeypatch.setattr(simulated_tests, "shrink", lambda *_: Shrunk(case, ("a promise is broken",), 1))
+
+    def play(_: SimulatedCase) -> PlayedCase:
+        raise RunError("its class failed")
+
+    story = simulated_tests._story(failed, play)
+    assert "a promise is broken" in story
+    assert story.endswith("played again, it ends otherwise: its class failed")
 
 
 @pytest.mark.thorough

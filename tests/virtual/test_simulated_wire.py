@@ -99,6 +99,59 @@ def test_an_hour_of_a_radio(evedrop_simulated_wire: Opener) -> None:
         radio.expect("radio.delivery", above=0.99)
 
 
+def test_a_program_that_ends_without_closing_its_session_has_sent_all(evedrop_simulated_wire: Opener) -> None:
+    """As an interpreter that ends; one that is killed has not."""
+    radio = evedrop_simulated_wire(**QUERIES)
+    kept: list[zenoh.Session] = []
+
+    def tell() -> None:
+        kept.append(zenoh.open(radio.config("robot")))
+        for number in range(300):
+            kept[0].put("place", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
+
+    radio.start(tell).result()
+    radio.clock.sleep(1.0)
+    assert radio.rows().num_rows == 300
+
+
+def test_a_program_that_starts_first_waits_for_its_wire(evedrop_simulated_wire: Opener) -> None:
+    """Its configuration says so with -1, for as long as it takes."""
+    free = "tcp/127.0.0.1:7558"
+    first = evedrop_simulated_wire(**QUERIES)
+    config = first.config("robot")
+    config.insert_json5("connect/endpoints", json.dumps([free]))
+    config.insert_json5("connect/timeout_ms", "-1")
+
+    def connect() -> float:
+        with zenoh.open(config):
+            return first.clock.monotonic()
+
+    early = first.start(connect)
+    first.clock.sleep(90.0)
+    assert early.is_running
+    opened = first.clock.monotonic()
+    evedrop_simulated_wire(**{**QUERIES, "side": {"robot": {"listen": free}, "base": {"listen": "tcp/127.0.0.1:7559"}}})
+    assert early.result(60.0) >= opened
+
+
+async def later() -> None:
+    """A coroutine."""
+    raise AssertionError
+
+
+def yields() -> Any:
+    """A generator."""
+    yield 1
+
+
+@pytest.mark.parametrize("work", [later, yields])
+def test_a_program_is_an_ordinary_function(work: Callable[[], Any], evedrop_simulated_wire: Opener) -> None:
+    """Nothing would run a coroutine."""
+    radio = evedrop_simulated_wire(**QUERIES)
+    with pytest.raises(UsageError, match="is no ordinary function"):
+        radio.start(work).result()
+
+
 @pytest.mark.campaign
 def test_a_wire_is_steered_while_programs_run(evedrop_simulated_wire: Opener) -> None:
     """At moments of virtual time, as a real one."""

@@ -48,6 +48,22 @@ def test_messages_keep_what_they_carry(net: Network) -> None:
 
 
 @behaviour
+def test_a_message_that_is_put_without_more_may_be_dropped(net: Network) -> None:
+    """And so may what is deleted, and what a publisher puts."""
+    router, got = net.router(), list[zenoh.Sample]()
+    router.declare_subscriber("**", got.append)
+    session = net.client("one")
+    publisher = session.declare_publisher("b")
+    net.until(lambda: publisher.matching_status.matching, "it is known")
+    session.put("b", bytearray(b"one"))
+    session.delete("b")
+    publisher.put(b"two")
+    net.until(lambda: len(got) == 3, "all arrive")
+    assert [sample.payload.to_bytes() for sample in got] == [b"one", b"", b"two"]
+    assert all(sample.congestion_control == zenoh.CongestionControl.DROP for sample in got)
+
+
+@behaviour
 def test_a_session_can_speak_to_others_only_and_hear_others_only(net: Network) -> None:
     """So a wire does not hear what it says itself."""
     router = net.router()

@@ -40,8 +40,6 @@ DISCONNECTS = "disconnects"
 """Process, from which router, why: "cut", "closed", "router is gone"."""
 FREEZES = "freezes"
 """Process, router: nothing gets through between them."""
-DECLARES = "declares"
-"""Process, what: such as "subscriber uplink" or "token"."""
 WRITES = "changes"
 """Process, what it does to a file (writes, renames, …), name of the file."""
 

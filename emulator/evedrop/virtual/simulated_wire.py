@@ -5,6 +5,7 @@ Source: docs/wire/python.md, an hour in seconds.
 
 from __future__ import annotations
 
+import inspect
 import signal
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -74,8 +75,18 @@ class SimulatedProgram(Generic[T]):
         world.machine.begin(name, self._run, self._process)
 
     def _run(self) -> int:
+        status = self._ended()
+        self._world.zenoh.close_sessions(self._process.task)  # as the end of an interpreter does, but not a signal
+        return status
+
+    def _ended(self) -> int:
+        """Do the work; returns the exit status."""
         try:
-            self._results.append(self._work())
+            result = self._work()
+            if inspect.iscoroutine(result) or inspect.isgenerator(result):
+                result.close()  # or Python warns of what was never awaited
+                raise UsageError(f"{self.name} is no ordinary function: simulated programs do not run coroutines")
+            self._results.append(result)
         except Ended:
             raise
         except SystemExit as end:

@@ -152,8 +152,7 @@ def _other(note: Occurrence) -> Step:
     if note.what == notes.SIGNAL and isinstance(note.words[1], int):
         text = signal.Signals(note.words[1]).name
     life = Life(note.what) if note.what in {life.value for life in Life} else None
-    steady = note.what == notes.DECLARES
-    step = Step(note.at, text, about, f"{note.what} {about}", steady=steady, life=life, about=about)
+    step = Step(note.at, text, about, f"{note.what} {about}", life=life, about=about)
     if note.what in (notes.SIGNAL, notes.STARTS) and note.process not in ("world", about):
         step.process, step.to = LAUNCHER if note.process in FORK_SERVERS else note.process, {about: Mark.ARRIVES}
     return step

@@ -6,6 +6,7 @@ Source: docs/maintainers/simulated-world.md.
 from __future__ import annotations
 
 import errno
+import math
 import os
 import socket
 import ssl
@@ -137,7 +138,8 @@ class VirtualZenoh:
             for place in places:
                 self._wait_while_suspended(place, (section(config, "transport/unicast/open_timeout") or _OPEN_MS) / 1e3)
                 connected = self._connect(session, place)
-                deadline = scheduler.now + (section(config, "connect/timeout_ms") or 0) / 1e3
+                wait = section(config, "connect/timeout_ms") or 0
+                deadline = scheduler.now + wait / 1e3 if wait >= 0 else math.inf
                 while not connected and not session.router and scheduler.now < deadline:
                     scheduler.sleep(session.again)
                     connected = self._connect(session, place)
@@ -237,6 +239,11 @@ class VirtualZenoh:
                 self.scheduler.after_seconds(seconds, attempt)
 
         try_after(self.scheduler.random.expovariate(1.0 / _OPEN_SECONDS))
+
+    def close_sessions(self, task: VirtualTask) -> None:
+        """Close all sessions of a process."""
+        for session in [session for session in self._sessions if session.task is task]:
+            session.close()
 
     def forget(self, session: VirtualSession) -> None:
         """A session has ended: nobody listens at its endpoints."""

@@ -290,14 +290,17 @@ class VirtualSession:
         payload: bytes | str | zenoh.ZBytes,
         *,
         allowed_destination: zenoh.Locality = zenoh.Locality.ANY,
+        congestion_control: zenoh.CongestionControl | None = None,
         **details: Any,
     ) -> None:
         """Put a message on a key; details: as of a `VirtualSample`. Raises ZError if the session is closed."""
+        control = zenoh.CongestionControl.DROP if congestion_control is None else congestion_control
         self.expect_open()
         self.task.allocate()
         message = bytes_of(payload)
         self.scheduler.note(notes.PUT, notes.key_within(expression_of(key)), len(message), notes.said_in(message))
-        frame = TransportFrame("put", str(key), message, self.scheduler.events, details_of(**details))
+        sent = details_of(congestion_control=control, **details)
+        frame = TransportFrame("put", str(key), message, self.scheduler.events, sent)
         self._pass_on(None, frame, remote=allowed_destination == zenoh.Locality.REMOTE)
         self.scheduler.interruptible()
 

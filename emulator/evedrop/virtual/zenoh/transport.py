@@ -131,10 +131,12 @@ class VirtualReply:
     replier_id: Replier | None = QUERYABLE
 
 
-def bytes_of(payload: bytes | str | zenoh.ZBytes | None) -> bytes:
+def bytes_of(payload: bytes | bytearray | str | zenoh.ZBytes | None) -> bytes:
     """The bytes of what a program puts."""
     if payload is None or isinstance(payload, bytes):
         return payload or b""
+    if isinstance(payload, bytearray):
+        return bytes(payload)
     return payload.encode() if isinstance(payload, str) else payload.to_bytes()
 
 
