@@ -442,6 +442,12 @@ def run_a_coroutine() -> None:
         asyncio.run(coroutine)
 
 
+def run_a_loop() -> None:
+    """As a program does that has made it before."""
+    with closing(asyncio.new_event_loop()) as loop:
+        loop.run_forever()
+
+
 @pytest.mark.parametrize(
     ("wait", "named"),
     [
@@ -456,6 +462,8 @@ def run_a_coroutine() -> None:
         (lambda: multiprocessing.get_context("spawn").Process(target=print).start(), "a process of multiprocessing"),
         (lambda: select.select([], [], [], 0.1), "select.select"),
         (run_a_coroutine, "asyncio.run"),
+        (run_a_loop, "an event loop of asyncio"),
+        (lambda: select.poll().poll(0), "select.poll"),
         (lambda: wire(**WIRE).__enter__(), "subprocess.Popen"),
     ],
 )

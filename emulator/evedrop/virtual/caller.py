@@ -45,7 +45,9 @@ _REAL: tuple[tuple[Any, str, str], ...] = (
     (os, "fork", "os.fork"),
     (multiprocessing.process.BaseProcess, "start", "a process of multiprocessing"),
     (select, "select", "select.select"),
+    (select, "poll", "select.poll"),
     (asyncio, "run", "asyncio.run"),
+    (asyncio.BaseEventLoop, "run_forever", "an event loop of asyncio"),
 )
 """What takes real time: place, name, and how users know it."""
 _MOST_TURNS = 100_000
